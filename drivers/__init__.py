@@ -1,0 +1,1 @@
+"""Drivers, one module per interface, found through entry points."""

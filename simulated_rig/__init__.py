@@ -1,0 +1,1 @@
+"""A rendered rig: ray-traced light transport, a camera and a projector on one world, and its truth."""

@@ -1,0 +1,1 @@
+"""slrig: drives structured-light rigs, captures, and reconstructs triangle meshes in millimetres."""

@@ -1,0 +1,112 @@
+"""Every error that slrig raises on purpose, in one tree.
+
+A message names four things: what was asked, what was found, and what to do about it, in the words of the person who
+reads it. Status codes and exit codes are decided at the edges (`slrig.api.problems`, `slrig.cli`), never here.
+"""
+
+from __future__ import annotations
+
+
+class SlrigError(Exception):
+    """Base of the tree. Catch it at an edge; raise one of its children."""
+
+
+class InvalidInputError(SlrigError):
+    """Something a person wrote or sent cannot be used as it is. Raise a child that says what kind of thing it was."""
+
+
+class ConfigError(InvalidInputError):
+    """A rig file, scene file or setting is wrong. All its faults belong in one message."""
+
+
+class BundleError(InvalidInputError):
+    """A scan bundle's description or one of its frames is wrong: missing, cut, another size, an unknown key."""
+
+
+class CalibrationError(InvalidInputError):
+    """A calibration is missing, malformed, not finite, or made for devices of another size."""
+
+
+class PatternError(InvalidInputError):
+    """A pattern cannot be shown or decoded on this projector: too few bits, too small, an impossible period."""
+
+
+class ScanEvidenceError(SlrigError):
+    """The frames themselves contradict what they should show: white not brighter than black, a repeated frame,
+    a bit that equals its inverse. Raise it when showing the same patterns again might help.
+    """
+
+
+class NothingToReconstructError(SlrigError):
+    """The frames are sound, and still hold no surface: nothing lit, nothing decoded, no stripe found."""
+
+
+class DeviceError(SlrigError):
+    """A camera or projector did not do what it was told. Raise a child where one fits."""
+
+
+class DeviceGoneError(DeviceError):
+    """The device was there and is not any more: unplugged, powered off. Reopening is the only way on."""
+
+
+class DeviceStateError(DeviceError):
+    """The call came in the wrong state: show before load, trigger before arm, anything after close.
+    This is a fault of the caller, not of the device.
+    """
+
+
+class UnsupportedByDeviceError(DeviceError):
+    """The device understood the request and cannot do it (an exposure out of range, a pattern of another size)."""
+
+
+class FrameTimeoutError(DeviceError):
+    """No frame that qualifies came in time. The device may be well: a late frame is not a lost device."""
+
+
+class DriverNotFoundError(ConfigError):
+    """A rig file names a driver that no installed package provides. Name those that are installed."""
+
+
+class DriverBrokenError(DeviceError):
+    """A driver is installed and cannot be loaded. Name the package and the cause; other drivers keep working."""
+
+
+class RigBusyError(SlrigError):
+    """The rig is held by another piece of work. Name the holder and since when."""
+
+    def __init__(self, message: str, *, holder: str, since: str) -> None:
+        super().__init__(message)
+        self.holder = holder
+        self.since = since
+
+
+class QueueFullError(SlrigError):
+    """The rig is held, and as many scans as are allowed to wait are waiting already."""
+
+
+class ScanCancelledError(SlrigError):
+    """Somebody asked for this scan to stop. Not a failure."""
+
+
+class ScanNotFoundError(SlrigError):
+    """No scan of this id is on record here."""
+
+
+class ArtefactNotReadyError(SlrigError):
+    """The scan exists, and the file asked for does not exist yet or never will (the scan failed)."""
+
+
+class ScanStateError(SlrigError):
+    """The scan exists and is in a state that forbids the call: deleting one that runs, for example."""
+
+
+class IdempotencyError(SlrigError):
+    """An idempotency key came again with another request body, or while the first one is still being answered."""
+
+
+class StorageError(SlrigError):
+    """The disk refused: full, read-only, gone. What was being written has been removed."""
+
+
+class ServiceError(SlrigError):
+    """The slrig service, asked as a client, could not be reached or answered with an error of its own."""

@@ -1,0 +1,1 @@
+"""From curves to a triangle mesh, and what the mesh is worth."""

@@ -1,0 +1,1 @@
+"""Patterns as described data: each module holds an encoding beside its inverse."""

@@ -1,0 +1,1 @@
+"""From frames to curves in millimetres: decoding, stripes, linking, triangulation."""

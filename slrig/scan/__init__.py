@@ -1,0 +1,1 @@
+"""One scan: plan, pipeline, runner, store."""

@@ -1,0 +1,44 @@
+"""What a scan is asked to do: frozen data, made once from a request and a rig file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class PatternPlan:
+    """Which patterns to play (DESIGN 5.1).
+
+    `line_shift_period_px` n; `gray_cell_px` defaults to ⌊n/2⌋, so that a code edge may be off by n/4 px.
+    `line_shift` False gives a Gray-only scan, whose cell defaults to 1 px.
+    """
+
+    line_shift: bool = True
+    line_shift_period_px: int = 8
+    line_width_px: int = 1
+    gray_cell_px: int | None = None
+    gray_offset_px: int = 0
+    rows: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReconstructionPlan:
+    """How frames become a mesh.
+
+    keep_holes : drop triangles that use a bridge between two stripes of one code.
+    depth_edge_ratio : a triangle edge longer than this many times the local sampling distance crosses a depth edge.
+    max_code_gap : neighbouring curves whose columns differ by at most this many column steps are meshed together.
+    """
+
+    keep_holes: bool = False
+    depth_edge_ratio: float = 6.0
+    max_code_gap: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPlan:
+    """One scan: patterns, exposure, reconstruction. `exposure_s` None keeps what the rig file says per camera."""
+
+    patterns: PatternPlan = field(default_factory=PatternPlan)
+    reconstruction: ReconstructionPlan = field(default_factory=ReconstructionPlan)
+    exposure_s: float | None = None
