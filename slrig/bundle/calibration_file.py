@@ -1,0 +1,130 @@
+"""calibration.json: where the devices of a rig stand, read, written, and held against the devices of a capture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from slrig.bundle.description import CameraName, Extent
+from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.bundle.opencv_calibration import read_opencv_calibration
+from slrig.bundle.storage import write_file
+from slrig.errors import CalibrationError
+from slrig.model import Calibration, Pinhole, Size
+
+MOST_CALIBRATION_BYTES = 4 * 2**20
+
+Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
+Distortion = Annotated[list[float], Field(min_length=5, max_length=5, description="k1, k2, p1, p2, k3")]
+
+
+class DeviceEntry(Strict):
+    """One camera or projector: pinhole, lens, and pose in the world."""
+
+    size_px: Extent
+    matrix: Matrix3
+    distortion: Distortion
+    rotation: Matrix3
+    translation_mm: Vector3
+
+
+class CalibrationEntry(Strict):
+    """The whole of calibration.json. Without a projector only cameras can be triangulated with each other."""
+
+    format: Literal["slrig-calibration"]
+    version: Literal[1]
+    cameras: Annotated[dict[CameraName, DeviceEntry], Field(min_length=1)]
+    projector: DeviceEntry | None = None
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Return the calibration in a file: slrig's JSON, or OpenCV FileStorage where the name ends in yml, yaml or xml.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, cut, has an unknown key or a number that is not finite; all faults in one message.
+    """
+    if path.suffix.lower() in {".yml", ".yaml", ".xml"}:
+        return read_opencv_calibration(path)
+    text = read_text(path, MOST_CALIBRATION_BYTES, CalibrationError)
+    data = read_json(text, path, CalibrationError)
+    try:
+        entry = CalibrationEntry.model_validate_json(text)
+    except ValidationError as cause:
+        message = f"{path} is not a valid calibration:\n{explain(cause, data, keys_of(CalibrationEntry))}"
+        raise CalibrationError(message) from cause
+    cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
+    projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
+    return Calibration(cameras, projector)
+
+
+def write_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration as slrig's JSON, whole or not at all.
+
+    Raises
+    ------
+    StorageError
+        The disk refused.
+    """
+    data: dict[str, Any] = {
+        "format": "slrig-calibration",
+        "version": 1,
+        "cameras": {name: _device(pinhole) for name, pinhole in calibration.cameras.items()},
+    }
+    if calibration.projector is not None:
+        data["projector"] = _device(calibration.projector)
+    write_file(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+
+
+def check_calibration(calibration: Calibration, projector: Size, cameras: Mapping[str, Size], source: str) -> None:
+    """Hold a calibration against the devices that it will be used for. `source` says where it came from.
+
+    Raises
+    ------
+    CalibrationError
+        It was made for devices of another size, or knows none of the cameras.
+    """
+    faults = [
+        f"cameras.{name}: expected {size} as the camera's frames are, found {calibration.cameras[name].size}"
+        for name, size in cameras.items()
+        if name in calibration.cameras and calibration.cameras[name].size != size
+    ]
+    if calibration.projector is not None and calibration.projector.size != projector:
+        faults.append(f"projector: expected {projector} as the projector is, found {calibration.projector.size}")
+    if not set(cameras) & set(calibration.cameras):
+        faults.append(f"cameras: expected {', '.join(cameras)}, found {', '.join(calibration.cameras)}")
+    if faults:
+        lines = "\n".join(f"  {fault}" for fault in faults)
+        message = f"{source}: the calibration is for other devices; calibrate these or name the right file:\n{lines}"
+        raise CalibrationError(message)
+
+
+def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
+    try:
+        return Pinhole(
+            Size(*device.size_px),
+            np.array(device.matrix, dtype=np.float64),
+            np.array(device.distortion, dtype=np.float64),
+            np.array(device.rotation, dtype=np.float64),
+            np.array(device.translation_mm, dtype=np.float64),
+        )
+    except CalibrationError as cause:
+        message = f"{path}: {place}.{cause}"
+        raise CalibrationError(message) from cause
+
+
+def _device(pinhole: Pinhole) -> dict[str, Any]:
+    return {
+        "size_px": [pinhole.size.width_px, pinhole.size.height_px],
+        "matrix": pinhole.matrix.tolist(),
+        "distortion": pinhole.distortion.tolist(),
+        "rotation": pinhole.rotation.tolist(),
+        "translation_mm": pinhole.translation_mm.tolist(),
+    }

@@ -1,0 +1,219 @@
+"""bundle.json: what a scan bundle says about itself, checked before a single pixel is read."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.errors import BundleError, PatternError
+from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Size, White
+
+DESCRIPTION = "bundle.json"
+MOST_DESCRIPTION_BYTES = 16 * 2**20
+MOST_SIDE_PX = 2**15
+MOST_CAMERA_PX = 2**26
+MOST_CAPTURE_BYTES = 2**32
+CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+"""Names of cameras become names of files."""
+
+Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
+Extent = Annotated[list[Side], Field(min_length=2, max_length=2)]
+CameraName = Annotated[str, Field(pattern=CAMERA_NAME)]
+AxisName = Literal["column", "row"]
+
+
+class ProjectorEntry(Strict):
+    """The projector: how many columns and rows it has."""
+
+    size_px: Extent
+
+
+class CameraEntry(Strict):
+    """One camera: extent and bit depth of its frames."""
+
+    size_px: Extent
+    bit_depth: Annotated[int, Field(ge=1, le=16)]
+
+    @field_validator("size_px")
+    @classmethod
+    def _fits_memory(cls, size_px: list[int]) -> list[int]:
+        if size_px[0] * size_px[1] > MOST_CAMERA_PX:
+            message = (
+                f"expected at most {MOST_CAMERA_PX} pixels per frame, found {size_px[0]} x {size_px[1]}; "
+                "crop or bin the frames"
+            )
+            raise ValueError(message)
+        return size_px
+
+
+class WhiteEntry(Strict):
+    """Every projector pixel lit."""
+
+    kind: Literal["white"]
+
+    def pattern(self) -> White:
+        """The pattern described."""
+        return White()
+
+
+class BlackEntry(Strict):
+    """No projector pixel lit."""
+
+    kind: Literal["black"]
+
+    def pattern(self) -> Black:
+        """The pattern described."""
+        return Black()
+
+
+class GrayEntry(Strict):
+    """One bit of a Gray code."""
+
+    kind: Literal["gray"]
+    axis: AxisName
+    bit: int
+    bits: int
+    cell_px: int = 1
+    offset_px: int = 0
+    inverted: bool = False
+
+    def pattern(self) -> Gray:
+        """The pattern described."""
+        return Gray(Axis(self.axis), self.bit, self.bits, self.cell_px, self.offset_px, self.inverted)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        _check_possible(self)
+        return self
+
+
+class LineShiftEntry(Strict):
+    """One frame of shifted lines."""
+
+    kind: Literal["line_shift"]
+    axis: AxisName
+    shift: int
+    period_px: int
+    line_width_px: int = 1
+
+    def pattern(self) -> LineShift:
+        """The pattern described."""
+        return LineShift(Axis(self.axis), self.shift, self.period_px, self.line_width_px)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        _check_possible(self)
+        return self
+
+
+def _check_possible(entry: GrayEntry | LineShiftEntry) -> None:
+    try:
+        entry.pattern()
+    except PatternError as cause:
+        raise ValueError(str(cause)) from cause
+
+
+class FrameEntry(Strict):
+    """One frame: which pattern, which camera, which file (and page of it), and when."""
+
+    pattern: Annotated[int, Field(ge=0)]
+    camera: CameraName
+    file: str
+    page: Annotated[int, Field(ge=0, le=65535)] = 0
+    exposure_s: Annotated[float, Field(gt=0)] | None = None
+    time_s: float | None = None
+
+    @field_validator("file")
+    @classmethod
+    def _inside(cls, file: str) -> str:
+        path = PurePosixPath(file)
+        if not path.parts or path.is_absolute() or ".." in path.parts or "\\" in file or ":" in file or "\0" in file:
+            message = (
+                f"expected a path inside the bundle with forward slashes, found {file!r}; "
+                "copy the frame into the bundle and write its path relative to bundle.json"
+            )
+            raise ValueError(message)
+        return file
+
+
+PatternEntry = Annotated[WhiteEntry | BlackEntry | GrayEntry | LineShiftEntry, Field(discriminator="kind")]
+
+
+class Description(Strict):
+    """The whole of bundle.json."""
+
+    format: Literal["slrig-bundle"]
+    version: Literal[1]
+    projector: ProjectorEntry
+    cameras: Annotated[dict[CameraName, CameraEntry], Field(min_length=1)]
+    patterns: Annotated[list[PatternEntry], Field(min_length=1)]
+    frames: Annotated[list[FrameEntry], Field(min_length=1)]
+
+    def projector_size(self) -> Size:
+        """Extent of the projector."""
+        return Size(*self.projector.size_px)
+
+    def camera_formats(self) -> dict[str, CameraFormat]:
+        """Extent and bit depth of each camera."""
+        return {name: CameraFormat(Size(*entry.size_px), entry.bit_depth) for name, entry in self.cameras.items()}
+
+    def pattern_list(self) -> tuple[Pattern, ...]:
+        """The patterns in order."""
+        return tuple(entry.pattern() for entry in self.patterns)
+
+
+def read_description(folder: Path) -> Description:
+    """Return the checked description of the bundle in `folder`.
+
+    Raises
+    ------
+    BundleError
+        Every fault of bundle.json in one message.
+    """
+    path = folder / DESCRIPTION
+    if not path.is_file():
+        found = "no such folder" if not folder.is_dir() else "a folder without it"
+        message = f"{path}: expected the description of a scan bundle, found {found}; give the folder that holds it"
+        raise BundleError(message)
+    text = read_text(path, MOST_DESCRIPTION_BYTES, BundleError)
+    data = read_json(text, path, BundleError)
+    try:
+        description = Description.model_validate_json(text)
+    except ValidationError as cause:
+        message = f"{path} is not a valid bundle description:\n{explain(cause, data, keys_of(Description))}"
+        raise BundleError(message) from cause
+    faults = _cross_faults(description)
+    if faults:
+        message = f"{path} is not a valid bundle description:\n" + "\n".join(f"  {fault}" for fault in faults[:20])
+        raise BundleError(message)
+    return description
+
+
+def _cross_faults(description: Description) -> list[str]:
+    """Faults that take two places of the file to see."""
+    faults = []
+    cameras = description.camera_formats()
+    size_bytes = 0
+    for index, frame in enumerate(description.frames):
+        if frame.pattern >= len(description.patterns):
+            faults.append(
+                f"frames[{index}].pattern: expected 0 to {len(description.patterns) - 1}, found {frame.pattern}; "
+                "number the patterns from 0"
+            )
+        camera = cameras.get(frame.camera)
+        if camera is None:
+            faults.append(
+                f"frames[{index}].camera: expected one of {', '.join(cameras)}, found '{frame.camera}'; "
+                "name a camera of the list `cameras`"
+            )
+            continue
+        size_bytes += camera.size.width_px * camera.size.height_px * (1 if camera.bit_depth <= 8 else 2)
+    if size_bytes > MOST_CAPTURE_BYTES:
+        faults.append(
+            f"frames: expected at most {MOST_CAPTURE_BYTES / 1e9:.1f} GB of samples, "
+            f"found {size_bytes / 1e9:.1f} GB in {len(description.frames)} frames; split the bundle or crop its frames"
+        )
+    return faults

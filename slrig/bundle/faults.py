@@ -1,0 +1,150 @@
+"""Faults of a description, told in the words of the person who wrote it.
+
+A description (bundle.json, calibration.json, a rig file) is checked by a pydantic model; what pydantic says is turned
+here into lines of the form `cameras.cam0.bit_depth: expected …, found …; do …`, all of them in one message.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from slrig.errors import InvalidInputError
+
+MOST_FAULTS = 20
+LONGEST_VALUE = 60
+
+
+class Strict(BaseModel):
+    """A description in which every key is known, every number finite, and nothing is converted in silence."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> str:
+    """Return the text of a small UTF-8 file.
+
+    Raises
+    ------
+    InvalidInputError
+        Of the class `error`: the file is missing, larger than `most_bytes`, or not text.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    except OSError as cause:
+        message = f"{path}: expected a readable file, found: {cause.strerror}; check the path"
+        raise error(message) from cause
+    if len(data) > most_bytes:
+        message = (
+            f"{path}: expected at most {most_bytes} bytes, found a larger file; "
+            "a description is short: check that this is the right file"
+        )
+        raise error(message)
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as cause:
+        message = f"{path}: expected UTF-8 text, found byte {data[cause.start]:#04x} at {cause.start}; save it as UTF-8"
+        raise error(message) from cause
+
+
+def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
+    """Return the data of a strict JSON text: no NaN, no infinity, no key twice.
+
+    Raises
+    ------
+    InvalidInputError
+        Of the class `error`, with the line where reading stopped.
+    """
+
+    def refuse_constant(name: str) -> NoReturn:
+        message = f"found {name}, which is not JSON; every number must be finite, leave an unknown value out"
+        raise ValueError(message)
+
+    def refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        data = dict(pairs)
+        if len(data) != len(pairs):
+            keys = [key for key, _ in pairs]
+            twice = sorted({key for key in keys if keys.count(key) > 1})
+            message = f"found the key {', '.join(map(repr, twice))} twice in one object; keep one of them"
+            raise ValueError(message)
+        return data
+
+    try:
+        return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_twice)
+    except json.JSONDecodeError as cause:
+        message = (
+            f"{source}: expected JSON, found a fault at line {cause.lineno} column {cause.colno} ({cause.msg}); "
+            "the file may be cut: copy it again or correct that line"
+        )
+        raise error(message) from cause
+    except RecursionError as cause:
+        message = f"{source}: expected a description, found JSON nested too deeply; check that this is the right file"
+        raise error(message) from cause
+    except ValueError as cause:
+        message = f"{source}: {cause}"
+        raise error(message) from cause
+
+
+def explain(cause: ValidationError, data: object, known: Sequence[str]) -> str:
+    """Return one line per fault; `known` are the keys to propose when one is misspelt."""
+    lines = [f"  {_line(fault, data, known)}" for fault in cause.errors(include_url=False)]
+    if len(lines) > MOST_FAULTS:
+        lines[MOST_FAULTS:] = [f"  … and {len(lines) - MOST_FAULTS} more"]
+    return "\n".join(lines)
+
+
+def keys_of(model: type[BaseModel]) -> tuple[str, ...]:
+    """Every key that a model and the models inside it know, for proposals."""
+    schema = model.model_json_schema()
+    return tuple(dict.fromkeys(_properties(schema)))
+
+
+def _properties(schema: object) -> Iterator[str]:
+    if isinstance(schema, Mapping):
+        properties = schema.get("properties")
+        if isinstance(properties, Mapping):
+            yield from properties
+        for part in schema.values():
+            yield from _properties(part)
+    elif isinstance(schema, list):
+        for part in schema:
+            yield from _properties(part)
+
+
+def _line(fault: ErrorDetails, data: object, known: Sequence[str]) -> str:
+    path = _path(fault["loc"], data, keep_last=fault["type"] == "missing")
+    if fault["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1)
+        remedy = f"did you mean '{near[0]}'?" if near else "remove it"
+        return f"{path}: unknown key; {remedy}"
+    if fault["type"] == "missing":
+        return f"{path}: missing; add it"
+    if fault["type"] == "value_error":
+        return f"{path}: {fault['ctx']['error']}"
+    return f"{path}: {fault['msg'][0].lower()}{fault['msg'][1:]}, found {shorten(fault['input'])}; correct it"
+
+
+def shorten(value: object) -> str:
+    """What was found, short enough for a line."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+
+
+def _path(loc: Sequence[int | str], data: object, *, keep_last: bool) -> str:
+    # Pydantic puts the tag of a union into the path; the file has no such step, so only steps found in the data count.
+    path = ""
+    for place, step in enumerate(loc):
+        if isinstance(step, int) and isinstance(data, Sequence) and step < len(data):
+            data, path = data[step], f"{path}[{step}]"
+        elif isinstance(data, Mapping) and step in data:
+            data, path = data[step], f"{path}.{step}"
+        elif keep_last and place == len(loc) - 1:
+            path = f"{path}.{step}"
+    return path.removeprefix(".") or "top level"

@@ -1,0 +1,192 @@
+"""Frame files: PNG and TIFF, their headers read before a pixel is decoded.
+
+A few hundred kilobytes can declare an image of gigabytes, so extent and depth come from the header, and only a file
+that fits what bundle.json declares is decoded. A PNG's chunks are walked with their checksums: a cut or damaged file is
+told as that, not as a strange image. So are TIFF pages without compression or with zlib; a fault inside LZW data, which
+has no checksum, shows only where the decoder stumbles.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import cv2
+import numpy as np
+import tifffile
+
+from slrig.errors import BundleError
+from slrig.model import CameraFormat, Pixels
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+PNG_GREY, PNG_COLOUR = 0, 2
+TIFF_ZLIB = (8, 32946)
+MOST_FILE_BYTES = 2**31
+TIFF_FAULTS = (
+    tifffile.TiffFileError,
+    struct.error,
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What reading a damaged TIFF header may raise."""
+
+
+def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[int, Pixels]:
+    """Return the wanted pages of a frame file, each (H, W) uint8 or uint16 of the camera's extent.
+
+    Samples are right-aligned; colour becomes grey with the weights of Rec. 601.
+
+    Raises
+    ------
+    BundleError
+        The file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
+    """
+    data = _read_bytes(path)
+    if data.startswith(PNG_SIGNATURE):
+        if set(pages) != {0}:
+            _refuse(path, "page 0 only, for a PNG holds one image", f"page {max(pages)}", "write page 0 or use a TIFF")
+        _check_png(path, data, camera)
+        images = {0: cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)}
+    elif data.startswith(TIFF_SIGNATURES):
+        _check_tiff(path, data, pages, camera)
+        images = {page: _tiff_page(data, page) for page in dict.fromkeys(pages)}
+    else:
+        found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
+        _refuse(path, "a PNG or TIFF file", found, "save the frame as PNG")
+    return {page: _grey(path, page, image, camera) for page, image in images.items()}
+
+
+def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
+    message = f"{path}: expected {expected}, found {found}; {remedy}"
+    raise BundleError(message)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        size_bytes = path.stat().st_size
+        if size_bytes > MOST_FILE_BYTES:
+            _refuse(path, f"at most {MOST_FILE_BYTES} bytes", f"{size_bytes}", "split the frames over several files")
+        return path.read_bytes()
+    except OSError as cause:
+        message = (
+            f"{path}: expected a frame file, found: {cause.strerror}; "
+            "copy the file into the bundle or remove its entry from bundle.json"
+        )
+        raise BundleError(message) from cause
+
+
+def _check_header(path: Path, width: int, height: int, bits: int, camera: CameraFormat) -> None:
+    rows, columns = camera.size.shape
+    if (height, width) != (rows, columns):
+        _refuse(
+            path,
+            f"{columns} x {rows} pixels as bundle.json declares",
+            f"{width} x {height}",
+            "correct size_px of the camera or replace the frame",
+        )
+    wanted = 8 if camera.bit_depth <= 8 else 16
+    if bits != wanted:
+        _refuse(
+            path,
+            f"{wanted}-bit samples for a bit_depth of {camera.bit_depth}",
+            f"{bits}-bit samples",
+            "correct bit_depth of the camera; all frames of one camera have one depth",
+        )
+
+
+def _check_png(path: Path, data: bytes, camera: CameraFormat) -> None:
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
+    width, height, bits, colour = struct.unpack(">IIBB", data[16:26])
+    if colour not in (PNG_GREY, PNG_COLOUR):
+        kind = "a palette" if colour == 3 else "an alpha channel"
+        _refuse(path, "a grey or colour PNG", f"one with {kind}", "save the frame as grey")
+    _check_header(path, width, height, bits, camera)
+    place = len(PNG_SIGNATURE)
+    view = memoryview(data)
+    while True:
+        length, kind_of_chunk = struct.unpack(">I4s", data[place : place + 8].ljust(8, b"\xff"))
+        end = place + 12 + length
+        if end > len(data):
+            _refuse(path, "a whole PNG file", f"one cut after {len(data)} bytes", "copy the frame again")
+        if zlib.crc32(view[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            _refuse(path, "a sound PNG file", f"a wrong checksum at byte {end - 4}", "copy the frame again")
+        if kind_of_chunk == b"IEND":
+            return
+        place = end
+
+
+def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
+    try:
+        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            count = len(tiff.pages)
+            if max(pages) >= count:
+                _refuse(path, f"a page {max(pages)}", f"{count} pages", "correct `page`, which counts from 0")
+            for index in dict.fromkeys(pages):
+                page = tiff.pages[index]
+                kind = getattr(page.photometric, "name", str(page.photometric))
+                if (kind, page.samplesperpixel) not in (("MINISBLACK", 1), ("RGB", 3)) or page.sampleformat != 1:
+                    _refuse(
+                        path,
+                        f"unsigned grey or colour samples on page {index}",
+                        f"{kind} with {page.samplesperpixel} samples of format {int(page.sampleformat)}",
+                        "save the frame as grey",
+                    )
+                _check_header(path, page.imagewidth, page.imagelength, page.bitspersample, camera)
+                ends = (offset + size for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True))
+                if max(ends, default=0) > len(data):
+                    _refuse(path, "a whole TIFF file", f"one cut after {len(data)} bytes", "copy the frame again")
+                if page.compression in TIFF_ZLIB:
+                    _check_zlib(path, index, data, page)
+    except BundleError:
+        raise
+    except TIFF_FAULTS as cause:
+        message = f"{path}: expected a sound TIFF file, found a damaged header ({cause}); copy the frame again"
+        raise BundleError(message) from cause
+
+
+def _check_zlib(path: Path, index: int, data: bytes, page: Any) -> None:
+    # OpenCV goes on after a fault in an 8-bit TIFF and returns what it has, so zlib and its checksum are asked first.
+    most_bytes = page.imagewidth * page.imagelength * page.samplesperpixel * page.bitspersample // 8
+    for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+        unpacker = zlib.decompressobj()
+        try:
+            unpacked = unpacker.decompress(memoryview(data)[offset : offset + size], most_bytes + 1)
+        except zlib.error:
+            unpacked = b""
+        if not unpacker.eof or len(unpacked) > most_bytes:
+            _refuse(path, f"sound data on page {index}", "data that cannot be unpacked", "copy the frame again")
+
+
+def _tiff_page(data: bytes, page: int) -> Pixels | None:
+    decoded, images = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED, None, (page, page + 1))
+    return images[0] if decoded and images else None
+
+
+def _grey(path: Path, page: int, image: Pixels | None, camera: CameraFormat) -> Pixels:
+    if image is None:
+        _refuse(path, f"a sound image on page {page}", "data that cannot be decoded", "copy the frame again")
+    if image.ndim == 3 and image.shape[2] == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if image.shape != camera.size.shape or image.dtype not in (np.uint8, np.uint16):
+        _refuse(path, f"{camera.size} grey samples", f"{image.shape} {image.dtype}", "save the frame as grey")
+    brightest = int(image.max())
+    if brightest > camera.full_scale:
+        _refuse(
+            path,
+            f"samples of 0 to {camera.full_scale} for a bit_depth of {camera.bit_depth}",
+            f"a sample of {brightest}",
+            "right-align the samples or correct bit_depth",
+        )
+    return image

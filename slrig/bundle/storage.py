@@ -1,0 +1,72 @@
+"""Files that are whole or absent: written beside their place, brought to disk, and renamed once."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from slrig.errors import StorageError
+
+
+@contextmanager
+def refusals_of(path: Path) -> Iterator[None]:
+    """Turn what the disk says about `path` into a StorageError."""
+    try:
+        yield
+    except OSError as cause:
+        message = (
+            f"{path}: the disk refused: {cause.strerror or cause}; nothing of it was kept: "
+            "free some space or choose another folder"
+        )
+        raise StorageError(message) from cause
+
+
+def write_durably(path: Path, data: bytes) -> None:
+    """Write a new file and bring it to disk; for a folder that is itself renamed into place later.
+
+    Raises
+    ------
+    OSError
+        The disk refused.
+    """
+    with path.open("xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def staging_name(path: Path) -> Path:
+    """A hidden sibling of `path` that nobody else uses."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Replace the file `path` by `data`, whole or not at all.
+
+    Raises
+    ------
+    StorageError
+        The disk refused; what was there before is still there.
+    """
+    staging = staging_name(path)
+    with refusals_of(path):
+        try:
+            write_durably(staging, data)
+            staging.replace(path)
+            sync_folder(path.parent)
+        except BaseException:
+            with suppress(OSError):
+                staging.unlink(missing_ok=True)
+            raise

@@ -1,0 +1,149 @@
+"""Whatever is written as a bundle or calibration is read back as it was."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slrig.bundle import (
+    read_bundle,
+    read_calibration,
+    read_opencv_calibration,
+    write_bundle,
+    write_calibration,
+    write_opencv_calibration,
+)
+from slrig.model import (
+    Axis,
+    Black,
+    Calibration,
+    CameraFormat,
+    Capture,
+    FloatArray,
+    Gray,
+    LineShift,
+    Pattern,
+    Pinhole,
+    Shot,
+    Size,
+    White,
+)
+from tests.samples import noise
+
+names = st.from_regex(r"[A-Za-z][A-Za-z0-9_-]{0,8}", fullmatch=True).filter(lambda name: name != "projector")
+sizes = st.builds(Size, st.integers(1, 24), st.integers(1, 24))
+finite = st.floats(-1e6, 1e6)
+axes = st.sampled_from(Axis)
+
+
+@st.composite
+def _grays(draw: st.DrawFn) -> Gray:
+    bits = draw(st.integers(1, 24))
+    numbers = draw(st.tuples(st.integers(0, bits - 1), st.integers(1, 300), st.integers(0, 300)))
+    return Gray(draw(axes), numbers[0], bits, numbers[1], numbers[2], draw(st.booleans()))
+
+
+@st.composite
+def _line_shifts(draw: st.DrawFn) -> LineShift:
+    period_px = draw(st.integers(4, 64))
+    width_px = draw(st.integers(1, period_px - 1))
+    return LineShift(draw(axes), draw(st.integers(0, period_px - 1)), period_px, width_px)
+
+
+patterns: st.SearchStrategy[Pattern] = st.one_of(st.just(White()), st.just(Black()), _grays(), _line_shifts())
+
+
+@st.composite
+def _captures(draw: st.DrawFn) -> Capture:
+    cameras = draw(st.dictionaries(names, st.builds(CameraFormat, sizes, st.integers(1, 16)), min_size=1, max_size=3))
+    shown = draw(st.lists(patterns, min_size=1, max_size=5))
+    times = st.none() | st.floats(0, 1e5)
+    exposures = st.none() | st.floats(1e-6, 10)
+    shots = tuple(
+        Shot(pattern, name, noise(cameras[name], draw(st.integers(0, 99))), draw(exposures), draw(times))
+        for pattern, name in draw(
+            st.lists(
+                st.tuples(st.integers(0, len(shown) - 1), st.sampled_from(sorted(cameras))), min_size=1, max_size=6
+            )
+        )
+    )
+    return Capture(draw(sizes), tuple(shown), cameras, shots)
+
+
+@st.composite
+def _pinholes(draw: st.DrawFn) -> Pinhole:
+    axis = np.array(draw(st.tuples(*[st.floats(-1, 1)] * 3)))
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    # Cayley's transform: a rotation from any skew matrix.
+    rotation = np.linalg.solve(np.eye(3) + skew, np.eye(3) - skew)
+    focal = st.floats(1, 1e5)
+    matrix = np.array([[draw(focal), draw(finite), draw(finite)], [0, draw(focal), draw(finite)], [0, 0, 1.0]])
+    distortion = np.array(draw(st.tuples(*[finite] * 5)))
+    return Pinhole(draw(sizes), matrix, distortion, rotation, np.array(draw(st.tuples(*[finite] * 3))))
+
+
+calibrations = st.builds(
+    Calibration, st.dictionaries(names, _pinholes(), min_size=1, max_size=3), st.none() | _pinholes()
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(_captures())
+def test_a_bundle_comes_back_as_it_was_written(capture: Capture) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        write_bundle(Path(folder) / "scan", capture)
+        read = read_bundle(Path(folder) / "scan")
+    assert read.calibration is None
+    assert read.capture.projector == capture.projector
+    assert read.capture.patterns == capture.patterns
+    assert read.capture.cameras == capture.cameras
+    for got, want in zip(read.capture.shots, capture.shots, strict=True):
+        assert (got.pattern, got.camera, got.exposure_s, got.time_s) == (
+            want.pattern,
+            want.camera,
+            want.exposure_s,
+            want.time_s,
+        )
+        assert got.image.dtype == want.image.dtype
+        np.testing.assert_array_equal(got.image, want.image)
+
+
+def _same(got: Calibration, want: Calibration) -> None:
+    assert list(got.cameras) == list(want.cameras)
+    assert (got.projector is None) == (want.projector is None)
+    pairs = [(got.cameras[name], want.cameras[name]) for name in want.cameras]
+    if got.projector is not None and want.projector is not None:
+        pairs.append((got.projector, want.projector))
+    for one, other in pairs:
+        assert one.size == other.size
+        arrays: list[tuple[FloatArray, FloatArray]] = [
+            (one.matrix, other.matrix),
+            (one.distortion, other.distortion),
+            (one.rotation, other.rotation),
+            (one.translation_mm, other.translation_mm),
+        ]
+        for left, right in arrays:
+            np.testing.assert_array_equal(left, right)
+
+
+@settings(max_examples=25, deadline=None)
+@given(calibrations)
+def test_a_calibration_comes_back_bit_by_bit(calibration: Calibration) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "calibration.json"
+        write_calibration(path, calibration)
+        _same(read_calibration(path), calibration)
+
+
+@settings(max_examples=25, deadline=None)
+@given(calibrations, st.sampled_from(["yml", "yaml", "xml"]))
+def test_an_opencv_calibration_comes_back_bit_by_bit(calibration: Calibration, ending: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"calibration.{ending}"
+        write_opencv_calibration(path, calibration)
+        _same(read_opencv_calibration(path), calibration)
+        _same(read_calibration(path), calibration)

@@ -1,0 +1,180 @@
+"""calibration.json and OpenCV FileStorage: every fault is told with its place, nothing is guessed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from slrig.bundle import (
+    check_calibration,
+    read_calibration,
+    read_opencv_calibration,
+    write_calibration,
+    write_opencv_calibration,
+)
+from slrig.errors import CalibrationError
+from slrig.model import Calibration, Size
+from tests.samples import CAMERA, PROJECTOR, pinhole, sample_calibration
+
+Edit = Callable[[dict[str, Any]], object]
+DEVICE = (
+    "{name}:\n   image_width: 40\n   image_height: 30\n"
+    "   camera_matrix: !!opencv-matrix\n      rows: 3\n      cols: 3\n      dt: d\n"
+    "      data: [ 50., 0., 20., 0., 50., 15., 0., 0., 1. ]\n"
+    "   distortion_coefficients: !!opencv-matrix\n      rows: 1\n      cols: {terms}\n      dt: d\n"
+    "      data: [ {distortion} ]\n"
+    "   rotation: !!opencv-matrix\n      rows: 3\n      cols: 3\n      dt: d\n"
+    "      data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]\n"
+    "   translation_mm: !!opencv-matrix\n      rows: 3\n      cols: 1\n      dt: d\n      data: [ 0., 0., 500. ]\n"
+)
+
+
+def _yaml(*distortion: float, name: str = "left") -> str:
+    terms = ", ".join(f"{value}" if np.isfinite(value) else ".Nan" for value in distortion)
+    return "%YAML:1.0\n---\n" + DEVICE.format(name=name, terms=len(distortion), distortion=terms)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    write_calibration(tmp_path / "calibration.json", sample_calibration())
+    return tmp_path / "calibration.json"
+
+
+BAD: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "unknown key": (
+        lambda data: data["projector"].update(rotatoin=[]),
+        ("projector.rotatoin: unknown key", "did you mean 'rotation'?"),
+    ),
+    "missing key": (lambda data: data["cameras"]["left"].pop("matrix"), ("cameras.left.matrix: missing",)),
+    "four distortion terms": (
+        lambda data: data["cameras"]["left"]["distortion"].pop(),
+        ("cameras.left.distortion", "at least 5 items"),
+    ),
+    "text in a matrix": (
+        lambda data: data["projector"]["matrix"][1].__setitem__(2, "nan"),
+        ("projector.matrix[1][2]", "found 'nan'"),
+    ),
+    "null in a matrix": (
+        lambda data: data["projector"]["matrix"][1].__setitem__(2, None),
+        ("projector.matrix[1][2]", "found None"),
+    ),
+    "mirrored rotation": (
+        lambda data: data["cameras"]["right"].update(rotation=[[1, 0, 0], [0, 1, 0], [0, 0, -1]]),
+        ("cameras.right.rotation: expected an orthonormal right-handed", "determinant -1"),
+    ),
+    "no focal length": (
+        lambda data: data["projector"].update(matrix=[[0, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        ("projector.matrix: expected", "positive fx and fy"),
+    ),
+    "no cameras": (lambda data: data.update(cameras={}), ("cameras", "at least 1 item")),
+    "a bundle": (lambda data: data.update(format="slrig-bundle"), ("format", "'slrig-calibration'")),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_calibration_is_told_with_its_place(path: Path, case: str) -> None:
+    change, parts = BAD[case]
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(CalibrationError) as caught:
+        read_calibration(path)
+    for part in (str(path), *parts):
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
+def test_a_number_that_is_not_finite_is_refused(path: Path, number: str) -> None:
+    path.write_text(path.read_text().replace("500.0", number, 1))
+    with pytest.raises(CalibrationError, match=r"(?s)calibration\.json.*(found (NaN|Infinity)|finite number)"):
+        read_calibration(path)
+
+
+def test_a_cut_or_missing_calibration_is_told(path: Path) -> None:
+    text = path.read_text()
+    path.write_text(text[: len(text) // 2])
+    with pytest.raises(CalibrationError, match="expected JSON, found a fault at line"):
+        read_calibration(path)
+    with pytest.raises(CalibrationError, match=r"none\.json: expected a readable file, found: No such file"):
+        read_calibration(path.with_name("none.json"))
+
+
+def test_the_projector_may_be_absent(path: Path) -> None:
+    write_calibration(path, Calibration({"left": pinhole()}, None))
+    assert "projector" not in json.loads(path.read_text())
+    assert read_calibration(path).projector is None
+
+
+def test_a_calibration_for_these_devices_is_accepted() -> None:
+    check_calibration(sample_calibration(), PROJECTOR, {"left": CAMERA}, "here")
+
+
+def test_every_device_of_another_size_is_told() -> None:
+    with pytest.raises(CalibrationError) as caught:
+        check_calibration(sample_calibration(), Size(5, 6), {"left": Size(7, 8), "right": CAMERA}, "here")
+    assert str(caught.value).splitlines()[1:] == [
+        "  cameras.left: expected 7 x 8 as the camera's frames are, found 40 x 30",
+        "  projector: expected 5 x 6 as the projector is, found 32 x 24",
+    ]
+
+
+@pytest.mark.parametrize("ending", ["yml", "yaml", "xml"])
+def test_opencv_itself_reads_what_we_export(tmp_path: Path, ending: str) -> None:
+    calibration = sample_calibration()
+    write_opencv_calibration(tmp_path / f"rig.{ending}", calibration)
+    storage = cv2.FileStorage(str(tmp_path / f"rig.{ending}"), cv2.FileStorage_READ)
+    node = storage.getNode("right")
+    np.testing.assert_array_equal(node.getNode("rotation").mat(), calibration.cameras["right"].rotation)
+    assert node.getNode("image_width").real() == CAMERA.width_px
+    storage.release()
+
+
+def test_four_distortion_terms_get_a_fifth_of_zero(tmp_path: Path) -> None:
+    (tmp_path / "rig.yml").write_text(_yaml(0.1, 0.2, 0.3, 0.4))
+    calibration = read_opencv_calibration(tmp_path / "rig.yml")
+    np.testing.assert_array_equal(calibration.cameras["left"].distortion, [0.1, 0.2, 0.3, 0.4, 0])
+    assert calibration.projector is None
+
+
+def test_higher_distortion_terms_must_be_zero(tmp_path: Path) -> None:
+    (tmp_path / "rig.yml").write_text(_yaml(0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0))
+    assert read_opencv_calibration(tmp_path / "rig.yml").cameras["left"].distortion[4] == 0.5
+    (tmp_path / "rig.yml").write_text(_yaml(0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.7, 0.0))
+    with pytest.raises(CalibrationError, match=r"at most k3 as distortion of 'left', found .*0\.7"):
+        read_opencv_calibration(tmp_path / "rig.yml")
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("", r"rig\.yml: expected"),
+        ("some words", r"rig\.yml: expected"),
+        ("%YAML:1.0\n---\n[ 1, 2", r"rig\.yml: expected"),
+        ("%YAML:1.0\n---\nname: bench\n", "'name', found no image_width"),
+        (_yaml(0.1, 0.2), "k1, k2, p1, p2"),
+        (_yaml(0.1, float("nan"), 0, 0, 0), r"left\.distortion: every number must be finite"),
+        (_yaml(0, 0, 0, 0, name="projector"), "one map per device, found projector"),
+        (_yaml(0, 0, 0, 0).replace("image_width: 40", "image_width: 40.5"), "whole numbers as extent of 'left'"),
+        (_yaml(0, 0, 0, 0).replace("image_width: 40", "image_width: 0"), "whole numbers as extent of 'left'"),
+        (_yaml(0, 0, 0, 0) + "   skew: 1\n", "unknown key skew"),
+        (_yaml(0, 0, 0, 0).replace("image_width: 40", "width: 40"), "found no image_width, the unknown key width"),
+    ],
+)
+@pytest.mark.usefixtures("capfd")
+def test_a_bad_opencv_file_is_told(tmp_path: Path, text: str, part: str) -> None:
+    (tmp_path / "rig.yml").write_text(text)
+    with pytest.raises(CalibrationError, match=part):
+        read_calibration(tmp_path / "rig.yml")
+
+
+@pytest.mark.parametrize(("name", "file"), [("projector", "rig.yml"), ("0left", "rig.yml"), ("left", "rig.json")])
+def test_what_opencv_cannot_hold_is_refused(tmp_path: Path, name: str, file: str) -> None:
+    with pytest.raises(CalibrationError, match=r"rig.*expected"):
+        write_opencv_calibration(tmp_path / file, Calibration({name: pinhole()}, None))
+    assert list(tmp_path.iterdir()) == []
