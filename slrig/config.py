@@ -1,0 +1,254 @@
+"""Rig files and service settings: TOML in, checked values out, every fault in one message.
+
+`python -m slrig.config` prints the JSON schema of a rig file, kept as config/schema.json for editors.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+import sys
+import tomllib
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
+
+from slrig.bundle.description import CameraName
+from slrig.bundle.faults import Strict, explain, keys_of, read_text
+from slrig.errors import ConfigError
+
+MOST_CONFIG_BYTES = 2**20
+
+ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
+Gain = Annotated[float, Field(gt=0, le=1000)]
+DriverName = Annotated[str, Field(min_length=1)]
+
+
+class ScanDefaults(Strict):
+    """What a scan on this rig does unless its request says otherwise. The keys are those of a scan's plan."""
+
+    line_shift: bool | None = None
+    line_shift_period_px: Annotated[int, Field(ge=4)] | None = None
+    line_width_px: Annotated[int, Field(ge=1)] | None = None
+    gray_cell_px: Annotated[int, Field(ge=1)] | None = None
+    gray_offset_px: Annotated[int, Field(ge=0)] | None = None
+    rows: bool | None = None
+    keep_holes: bool | None = None
+    depth_edge_ratio: Annotated[float, Field(gt=1)] | None = None
+    max_code_gap: Annotated[int, Field(ge=1)] | None = None
+    exposure_s: ExposureSeconds | None = None
+
+
+class DriverTable(Strict):
+    """A device: the driver that opens it; every other key is an option of that driver, checked by the driver."""
+
+    model_config = ConfigDict(extra="allow")
+
+    driver: DriverName
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """The keys that belong to the driver."""
+        return dict(self.model_extra or {})
+
+
+class HeadTable(DriverTable):
+    """One instrument that is projector and cameras. Exposure and gain hold for each of its cameras."""
+
+    exposure_s: ExposureSeconds | None = None
+    gain: Gain = 1.0
+
+
+class CameraTable(DriverTable):
+    """One camera."""
+
+    name: CameraName
+    exposure_s: ExposureSeconds | None = None
+    gain: Gain = 1.0
+
+
+class RigTable(Strict):
+    """A rig file: either `[head]`, or `[projector]` and one `[[camera]]` or more."""
+
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    calibration: Annotated[str, Field(min_length=1, description="path, relative to the rig file")] | None = None
+    head: HeadTable | None = None
+    projector: DriverTable | None = None
+    camera: Annotated[list[CameraTable], Field(default_factory=list)]
+    scan: ScanDefaults = ScanDefaults()
+
+    @model_validator(mode="after")
+    def _one_kind_of_rig(self) -> Self:
+        if self.head is not None and (self.projector is not None or self.camera):
+            message = "expected [head] alone, found [projector] or [[camera]] beside it; keep one kind"
+            raise ValueError(message)
+        if self.head is None and (self.projector is None or not self.camera):
+            lacking = "[projector]" if self.projector is None else "[[camera]]"
+            message = f"expected [head], or [projector] and one [[camera]] or more, found no {lacking}; add it"
+            raise ValueError(message)
+        names = [camera.name for camera in self.camera]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            message = f"expected each camera to have a name of its own, found {', '.join(twice)} twice; rename one"
+            raise ValueError(message)
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class RigConfig:
+    """A checked rig file. `folder` is where it lies: paths in it are relative to that folder.
+
+    Either `head` is given, or `projector` and `cameras`.
+    """
+
+    name: str
+    folder: Path
+    calibration: Path | None
+    head: HeadTable | None
+    projector: DriverTable | None
+    cameras: tuple[CameraTable, ...]
+    scan: ScanDefaults
+
+
+def read_rig(path: Path) -> RigConfig:
+    """Return the rig that a TOML file describes.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one message.
+    """
+    data = _read_toml(path)
+    try:
+        table = RigTable.model_validate(data)
+    except ValidationError as cause:
+        message = f"{path} is not a valid rig file:\n{explain(cause, data, keys_of(RigTable))}"
+        raise ConfigError(message) from cause
+    folder = path.resolve().parent
+    return RigConfig(
+        name=table.name,
+        folder=folder,
+        calibration=None if table.calibration is None else folder / table.calibration,
+        head=table.head,
+        projector=table.projector,
+        cameras=tuple(table.camera),
+        scan=table.scan,
+    )
+
+
+def rig_schema() -> str:
+    """The JSON schema of a rig file, as text."""
+    return json.dumps(RigTable.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
+
+
+def default_data_dir() -> Path:
+    """Where scans are kept unless a setting says otherwise: the folder for data of the XDG base directories."""
+    base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+    return Path(base) / "slrig"
+
+
+class ServiceSettings(BaseSettings):
+    """What the service needs to know, from `SLRIG_…` in the environment, then a TOML file, then these defaults.
+
+    `require_key` False opens the service to everyone who reaches it, so it is refused beyond this machine.
+    `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
+    environment they are separated by commas.
+    """
+
+    model_config = SettingsConfigDict(
+        env_prefix="SLRIG_", extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True
+    )
+
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8731
+    data_dir: Path = Field(default_factory=default_data_dir)
+    rig: Path | None = None
+    require_key: bool = True
+    allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
+    queue_length: Annotated[int, Field(ge=0, le=1000)] = 8
+    max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
+    min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
+    max_event_streams: Annotated[int, Field(ge=1)] = 32
+    keepalive_s: Annotated[float, Field(gt=0)] = 15.0
+    shutdown_s: Annotated[float, Field(gt=0)] = 3.0
+    idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
+    page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+
+    @property
+    def key_path(self) -> Path:
+        """The file that holds the hash of the service's key."""
+        return self.data_dir / "key.sha256"
+
+    @field_validator("data_dir", "rig")
+    @classmethod
+    def _at_home(cls, path: Path | None) -> Path | None:
+        return None if path is None else path.expanduser()
+
+    @field_validator("allowed_hosts", mode="before")
+    @classmethod
+    def _split(cls, hosts: object) -> object:
+        return tuple(host.strip() for host in hosts.split(",") if host.strip()) if isinstance(hosts, str) else hosts
+
+    @model_validator(mode="after")
+    def _closed_beyond_this_machine(self) -> Self:
+        if not self.require_key and not is_loopback(self.host):
+            message = (
+                f"expected require_key on a service that others can reach, found host {self.host} without it; "
+                "listen on 127.0.0.1 or leave require_key on"
+            )
+            raise ValueError(message)
+        return self
+
+
+def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
+    """Return the settings of the service; `given` values come before the environment, and that before the file.
+
+    Paths in the file are relative to it.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or not TOML, or a value is wrong; all faults in one message.
+    """
+    data: dict[str, Any] = {} if path is None else _read_toml(path)
+    for key in ("data_dir", "rig"):
+        if path is not None and isinstance(data.get(key), str):
+            data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
+    source = "settings" if path is None else str(path)
+    try:
+        data.update(EnvSettingsSource(ServiceSettings)())
+        data.update(given)
+        return ServiceSettings(**data)
+    except ValidationError as cause:
+        known = tuple(ServiceSettings.model_fields)
+        message = f"{source}: not valid settings of the service:\n{explain(cause, data, known)}"
+        raise ConfigError(message) from cause
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a service that listens on `host`."""
+    if host == "localhost":
+        return True
+    with suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return False
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    text = read_text(path, MOST_CONFIG_BYTES, ConfigError)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as cause:
+        message = f"{path}: expected TOML, found a fault: {cause}; correct that line"
+        raise ConfigError(message) from cause
+
+
+if __name__ == "__main__":
+    sys.stdout.write(rig_schema())

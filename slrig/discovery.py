@@ -1,0 +1,233 @@
+"""Drivers found by entry points, and the rig that a rig file describes, opened.
+
+A driver package declares factories in the groups below; slrig names no driver. A camera's factory is
+`open_camera(name, options, folder) -> Camera`, a projector's `open_projector(options, folder) -> Projector`, a head's
+`open_head(options, folder) -> Head`; `options` are the driver's own keys of the rig file, `folder` is where that file
+lies. A finder is `find_devices() -> tuple[FoundDevice, ...]`.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from slrig.bundle.calibration_file import check_calibration, read_calibration
+from slrig.bundle.faults import explain
+from slrig.config import DriverTable, RigConfig
+from slrig.devices import Camera, CameraInfo, CameraSettings, FoundDevice, Head, Projector, Rig
+from slrig.errors import ConfigError, DeviceError, DriverBrokenError, DriverNotFoundError, SlrigError
+from slrig.model import Calibration
+
+GROUPS: Mapping[str, str] = {
+    "camera": "slrig.cameras",
+    "projector": "slrig.projectors",
+    "head": "slrig.heads",
+    "finder": "slrig.finders",
+}
+USUAL_EXPOSURE_S = 1 / 60
+"""One period of a usual projector: the exposure of a camera whose rig file gives none, within what the camera can."""
+
+
+@dataclass(frozen=True, slots=True)
+class InstalledDriver:
+    """A driver that an installed package declares. `fault` says why it cannot be loaded; None if it can."""
+
+    kind: str
+    name: str
+    package: str
+    version: str
+    target: str
+    fault: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What the finders found, and the finders that failed."""
+
+    devices: tuple[FoundDevice, ...]
+    faults: tuple[DriverBrokenError, ...]
+
+
+def installed_drivers() -> tuple[InstalledDriver, ...]:
+    """Every driver that an installed package declares, loaded once to see whether it can be; sorted by kind, name."""
+    drivers = []
+    for kind, group in GROUPS.items():
+        for entry in importlib.metadata.entry_points(group=group):
+            fault = None
+            try:
+                _load(kind, entry)
+            except DriverBrokenError as error:
+                fault = str(error)
+            package, version = _package(entry)
+            drivers.append(InstalledDriver(kind, entry.name, package, version, entry.value, fault))
+    return tuple(sorted(drivers, key=lambda driver: (driver.kind, driver.name, driver.package)))
+
+
+def found_devices() -> Findings:
+    """Ask every installed finder for the devices that are plugged in; one that fails does not hide the others."""
+    devices: list[FoundDevice] = []
+    faults: list[DriverBrokenError] = []
+    for entry in sorted(importlib.metadata.entry_points(group=GROUPS["finder"]), key=lambda entry: entry.name):
+        try:
+            finder = _load("finder", entry)
+            with _told("finder", entry.name, {}):
+                devices.extend(finder())
+        except DriverBrokenError as error:
+            faults.append(error)
+        except SlrigError as error:
+            message = f"finder '{entry.name}' failed: {error}"
+            faults.append(DriverBrokenError(message))
+    return Findings(tuple(devices), tuple(faults))
+
+
+def open_rig(config: RigConfig) -> Rig:
+    """Open every device of a rig; if one fails, those that are open already are closed again.
+
+    The calibration is that of the rig file, else that which the head carries.
+
+    Raises
+    ------
+    DriverNotFoundError
+        No installed package provides a driver of that name.
+    DriverBrokenError
+        A driver cannot be loaded, or fails with an error of no known kind.
+    ConfigError
+        A driver does not take the options of the rig file.
+    CalibrationError
+        The calibration is malformed, or made for devices of another size.
+    DeviceError
+        A device cannot be opened.
+    """
+    with ExitStack() as opened:
+        head: Head | None = None
+        cameras: Mapping[str, Camera]
+        if config.head is not None:
+            head = _open("head", config.head, Head, config.folder)
+            projector, cameras = head.projector, dict(head.cameras)
+            _close_later(opened, projector, cameras)
+            asked = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
+        else:
+            if config.projector is None:
+                message = f"rig '{config.name}' has neither a head nor a projector; add one of the tables to its file"
+                raise ConfigError(message)
+            projector = _open("projector", config.projector, Projector, config.folder)
+            _close_later(opened, projector, {})
+            cameras, asked = {}, {}
+            for table in config.cameras:
+                camera = _open("camera", table, Camera, config.folder, table.name)
+                opened.callback(_close_quietly, camera)
+                cameras = {**cameras, table.name: camera}
+                asked[table.name] = (table.exposure_s, table.gain)
+        settings = {
+            name: CameraSettings(_exposure_s(camera.info, asked[name][0], config), asked[name][1])
+            for name, camera in cameras.items()
+        }
+        calibration = _calibration(config, head, projector, cameras)
+        rig = Rig(config.name, cameras, projector, settings, calibration, head)
+        opened.pop_all()
+        return rig
+
+
+def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) -> float:
+    for exposure_s in (asked_s, config.scan.exposure_s):
+        if exposure_s is not None:
+            return exposure_s
+    least_s, most_s = camera.exposure_range_s
+    return min(max(USUAL_EXPOSURE_S, least_s), most_s)
+
+
+def _calibration(
+    config: RigConfig, head: Head | None, projector: Projector, cameras: Mapping[str, Camera]
+) -> Calibration | None:
+    if config.calibration is not None:
+        calibration: Calibration | None = read_calibration(config.calibration)
+        source = str(config.calibration)
+    else:
+        calibration = head.calibration if head is not None else None
+        source = f"the head of rig '{config.name}'"
+    if calibration is not None:
+        sizes = {name: camera.info.format.size for name, camera in cameras.items()}
+        check_calibration(calibration, projector.info.size, sizes, source)
+    return calibration
+
+
+def _close_later(opened: ExitStack, projector: Projector, cameras: Mapping[str, Camera]) -> None:
+    opened.callback(_close_quietly, projector)
+    for camera in cameras.values():
+        opened.callback(_close_quietly, camera)
+
+
+def _close_quietly(device: Camera | Projector) -> None:
+    # The error that made us close is the one to tell.
+    with suppress(DeviceError):
+        device.close()
+
+
+def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *name: str) -> Any:
+    entries = list(importlib.metadata.entry_points(group=GROUPS[kind], name=table.driver))
+    if not entries:
+        names = sorted({entry.name for entry in importlib.metadata.entry_points(group=GROUPS[kind])})
+        installed = ", ".join(names) or "none"
+        message = (
+            f"no installed package provides the {kind} driver '{table.driver}' (group {GROUPS[kind]}); installed: "
+            f"{installed}; correct the name or install the driver's package"
+        )
+        raise DriverNotFoundError(message)
+    if len(entries) > 1:
+        packages = ", ".join(sorted(_package(entry)[0] for entry in entries))
+        message = f"{kind} driver '{table.driver}' is provided by several packages: {packages}; uninstall all but one"
+        raise DriverBrokenError(message)
+    factory = _load(kind, entries[0])
+    with _told(kind, table.driver, table.options):
+        device = factory(*name, table.options, folder)
+        if not isinstance(device, protocol):
+            message = (
+                f"{kind} driver '{table.driver}' returned {type(device).__name__}, which is no {protocol.__name__}"
+            )
+            raise DriverBrokenError(message)
+        return device
+
+
+def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]:
+    package, version = _package(entry)
+    try:
+        factory = entry.load()
+    except Exception as cause:
+        message = (
+            f"{kind} driver '{entry.name}' of {package} {version} cannot be loaded ({entry.value}): "
+            f"{type(cause).__name__}: {cause}; install what it needs or uninstall it"
+        )
+        raise DriverBrokenError(message) from cause
+    if not callable(factory):
+        message = (
+            f"{kind} driver '{entry.name}' of {package} {version}: {entry.value} cannot be called; report it there"
+        )
+        raise DriverBrokenError(message)
+    loaded: Callable[..., Any] = factory
+    return loaded
+
+
+@contextmanager
+def _told(kind: str, name: str, options: Mapping[str, object]) -> Iterator[None]:
+    """Give what a driver's factory raises a name and a kind."""
+    try:
+        yield
+    except SlrigError:
+        raise
+    except ValidationError as cause:
+        message = f"{kind} driver '{name}' does not take these options:\n{explain(cause, options, ())}"
+        raise ConfigError(message) from cause
+    except Exception as cause:
+        message = f"{kind} driver '{name}' failed: {type(cause).__name__}: {cause}; report it to the driver's package"
+        raise DriverBrokenError(message) from cause
+
+
+def _package(entry: importlib.metadata.EntryPoint) -> tuple[str, str]:
+    found = entry.dist
+    return ("an unknown package", "") if found is None else (found.name, found.version)

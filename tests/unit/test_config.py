@@ -1,0 +1,191 @@
+"""Rig files and service settings: every fault in one message, nothing converted in silence."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from slrig.config import ScanDefaults, ServiceSettings, is_loopback, read_rig, read_settings
+from slrig.errors import ConfigError
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+
+RIGS = sorted((Path(__file__).resolve().parents[2] / "config" / "rigs").glob("*.toml"))
+
+BENCH = """
+name = "bench"
+calibration = "bench.json"
+[projector]
+driver = "serial_projector"
+port = "/dev/serial/by-id/usb-1"
+[[camera]]
+name = "left"
+driver = "v4l2"
+device = "usb-2"
+exposure_s = 0.0167
+[[camera]]
+name = "right"
+driver = "v4l2"
+device = "usb-3"
+gain = 2
+[scan]
+line_shift_period_px = 8
+depth_edge_ratio = 6
+"""
+
+
+@pytest.fixture(autouse=True)
+def _no_settings_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ServiceSettings.model_fields:
+        monkeypatch.delenv(f"SLRIG_{name.upper()}", raising=False)
+
+
+def _rig(folder: Path, text: str) -> Path:
+    (folder / "rig.toml").write_text(text)
+    return folder / "rig.toml"
+
+
+def test_a_bench_is_read(tmp_path: Path) -> None:
+    rig = read_rig(_rig(tmp_path, BENCH))
+    assert rig.name == "bench"
+    assert rig.folder == tmp_path
+    assert rig.calibration == tmp_path / "bench.json"
+    assert rig.head is None
+    assert rig.projector is not None
+    assert rig.projector.driver == "serial_projector"
+    assert rig.projector.options == {"port": "/dev/serial/by-id/usb-1"}
+    assert [camera.name for camera in rig.cameras] == ["left", "right"]
+    assert rig.cameras[0].options == {"device": "usb-2"}
+    assert (rig.cameras[0].exposure_s, rig.cameras[0].gain) == (0.0167, 1.0)
+    assert (rig.cameras[1].exposure_s, rig.cameras[1].gain) == (None, 2.0)
+    assert rig.scan.line_shift_period_px == 8
+    assert rig.scan.rows is None
+
+
+def test_a_head_is_read(tmp_path: Path) -> None:
+    rig = read_rig(_rig(tmp_path, 'name = "demo"\n[head]\ndriver = "simulated"\nexposure_s = 0.01\nseed = 3\n'))
+    assert rig.head is not None
+    assert rig.head.options == {"seed": 3}
+    assert rig.head.exposure_s == 0.01
+    assert rig.cameras == ()
+    assert rig.calibration is None
+
+
+def test_there_are_rigs_to_read() -> None:
+    assert RIGS
+
+
+@pytest.mark.parametrize("path", RIGS, ids=lambda path: path.stem)
+def test_every_rig_of_the_repository_is_read(path: Path) -> None:
+    assert read_rig(path).name
+
+
+def test_scan_defaults_are_the_fields_of_a_plan() -> None:
+    plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
+    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ('name = "bench"', 'nmae = "bench"', "nmae: unknown key; did you mean 'name'?"),
+        ('name = "bench"', "", "name: missing; add it"),
+        ("[projector]", "[projektor]", "projektor: unknown key; did you mean 'projector'?"),
+        ('driver = "serial_projector"', "", "projector.driver: missing"),
+        ('name = "right"', 'name = "left"', "found left twice"),
+        ('name = "right"', 'name = "../right"', "camera[1].name"),
+        ("exposure_s = 0.0167", "exposure_s = 0", "camera[0].exposure_s"),
+        ("exposure_s = 0.0167", 'exposure_s = "0.0167"', "camera[0].exposure_s"),
+        ("exposure_s = 0.0167", "exposure_s = nan", "camera[0].exposure_s"),
+        ("gain = 2", "gain = true", "camera[1].gain"),
+        ("line_shift_period_px = 8", "line_shift_period_px = 3", "scan.line_shift_period_px"),
+        ("line_shift_period_px = 8", "line_shift_periode_px = 8", "did you mean 'line_shift_period_px'?"),
+        ("[scan]", '[head]\ndriver = "x"\n[scan]', "expected [head] alone"),
+    ],
+)
+def test_a_bad_rig_is_told_with_its_key(tmp_path: Path, old: str, new: str, part: str) -> None:
+    assert old in BENCH
+    path = _rig(tmp_path, BENCH.replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        read_rig(path)
+    assert str(path) in str(caught.value)
+    assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ('name = "x"', r"found no \[projector\]"),
+        ('name = "x"\n[projector]\ndriver = "y"', r"found no \[\[camera\]\]"),
+        ('name = "x"\nname = "y"', "expected TOML, found a fault: Cannot overwrite"),
+        ("name = ", "expected TOML, found a fault"),
+    ],
+)
+def test_what_is_no_rig_is_told(tmp_path: Path, text: str, part: str) -> None:
+    with pytest.raises(ConfigError, match=part):
+        read_rig(_rig(tmp_path, text))
+
+
+def test_a_missing_rig_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: expected a readable file, found: No such file"):
+        read_rig(tmp_path / "none.toml")
+
+
+def test_every_fault_of_a_rig_is_in_one_message(tmp_path: Path) -> None:
+    text = BENCH.replace('name = "left"', "").replace("gain = 2", 'gain = "2"').replace("depth_edge_ratio", "ratio")
+    with pytest.raises(ConfigError) as caught:
+        read_rig(_rig(tmp_path, text))
+    assert len(str(caught.value).splitlines()) == 4
+
+
+def test_settings_are_closed_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    settings = read_settings()
+    assert (settings.host, settings.port, settings.require_key) == ("127.0.0.1", 8731, True)
+    assert settings.queue_length == 8
+    assert settings.data_dir == tmp_path / "slrig"
+    assert settings.key_path.parent == settings.data_dir
+
+
+def test_the_call_comes_before_the_environment_and_that_before_the_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "service.toml").write_text('port = 1\nqueue_length = 2\nmax_event_streams = 3\nrig = "rigs/a.toml"\n')
+    monkeypatch.setenv("SLRIG_PORT", "10")
+    monkeypatch.setenv("SLRIG_QUEUE_LENGTH", "20")
+    monkeypatch.setenv("SLRIG_ALLOWED_HOSTS", "bench.local, bench")
+    settings = read_settings(tmp_path / "service.toml", port=100)
+    assert (settings.port, settings.queue_length, settings.max_event_streams) == (100, 20, 3)
+    assert settings.rig == tmp_path / "rigs/a.toml"
+    assert settings.allowed_hosts == ("bench.local", "bench")
+
+
+def test_settings_are_checked_all_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "service.toml").write_text('port = 99999\nqueue_lenght = 2\nlog_level = "loud"\n')
+    monkeypatch.setenv("SLRIG_SHUTDOWN_S", "soon")
+    with pytest.raises(ConfigError) as caught:
+        read_settings(tmp_path / "service.toml")
+    message = str(caught.value)
+    for part in (
+        "port:",
+        "99999",
+        "queue_lenght: unknown key; did you mean 'queue_length'?",
+        "log_level",
+        "shutdown_s",
+    ):
+        assert part in message
+    assert len(message.splitlines()) == 5
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "bench.local"])  # noqa: S104 - it must be refused
+def test_an_open_service_is_refused_beyond_this_machine(host: str) -> None:
+    with pytest.raises(ConfigError, match=r"expected require_key .*; listen on 127\.0\.0\.1 or leave require_key on"):
+        read_settings(host=host, require_key=False)
+    assert read_settings(host=host).require_key
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "::1", "localhost"])
+def test_an_open_service_is_allowed_on_this_machine(host: str) -> None:
+    assert is_loopback(host)
+    assert not read_settings(host=host, require_key=False).require_key
