@@ -1,0 +1,140 @@
+"""One camera's frames to linked curves: noise, code, stripes, identity, links."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, IntArray, Refusal
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
+from slrig.reconstruction.edges import EdgeLimits, dense_position, near_edges
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.identification import identify
+from slrig.reconstruction.linking import StripeEnsemble, link
+from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from slrig.reconstruction.stripes import (
+    StripeLimits,
+    Stripes,
+    joined,
+    locate_edges,
+    locate_stripes,
+    measured_sigma_px,
+    normalised,
+)
+
+_FINEST_SCALE_PX = 1.0
+_COARSEST_SCALE_PX = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class CodeTables:
+    """What the patterns mean. index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px;
+    position_of : (frames, cells) float64, px, of lines or of code edges; step_px : between neighbouring curves.
+    """
+
+    index_of_word: IntArray
+    cell_position: FloatArray
+    position_of: FloatArray
+    step_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """All thresholds of a camera's reconstruction."""
+
+    decoding: DecodingLimits = field(default_factory=DecodingLimits)
+    stripes: StripeLimits = field(default_factory=StripeLimits)
+    edges: EdgeLimits = field(default_factory=EdgeLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCurves:
+    """What one camera gives. refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking."""
+
+    ensemble: StripeEnsemble
+    refusal: NDArray[np.uint8]
+    noise: NoiseModel
+    scale_px: float
+    decoded_pixels: int
+    stripe_points: int
+    stripe_count: int
+
+
+def camera_curves(
+    frames: AxisFrames, tables: CodeTables, limits: Limits, /, *, entered: Callable[[str], None]
+) -> CameraCurves:
+    """Reconstruct the curves of one camera. `entered` is told the name of each stage as it begins."""
+    entered("decode")
+    noise = estimate_noise(frames)
+    code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits.decoding)
+    entered("locate stripes")
+    lit = code.refusal != Refusal.NOT_LIT
+    stripes, scale_px = (
+        _line_stripes(frames, noise, lit, limits.stripes)
+        if len(frames.lines)
+        else _edge_stripes(frames, noise, lit, limits.stripes)
+    )
+    entered("identify stripes")
+    near_shadow, near_step = _borders(frames, code, tables, limits.edges)
+    coded, refusal = identify(
+        stripes, code, tables.position_of, near_shadow, near_step, shortest_points=limits.stripes.shortest_points
+    )
+    entered("link stripes")
+    return CameraCurves(
+        ensemble=link(coded),
+        refusal=refusal,
+        noise=noise,
+        scale_px=scale_px,
+        decoded_pixels=int((code.refusal == Refusal.NONE).sum()),
+        stripe_points=len(stripes.points_px),
+        stripe_count=len(coded.stripes),
+    )
+
+
+def _borders(
+    frames: AxisFrames, code: CodeMap, tables: CodeTables, limits: EdgeLimits
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    position = dense_position(frames, code, tables.cell_position)
+    continuous = len(frames.lines) > 0
+    resolution_px = 0.0 if continuous else float(frames.gray.cell_px)
+    return near_edges(position, code.refusal == Refusal.NOT_LIT, resolution_px, limits)
+
+
+def _line_stripes(
+    frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
+) -> tuple[Stripes, float]:
+    contrast = frames.contrast
+    dark_variance = noise.variance(frames.black)
+    scale_px = limits.sigma_px
+    parts = []
+    for index, line in enumerate(frames.lines):
+        image, deviation = normalised(line, frames.black, contrast, np.sqrt(noise.variance(line) + dark_variance))
+        if scale_px is None:
+            measured = measured_sigma_px(image, deviation, lit)
+            scale_px = float(np.clip(measured, _FINEST_SCALE_PX, _COARSEST_SCALE_PX))
+        parts.append(locate_stripes(image, deviation, lit, index, limits, sigma_px=scale_px))
+    return joined(parts), scale_px or _FINEST_SCALE_PX
+
+
+def _edge_stripes(
+    frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
+) -> tuple[Stripes, float]:
+    scale_px = limits.sigma_px or _FINEST_SCALE_PX
+    contrast = frames.contrast
+    none = np.zeros_like(contrast)
+    ends_variance = noise.variance(frames.white) + noise.variance(frames.black)
+    parts = []
+    for index, bit in enumerate(frames.bits):
+        if frames.inverses is not None:
+            inverse = frames.inverses[index]
+            swing = bit - inverse
+            variance = noise.variance(bit) + noise.variance(inverse)
+        else:
+            swing = 2 * bit - frames.white - frames.black
+            variance = 4 * noise.variance(bit) + ends_variance
+        image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
+        parts.append(locate_edges(image, deviation, lit, index, limits, sigma_px=scale_px))
+    return joined(parts), scale_px

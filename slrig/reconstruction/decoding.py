@@ -1,0 +1,140 @@
+"""Gray-code decoding with a reason for every refused pixel.
+
+A bit is read by comparing it with its inverse (or with the middle of white and black) against a margin that the
+noise sets. A bit inside the margin has two minds; the pixel is then known to an interval of cells. One such bit at
+its own code edge gives two neighbouring cells and does no harm; a finest bit lost in blur costs resolution only;
+anywhere else the interval is wide and the pixel is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from slrig.model import IntArray, Refusal
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.noise import NoiseModel
+
+_NOT_LIT = int(Refusal.NOT_LIT)
+_SATURATED = int(Refusal.SATURATED)
+_AMBIGUOUS_BIT = int(Refusal.AMBIGUOUS_BIT)
+_BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
+_MOST_UNCERTAIN_BITS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class DecodingLimits:
+    """When a pixel is lit and a bit is certain.
+
+    lit_sigma : white must exceed black by this many standard deviations of their difference,
+    lit_fraction : and by this fraction of full scale.
+    bit_sigma : a bit must differ from its inverse by this many standard deviations of the difference,
+    bit_fraction : and by this fraction of the pixel's contrast.
+    widest_interval : the greatest hi - lo, in cells, that still counts as decoded.
+    """
+
+    lit_sigma: float = 6.0
+    lit_fraction: float = 0.012
+    bit_sigma: float = 3.0
+    bit_fraction: float = 0.08
+    widest_interval: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class CodeMap:
+    """For each camera pixel the interval of code cells that it may show, both ends included.
+
+    lowest, highest : (H, W) int32, -1 where refused; refusal : (H, W) uint8, `Refusal`.
+    """
+
+    lowest: IntArray
+    highest: IntArray
+    refusal: NDArray[np.uint8]
+
+    def centre(self) -> NDArray[np.float64]:
+        """(H, W) float64: the middle of the interval in cells, NaN where refused."""
+        middle = (self.lowest + self.highest) / 2
+        return np.where(self.refusal == 0, middle, np.nan)
+
+
+def decode(
+    frames: AxisFrames, noise: NoiseModel, index_of_word: IntArray, cell_count: int, limits: DecodingLimits, /
+) -> CodeMap:
+    """Decode the Gray code of one axis.
+
+    index_of_word : (2^bits,) int32, the cell index of each Gray word; cell_count : cells that the projector shows.
+    """
+    contrast = frames.contrast
+    shown = frames.bits
+    against = frames.inverses if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
+    spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
+    lit = contrast > np.maximum(limits.lit_sigma * spread, limits.lit_fraction * frames.full_scale)
+    lowest = np.full(contrast.shape, -1, dtype=np.int32)
+    highest = np.full(contrast.shape, -1, dtype=np.int32)
+    refusal = np.zeros(contrast.shape, dtype=np.uint8)
+    paired = frames.inverses is not None
+    # Against the middle of white and black a bit swings half as far as against its inverse.
+    margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * contrast) * (1.0 if paired else 0.5)
+    _decode_kernel(
+        shown, against, paired, frames.white, lit, margin.astype(np.float32), np.float32(frames.full_scale),
+        index_of_word.astype(np.int32), cell_count, limits.widest_interval, lowest, highest, refusal,
+    )  # fmt: skip
+    return CodeMap(lowest, highest, refusal)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _decode_kernel(
+    shown: Any, against: Any, paired: bool, white: Any, lit: Any, margin: Any, full_scale: Any, index_of_word: Any,
+    cell_count: int, widest: int, lowest: Any, highest: Any, refusal: Any,
+) -> None:  # fmt: skip
+    bits, rows, columns = shown.shape
+    for y in prange(rows):
+        uncertain = np.zeros(_MOST_UNCERTAIN_BITS, dtype=np.int32)
+        for x in range(columns):
+            if not lit[y, x]:
+                refusal[y, x] = _NOT_LIT
+                continue
+            if not paired and white[y, x] >= full_scale:
+                refusal[y, x] = _SATURATED
+                continue
+            word = 0
+            count = 0
+            clipped = False
+            for b in range(bits):
+                seen = shown[b, y, x]
+                other = against[b, y, x] if paired else against[0, y, x]
+                if seen > other:
+                    word |= 1 << (bits - 1 - b)
+                if paired and seen >= full_scale and other >= full_scale:
+                    clipped = True
+                if abs(seen - other) < margin[y, x]:
+                    if count < _MOST_UNCERTAIN_BITS:
+                        uncertain[count] = bits - 1 - b
+                    count += 1
+            if clipped:
+                refusal[y, x] = _SATURATED
+                continue
+            if count > _MOST_UNCERTAIN_BITS:
+                refusal[y, x] = _AMBIGUOUS_BIT
+                continue
+            low = index_of_word[word]
+            high = low
+            for choice in range(1, 1 << count):
+                other_word = word
+                for k in range(count):
+                    if choice >> k & 1:
+                        other_word ^= 1 << uncertain[k]
+                index = index_of_word[other_word]
+                low = min(low, index)
+                high = max(high, index)
+            if high - low > widest:
+                refusal[y, x] = _AMBIGUOUS_BIT
+            elif low >= cell_count:
+                refusal[y, x] = _BEYOND_PROJECTOR
+            else:
+                lowest[y, x] = low
+                highest[y, x] = min(high, cell_count - 1)

@@ -1,0 +1,146 @@
+"""Giving each stripe its projector column, and refusing points with two minds.
+
+Every point looks up the interval of code cells at its pixel; both ends of the interval must mean the same light
+column in the frame that the point was found in. A chain is cut where the column changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, Refusal
+from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.stripes import Stripes
+
+_AMBIGUOUS_LINE = int(Refusal.AMBIGUOUS_LINE)
+_BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
+_STRAY_CODE = int(Refusal.STRAY_CODE)
+_SHADOW_EDGE = int(Refusal.SHADOW_EDGE)
+_DEPTH_EDGE = int(Refusal.DEPTH_EDGE)
+_SHORT_STRIPE = int(Refusal.SHORT_STRIPE)
+_LONGEST_GAP_POINTS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class CodedStripes:
+    """Stripes with the projector position each shows: position_px (s,) float64, rising or not."""
+
+    stripes: Stripes
+    position_px: FloatArray
+
+
+def identify(
+    stripes: Stripes,
+    code: CodeMap,
+    position_of: FloatArray,
+    near_shadow: NDArray[np.bool_],
+    near_step: NDArray[np.bool_],
+    /,
+    *,
+    shortest_points: int,
+) -> tuple[CodedStripes, NDArray[np.uint8]]:
+    """Number the stripes of one camera and axis.
+
+    position_of : (frames, cells) float64, the light position, px, that a stripe of this frame has when its pixel shows
+    this cell; NaN where the projector's border cuts the line.
+    near_shadow, near_step : (H, W) bool, pixels where light of two surfaces mixes.
+    Returns the coded stripes, and the (H, W) uint8 map of refusals with those of the stripe points added.
+    """
+    refusal = code.refusal.copy()
+    order, offsets, chains, position = _identify_kernel(
+        stripes.offsets, stripes.frame, stripes.points_px, code.lowest, code.highest, position_of,
+        near_shadow, near_step, shortest_points, refusal,
+    )  # fmt: skip
+    cut = Stripes(
+        offsets=offsets,
+        frame=stripes.frame[chains],
+        points_px=stripes.points_px[order],
+        normals=stripes.normals[order],
+        sigma_px=stripes.sigma_px[order],
+    )
+    return CodedStripes(cut, position), refusal
+
+
+@njit(cache=True, nogil=True)
+def _identify_kernel(
+    offsets: Any, frame: Any, points: Any, lowest: Any, highest: Any, position_of: Any,
+    near_shadow: Any, near_step: Any, shortest: int, refusal: Any,
+) -> Any:  # fmt: skip
+    count = len(points)
+    position = np.full(count, np.nan)
+    for s in range(len(offsets) - 1):
+        for i in range(offsets[s], offsets[s + 1]):
+            x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
+            if lowest[y, x] < 0:
+                continue
+            low = position_of[frame[s], lowest[y, x]]
+            high = position_of[frame[s], highest[y, x]]
+            if np.isnan(low) or np.isnan(high):
+                refusal[y, x] = _BEYOND_PROJECTOR
+            elif low != high:
+                refusal[y, x] = _AMBIGUOUS_LINE
+            elif near_shadow[y, x]:
+                refusal[y, x] = _SHADOW_EDGE
+            elif near_step[y, x]:
+                refusal[y, x] = _DEPTH_EDGE
+            else:
+                position[i] = low
+    order = np.zeros(count, dtype=np.int32)
+    out_offsets = np.zeros(count + 1, dtype=np.int32)
+    chains = np.zeros(count, dtype=np.int32)
+    out_position = np.zeros(count)
+    filled = 0
+    made = 0
+    for s in range(len(offsets) - 1):
+        first = offsets[s]
+        last = offsets[s + 1]
+        i = first
+        while i < last:
+            if np.isnan(position[i]):
+                i += 1
+                continue
+            # A run of one position; other points in it are passed over when the run goes on soon after.
+            here = position[i]
+            begin = filled
+            order[filled] = i
+            filled += 1
+            k = i + 1
+            while k < last:
+                if position[k] == here:
+                    order[filled] = k
+                    filled += 1
+                    k += 1
+                    continue
+                ahead = -1
+                for m in range(k + 1, min(last, k + 1 + _LONGEST_GAP_POINTS)):
+                    if position[m] == here:
+                        ahead = m
+                        break
+                if ahead < 0:
+                    break
+                for m in range(k, ahead):
+                    if not np.isnan(position[m]):
+                        _mark(refusal, points, m, _STRAY_CODE)
+                k = ahead
+            if filled - begin < shortest:
+                alone = first == i and k == last
+                for m in range(begin, filled):
+                    _mark(refusal, points, order[m], _SHORT_STRIPE if alone else _STRAY_CODE)
+                filled = begin
+            else:
+                chains[made] = s
+                out_position[made] = here
+                made += 1
+                out_offsets[made] = filled
+            i = k
+    return order[:filled].copy(), out_offsets[: made + 1].copy(), chains[:made].copy(), out_position[:made].copy()
+
+
+@njit(cache=True, nogil=True)
+def _mark(refusal: Any, points: Any, i: int, cause: int) -> None:
+    refusal[int(np.rint(points[i, 1])), int(np.rint(points[i, 0]))] = cause

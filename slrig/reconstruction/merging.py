@@ -1,0 +1,213 @@
+"""One set of curves from several cameras that see the same light sheets.
+
+A projector ray meets one surface point, so on a light sheet the depth is a function of the projector row. Curves of one
+code from two cameras sample the same function: they are merged by row. Where both have it, the point is the mean
+weighted by inverse variance, and their distance, in standard deviations and in pixels, is a live check of the
+calibration; where one has it alone, it fills the gap. Never two sheets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, Source
+from slrig.reconstruction.triangulation import SheetCurves
+
+_ALL = int(Source.ALL)
+
+
+@dataclass(frozen=True, slots=True)
+class MergedCurves:
+    """Curves of all cameras, and what the redundancy says.
+
+    camera : (n,) int32, index of the camera whose pixel the point has.
+    residual_sigma : (m,) float64, distance between two cameras' points of one ray over its standard deviation.
+    residual_mm : (m,) float64, the same distance, signed towards the first camera.
+    """
+
+    curves: SheetCurves
+    camera: NDArray[np.int32]
+    residual_sigma: FloatArray
+    residual_mm: FloatArray
+
+
+def merged(parts: list[SheetCurves], centre_mm: FloatArray, /, *, widest_gap_px: float) -> MergedCurves:
+    """Merge the curves of several cameras along each light sheet.
+
+    centre_mm : (3,) float64, the projector's centre; widest_gap_px : rows between two consecutive points of one camera
+    up to which the curve between them counts as seen.
+    """
+    result, camera = parts[0], np.zeros(len(parts[0].points_mm), dtype=np.int32)
+    sigmas, distances = [], []
+    for index, part in enumerate(parts[1:], start=1):
+        result, camera, sigma, distance = _merged_pair(result, camera, part, index, centre_mm, widest_gap_px)
+        sigmas.append(sigma)
+        distances.append(distance)
+    return MergedCurves(
+        result,
+        camera,
+        np.concatenate([np.zeros(0), *sigmas]),
+        np.concatenate([np.zeros(0), *distances]),
+    )
+
+
+def _merged_pair(
+    first: SheetCurves,
+    camera: NDArray[np.int32],
+    second: SheetCurves,
+    index: int,
+    centre_mm: FloatArray,
+    widest_gap_px: float,
+) -> tuple[SheetCurves, NDArray[np.int32], FloatArray, FloatArray]:
+    first, order_first = _by_row(first)
+    second, _ = _by_row(second)
+    camera = camera[order_first]
+    offset = int(first.stripe.max(initial=-1)) + 1
+    positions = np.union1d(first.position_px, second.position_px)
+    a, b = _spread(first, positions), _spread(second, positions)
+    fused, spread, source, sigma, distance = _fuse_kernel(
+        a, first.points_mm, first.deviation_mm, first.along_px, first.source,
+        b, second.points_mm, second.deviation_mm, second.along_px, second.bridge_after, centre_mm, widest_gap_px,
+    )  # fmt: skip
+    alone = _alone_kernel(a, first.along_px, first.bridge_after, b, second.along_px, widest_gap_px)
+    # Concatenate, then sort each sheet by row; the sort is stable, so equal rows keep the first camera first.
+    curve = np.concatenate([np.repeat(np.arange(len(positions)), np.diff(a)),
+                            np.repeat(np.arange(len(positions)), np.diff(b))[alone]])  # fmt: skip
+    along = np.concatenate([first.along_px, second.along_px[alone]])
+    order = np.lexsort((along, curve))
+    bridge = np.concatenate([first.bridge_after, second.bridge_after[alone]])[order]
+    along = along[order]
+    step = np.append(np.diff(along), np.inf)
+    result = SheetCurves(
+        offsets=np.searchsorted(curve[order], np.arange(len(positions) + 1)).astype(np.int32),
+        position_px=positions,
+        points_mm=np.concatenate([fused, second.points_mm[alone]])[order],
+        deviation_mm=np.concatenate([spread, second.deviation_mm[alone]])[order],
+        along_px=along,
+        pixels_px=np.concatenate([first.pixels_px, second.pixels_px[alone]])[order],
+        stripe=np.concatenate([first.stripe, second.stripe[alone] + offset])[order],
+        # A hole that the other camera filled is no bridge any more.
+        bridge_after=bridge & (step > widest_gap_px),
+        source=np.concatenate([source, second.source[alone]])[order],
+    )
+    cameras = np.concatenate([camera, np.full(int(alone.sum()), index, dtype=np.int32)])[order]
+    seen = np.isfinite(sigma)
+    return result, cameras.astype(np.int32), sigma[seen], distance[seen]
+
+
+def _by_row(curves: SheetCurves) -> tuple[SheetCurves, NDArray[np.intp]]:
+    order = np.lexsort((curves.along_px, curves.curve_of_point()))
+    return SheetCurves(
+        offsets=curves.offsets,
+        position_px=curves.position_px,
+        points_mm=curves.points_mm[order],
+        deviation_mm=curves.deviation_mm[order],
+        along_px=curves.along_px[order],
+        pixels_px=curves.pixels_px[order],
+        stripe=curves.stripe[order],
+        bridge_after=curves.bridge_after[order],
+        source=curves.source[order],
+    ), order
+
+
+def _spread(curves: SheetCurves, positions: FloatArray) -> NDArray[np.int32]:
+    counts = np.zeros(len(positions), dtype=np.int64)
+    counts[np.searchsorted(positions, curves.position_px)] = np.diff(curves.offsets)
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _fuse_kernel(
+    a: Any, points: Any, deviation: Any, along: Any, source: Any,
+    b: Any, points2: Any, deviation2: Any, along2: Any, bridge2: Any, centre: Any, widest: float,
+) -> Any:  # fmt: skip
+    count = len(points)
+    fused = points.copy()
+    spread = deviation.copy()
+    kind = source.copy()
+    sigma = np.full(count, np.nan)
+    distance = np.full(count, np.nan)
+    ray = np.zeros(3)
+    for curve in range(len(a) - 1):
+        k = b[curve]
+        last = b[curve + 1] - 1
+        for i in range(a[curve], a[curve + 1]):
+            while k < last and along2[k + 1] < along[i]:
+                k += 1
+            if k >= last or along2[k] > along[i] or along2[k + 1] - along2[k] > widest or bridge2[k]:
+                continue
+            share = (along[i] - along2[k]) / (along2[k + 1] - along2[k])
+            norm = 0.0
+            for c in range(3):
+                ray[c] = points[i, c] - centre[c]
+                norm += ray[c] * ray[c]
+            norm = np.sqrt(norm)
+            # Errors at a given row act along the projector ray: a point displaced in the sheet slides along its
+            # curve until the row is right again, so each deviation counts with its part along the ray, corrected
+            # by the slope of the curve in that ray's direction.
+            e1 = _along_ray(points, deviation, i, a[curve], a[curve + 1], ray, norm)
+            e2 = _along_ray(points2, deviation2, k, b[curve], b[curve + 1], ray, norm)
+            gap = 0.0
+            for c in range(3):
+                other = points2[k, c] + share * (points2[k + 1, c] - points2[k, c])
+                gap += (other - points[i, c]) * ray[c] / norm
+            if e1 <= 0 or e2 <= 0:
+                continue
+            weight = e1 * e1 / (e1 * e1 + e2 * e2)
+            for c in range(3):
+                fused[i, c] = points[i, c] + weight * gap * ray[c] / norm
+                spread[i, c] = ray[c] / norm * e1 * e2 / np.sqrt(e1 * e1 + e2 * e2)
+            kind[i] = _ALL
+            sigma[i] = gap / np.sqrt(e1 * e1 + e2 * e2)
+            distance[i] = gap
+    return fused, spread, kind, sigma, distance
+
+
+@njit(cache=True, nogil=True)
+def _along_ray(points: Any, deviation: Any, i: int, first: int, end: int, ray: Any, norm: float) -> float:
+    """Standard deviation of the depth at a fixed row: the deviation less its slide along the curve, on the ray."""
+    before, after = max(first, i - 2), min(end - 1, i + 2)
+    tangent = np.zeros(3)
+    length = 0.0
+    for c in range(3):
+        tangent[c] = points[after, c] - points[before, c]
+        length += tangent[c] * tangent[c]
+    if length <= 0:
+        return 0.0
+    # Solve deviation = depth · r̂ + slide · tangent in the sheet (two unknowns, three equations).
+    rr = tt = rt = rd = td = 0.0
+    for c in range(3):
+        r = ray[c] / norm
+        rr += r * r
+        tt += tangent[c] * tangent[c]
+        rt += r * tangent[c]
+        rd += r * deviation[i, c]
+        td += tangent[c] * deviation[i, c]
+    det = rr * tt - rt * rt
+    if det <= 1e-12 * rr * tt:
+        return 0.0
+    return float(abs((tt * rd - rt * td) / det))
+
+
+@njit(cache=True, nogil=True)
+def _alone_kernel(a: Any, along: Any, bridge: Any, b: Any, along2: Any, widest: float) -> Any:
+    """Points of the second camera that lie in no stretch which the first camera has."""
+    alone = np.ones(len(along2), dtype=np.bool_)
+    for curve in range(len(a) - 1):
+        k = a[curve]
+        last = a[curve + 1] - 1
+        for i in range(b[curve], b[curve + 1]):
+            while k < last and along[k + 1] < along2[i]:
+                k += 1
+            if k > last:
+                continue
+            inside = along[k] <= along2[i] and k < last and along[k + 1] - along[k] <= widest and not bridge[k]
+            touching = abs(along[k] - along2[i]) < 0.5 or (k < last and abs(along[k + 1] - along2[i]) < 0.5)
+            if inside or touching:
+                alone[i] = False
+    return alone

@@ -1,0 +1,94 @@
+"""The noise of a camera, estimated from the frames of a scan themselves.
+
+Model: variance(I) = read + slope · I, in camera units (photon transfer; EMVA 1288).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.reconstruction.frames import AxisFrames
+
+_QUANTISATION_VARIANCE = 1.0 / 12.0
+_SAMPLES = 200_000
+_BINS = 24
+_LEAST_PER_BIN = 50
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """variance(I) = read_variance + slope · I, camera units squared."""
+
+    read_variance: float
+    slope: float
+
+    def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(H, W) float32: the variance expected of each sample of `image`."""
+        return np.asarray(self.read_variance + self.slope * np.maximum(image, 0), dtype=np.float32)
+
+
+def estimate_noise(frames: AxisFrames) -> NoiseModel:
+    """Fit the noise model to the frames of one camera.
+
+    A bit and its inverse add up to white plus black whatever the code, the blur and the projector's response, so the
+    scatter of that sum over the bits is noise alone: variance = 2 · read + slope · (white + black). Without inverses
+    the scatter between neighbouring pixels stands in (Immerkær 1996, DOI 10.1006/cviu.1996.0060).
+    """
+    if frames.inverses is not None and len(frames.bits) >= 3:
+        return _fitted(*_scatter_of_sums(frames.bits, frames.inverses, frames.full_scale))
+    return _fitted(*_scatter_between_neighbours(frames))
+
+
+def _scatter_of_sums(
+    bits: NDArray[np.float32], inverses: NDArray[np.float32], full_scale: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Levels and variances of single samples, half those of the sums."""
+    step = max(1, int(np.sqrt(bits[0].size / _SAMPLES)))
+    direct, inverse = bits[:, ::step, ::step], inverses[:, ::step, ::step]
+    sums = direct + inverse
+    unclipped = (np.maximum(direct, inverse).max(axis=0) < full_scale) & (np.minimum(direct, inverse).min(axis=0) > 0)
+    count = len(sums) - 1
+    variance = sums.var(axis=0, ddof=1, dtype=np.float64)
+    # A bin takes the median, which lies below the mean of a chi-square (Wilson-Hilferty).
+    variance = variance / (1 - 2 / (9 * count)) ** 3
+    return sums.mean(axis=0)[unclipped] / 2, (variance[unclipped] / 2).astype(np.float32)
+
+
+def _scatter_between_neighbours(frames: AxisFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    levels, variances = [], []
+    for image in (frames.white, frames.black):
+        across = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
+        both = across[:-2] - 2 * across[1:-1] + across[2:]
+        centre = image[1:-1, 1:-1]
+        unclipped = (centre > 0) & (centre < frames.full_scale)
+        levels.append(centre[unclipped])
+        # median of a squared normal = 0.4549 of its variance; the mask has norm² 36
+        variances.append(both[unclipped] ** 2 / 36 / 0.4549)
+    return np.concatenate(levels), np.concatenate(variances)
+
+
+def _fitted(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseModel:
+    floor = NoiseModel(_QUANTISATION_VARIANCE, 0.0)
+    if len(level) < _LEAST_PER_BIN:
+        return floor
+    borders = np.unique(np.quantile(level, np.linspace(0, 1, _BINS + 1)))
+    which = np.clip(np.searchsorted(borders, level, side="right") - 1, 0, max(len(borders) - 2, 0))
+    points = [
+        (float(np.median(level[which == b])), float(np.median(variance[which == b])), int((which == b).sum()))
+        for b in range(len(borders) - 1)
+        if (which == b).sum() >= _LEAST_PER_BIN
+    ]
+    if not points:
+        return floor
+    x, y, weight = np.array(points).T
+    if np.ptp(x) < 1.0:
+        return NoiseModel(max(float(np.median(y)), _QUANTISATION_VARIANCE), 0.0)
+    # Weighted by 1/variance: the scatter of a variance grows with the variance.
+    root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)
+    slope, read = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * root[:, None], y * root, rcond=None)[0]
+    slope = max(float(slope), 0.0)
+    read = float(read) if slope > 0 else float(np.average(y, weights=weight))
+    return NoiseModel(max(read, _QUANTISATION_VARIANCE), slope)

@@ -1,0 +1,120 @@
+"""Pinhole optics with Brown distortion, for kernels: pixels to rays and points to pixels (Brown 1966; OpenCV's order).
+
+A device is passed to kernels as one flat array (22,) float64:
+fx, skew, cx, fy, cy, k1, k2, p1, p2, k3, then the rotation row by row and the translation.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from slrig.model import FloatArray, Pinhole
+
+_UNDISTORT_STEPS = 30
+_CONVERGED = 1e-13
+
+
+def packed(device: Pinhole) -> FloatArray:
+    """(22,) float64: the device as kernels take it."""
+    m = device.matrix
+    return np.concatenate(
+        [
+            [m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2]],
+            device.distortion,
+            device.rotation.ravel(),
+            device.translation_mm,
+        ]
+    ).astype(np.float64)
+
+
+def rays(device: Pinhole, points_px: FloatArray) -> FloatArray:
+    """(n, 3) float64: world direction through each pixel (n, 2), scaled so that its depth in the device is 1."""
+    return np.asarray(_rays_kernel(packed(device), np.ascontiguousarray(points_px, dtype=np.float64)))
+
+
+def project(device: Pinhole, points_mm: FloatArray) -> FloatArray:
+    """(n, 2) float64 pixels of world points (n, 3); NaN for points behind the device."""
+    return np.asarray(_project_kernel(packed(device), np.ascontiguousarray(points_mm, dtype=np.float64)))
+
+
+def to_depths(device: Pinhole, points_mm: FloatArray) -> FloatArray:
+    """(n,) float64: depth of world points (n, 3) along the device's optical axis, mm."""
+    return np.asarray(points_mm @ device.rotation[2] + device.translation_mm[2])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def distort(d: Any, x: float, y: float) -> Any:
+    """Distorted normalised coordinates and their Jacobian: xd, yd, ∂xd/∂x, ∂xd/∂y, ∂yd/∂x, ∂yd/∂y."""
+    k1, k2, p1, p2, k3 = d[5], d[6], d[7], d[8], d[9]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # ∂radial/∂r²
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    return (
+        xd,
+        yd,
+        radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+        cross,
+        cross,
+        radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+    )
+
+
+@njit(cache=True, nogil=True)
+def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
+    """Undistorted normalised coordinates of a pixel, by Newton's method on the distortion."""
+    yd = (v - d[4]) / d[3]
+    xd = (u - d[2] - d[1] * yd) / d[0]
+    x, y = xd, yd
+    for _ in range(_UNDISTORT_STEPS):
+        gx, gy, a, b, c, e = distort(d, x, y)
+        det = a * e - b * c
+        dx, dy = (e * (xd - gx) - b * (yd - gy)) / det, (a * (yd - gy) - c * (xd - gx)) / det
+        x += dx
+        y += dy
+        if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
+            break
+    return x, y
+
+
+@njit(cache=True, nogil=True)
+def world_ray(d: Any, u: float, v: float, out: Any) -> None:
+    """Fill out (3,) with the world direction through a pixel: Rᵀ (x, y, 1)."""
+    x, y = normalised_from_pixel(d, u, v)
+    for k in range(3):
+        out[k] = d[10 + k] * x + d[13 + k] * y + d[16 + k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def to_device(d: Any, px: float, py: float, pz: float) -> Any:
+    """World point to device coordinates, mm: R X + t."""
+    return (
+        d[10] * px + d[11] * py + d[12] * pz + d[19],
+        d[13] * px + d[14] * py + d[15] * pz + d[20],
+        d[16] * px + d[17] * py + d[18] * pz + d[21],
+    )
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _rays_kernel(d: Any, points: Any) -> Any:
+    out = np.zeros((len(points), 3))
+    for i in prange(len(points)):
+        world_ray(d, points[i, 0], points[i, 1], out[i])
+    return out
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _project_kernel(d: Any, points: Any) -> Any:
+    out = np.full((len(points), 2), np.nan)
+    for i in prange(len(points)):
+        px, py, pz = to_device(d, points[i, 0], points[i, 1], points[i, 2])
+        if pz > 0:
+            xd, yd, _, _, _, _ = distort(d, px / pz, py / pz)
+            out[i, 0] = d[0] * xd + d[1] * yd + d[2]
+            out[i, 1] = d[3] * yd + d[4]
+    return out

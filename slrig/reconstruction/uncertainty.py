@@ -1,0 +1,30 @@
+"""What the errors of stripe points mean in space."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, Pinhole
+from slrig.reconstruction.optics import to_depths
+
+
+def sigma_along_normal(deviation_mm: FloatArray, normals: NDArray[np.float32]) -> FloatArray:
+    """(n,) float64: standard deviation along the surface normal, mm.
+
+    deviation_mm : (n, 3), displacement for one standard deviation; normals : (n, 3), unit. Where no triangle gives a
+    normal the whole displacement stands: an upper bound.
+    """
+    along = np.abs(np.sum(deviation_mm * normals, axis=1))
+    return np.asarray(np.where(np.isfinite(along), along, np.linalg.norm(deviation_mm, axis=1)))
+
+
+def sampling_mm(points_mm: FloatArray, camera: Pinhole, projector: Pinhole | None, step_px: float) -> FloatArray:
+    """(n,) float64: how far apart the rig samples a surface that faces it, mm.
+
+    The larger of a camera pixel's width at the point's depth and, with a projector, that of `step_px` columns.
+    """
+    pixel = to_depths(camera, points_mm) / camera.matrix[0, 0]
+    if projector is None:
+        return np.asarray(pixel * step_px)
+    return np.asarray(np.maximum(pixel, step_px * to_depths(projector, points_mm) / projector.matrix[0, 0]))
