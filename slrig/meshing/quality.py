@@ -1,0 +1,245 @@
+"""Figures about a mesh: its shape by itself, and its error against a surface that is known."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.meshing.search_tree import SearchTree
+from slrig.meshing.topology import (
+    degenerate_faces,
+    duplicate_face_count,
+    misoriented_edge_count,
+    nonmanifold_edge_count,
+    topology_counts,
+)
+from slrig.model import FloatArray, IntArray, Mesh, Surface
+
+_GROSS_MM = 1.0
+_FALSE_MM = 0.5
+_WELD_MM = 1e-3
+_FLAT_MM2 = 1e-9
+_ASIDE_MM = 0.05
+_SLIVER_DEG = 10.0
+_ONE_SIGMA_PERCENT = 68.27
+
+
+@dataclass(frozen=True, slots=True)
+class TruthScore:
+    """How far a mesh is from the surface that was scanned, millimetres; NaN where the mesh has nothing to measure.
+
+    rms_mm : over the mesh's area, of distances to the true surface below 1 mm.
+    p50_mm, p95_mm, p99_mm : percentiles of all those distances, by area.
+    gross_fraction, false_area_05mm : share of the mesh's area that is 1 mm, more than 0.5 mm from the true surface.
+    complete_01mm, complete_03mm : share of the visible points that are covered to this tolerance: the mesh passes so
+        near to the point, and what the camera's ray to the point meets first in the mesh is so near to the surface.
+    extra_layer_fraction : share of the camera's rays that cross the mesh more than once.
+    nonmanifold_edges, misoriented_edges, duplicate_faces, degenerate_faces : after welding vertices at 1 µm.
+    facing_camera_fraction : share of the mesh's area whose front the camera sees.
+    error_over_sigma_p68 : 68.27 % of the vertices are at most this many of their own standard deviations from the
+        true surface: 1 if the stated uncertainty is honest. NaN if the mesh states none.
+    """
+
+    rms_mm: float
+    p50_mm: float
+    p95_mm: float
+    p99_mm: float
+    gross_fraction: float
+    false_area_05mm: float
+    complete_01mm: float
+    complete_03mm: float
+    extra_layer_fraction: float
+    nonmanifold_edges: int
+    misoriented_edges: int
+    duplicate_faces: int
+    degenerate_faces: int
+    facing_camera_fraction: float
+    error_over_sigma_p68: float
+
+    def as_dict(self) -> dict[str, float | int]:
+        """The figures under the names that a report shows."""
+        shown = {
+            "false_area_05mm": "false_area_0.5mm",
+            "complete_01mm": "complete_0.1mm",
+            "complete_03mm": "complete_0.3mm",
+            "facing_camera_fraction": "facing_camera_area",
+        }
+        return {shown.get(name, name): value for name, value in asdict(self).items()}
+
+
+def mesh_figures(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> dict[str, float | int]:
+    """Size, shape of the triangles and topology of a mesh: vertices (V, 3), faces (F, 3).
+
+    `min_angle_*_deg` are percentiles of each triangle's smallest angle, by area. `sliver_fraction_below_10deg` is the
+    share of triangles, by number. `harmonic_index_mean` is the mean of hrm = 4 (cot α + cot β + cot η) over triangles
+    with an area (paper, section 3.3), 4√3 if all are equilateral. Figures of no triangle are NaN.
+    """
+    corners = np.asarray(vertices_mm, dtype=np.float64)[faces]
+    area_mm2 = _areas_mm2(corners)
+    angle_deg = smallest_angles_deg(corners)
+    index = harmonic_indices(corners)
+    counts = topology_counts(faces)
+    p1, p5, p50 = _weighted_percentiles(angle_deg, area_mm2, (1.0, 5.0, 50.0))
+    return {
+        "vertices": counts.vertices,
+        "triangles": len(faces),
+        "boundary_points": counts.boundary_vertices,
+        "area_mm2": float(area_mm2.sum()),
+        "min_angle_p1_deg": p1,
+        "min_angle_p5_deg": p5,
+        "min_angle_p50_deg": p50,
+        "sliver_fraction_below_10deg": float((angle_deg < _SLIVER_DEG).mean()) if len(faces) else np.nan,
+        "harmonic_index_mean": float(index[np.isfinite(index)].mean()) if np.isfinite(index).any() else np.nan,
+        "components": counts.components,
+        "euler_characteristic": counts.euler_characteristic,
+        "boundary_edges": counts.boundary_edges,
+        "nonmanifold_edges": counts.nonmanifold_edges,
+        "misoriented_edges": counts.misoriented_edges,
+        "duplicate_faces": counts.duplicate_faces,
+        "degenerate_faces": int((area_mm2 < _FLAT_MM2).sum()),
+    }
+
+
+def smallest_angles_deg(corners_mm: FloatArray) -> FloatArray:
+    """(F,) float64: the smallest angle of each triangle, (F, 3, 3); 0 for a triangle that is a point."""
+    twice_area = 2 * _areas_mm2(corners_mm)
+    smallest = np.full(len(corners_mm), np.pi)
+    for corner in range(3):
+        u = corners_mm[:, (corner + 1) % 3] - corners_mm[:, corner]
+        v = corners_mm[:, (corner + 2) % 3] - corners_mm[:, corner]
+        smallest = np.minimum(smallest, np.arctan2(twice_area, np.einsum("ij,ij->i", u, v)))
+    return np.asarray(np.degrees(smallest))
+
+
+def harmonic_indices(corners_mm: FloatArray) -> FloatArray:
+    """(F,) float64: hrm = 4 (cot α + cot β + cot η) of each triangle, (F, 3, 3); infinite where it has no area.
+
+    By the law of cosines this is (a² + b² + c²) / area, a, b, c the sides.
+    """
+    sides = corners_mm - np.roll(corners_mm, 1, axis=1)
+    squares = np.einsum("ijk,ijk->i", sides, sides)
+    area_mm2 = _areas_mm2(corners_mm)
+    return np.asarray(np.divide(squares, area_mm2, out=np.full(len(squares), np.inf), where=area_mm2 > 0))
+
+
+def score(
+    mesh: Mesh,
+    surface: Surface,
+    visible_points_mm: NDArray[np.floating[Any]],
+    eye_mm: FloatArray,
+    *,
+    sample_count: int = 200_000,
+    seed: int = 0,
+) -> TruthScore:
+    """The error of `mesh` against the true `surface`, all in one world frame.
+
+    Errors are taken over points spread evenly on the mesh's area, so that extra vertices or dust cannot dilute them.
+
+    Parameters
+    ----------
+    visible_points_mm : (n, 3), points of the true surface that the camera sees and the projector lights.
+    eye_mm : (3,), the camera's centre of projection.
+    sample_count : points on the mesh.
+    seed : of the points on the mesh and of the rays that count layers.
+    """
+    vertices, faces = _welded(np.asarray(mesh.vertices_mm, dtype=np.float64), mesh.faces)
+    collapsed = degenerate_faces(faces)
+    faces = np.ascontiguousarray(faces[~collapsed])
+    corners = vertices[faces]
+    area_mm2 = _areas_mm2(corners)
+    random = np.random.default_rng(seed)
+
+    truth = SearchTree.over(surface.vertices_mm, surface.faces)
+    found = SearchTree.over(vertices, faces)
+    error_mm = truth.distances_mm(_points_on(corners, area_mm2, sample_count, random))
+    near = error_mm < _GROSS_MM
+    p50, p95, p99 = np.percentile(error_mm, (50, 95, 99)) if len(error_mm) else (np.nan, np.nan, np.nan)
+    first_mm, gap_mm, layers = _seen_through(
+        found, truth, np.asarray(visible_points_mm, dtype=np.float64), eye_mm, random
+    )
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = np.einsum("ij,ij->i", eye_mm - corners.mean(axis=1), normals) > 0
+    return TruthScore(
+        rms_mm=float(np.sqrt((error_mm[near] ** 2).mean())) if near.any() else np.nan,
+        p50_mm=float(p50),
+        p95_mm=float(p95),
+        p99_mm=float(p99),
+        gross_fraction=1.0 - _share(near),
+        false_area_05mm=_share(error_mm > _FALSE_MM),
+        complete_01mm=_share((first_mm < 0.1) & (gap_mm < 0.1)),
+        complete_03mm=_share((first_mm < 0.3) & (gap_mm < 0.3)),
+        extra_layer_fraction=_share(layers > 1),
+        nonmanifold_edges=nonmanifold_edge_count(faces),
+        misoriented_edges=misoriented_edge_count(faces),
+        duplicate_faces=duplicate_face_count(faces),
+        degenerate_faces=int((area_mm2 < _FLAT_MM2).sum() + collapsed.sum()),
+        facing_camera_fraction=float(area_mm2[facing].sum() / area_mm2.sum()) if area_mm2.any() else np.nan,
+        error_over_sigma_p68=_error_over_sigma(mesh, truth),
+    )
+
+
+def _seen_through(
+    found: SearchTree, truth: SearchTree, points_mm: FloatArray, eye_mm: FloatArray, random: np.random.Generator
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """For each visible point: error of what its ray meets first, distance to the mesh, crossings of a ray beside it."""
+    rays = points_mm - eye_mm
+    reach = found.first_hits(eye_mm, rays)
+    hit = np.isfinite(reach)
+    first_mm = np.full(len(points_mm), np.inf)
+    first_mm[hit] = truth.distances_mm(eye_mm + rays[hit] * reach[hit, None])
+    # A ray through a vertex or along an edge crosses several triangles of one sheet: aim beside the point.
+    layers = found.crossing_counts(eye_mm, rays + random.normal(0.0, _ASIDE_MM, rays.shape))
+    return first_mm, found.distances_mm(points_mm), layers
+
+
+def _points_on(corners_mm: FloatArray, area_mm2: FloatArray, count: int, random: np.random.Generator) -> FloatArray:
+    """(count, 3) float64: random points, evenly spread over the area of the triangles; none if there is no area.
+
+    One point per equal share of the cumulated area, which spreads better than independent draws; inside its triangle
+    a point is uniform (Osada et al. 2002, "Shape distributions", 3.1).
+    """
+    cumulated = np.cumsum(area_mm2)
+    if not len(cumulated) or cumulated[-1] <= 0:
+        return np.zeros((0, 3))
+    at = (np.arange(count) + random.random(count)) / count * cumulated[-1]
+    picked = corners_mm[np.minimum(np.searchsorted(cumulated, at, side="right"), len(cumulated) - 1)]
+    root, along = np.sqrt(random.random(count)), random.random(count)
+    weights = np.stack((1 - root, root * (1 - along), root * along), axis=1)
+    return np.asarray(np.einsum("ij,ijk->ik", weights, picked))
+
+
+def _welded(vertices_mm: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
+    """Vertices that round to the same micrometre made one, the first of them."""
+    cells = np.rint(vertices_mm / _WELD_MM).astype(np.int64)
+    _, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    return vertices_mm[first], number.ravel().astype(np.int32)[faces]
+
+
+def _error_over_sigma(mesh: Mesh, truth: SearchTree) -> float:
+    error_mm = truth.distances_mm(mesh.vertices_mm)
+    stated = np.isfinite(mesh.sigma_mm) & (mesh.sigma_mm > 0) & (error_mm < _GROSS_MM)
+    if not stated.any():
+        return float(np.nan)
+    return float(np.percentile(error_mm[stated] / mesh.sigma_mm[stated], _ONE_SIGMA_PERCENT))
+
+
+def _areas_mm2(corners_mm: FloatArray) -> FloatArray:
+    normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", normals, normals)) / 2)
+
+
+def _share(true_where: NDArray[np.bool_]) -> float:
+    return float(true_where.mean()) if len(true_where) else float(np.nan)
+
+
+def _weighted_percentiles(values: FloatArray, weights: FloatArray, percents: tuple[float, ...]) -> list[float]:
+    """The values below which these percents of the weight lie; NaN if there is no weight."""
+    order = np.argsort(values)
+    cumulated = np.cumsum(weights[order])
+    if not len(cumulated) or cumulated[-1] <= 0:
+        return [float(np.nan)] * len(percents)
+    at = np.searchsorted(cumulated, np.asarray(percents) / 100 * cumulated[-1])
+    return [float(value) for value in values[order][np.minimum(at, len(values) - 1)]]

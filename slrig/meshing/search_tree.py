@@ -1,0 +1,296 @@
+"""A bounding-box tree over triangles: exact distance to the nearest one, and what a ray meets first.
+
+Triangles are ordered along a Morton curve through their centroids (Lauterbach et al. 2009, "Fast BVH construction on
+GPUs") and shared out evenly among the leaves of a complete binary tree, so that node i has the children 2i + 1 and
+2i + 2 and nothing but the boxes is stored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, IntArray
+
+_TRIANGLES_PER_LEAF = 4
+_STACK = 64
+# A ray along an edge or through a vertex must not slip between two triangles: barycentric tolerance.
+_EDGE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class SearchTree:
+    """Triangles in Morton order, (T, 3, 3) float64 mm, and the boxes of the tree, (2L - 1, 6) float64 mm: low, high."""
+
+    corners_mm: FloatArray
+    boxes_mm: FloatArray
+
+    @classmethod
+    def over(cls, vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> SearchTree:
+        """The tree of a mesh: vertices (V, 3), faces (F, 3).
+
+        Raises
+        ------
+        ValueError
+            A vertex that a face uses is not finite.
+        """
+        corners = np.asarray(vertices_mm, dtype=np.float64)[faces]
+        if not np.isfinite(corners).all():
+            message = "a search tree needs finite vertices; drop the faces that use an unmeasured one"
+            raise ValueError(message)
+        centroids = corners.mean(axis=1)
+        corners = np.ascontiguousarray(corners[np.argsort(_morton_codes(centroids), kind="stable")])
+        leaf_count = 1
+        while leaf_count * _TRIANGLES_PER_LEAF < len(corners):
+            leaf_count *= 2
+        return cls(corners, np.asarray(_boxes(corners, leaf_count)))
+
+    def distances_mm(self, points_mm: NDArray[np.floating[Any]]) -> FloatArray:
+        """(n,) float64: exact distance from each point, (n, 3), to the nearest triangle.
+
+        Infinite if there is no triangle, NaN for a point that is not finite.
+        """
+        points = np.ascontiguousarray(points_mm, dtype=np.float64)
+        order = np.argsort(_morton_codes(points), kind="stable")  # neighbours in turn walk the same nodes
+        return np.asarray(np.sqrt(_squared_distances(points, order, self.corners_mm, self.boxes_mm)))
+
+    def first_hits(self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]]) -> FloatArray:
+        """How far along its direction each ray first meets a triangle, in units of that direction's length.
+
+        Rays start at `origin`, (3,), and run along `directions`, (n, 3); both sides of a triangle count.
+        Returns (n,) float64, infinite where a ray meets nothing.
+        """
+        return np.asarray(self._walk(origin, directions, first_only=True)[0])
+
+    def crossing_counts(self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]]) -> IntArray:
+        """How many triangles each ray of `first_hits` crosses, (n,) int32.
+
+        A ray along an edge crosses both triangles there.
+        """
+        return np.asarray(self._walk(origin, directions, first_only=False)[1])
+
+    def _walk(
+        self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]], *, first_only: bool
+    ) -> tuple[FloatArray, IntArray]:
+        start = np.ascontiguousarray(origin, dtype=np.float64)
+        along = np.ascontiguousarray(directions, dtype=np.float64)
+        reach, crossings = _ray_hits(start, along, self.corners_mm, self.boxes_mm, first_only)
+        return reach, crossings
+
+
+def _morton_codes(points: FloatArray) -> NDArray[np.uint64]:
+    """(n,) uint64: 21 bits of each coordinate, interleaved; 0 for a point that is not finite."""
+    finite: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+    if not finite.any():
+        return np.zeros(len(points), dtype=np.uint64)
+    low = points[finite].min(axis=0)
+    extent = max(float((points[finite].max(axis=0) - low).max()), 1e-300)
+    steps = np.where(finite[:, None], (points - low) * ((2**21 - 1) / extent), 0.0)
+    return np.asarray(_interleaved(steps.astype(np.uint64)))
+
+
+@njit(cache=True, nogil=True)
+def _interleaved(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    codes = np.zeros(len(steps), dtype=np.uint64)
+    one = np.uint64(1)
+    for i in range(len(steps)):
+        code = np.uint64(0)
+        for bit in range(20, -1, -1):
+            for axis in range(3):
+                code = (code << one) | ((steps[i, axis] >> np.uint64(bit)) & one)
+        codes[i] = code
+    return codes
+
+
+@njit(cache=True, nogil=True)
+def _boxes(corners: FloatArray, leaf_count: int) -> FloatArray:
+    """(2 leaf_count - 1, 6): leaves from their triangles, then every parent from its two children."""
+    boxes = np.full((2 * leaf_count - 1, 6), np.inf)
+    boxes[:, 3:] = -np.inf
+    for leaf in range(leaf_count):
+        node = leaf_count - 1 + leaf
+        for triangle in range(leaf * len(corners) // leaf_count, (leaf + 1) * len(corners) // leaf_count):
+            for corner in range(3):
+                for axis in range(3):
+                    value = corners[triangle, corner, axis]
+                    boxes[node, axis] = min(boxes[node, axis], value)
+                    boxes[node, axis + 3] = max(boxes[node, axis + 3], value)
+    for node in range(leaf_count - 2, -1, -1):
+        for axis in range(3):
+            boxes[node, axis] = min(boxes[2 * node + 1, axis], boxes[2 * node + 2, axis])
+            boxes[node, axis + 3] = max(boxes[2 * node + 1, axis + 3], boxes[2 * node + 2, axis + 3])
+    return boxes
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _box_gap(x: float, y: float, z: float, boxes: FloatArray, node: int) -> float:
+    """Squared distance from a point to a box, 0 inside."""
+    dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
+    dy = max(boxes[node, 1] - y, 0.0, y - boxes[node, 4])
+    dz = max(boxes[node, 2] - z, 0.0, z - boxes[node, 5])
+    gap: float = dx * dx + dy * dy + dz * dz
+    return gap
+
+
+@njit(cache=True, nogil=True)
+def _squared_distances(
+    points: FloatArray, order: NDArray[np.intp], corners: FloatArray, boxes: FloatArray
+) -> FloatArray:
+    """Nearest-first descent; a node farther than the best triangle so far is left out."""
+    leaf_count = (len(boxes) + 1) // 2
+    out = np.full(len(points), np.nan)
+    stack = np.zeros(_STACK, dtype=np.int64)
+    gaps = np.zeros(_STACK)
+    near = 0
+    for index in order:
+        x, y, z = points[index]
+        if not np.isfinite(x + y + z):
+            continue
+        best = np.inf
+        if len(corners):
+            best = _triangle_gap(x, y, z, corners[near])  # the last point's triangle: a close bound at no cost
+        stack[0], gaps[0], depth = 0, _box_gap(x, y, z, boxes, 0), 1
+        while depth > 0:
+            depth -= 1
+            if gaps[depth] >= best:
+                continue
+            node = stack[depth]
+            if node >= leaf_count - 1:
+                leaf = node - leaf_count + 1
+                for triangle in range(leaf * len(corners) // leaf_count, (leaf + 1) * len(corners) // leaf_count):
+                    gap = _triangle_gap(x, y, z, corners[triangle])
+                    if gap < best:
+                        best, near = gap, triangle
+                continue
+            first, second = 2 * node + 1, 2 * node + 2
+            first_gap, second_gap = _box_gap(x, y, z, boxes, first), _box_gap(x, y, z, boxes, second)
+            if first_gap < second_gap:
+                first, second, first_gap, second_gap = second, first, second_gap, first_gap
+            if first_gap < best:
+                stack[depth], gaps[depth] = first, first_gap
+                depth += 1
+            if second_gap < best:
+                stack[depth], gaps[depth] = second, second_gap
+                depth += 1
+        out[index] = best
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _triangle_gap(x: float, y: float, z: float, triangle: FloatArray) -> float:
+    """Squared distance from a point to a triangle, exact for slivers and collapsed triangles too.
+
+    The nearest point is the foot of the perpendicular if that lies inside, else it is on an edge
+    (Ericson 2004, "Real-time collision detection", 5.1).
+    """
+    ax, ay, az = triangle[0, 0] - x, triangle[0, 1] - y, triangle[0, 2] - z
+    bx, by, bz = triangle[1, 0] - x, triangle[1, 1] - y, triangle[1, 2] - z
+    cx, cy, cz = triangle[2, 0] - x, triangle[2, 1] - y, triangle[2, 2] - z
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    vx, vy, vz = cx - ax, cy - ay, cz - az
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    square = nx * nx + ny * ny + nz * nz
+    if square > 0.0:
+        # The point, now the origin, is inside if it is on the inner side of each edge's upright plane.
+        in_ab = nx * (ay * bz - az * by) + ny * (az * bx - ax * bz) + nz * (ax * by - ay * bx)
+        in_bc = nx * (by * cz - bz * cy) + ny * (bz * cx - bx * cz) + nz * (bx * cy - by * cx)
+        in_ca = nx * (cy * az - cz * ay) + ny * (cz * ax - cx * az) + nz * (cx * ay - cy * ax)
+        if in_ab >= 0.0 and in_bc >= 0.0 and in_ca >= 0.0:
+            height = nx * ax + ny * ay + nz * az
+            upright: float = height * height / square
+            return upright
+    nearest: float = min(
+        _segment_gap(ax, ay, az, ux, uy, uz),
+        _segment_gap(ax, ay, az, vx, vy, vz),
+        _segment_gap(bx, by, bz, cx - bx, cy - by, cz - bz),
+    )
+    return nearest
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _segment_gap(px: float, py: float, pz: float, dx: float, dy: float, dz: float) -> float:
+    """Squared distance from the origin to the segment from p to p + d."""
+    square = dx * dx + dy * dy + dz * dz
+    t = 0.0
+    if square > 0.0:
+        t = min(max(-(px * dx + py * dy + pz * dz) / square, 0.0), 1.0)
+    qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
+    return qx * qx + qy * qy + qz * qz
+
+
+@njit(cache=True, nogil=True)
+def _ray_hits(
+    origin: FloatArray, directions: FloatArray, corners: FloatArray, boxes: FloatArray, first_only: bool
+) -> tuple[FloatArray, IntArray]:
+    """Distances to the first hit and numbers of hits; `first_only` leaves out what lies behind a hit."""
+    leaf_count = (len(boxes) + 1) // 2
+    reach = np.full(len(directions), np.inf)
+    crossings = np.zeros(len(directions), dtype=np.int32)
+    stack = np.zeros(_STACK, dtype=np.int64)
+    entries = np.zeros(_STACK)
+    for i in range(len(directions)):
+        stack[0], entries[0], depth = 0, _box_entry(origin, directions[i], boxes[0]), 1
+        while depth > 0:
+            depth -= 1
+            node = stack[depth]
+            if entries[depth] == np.inf or (first_only and entries[depth] > reach[i]):
+                continue
+            if node >= leaf_count - 1:
+                leaf = node - leaf_count + 1
+                for triangle in range(leaf * len(corners) // leaf_count, (leaf + 1) * len(corners) // leaf_count):
+                    t = _ray_meets_triangle(origin, directions[i], corners[triangle])
+                    if t < np.inf:
+                        crossings[i] += 1
+                        reach[i] = min(reach[i], t)
+                continue
+            first, second = 2 * node + 1, 2 * node + 2
+            first_entry = _box_entry(origin, directions[i], boxes[first])
+            second_entry = _box_entry(origin, directions[i], boxes[second])
+            if first_entry < second_entry:
+                first, second, first_entry, second_entry = second, first, second_entry, first_entry
+            stack[depth], entries[depth] = first, first_entry
+            stack[depth + 1], entries[depth + 1] = second, second_entry
+            depth += 2
+    return reach, crossings
+
+
+@njit(cache=True, nogil=True)
+def _box_entry(origin: FloatArray, direction: FloatArray, box: FloatArray) -> float:
+    """How far along the ray the box begins, infinite if it is missed: slab test.
+
+    The box is padded by some rounding errors, because it may be flat.
+    """
+    enter, leave = 0.0, np.inf
+    for axis in range(3):
+        pad = 1e-12 * (abs(box[axis]) + abs(box[axis + 3]) + abs(origin[axis]))
+        low, high = box[axis] - pad - origin[axis], box[axis + 3] + pad - origin[axis]
+        if direction[axis] == 0.0:
+            if low > 0.0 or high < 0.0:
+                return np.inf
+        else:
+            one, two = low / direction[axis], high / direction[axis]
+            enter, leave = max(enter, min(one, two)), min(leave, max(one, two))
+    return enter if enter <= leave else np.inf
+
+
+@njit(cache=True, nogil=True)
+def _ray_meets_triangle(origin: FloatArray, direction: FloatArray, triangle: FloatArray) -> float:
+    """How far along the ray it meets the triangle, infinite if it does not (Möller and Trumbore 1997)."""
+    ux, uy, uz = triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]
+    vx, vy, vz = triangle[2, 0] - triangle[0, 0], triangle[2, 1] - triangle[0, 1], triangle[2, 2] - triangle[0, 2]
+    sx, sy, sz = origin[0] - triangle[0, 0], origin[1] - triangle[0, 1], origin[2] - triangle[0, 2]
+    dx, dy, dz = direction
+    px, py, pz = dy * vz - dz * vy, dz * vx - dx * vz, dx * vy - dy * vx
+    determinant = ux * px + uy * py + uz * pz
+    if determinant == 0.0:
+        return np.inf
+    a = (sx * px + sy * py + sz * pz) / determinant
+    qx, qy, qz = sy * uz - sz * uy, sz * ux - sx * uz, sx * uy - sy * ux
+    b = (dx * qx + dy * qy + dz * qz) / determinant
+    t = (vx * qx + vy * qy + vz * qz) / determinant
+    inside = a >= -_EDGE_TOLERANCE and b >= -_EDGE_TOLERANCE and a + b <= 1.0 + _EDGE_TOLERANCE
+    return t if inside and t > 0.0 else np.inf

@@ -1,0 +1,259 @@
+"""How the triangles of a mesh hang together: edges, borders, faults of orientation, components, vertex normals.
+
+`faces` is (F, 3) int32, vertex indices, throughout. Coordinates play no part, except in `vertex_normals`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slrig.model import IntArray
+
+
+class EdgeTable(NamedTuple):
+    """Every undirected edge of a mesh, once.
+
+    edges : (E, 2) int32, lower vertex first, in rising order; triangle_counts : (E,) int32, triangles that use it.
+    """
+
+    edges: IntArray
+    triangle_counts: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class TopologyCounts:
+    """What is right and wrong with how a mesh hangs together.
+
+    vertices : those that a face uses. boundary_edges : used by one triangle; boundary_vertices : their ends.
+    nonmanifold_edges : used by more than two triangles.
+    misoriented_edges : run along in the same direction by more than one triangle.
+    duplicate_faces : faces with the three vertices of an earlier one. degenerate_faces : a vertex comes twice.
+    components : pieces that share no vertex. euler_characteristic : vertices - edges + faces.
+    """
+
+    vertices: int
+    edges: int
+    boundary_edges: int
+    boundary_vertices: int
+    nonmanifold_edges: int
+    misoriented_edges: int
+    duplicate_faces: int
+    degenerate_faces: int
+    components: int
+    euler_characteristic: int
+
+
+class CompactIndex(NamedTuple):
+    """How to leave out the vertices that no face uses.
+
+    kept : (K,) int32, old indices of the vertices that stay, rising: `vertices_mm[kept]`.
+    faces : (F, 3) int32, the faces in the new numbering.
+    """
+
+    kept: IntArray
+    faces: IntArray
+
+
+def edge_table(faces: IntArray) -> EdgeTable:
+    """Every undirected edge of `faces`, with the number of triangles that use it."""
+    keys, counts = _runs(_edge_keys(faces))
+    edges = np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32)
+    return EdgeTable(edges, counts)
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """(B, 2) int32: edges that only one triangle uses, in the direction in which it runs along them.
+
+    The surface lies to the left of each, seen from the side where triangles are counter-clockwise.
+    """
+    table = edge_table(faces)
+    alone = table.edges[table.triangle_counts == 1].astype(np.int64)
+    undirected = _edge_keys(faces)
+    directed = _directed_edges(faces)
+    return directed[_is_among(undirected, (alone[:, 0] << 32) | alone[:, 1])]
+
+
+def boundary_vertex_count(faces: IntArray) -> int:
+    """Number of vertices that lie on an edge which only one triangle uses."""
+    table = edge_table(faces)
+    return _marked_count(table.edges[table.triangle_counts == 1])
+
+
+def nonmanifold_edge_count(faces: IntArray) -> int:
+    """Number of undirected edges that more than two triangles use."""
+    return int((_runs(_edge_keys(faces))[1] > 2).sum())
+
+
+def misoriented_edge_count(faces: IntArray) -> int:
+    """Number of directed edges that more than one triangle runs along: its neighbours face opposite sides."""
+    edges = _directed_edges(faces).astype(np.int64)
+    return int((_runs((edges[:, 0] << 32) | edges[:, 1])[1] > 1).sum())
+
+
+def duplicate_face_count(faces: IntArray) -> int:
+    """Number of faces whose three vertices, in any order, an earlier face has already."""
+    if not len(faces):
+        return 0
+    low, high = faces.min(axis=1), faces.max(axis=1)
+    middle = faces.sum(axis=1, dtype=np.int64) - low - high
+    order = np.lexsort((high, middle, low))
+    low, middle, high = low[order], middle[order], high[order]
+    same = (low[1:] == low[:-1]) & (middle[1:] == middle[:-1]) & (high[1:] == high[:-1])
+    return int(same.sum())
+
+
+def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
+    """(F,) bool: a vertex comes twice in the face."""
+    a, b, c = faces.T
+    return np.asarray((a == b) | (b == c) | (c == a))
+
+
+def component_labels(faces: IntArray) -> IntArray:
+    """(F,) int32: which connected piece each face belongs to, numbered from 0 in order of first appearance.
+
+    Faces that share a vertex belong together.
+    """
+    return np.asarray(_component_labels(np.ascontiguousarray(faces), _vertex_bound(faces)))
+
+
+def topology_counts(faces: IntArray) -> TopologyCounts:
+    """All the counts of this module at once."""
+    table = edge_table(faces)
+    labels = component_labels(faces)
+    vertices = _marked_count(faces)
+    border = table.edges[table.triangle_counts == 1]
+    return TopologyCounts(
+        vertices=vertices,
+        edges=len(table.edges),
+        boundary_edges=len(border),
+        boundary_vertices=_marked_count(border),
+        nonmanifold_edges=int((table.triangle_counts > 2).sum()),
+        misoriented_edges=misoriented_edge_count(faces),
+        duplicate_faces=duplicate_face_count(faces),
+        degenerate_faces=int(degenerate_faces(faces).sum()),
+        components=int(labels.max()) + 1 if len(labels) else 0,
+        euler_characteristic=vertices - len(table.edges) + len(faces),
+    )
+
+
+def compact(faces: IntArray, *, vertex_count: int) -> CompactIndex:
+    """How to leave out the vertices that no face uses, keeping the order of the others."""
+    used = np.zeros(vertex_count, dtype=np.bool_)
+    used[faces.ravel()] = True
+    renumbered = (np.cumsum(used) - 1).astype(np.int32)
+    return CompactIndex(np.flatnonzero(used).astype(np.int32), np.ascontiguousarray(renumbered[faces]))
+
+
+def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> NDArray[np.float32]:
+    """(V, 3) float32, unit: the mean normal of the triangles at each vertex, weighted by their angle there.
+
+    Weighting by angle makes the normal independent of how the surface is cut into triangles
+    (Thürmer and Wüthrich 1998, "Computing vertex normals from polygonal facets").
+    NaN where no triangle with an area meets the vertex.
+    """
+    points = np.ascontiguousarray(vertices_mm, dtype=np.float64)
+    return np.asarray(_vertex_normals(points, np.ascontiguousarray(faces)))
+
+
+def _directed_edges(faces: IntArray) -> IntArray:
+    """(3F, 2) int32: edges 0-1 of all faces, then 1-2, then 2-0."""
+    return np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+
+
+def _edge_keys(faces: IntArray) -> NDArray[np.int64]:
+    """(3F,) int64: each edge as one number, lower vertex in the upper 32 bits, in the order of `_directed_edges`."""
+    rolled = faces[:, [1, 2, 0]]
+    low = np.minimum(faces, rolled).T.ravel().astype(np.int64)
+    return (low << 32) | np.maximum(faces, rolled).T.ravel()
+
+
+def _runs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], IntArray]:
+    """Distinct keys in rising order, (K,), and how often each comes, (K,) int32."""
+    ordered = np.sort(keys)
+    starts = np.flatnonzero(np.concatenate(([True], ordered[1:] != ordered[:-1]))) if len(keys) else np.zeros(0, int)
+    return ordered[starts], np.diff(np.append(starts, len(ordered))).astype(np.int32)
+
+
+def _is_among(keys: NDArray[np.int64], rising: NDArray[np.int64]) -> NDArray[np.bool_]:
+    if not len(rising):
+        return np.zeros(len(keys), dtype=np.bool_)
+    at = np.minimum(np.searchsorted(rising, keys), len(rising) - 1)
+    return np.asarray(rising[at] == keys)
+
+
+def _vertex_bound(faces: IntArray) -> int:
+    return int(faces.max()) + 1 if faces.size else 0
+
+
+def _marked_count(indices: IntArray) -> int:
+    """Number of different vertices among `indices`."""
+    marked = np.zeros(_vertex_bound(indices), dtype=np.bool_)
+    marked[indices.ravel()] = True
+    return int(marked.sum())
+
+
+@njit(cache=True, nogil=True)
+def _root(parents: IntArray, vertex: int) -> int:
+    while parents[vertex] != vertex:
+        parents[vertex] = parents[parents[vertex]]
+        vertex = parents[vertex]
+    return vertex
+
+
+@njit(cache=True, nogil=True)
+def _component_labels(faces: IntArray, vertex_bound: int) -> IntArray:
+    """Union-find over vertices with path halving, the lower index always the root."""
+    parents = np.arange(vertex_bound).astype(np.int32)
+    for face in range(len(faces)):
+        first = _root(parents, faces[face, 0])
+        for corner in (1, 2):
+            second = _root(parents, faces[face, corner])
+            if first < second:
+                parents[second] = first
+            else:
+                parents[first] = second
+                first = second
+    numbers = np.full(vertex_bound, -1, dtype=np.int32)
+    labels = np.zeros(len(faces), dtype=np.int32)
+    count = 0
+    for face in range(len(faces)):
+        root = _root(parents, faces[face, 0])
+        if numbers[root] < 0:
+            numbers[root] = count
+            count += 1
+        labels[face] = numbers[root]
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def _vertex_normals(points: NDArray[np.float64], faces: IntArray) -> NDArray[np.float32]:
+    sums = np.zeros((len(points), 3))
+    for face in range(len(faces)):
+        a, b, c = faces[face]
+        ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+        vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        twice_area = np.sqrt(nx * nx + ny * ny + nz * nz)
+        if not twice_area > 0.0:
+            continue
+        nx, ny, nz = nx / twice_area, ny / twice_area, nz / twice_area
+        # The cross product of any two edges is twice the area, so each angle is atan2(2 A, dot of the edges there).
+        at_a = np.arctan2(twice_area, ux * vx + uy * vy + uz * vz)
+        at_b = np.arctan2(twice_area, ux * (ux - vx) + uy * (uy - vy) + uz * (uz - vz))
+        at_c = np.pi - at_a - at_b
+        for corner, angle in ((a, at_a), (b, at_b), (c, at_c)):
+            sums[corner, 0] += angle * nx
+            sums[corner, 1] += angle * ny
+            sums[corner, 2] += angle * nz
+    normals = np.full((len(points), 3), np.nan, dtype=np.float32)
+    for vertex in range(len(points)):
+        x, y, z = sums[vertex]
+        length = np.sqrt(x * x + y * y + z * z)
+        if length > 0.0:
+            normals[vertex, 0], normals[vertex, 1], normals[vertex, 2] = x / length, y / length, z / length
+    return normals
