@@ -1,0 +1,264 @@
+"""A camera of the rendered rig: triggers, timing, frames and their faults."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from simulated_rig.options import CameraOptions, Faults
+from simulated_rig.rendering import View
+from simulated_rig.world import Clock, Lamp, nanoseconds
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Trigger
+from slrig.errors import DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import CameraFormat, Frame, Pixels
+
+_NOISE, _FATE, _GARBLE = range(3)
+
+
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    """One exposure of the sensor; `t_ready_ns` is when its frame can be read."""
+
+    number: int
+    t_start_ns: int
+    t_end_ns: int
+    t_ready_ns: int
+
+
+class SimulatedCamera:
+    """Implements `slrig.devices.Camera` on the rendered world.
+
+    Noise depends on the seed and the frame's sequence number only: runs repeat, and no two frames are alike.
+    """
+
+    def __init__(
+        self, options: CameraOptions, view: View, lamp: Lamp, clock: Clock, *, faults: Faults, seed: tuple[int, int]
+    ) -> None:
+        self._options = options
+        self._view = view
+        self._lamp = lamp
+        self._clock = clock
+        self._faults = faults
+        self._seed = seed
+        self._sensor = options.sensor()
+        self._settings = AppliedSettings(options.exposure_s, 1.0)
+        self._trigger: Trigger | None = None
+        self._pending: deque[_Exposure] = deque()
+        self._made = 0
+        self._dropped = 0
+        self._t_armed_ns = 0
+        self._t_busy_ns = 0
+        self._free_index = 0
+        self._last_image: Pixels | None = None
+        self._closed = threading.Event()
+        self._gone = False
+
+    @property
+    def info(self) -> CameraInfo:
+        """See `Camera`."""
+        options = self._options
+        return CameraInfo(
+            name=options.name,
+            model="rendered camera",
+            serial=f"simulated-{options.name}",
+            format=CameraFormat(options.size, options.bit_depth),
+            triggers=frozenset({Trigger.FREE, Trigger.SOFTWARE}),
+            exposure_range_s=(options.exposure_min_s, options.exposure_max_s),
+            gain_range=(1.0, options.gain_max),
+        )
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`."""
+        self._require_usable()
+        if self._trigger is not None:
+            message = f"camera '{self._options.name}' is armed; disarm it before changing its settings"
+            raise DeviceStateError(message)
+        info = self.info
+        for what, asked, (low, high) in (
+            ("exposure_s", settings.exposure_s, info.exposure_range_s),
+            ("gain", settings.gain, info.gain_range),
+        ):
+            if not low <= asked <= high:
+                message = f"camera '{info.name}': {what} {asked} is out of range, choose {low} to {high}"
+                raise UnsupportedByDeviceError(message)
+        self._settings = AppliedSettings(settings.exposure_s, settings.gain)
+        return self._settings
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`. Frames beyond `count` can be had: a caller may take one again."""
+        self._require_usable()
+        if self._trigger is not None:
+            message = f"camera '{self._options.name}' is armed already; disarm it first"
+            raise DeviceStateError(message)
+        if count < 1 or trigger not in self.info.triggers:
+            offered = ", ".join(sorted(self.info.triggers))
+            message = (
+                f"camera '{self._options.name}': asked for {count} frames by {trigger} trigger, it takes 1 or more by "
+                f"one of: {offered}"
+            )
+            raise UnsupportedByDeviceError(message)
+        # Tracing takes seconds of real time; done here, it delays no frame.
+        self._view.prepare()
+        self._pending.clear()
+        self._dropped = self._free_index = 0
+        self._t_armed_ns = self._t_busy_ns = self._clock.now_ns()
+        self._trigger = trigger
+
+    def trigger(self) -> None:
+        """See `Camera`. A trigger during an exposure starts the next one right after it."""
+        self._require_usable()
+        if self._trigger is not Trigger.SOFTWARE:
+            message = f"camera '{self._options.name}' is not armed for software triggers; call arm first"
+            raise DeviceStateError(message)
+        start_ns = max(self._clock.now_ns() + nanoseconds(self._options.trigger_latency_s), self._t_busy_ns)
+        exposure = self._exposure(self._made, start_ns)
+        self._made += 1
+        self._t_busy_ns = exposure.t_end_ns
+        self._pending.append(exposure)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`."""
+        self._require_usable()
+        if self._trigger is None:
+            message = f"camera '{self._options.name}' is not armed; call arm first"
+            raise DeviceStateError(message)
+        asked_ns = self._clock.now_ns()
+        deadline_ns = asked_ns + nanoseconds(timeout_s)
+        while True:
+            exposure = self._upcoming(after_ns, deadline_ns)
+            ready = exposure is not None and exposure.t_ready_ns <= deadline_ns
+            self._clock.wait_until(exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._closed)
+            self._require_usable()
+            if exposure is None or not ready:
+                message = (
+                    f"camera '{self._options.name}': no frame that began after {after_ns} ns came within {timeout_s} s "
+                    f"({self._dropped} lost since it was armed); trigger again, or allow more time"
+                )
+                raise FrameTimeoutError(message)
+            self._pending.popleft()
+            if self._is_dropped(exposure.number):
+                self._dropped += 1
+                continue
+            return self._frame(exposure)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        if self._trigger is Trigger.FREE:
+            begun = (self._clock.now_ns() - self._t_armed_ns) // self._period_ns + 1
+            self._made += max(begun, self._free_index)
+        self._trigger = None
+        self._pending.clear()
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self.disarm()
+        self._closed.set()
+
+    @property
+    def _period_ns(self) -> int:
+        shortest = nanoseconds(self._settings.exposure_s + self._options.readout_s)
+        return max(shortest, nanoseconds(self._options.period_s or 0.0), 1)
+
+    def _exposure(self, number: int, start_ns: int) -> _Exposure:
+        end_ns = start_ns + nanoseconds(self._settings.exposure_s)
+        late_s = self._faults.late_s if self._befalls(self._faults.late_frames, number) else 0.0
+        return _Exposure(number, start_ns, end_ns, end_ns + nanoseconds(self._options.readout_s + late_s))
+
+    def _upcoming(self, after_ns: int, deadline_ns: int) -> _Exposure | None:
+        """Return the first exposure that lies wholly after `after_ns`, passing over earlier ones, or None."""
+        earliest_ns = after_ns + nanoseconds(self._options.stamp_error_s)
+        while True:
+            if not self._pending and self._trigger is Trigger.FREE:
+                self._run_free(earliest_ns, deadline_ns)
+            if not self._pending:
+                return None
+            upcoming = self._pending[0]
+            unplug = self._faults.unplug_camera_at_frame
+            if unplug is not None and self._is_faulty and upcoming.number >= unplug:
+                self._clock.wait_until(min(upcoming.t_ready_ns, deadline_ns), self._closed)
+                self._gone = True
+                self._require_usable()
+            if upcoming.t_start_ns >= earliest_ns:
+                return upcoming
+            self._pending.popleft()
+
+    def _run_free(self, earliest_ns: int, deadline_ns: int) -> None:
+        """Append the next free-running exposure that began late enough, if its time comes before the deadline.
+
+        Frames that finished before it are passed over, or were overwritten while nobody read.
+        """
+        overwritten = max(self._finished(self._clock.now_ns()) - self._options.buffers - self._free_index, 0)
+        self._dropped += overwritten
+        self._free_index += overwritten
+        wanted = -((self._t_armed_ns - earliest_ns) // self._period_ns)
+        by_deadline = self._finished(deadline_ns)
+        index = max(self._free_index, wanted)
+        if index < by_deadline:
+            start_ns = self._t_armed_ns + index * self._period_ns
+            self._pending.append(self._exposure(self._made + index, start_ns))
+            self._free_index = index + 1
+        else:
+            self._free_index = max(self._free_index, min(wanted, by_deadline))
+
+    def _finished(self, t_ns: int) -> int:
+        """How many free-running exposures were read out by `t_ns`."""
+        first_ns = self._t_armed_ns + nanoseconds(self._settings.exposure_s + self._options.readout_s)
+        return max((t_ns - first_ns) // self._period_ns + 1, 0)
+
+    def _frame(self, exposure: _Exposure) -> Frame:
+        repeated = self._last_image if self._befalls(self._faults.stale_frames, exposure.number) else None
+        image = repeated if repeated is not None else self._rendered(exposure)
+        self._last_image = image
+        if self._befalls(self._faults.corrupt_frames, exposure.number):
+            image = self._garbled(image, exposure.number)
+        return Frame(
+            camera=self._options.name,
+            image=image,
+            t_start_ns=exposure.t_start_ns,
+            t_end_ns=exposure.t_end_ns,
+            t_err_ns=nanoseconds(self._options.stamp_error_s),
+            sequence_number=exposure.number,
+            dropped_count=self._dropped,
+            exposure_s=self._settings.exposure_s,
+            gain=self._settings.gain,
+        )
+
+    def _rendered(self, exposure: _Exposure) -> Pixels:
+        mean = self._view.image(self._lamp.light_between(exposure.t_start_ns, exposure.t_end_ns))
+        electrons = self._sensor.electrons(mean, self._settings.exposure_s)
+        return self._sensor.read_out(electrons, gain=self._settings.gain, rng=self._rng(_NOISE, exposure.number))
+
+    def _garbled(self, image: Pixels, number: int) -> Pixels:
+        rng = self._rng(_GARBLE, number)
+        rows = len(image)
+        band = slice(rows // 3, rows // 3 + max(rows // 3, 1))
+        out = image.copy()
+        out[band] = rng.integers(0, self._sensor.full_scale, out[band].shape, dtype=out.dtype, endpoint=True)
+        return out
+
+    def _rng(self, purpose: int, number: int) -> np.random.Generator:
+        return np.random.default_rng((*self._seed, purpose, number))
+
+    @property
+    def _is_faulty(self) -> bool:
+        return self._faults.cameras is None or self._options.name in self._faults.cameras
+
+    def _befalls(self, frames: tuple[int, ...], number: int) -> bool:
+        return self._is_faulty and number in frames
+
+    def _is_dropped(self, number: int) -> bool:
+        chance = self._faults.drop_probability if self._is_faulty else 0.0
+        return self._befalls(self._faults.drop_frames, number) or (
+            chance > 0 and bool(self._rng(_FATE, number).random() < chance)
+        )
+
+    def _require_usable(self) -> None:
+        if self._closed.is_set():
+            message = f"camera '{self._options.name}' is closed; open the rig again"
+            raise DeviceStateError(message)
+        if self._gone:
+            message = f"camera '{self._options.name}' is gone (unplugged or powered off); plug it in and open it again"
+            raise DeviceGoneError(message)

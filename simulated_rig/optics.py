@@ -1,0 +1,110 @@
+"""Lenses of the rendered rig: pinhole with Brown distortion, forwards (to pixels) and backwards (to rays).
+
+x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewise with p1 (r² + 2 y²) + 2 p2 x y
+(Brown 1966, in the form and order of OpenCV). This is code of the simulator alone: the reconstruction has its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, Pinhole
+
+LensArray = NDArray[np.float64]
+"""(9,) float64: fx, fy, cx, cy, k1, k2, p1, p2, k3."""
+
+_NEWTON_STEPS = 12
+_CONVERGED = 1e-13
+_MARGIN = 1.05
+
+
+def lens_array(device: Pinhole) -> LensArray:
+    """Return the numbers of a lens as kernels take them."""
+    k = device.matrix
+    return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *device.distortion], np.float64)
+
+
+@njit(cache=True, nogil=True)
+def distorted(x: float, y: float, lens: LensArray) -> tuple[float, float]:
+    """Where the lens sends the undistorted normalised point (x, y)."""
+    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+@njit(cache=True, nogil=True)
+def undistorted(xd: float, yd: float, lens: LensArray) -> tuple[float, float]:
+    """The normalised point that the lens sends to (xd, yd), by Newton's method on the two equations."""
+    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
+    x, y = xd, yd
+    for _ in range(_NEWTON_STEPS):
+        fx, fy = distorted(x, y, lens)
+        ex, ey = fx - xd, fy - yd
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        jxx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        jyy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        jxy = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        determinant = jxx * jyy - jxy * jxy
+        if determinant == 0.0:
+            break
+        x -= (jyy * ex - jxy * ey) / determinant
+        y -= (jxx * ey - jxy * ex) / determinant
+        if ex * ex + ey * ey < _CONVERGED * _CONVERGED:
+            break
+    return x, y
+
+
+@njit(cache=True, nogil=True)
+def world_directions(
+    u: NDArray[np.float64], v: NDArray[np.float64], lens: LensArray, rotation: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n, 3) float64: unit directions in the world of the rays through the pixel positions u, v ((n,) float64)."""
+    out = np.zeros((len(u), 3))
+    for i in range(len(u)):
+        x, y = undistorted((u[i] - lens[2]) / lens[0], (v[i] - lens[3]) / lens[1], lens)
+        scale = 1.0 / np.sqrt(x * x + y * y + 1.0)
+        for axis in range(3):
+            out[i, axis] = scale * (rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis])
+    return out
+
+
+def field_radius(device: Pinhole) -> float:
+    """Return the largest undistorted radius of a point within the image, with a small margin.
+
+    Points farther out are not imaged: beyond it a distortion polynomial may turn back and give a false pixel.
+    """
+    width, height = device.size.width_px, device.size.height_px
+    along, down = np.linspace(-0.5, width - 0.5, 65), np.linspace(-0.5, height - 0.5, 65)
+    u = np.concatenate([along, along, np.full(65, -0.5), np.full(65, width - 0.5)])
+    v = np.concatenate([np.full(65, -0.5), np.full(65, height - 0.5), down, down])
+    rays = world_directions(u, v, lens_array(device), np.eye(3))
+    return float(np.hypot(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]).max()) * _MARGIN
+
+
+def look_at(position_mm: FloatArray, target_mm: FloatArray, down: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return (rotation, translation_mm), world to device, of a device that looks at a point.
+
+    `down` is the world direction that points down in the image, as nearly as the viewing direction allows.
+    Raises ValueError when the device stands on its target or looks along `down`.
+    """
+    forward = target_mm - position_mm
+    distance = float(np.linalg.norm(forward))
+    right = np.cross(down, forward)
+    spread = float(np.linalg.norm(right))
+    if distance == 0.0 or spread <= 1e-9 * distance * float(np.linalg.norm(down)):
+        message = (
+            f"a device at {position_mm.tolist()} cannot look at {target_mm.tolist()} with {down.tolist()} pointing "
+            "down: the two directions must differ"
+        )
+        raise ValueError(message)
+    z, x = forward / distance, right / spread
+    rotation = np.stack([x, np.cross(z, x), z])
+    return rotation, -rotation @ position_mm

@@ -1,0 +1,146 @@
+"""The projector of the rendered rig."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from simulated_rig.light import LightTable, light_table, no_light
+from simulated_rig.options import Faults, ProjectorOptions
+from simulated_rig.world import Clock, Lamp, nanoseconds
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
+from slrig.model import PatternSequence
+
+NAME = "projector"
+
+
+class SimulatedProjector:
+    """Implements `slrig.devices.Projector` on the rendered world."""
+
+    def __init__(self, options: ProjectorOptions, clock: Clock, *, faults: Faults, seed: int) -> None:
+        self._options = options
+        self._clock = clock
+        self._faults = faults
+        self._response = options.response()
+        self._dark = self._table(np.zeros((1, 1), np.uint8))
+        self.lamp = Lamp(self._dark)
+        self._rng = np.random.default_rng((seed, 0x70726F6A))
+        self._sequence: PatternSequence | None = None
+        self._tables: dict[int, LightTable] = {}
+        self._shows = 0
+        self._showing: int | None = None
+        self._closed = threading.Event()
+        self._gone = False
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return ProjectorInfo(
+            name=NAME,
+            model="rendered projector",
+            serial="simulated",
+            size=self._options.size,
+            plays=False,
+            latency_s=self._options.latency_s,
+        )
+
+    @property
+    def showing(self) -> int | None:
+        """The pattern that the projector was last told to show, None when it was told to be dark."""
+        return self._showing
+
+    @property
+    def lit(self) -> bool:
+        """Whether more light than the dark projector's leak is on the scene now."""
+        return self.lamp.light_at(self._clock.now_ns()).peak > self._dark.peak * (1 + 1e-6)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. What was shown before goes dark."""
+        self._require_usable()
+        size = self._options.size
+        if sequence.projector != size:
+            message = f"the projector is {size}, the sequence was made for {sequence.projector}; encode it for {size}"
+            raise UnsupportedByDeviceError(message)
+        if len(sequence) > self._options.max_patterns:
+            message = (
+                f"the projector holds {self._options.max_patterns} patterns, the sequence has {len(sequence)}; "
+                "shorten it or raise max_patterns"
+            )
+            raise UnsupportedByDeviceError(message)
+        for index, profile in enumerate(sequence.profiles):
+            if min(profile.shape) > 1:
+                message = (
+                    f"pattern {index} varies along both axes ({profile.shape}), the rendered projector shows patterns "
+                    "that vary along one"
+                )
+                raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._sequence, self._tables = sequence, {}
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`."""
+        self._require_usable()
+        if self._sequence is None:
+            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
+            raise DeviceStateError(message)
+        if not 0 <= index < len(self._sequence):
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._sequence) - 1}"
+            raise UnsupportedByDeviceError(message)
+        if self._faults.unplug_projector_at_show is not None and self._shows >= self._faults.unplug_projector_at_show:
+            self._gone, self._showing = True, None
+            self.lamp.darken(at_ns=self._clock.now_ns())
+            self._require_usable()
+        self._shows += 1
+        if index not in self._tables:
+            self._tables[index] = self._table(self._sequence.profiles[index])
+        error_s = self._options.visible_error_s
+        t_visible_ns = self._clock.now_ns() + nanoseconds(self._options.latency_s)
+        off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
+        self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
+        self._showing = index
+        self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._closed)
+        return Shown(index, t_visible_ns, nanoseconds(error_s))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. This one does not play."""
+        self._require_usable()
+        message = (
+            f"asked to play {exposure_s} s patterns every {period_s} s, the rendered projector has no trigger wire; "
+            "show each pattern and trigger the cameras by software"
+        )
+        raise UnsupportedByDeviceError(message)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`. Raises DeviceGoneError after an unplug: nobody can say what it shows."""
+        if self._closed.is_set():
+            return
+        if self._gone:
+            self._require_usable()
+        self._showing = None
+        self.lamp.darken(at_ns=self._clock.now_ns())
+
+    def close(self) -> None:
+        """See `Projector`."""
+        if not self._gone:
+            self.blank()
+        self._showing, self._sequence, self._tables = None, None, {}
+        self._closed.set()
+
+    def _table(self, profile: np.ndarray[tuple[int, ...], np.dtype[np.unsignedinteger]]) -> LightTable:
+        if self._faults.lamp_off:
+            return no_light(self._options.size)
+        return light_table(profile, self._options.size, self._response)
+
+    def _require_usable(self) -> None:
+        if self._closed.is_set():
+            message = "the projector is closed; open the rig again"
+            raise DeviceStateError(message)
+        if self._gone:
+            message = "the projector is gone (unplugged or powered off); plug it in and open the rig again"
+            raise DeviceGoneError(message)

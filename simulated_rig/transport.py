@@ -1,0 +1,384 @@
+"""Ray-traced paths projector -> surface -> camera: where each camera sample is lit from, and how strongly.
+
+One pose of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`).
+Only direct light is traced: no light from one surface to another, no defocus with depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from simulated_rig.casting import Caster
+from simulated_rig.optics import LensArray, distorted, field_radius, lens_array, world_directions
+from simulated_rig.scene import SceneSurface
+from slrig.model import FloatArray, IntArray, Pinhole
+
+SHADOW_BIAS_MM = 0.05
+"""A surface shades a point only if it lies nearer to the projector by more than this: facets must not shade
+the curved surface that they stand for."""
+
+_BLOCK_RAYS = 120_000
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """What n rays from one camera met.
+
+    points_mm : (n, 3) float64, world, NaN where nothing was met; seen, lit : (n,) bool, lit by the projector's image.
+    column_px, row_px : (n,) float64, where the projector's lens images the point (perhaps beside its image), NaN in
+    shadow.
+    weight : (n,) float32, light sent to the camera per unit of projector light; albedo : (n,) float32.
+    """
+
+    points_mm: FloatArray
+    seen: NDArray[np.bool_]
+    lit: NDArray[np.bool_]
+    column_px: FloatArray
+    row_px: FloatArray
+    weight: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """Every sub-pixel sample of one camera, S per pixel.
+
+    column_px, row_px, weight : (H, W, S) float32, weight 0 where the sample is not lit.
+    albedo : (H, W) float32, mean over the pixel's samples, 0 where they meet nothing.
+    """
+
+    column_px: NDArray[np.float32]
+    row_px: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+
+
+def trace(
+    u: FloatArray,
+    v: FloatArray,
+    camera: Pinhole,
+    projector: Pinhole,
+    surface: SceneSurface,
+    rays: Caster,
+    *,
+    working_distance_mm: float,
+) -> Hits:
+    """Follow the camera's rays through pixel positions u, v ((n,) float64) to the surface and on to the projector.
+
+    The weight is the Lambert and Phong light times (working distance / distance to the projector)², so that a white
+    diffuser at the working distance that faces the projector has weight 1.
+    """
+    eye, lamp = camera.centre_mm, projector.centre_mm
+    directions = world_directions(u, v, lens_array(camera), camera.rotation)
+    triangle = rays.first_hit(eye, directions)
+    points, normals = _hit_points(
+        eye,
+        directions,
+        triangle,
+        surface.vertices_mm,
+        surface.faces,
+        surface.corner_normals,
+        surface.part,
+        surface.sphere_mm,
+    )
+    seen = np.isfinite(points[:, 0])
+    to_point = points - lamp
+    distance = np.linalg.norm(to_point, axis=1)
+    # Rays that met nothing are cast along x, and ignored.
+    towards = np.where(seen[:, None], to_point / np.where(distance > 0, distance, 1.0)[:, None], (1.0, 0.0, 0.0))
+    blocker = rays.first_hit(lamp, towards)
+    column, row = np.full(len(u), np.nan), np.full(len(u), np.nan)
+    weight, albedo = np.zeros(len(u), np.float32), np.zeros(len(u), np.float32)
+    _light_points(
+        points,
+        normals,
+        directions,
+        triangle,
+        blocker,
+        towards,
+        distance,
+        surface.vertices_mm,
+        surface.faces,
+        surface.part,
+        surface.to_object,
+        surface.material,
+        lamp,
+        lens_array(projector),
+        projector.rotation,
+        projector.translation_mm,
+        field_radius(projector),
+        working_distance_mm,
+        column,
+        row,
+        weight,
+        albedo,
+    )
+    width, height = projector.size.width_px, projector.size.height_px
+    inside = (column >= -0.5) & (column <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
+    return Hits(points, seen, inside & (weight > 0), column, row, weight, albedo)
+
+
+def paths(
+    camera: Pinhole,
+    projector: Pinhole,
+    surface: SceneSurface,
+    rays: Caster,
+    *,
+    samples_per_axis: int,
+    jitter: bool,
+    seed: int,
+    working_distance_mm: float,
+    workers: int,
+) -> Paths:
+    """Trace samples_per_axis² samples per pixel: at the middles of equal cells, or, jittered, anywhere in each cell."""
+    rows, columns = camera.size.shape
+    count = samples_per_axis**2
+    out = Paths(
+        column_px=np.zeros((rows, columns, count), np.float32),
+        row_px=np.zeros((rows, columns, count), np.float32),
+        weight=np.zeros((rows, columns, count), np.float32),
+        albedo=np.zeros((rows, columns), np.float32),
+    )
+    block_rows = max(_BLOCK_RAYS // (columns * count), 1)
+
+    def fill(first: int) -> None:
+        last = min(first + block_rows, rows)
+        u, v = _sample_positions(
+            first, last, columns, samples_per_axis, np.random.default_rng((seed, first)) if jitter else None
+        )
+        hits = trace(u, v, camera, projector, surface, rays, working_distance_mm=working_distance_mm)
+        shape = (last - first, columns, count)
+        known = np.isfinite(hits.column_px)
+        out.column_px[first:last] = np.where(known, hits.column_px, 0.0).reshape(shape)
+        out.row_px[first:last] = np.where(known, hits.row_px, 0.0).reshape(shape)
+        out.weight[first:last] = np.where(known, hits.weight, 0.0).reshape(shape)
+        out.albedo[first:last] = hits.albedo.reshape(shape).mean(axis=2)
+
+    starts = range(0, rows, block_rows)
+    if workers == 1:
+        for start in starts:
+            fill(start)
+    else:
+        with ThreadPoolExecutor(workers, thread_name_prefix="trace") as pool:
+            # Each block writes rows of its own; the list makes a failure in any of them surface here.
+            list(pool.map(fill, starts))
+    return out
+
+
+def pixel_centres(camera: Pinhole) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
+    """Yield blocks of whole rows: (rows, u, v) with the centres of their pixels, row by row."""
+    rows, columns = camera.size.shape
+    block_rows = max(_BLOCK_RAYS // columns, 1)
+    for first in range(0, rows, block_rows):
+        last = min(first + block_rows, rows)
+        u, v = _sample_positions(first, last, columns, 1, None)
+        yield slice(first, last), u, v
+
+
+def _sample_positions(
+    first: int, last: int, columns: int, per_axis: int, jitter: np.random.Generator | None
+) -> tuple[FloatArray, FloatArray]:
+    shape = (last - first, columns, per_axis, per_axis)
+    row, column, below, beside = np.meshgrid(
+        np.arange(first, last, dtype=np.float64),
+        np.arange(columns, dtype=np.float64),
+        np.arange(per_axis, dtype=np.float64),
+        np.arange(per_axis, dtype=np.float64),
+        indexing="ij",
+    )
+    across: FloatArray | float = 0.5 if jitter is None else jitter.random(shape)
+    down: FloatArray | float = 0.5 if jitter is None else jitter.random(shape)
+    u = column + (beside + across) / per_axis - 0.5
+    v = row + (below + down) / per_axis - 0.5
+    return u.ravel(), v.ravel()
+
+
+@njit(cache=True, nogil=True)
+def _plane_distance(
+    origin: FloatArray, direction: FloatArray, face: IntArray, vertices: FloatArray
+) -> tuple[float, float, float, float]:
+    """Distance along a ray to a triangle's plane, and the plane's normal (not unit). NaN when they are parallel."""
+    a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
+    e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    f0, f1, f2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+    along = n0 * direction[0] + n1 * direction[1] + n2 * direction[2]
+    if along == 0.0:
+        return np.nan, n0, n1, n2
+    height = n0 * (a[0] - origin[0]) + n1 * (a[1] - origin[1]) + n2 * (a[2] - origin[2])
+    return height / along, n0, n1, n2
+
+
+@njit(cache=True, nogil=True)
+def _hit_points(
+    origin: FloatArray,
+    directions: FloatArray,
+    triangle: IntArray,
+    vertices: FloatArray,
+    faces: IntArray,
+    corner_normals: NDArray[np.float32],
+    part: IntArray,
+    spheres: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """(points, normals), both (n, 3) float64, NaN where nothing was met; normals are unit and face the origin.
+
+    The point is where the ray meets the triangle's plane, or the exact ball that the triangle stands for.
+    """
+    count = len(triangle)
+    points, normals = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+    for i in range(count):
+        if triangle[i] < 0:
+            continue
+        direction, face = directions[i], faces[triangle[i]]
+        ball = spheres[part[triangle[i]]]
+        n = np.zeros(3)
+        p = np.zeros(3)
+        if ball[3] > 0.0:
+            o0, o1, o2 = origin[0] - ball[0], origin[1] - ball[1], origin[2] - ball[2]
+            along = o0 * direction[0] + o1 * direction[1] + o2 * direction[2]
+            # Distance² from the centre to the ray, without the cancellation of |o|² - along².
+            c0 = o0 - along * direction[0]
+            c1 = o1 - along * direction[1]
+            c2 = o2 - along * direction[2]
+            half_chord = np.sqrt(max(ball[3] * ball[3] - (c0 * c0 + c1 * c1 + c2 * c2), 0.0))
+            t = -along - half_chord
+            if t <= 0.0:
+                t = -along + half_chord
+            for axis in range(3):
+                p[axis] = origin[axis] + t * direction[axis]
+                n[axis] = (p[axis] - ball[axis]) / ball[3]
+        else:
+            t, n0, n1, n2 = _plane_distance(origin, direction, face, vertices)
+            if not t > 0.0:
+                continue
+            for axis in range(3):
+                p[axis] = origin[axis] + t * direction[axis]
+            # Barycentric weights: areas of the sub-triangles, measured along the plane's normal.
+            area2 = n0 * n0 + n1 * n1 + n2 * n2
+            for corner in range(3):
+                b, c = vertices[face[(corner + 1) % 3]], vertices[face[(corner + 2) % 3]]
+                g0, g1, g2 = b[0] - p[0], b[1] - p[1], b[2] - p[2]
+                h0, h1, h2 = c[0] - p[0], c[1] - p[1], c[2] - p[2]
+                share = (n0 * (g1 * h2 - g2 * h1) + n1 * (g2 * h0 - g0 * h2) + n2 * (g0 * h1 - g1 * h0)) / area2
+                for axis in range(3):
+                    n[axis] += share * corner_normals[triangle[i], corner, axis]
+            length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+            if length == 0.0:
+                n[0], n[1], n[2], length = n0, n1, n2, np.sqrt(area2)
+            for axis in range(3):
+                n[axis] /= length
+        facing = n[0] * direction[0] + n[1] * direction[1] + n[2] * direction[2]
+        sign = -1.0 if facing > 0.0 else 1.0
+        for axis in range(3):
+            points[i, axis] = p[axis]
+            normals[i, axis] = sign * n[axis]
+    return points, normals
+
+
+@njit(cache=True, nogil=True)
+def _hash01(x: int, y: int, z: int) -> float:
+    """A number in 0..1 that looks random, the same for the same lattice point."""
+    # 64-bit arithmetic cut to 32 bits after each product: the same under numba and in plain Python.
+    h = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
+    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
+    return float(h ^ (h >> 16)) / 4294967295.0
+
+
+@njit(cache=True, nogil=True)
+def texture_value(kind: int, x: float, y: float, z: float) -> float:
+    """Darkness 0..1 of a texture at (x, y, z), in grains. 0 uniform, 1 checker, 2 smooth value noise, two octaves."""
+    if kind == 1:
+        return float((int(np.floor(x)) + int(np.floor(y))) % 2)
+    if kind != 2:
+        return 0.0
+    total = 0.0
+    for octave in range(2):
+        scale = 1.0 + octave
+        xs, ys, zs = x * scale, y * scale, z * scale
+        i, j, k = int(np.floor(xs)), int(np.floor(ys)), int(np.floor(zs))
+        fx, fy, fz = xs - i, ys - j, zs - k
+        # Smoothstep, so that the shading has no creases at the lattice.
+        fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
+        value = 0.0
+        for corner in range(8):
+            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
+            share = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
+            value += share * _hash01(i + a, j + b, k + c)
+        total += value * (2.0 / 3.0 if octave == 0 else 1.0 / 3.0)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _light_points(
+    points: FloatArray,
+    normals: FloatArray,
+    view: FloatArray,
+    triangle: IntArray,
+    blocker: IntArray,
+    towards: FloatArray,
+    distance: FloatArray,
+    vertices: FloatArray,
+    faces: IntArray,
+    part: IntArray,
+    to_object: FloatArray,
+    material: FloatArray,
+    lamp: FloatArray,
+    lens: LensArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    field: float,
+    working_distance: float,
+    column: FloatArray,
+    row: FloatArray,
+    weight: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+) -> None:
+    """Fill column, row, weight and albedo (see `Hits`) for points met by camera rays `view`."""
+    for i in range(len(triangle)):
+        if not np.isfinite(points[i, 0]):
+            continue
+        p, n, light, eye = points[i], normals[i], towards[i], view[i]
+        owner = part[triangle[i]]
+        m, f = material[owner], to_object[owner]
+        darkness = 0.0
+        if m[1] > 0.0:
+            grain = m[3]
+            x = (f[0, 0] * p[0] + f[0, 1] * p[1] + f[0, 2] * p[2] + f[0, 3]) / grain
+            y = (f[1, 0] * p[0] + f[1, 1] * p[1] + f[1, 2] * p[2] + f[1, 3]) / grain
+            z = (f[2, 0] * p[0] + f[2, 1] * p[1] + f[2, 2] * p[2] + f[2, 3]) / grain
+            darkness = texture_value(int(m[1]), x, y, z)
+        albedo[i] = m[0] * (1.0 - m[2] * darkness)
+        cosine = -(n[0] * light[0] + n[1] * light[1] + n[2] * light[2])
+        if cosine <= 0.0:
+            continue
+        if blocker[i] >= 0 and blocker[i] != triangle[i]:
+            reach, _n0, _n1, _n2 = _plane_distance(lamp, light, faces[blocker[i]], vertices)
+            if reach < distance[i] - SHADOW_BIAS_MM:
+                continue
+        q0 = rotation[0, 0] * p[0] + rotation[0, 1] * p[1] + rotation[0, 2] * p[2] + translation[0]
+        q1 = rotation[1, 0] * p[0] + rotation[1, 1] * p[1] + rotation[1, 2] * p[2] + translation[1]
+        q2 = rotation[2, 0] * p[0] + rotation[2, 1] * p[1] + rotation[2, 2] * p[2] + translation[2]
+        if q2 <= 0.0:
+            continue
+        x, y = q0 / q2, q1 / q2
+        if x * x + y * y > field * field:
+            continue
+        xd, yd = distorted(x, y, lens)
+        column[i] = lens[0] * xd + lens[2]
+        row[i] = lens[1] * yd + lens[3]
+        strength = albedo[i] * cosine
+        if m[4] > 0.0:
+            # Mirror direction of the light about the normal, against the direction back to the camera.
+            mirrored = 0.0
+            for axis in range(3):
+                mirrored -= (light[axis] + 2.0 * cosine * n[axis]) * eye[axis]
+            if mirrored > 0.0:
+                strength += m[4] * mirrored ** m[5]
+        weight[i] = strength * (working_distance / distance[i]) ** 2

@@ -1,0 +1,1 @@
+"""Tests of the rendered rig against arithmetic done by hand, OpenCV and plain numpy."""
