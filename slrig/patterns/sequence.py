@@ -1,0 +1,104 @@
+"""From what a scan asks for to the patterns it plays, and from patterns to light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.errors import PatternError
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Size, White
+from slrig.patterns.gray import gray_bits, gray_profile
+from slrig.patterns.line_shift import line_profile
+
+
+def scan_patterns(
+    size: Size,
+    *,
+    line_shift: bool,
+    period_px: int,
+    line_width_px: int,
+    gray_cell_px: int | None,
+    gray_offset_px: int,
+    rows: bool,
+) -> tuple[Pattern, ...]:
+    """List the patterns of one scan in the order of play.
+
+    White, black; for columns, then for rows if asked: the Gray bits, most significant first, each followed by its
+    inverse, and the n line frames; white, black again. The two pairs of white and black bracket everything that can
+    drift.
+
+    Parameters
+    ----------
+    size
+        The projector.
+    line_shift
+        False leaves the line frames out: a Gray-only scan.
+    period_px, line_width_px
+        n and the width of a line.
+    gray_cell_px
+        None stands for ⌊n/2⌋, or 1 without line shift.
+    gray_offset_px
+        Added to a position before it is cut into cells: moves the cell edges.
+    rows
+        Play the row axis as well.
+
+    Raises
+    ------
+    PatternError
+        A code that cannot tell the lines of one frame apart, or a pattern that does not fit the projector.
+
+    >>> options = dict(line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False)
+    >>> patterns = scan_patterns(Size(1280, 800), line_shift=True, period_px=8, **options)
+    >>> len(patterns), patterns[2]
+    (30, Gray(axis=<Axis.COLUMN: 'column'>, bit=0, bits=9, cell_px=4, offset_px=0, inverted=False, kind='gray'))
+    """
+    cell_px = gray_cell_px if gray_cell_px is not None else (period_px // 2 if line_shift else 1)
+    if line_shift and 2 * cell_px > period_px:
+        message = (
+            f"a Gray cell of {cell_px} px cannot number lines that are {period_px} px apart: a cell edge that is "
+            f"slightly off moves a stripe by a whole period; use gray_cell_px ≤ {period_px // 2} or a longer period"
+        )
+        raise PatternError(message)
+    bracket: tuple[Pattern, ...] = (White(), Black())
+    middle: list[Pattern] = []
+    for axis in (Axis.COLUMN, Axis.ROW) if rows else (Axis.COLUMN,):
+        middle.extend(_gray_patterns(axis, size.along(axis), cell_px, gray_offset_px))
+        if line_shift:
+            middle.extend(LineShift(axis, shift, period_px, line_width_px) for shift in range(period_px))
+    return (*bracket, *middle, *bracket)
+
+
+def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int) -> Iterator[Gray]:
+    bits = gray_bits(extent_px, cell_px, offset_px)
+    for bit in range(bits):
+        for inverted in (False, True):
+            yield Gray(axis, bit, bits, cell_px, offset_px, inverted)
+
+
+def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
+    """Light of one pattern: (1, 1), (1, Wp) or (Hp, 1) uint8. Raises PatternError when it does not fit."""
+    match pattern:
+        case White():
+            return np.full((1, 1), 255, dtype=np.uint8)
+        case Black():
+            return np.zeros((1, 1), dtype=np.uint8)
+        case Gray():
+            return gray_profile(pattern, size)
+        case LineShift():
+            return line_profile(pattern, size)
+
+
+def encode(patterns: Sequence[Pattern], size: Size) -> PatternSequence:
+    """Turn patterns into light for a projector of this size; a few kilobytes, since each varies along one axis only.
+
+    Raises
+    ------
+    PatternError
+        The list is empty, or a pattern does not fit the projector.
+    """
+    if not patterns:
+        message = "a sequence needs at least one pattern, found none; see scan_patterns"
+        raise PatternError(message)
+    return PatternSequence(size, tuple(patterns), tuple(profile(pattern, size) for pattern in patterns))

@@ -1,0 +1,82 @@
+"""What a scan plays, and the light of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slrig.errors import PatternError
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Size, White
+from slrig.patterns.sequence import encode, scan_patterns
+
+
+def patterns_of(
+    size: Size, *, line_shift: bool = True, period_px: int = 8, gray_cell_px: int | None = None, rows: bool = False
+) -> tuple[Pattern, ...]:
+    return scan_patterns(
+        size,
+        line_shift=line_shift,
+        period_px=period_px,
+        line_width_px=1,
+        gray_cell_px=gray_cell_px,
+        gray_offset_px=0,
+        rows=rows,
+    )
+
+
+def test_white_and_black_open_and_close() -> None:
+    patterns = patterns_of(Size(64, 48))
+    assert patterns[:2] == patterns[-2:] == (White(), Black())
+
+
+def test_each_bit_is_followed_by_its_inverse_most_significant_first() -> None:
+    bits = [pattern for pattern in patterns_of(Size(64, 48)) if isinstance(pattern, Gray)]
+    assert [(pattern.bit, pattern.inverted) for pattern in bits] == [(b, i) for b in range(4) for i in (False, True)]
+    assert {(pattern.bits, pattern.cell_px) for pattern in bits} == {(4, 4)}
+
+
+def test_every_shift_is_played_once() -> None:
+    lines = [pattern for pattern in patterns_of(Size(64, 48), period_px=5) if isinstance(pattern, LineShift)]
+    assert lines == [LineShift(Axis.COLUMN, shift, 5) for shift in range(5)]
+
+
+def test_gray_only_has_cells_of_one_pixel_and_no_lines() -> None:
+    patterns = patterns_of(Size(64, 48), line_shift=False)
+    assert len(patterns) == 2 + 2 * 6 + 2
+    assert all(pattern.cell_px == 1 for pattern in patterns if isinstance(pattern, Gray))
+
+
+def test_rows_follow_columns_with_bits_of_their_own() -> None:
+    axes = [pattern.axis for pattern in patterns_of(Size(64, 30), rows=True) if isinstance(pattern, Gray | LineShift)]
+    assert axes == [Axis.COLUMN] * (2 * 4 + 8) + [Axis.ROW] * (2 * 3 + 8)
+
+
+def test_a_cell_wider_than_half_a_period_is_refused() -> None:
+    with pytest.raises(PatternError, match=r"cell of 5 px.*8 px apart.*gray_cell_px ≤ 4"):
+        patterns_of(Size(64, 48), gray_cell_px=5)
+
+
+def test_images_are_spread_from_profiles_and_cannot_be_written() -> None:
+    size = Size(64, 48)
+    sequence = encode(patterns_of(size, rows=True), size)
+    assert {sequence.image(index).shape for index in range(len(sequence))} == {(48, 64)}
+    assert (sequence.image(0) == 255).all()
+    assert not sequence.image(1).any()
+    assert not sequence.image(2).flags.writeable
+
+
+def test_a_large_sequence_stays_small() -> None:
+    size = Size(4096, 2160)
+    sequence = encode(patterns_of(size, rows=True), size)
+    assert sum(profile.nbytes for profile in sequence.profiles) < 500_000
+    assert all(profile.dtype == np.uint8 for profile in sequence.profiles)
+
+
+def test_an_empty_sequence_is_refused() -> None:
+    with pytest.raises(PatternError, match="at least one pattern"):
+        encode((), Size(64, 48))
+
+
+def test_a_pattern_for_another_projector_is_refused() -> None:
+    with pytest.raises(PatternError, match="smaller than the code"):
+        encode(patterns_of(Size(1024, 768)), Size(64, 48))
