@@ -341,7 +341,8 @@ class Refusal(IntEnum):
     STRAY_CODE = 6
     SHORT_STRIPE = 7
     SHADOW_EDGE = 8
-    BEHIND_DEVICE = 9
+    DEPTH_EDGE = 9
+    OFF_PROJECTOR = 10
 
 
 class Source(IntEnum):

@@ -1,0 +1,71 @@
+"""Recorded bundles of an independent renderer, scored against the surface that was rendered."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from slrig.bundle import read_bundle, write_bundle
+from slrig.model import Capture, LineShift
+from slrig.scan.pipeline import reconstruct_bundle
+from slrig.scan.plan import ReconstructionPlan
+
+pytestmark = pytest.mark.shared
+
+SCENES = ("vase", "terrace", "gauge")
+
+
+def reconstructed(bundle: Path, output: Path) -> Any:
+    """Reconstruct a bundle as the service does; the report."""
+    return reconstruct_bundle(
+        bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
+    )
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_line_shift_bundle_meets_its_figures(shared: Path, tmp_path: Path, scene: str) -> None:
+    report = reconstructed(shared / "bundles" / scene, tmp_path / "out")
+    truth = report["truth"]
+    assert truth["rms_mm"] <= 0.05
+    assert truth["complete_0.3mm"] >= 0.90
+    assert truth["gross_fraction"] <= 0.003
+    assert truth["false_area_0.5mm"] <= 0.01
+    assert truth["nonmanifold_edges"] == truth["misoriented_edges"] == truth["duplicate_faces"] == 0
+    assert truth["facing_camera_area"] > 0.98
+    assert report["method"] == "Gray code and line shift"
+    assert report["evidence"]["patterns_verified"] == "30/30"
+    assert report["evidence"]["contradictions"] == []
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
+    shared: Path, tmp_path: Path, scene: str
+) -> None:
+    folder = shared / "bundles" / scene
+    bundle = read_bundle(folder)
+    capture = bundle.capture
+    gray = Capture(
+        capture.projector,
+        capture.patterns,
+        capture.cameras,
+        tuple(shot for shot in capture.shots if not isinstance(capture.patterns[shot.pattern], LineShift)),
+    )
+    write_bundle(tmp_path / "gray", gray, bundle.calibration)
+    for name in ("truth.ply", "visible_points.npy"):
+        shutil.copy(folder / name, tmp_path / "gray" / name)
+    report = reconstructed(tmp_path / "gray", tmp_path / "out")
+    assert report["method"] == "Gray-only"
+    assert any("Gray-only" in note for note in report["notes"])
+    assert report["truth"]["rms_mm"] <= 0.12
+    assert report["truth"]["complete_0.3mm"] >= 0.70
+    assert report["truth"]["nonmanifold_edges"] == 0
+
+
+def test_one_bundle_gives_the_same_bytes_of_mesh_twice(shared: Path, tmp_path: Path) -> None:
+    for run in ("first", "second"):
+        reconstructed(shared / "bundles" / "vase", tmp_path / run)
+    for name in ("mesh.ply", "mesh.glb", "mesh.stl", "points.ply"):
+        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes(), name
