@@ -27,6 +27,7 @@ from slrig.reconstruction.stripes import (
 
 _FINEST_SCALE_PX = 1.0
 _COARSEST_SCALE_PX = 2.5
+_LEAST_SMOOTHED_PX = 1.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,10 +114,19 @@ def _line_stripes(
     for index, line in enumerate(frames.lines):
         image, deviation = normalised(line, frames.black, contrast, np.sqrt(noise.variance(line) + dark_variance))
         if scale_px is None:
-            measured = measured_sigma_px(image, deviation, lit)
-            scale_px = float(np.clip(measured, _FINEST_SCALE_PX, _COARSEST_SCALE_PX))
+            scale_px = _matched_scale_px(measured_sigma_px(image, deviation, lit))
         parts.append(locate_stripes(image, deviation, lit, index, limits, sigma_px=scale_px))
     return joined(parts), scale_px or _FINEST_SCALE_PX
+
+
+def _matched_scale_px(stripe_sigma_px: float) -> float:
+    """Scale of the Gaussian for stripes of this width, px.
+
+    The stripe's own width is the best scale against noise (reconstruction at the physical limit). Stripes sharper than
+    the pixels sample well are smoothed more: below a total of 1.4 px the sampling itself displaces the centre.
+    """
+    more = np.sqrt(max(_LEAST_SMOOTHED_PX**2 - stripe_sigma_px**2, 0.0))
+    return float(np.clip(max(stripe_sigma_px, more), _FINEST_SCALE_PX, _COARSEST_SCALE_PX))
 
 
 def _edge_stripes(

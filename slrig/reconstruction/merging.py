@@ -19,6 +19,7 @@ from slrig.model import FloatArray, Source
 from slrig.reconstruction.triangulation import SheetCurves
 
 _ALL = int(Source.ALL)
+_SAME_POINT_SIGMA = 12.0  # beyond this the two saw different things; the mean would be neither
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,13 +159,15 @@ def _fuse_kernel(
                 gap += (other - points[i, c]) * ray[c] / norm
             if e1 <= 0 or e2 <= 0:
                 continue
+            sigma[i] = gap / np.sqrt(e1 * e1 + e2 * e2)
+            distance[i] = gap
+            if abs(sigma[i]) > _SAME_POINT_SIGMA:
+                continue
             weight = e1 * e1 / (e1 * e1 + e2 * e2)
             for c in range(3):
                 fused[i, c] = points[i, c] + weight * gap * ray[c] / norm
                 spread[i, c] = ray[c] / norm * e1 * e2 / np.sqrt(e1 * e1 + e2 * e2)
             kind[i] = _ALL
-            sigma[i] = gap / np.sqrt(e1 * e1 + e2 * e2)
-            distance[i] = gap
     return fused, spread, kind, sigma, distance
 
 

@@ -17,7 +17,7 @@ from slrig.bundle import Bundle, BundleWriter, read_bundle, read_truth, write_tr
 from slrig.capture.evidence import check_capture
 from slrig.capture.sequencer import capture
 from slrig.devices import Rig
-from slrig.errors import CalibrationError, NothingToReconstructError, ScanCancelledError
+from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError
 from slrig.meshing.initial import InitialMesh, initial_mesh
 from slrig.meshing.quality import score
 from slrig.meshing.topology import compact
@@ -225,8 +225,13 @@ def _seen(
         def stage_entered(stage: str, name: str = name, start: float = start) -> None:
             entered(stage, start + share * stages.index(stage) / len(stages), f"camera '{name}'")
 
-        frames = axis_frames(recorded.capture, name, axis)
-        curves = camera_curves(frames, _tables(recorded, frames), Limits(), entered=stage_entered)
+        try:
+            frames = axis_frames(recorded.capture, name, axis)
+            tables = _tables(recorded, frames)
+        except PatternError as cause:
+            message = f"{recorded.folder}: {cause}"
+            raise PatternError(message) from cause
+        curves = camera_curves(frames, tables, Limits(), entered=stage_entered)
         cameras.append(_Seen(name, devices.cameras[name], frames, curves))
     _require(any(seen.curves.decoded_pixels > 0 for seen in cameras), recorded, "no pixel could be decoded", cameras)
     _require(any(seen.curves.stripe_count > 0 for seen in cameras), recorded, "no stripe was found", cameras)

@@ -1,0 +1,194 @@
+"""What the walk refuses, and that it leaves nothing behind when it does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slrig.bundle import read_bundle, write_bundle
+from slrig.config import read_rig
+from slrig.discovery import open_rig
+from slrig.errors import (
+    BundleError,
+    CalibrationError,
+    InvalidInputError,
+    NothingToReconstructError,
+    PatternError,
+    ScanCancelledError,
+    SlrigError,
+)
+from slrig.model import Capture, Gray, LineShift, Shot, Size, White
+from slrig.scan.pipeline import capture_bundle, reconstruct_bundle
+from slrig.scan.plan import ReconstructionPlan, ScanPlan
+
+RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "bundle"
+    with open_rig(read_rig(RIG)) as rig:
+        capture_bundle(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False)
+    return folder
+
+
+def run(bundle: Path, output: Path, **options: object) -> dict[str, object]:
+    plan = ReconstructionPlan(**options)  # type: ignore[arg-type]
+    return reconstruct_bundle(bundle, output, plan=plan, progress=lambda *_: None, cancelled=lambda: False)
+
+
+def changed(recorded: Path, folder: Path, change: Callable[[Shot, Capture], Shot | None]) -> Path:
+    """A copy of the bundle with each frame changed, or left out."""
+    bundle = read_bundle(recorded)
+    capture = bundle.capture
+    shots = (change(shot, capture) for shot in capture.shots)
+    kept = Capture(capture.projector, capture.patterns, capture.cameras, tuple(s for s in shots if s is not None))
+    write_bundle(folder, kept, bundle.calibration)
+    return folder
+
+
+def refused(error: type[SlrigError], bundle: Path, output: Path) -> str:
+    """The message of a refusal that left nothing behind."""
+    with pytest.raises(error) as caught:
+        run(bundle, output)
+    assert not output.exists()
+    assert [path.name for path in output.parent.iterdir() if path.name.startswith(".")] == []
+    return str(caught.value)
+
+
+def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(recorded: Path, tmp_path: Path) -> None:
+    report = run(recorded, tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"mesh.ply", "mesh.glb", "mesh.stl", "points.ply", "report.json", "preview.png"} <= names
+    assert any(name.startswith("rejected-") for name in names)
+    written = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert written["mesh"]["initial"] == report["mesh"]["initial"]  # type: ignore[index]
+    initial = written["mesh"]["initial"]
+    assert initial["triangles"] == initial["strip_triangles"] - initial["dropped_triangles"]
+
+
+def test_results_of_an_earlier_run_are_replaced_and_other_folders_are_not(recorded: Path, tmp_path: Path) -> None:
+    run(recorded, tmp_path / "out")
+    run(recorded, tmp_path / "out")
+    other = tmp_path / "holiday"
+    other.mkdir()
+    (other / "picture.jpg").write_bytes(b"not ours")
+    with pytest.raises(InvalidInputError, match="name a new folder"):
+        run(recorded, other)
+    assert [path.name for path in other.iterdir()] == ["picture.jpg"]
+
+
+def test_holes_are_kept_on_request(recorded: Path, tmp_path: Path) -> None:
+    filled = run(recorded, tmp_path / "filled")["mesh"]["initial"]  # type: ignore[index]
+    kept = run(recorded, tmp_path / "kept", keep_holes=True)["mesh"]["initial"]  # type: ignore[index]
+    assert kept["strip_triangles"] == filled["strip_triangles"]
+    assert filled["dropped_at_bridges"] == 0
+    assert kept["triangles"] <= filled["triangles"]
+
+
+def test_a_missing_calibration_is_asked_for(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "bundle")
+    (tmp_path / "bundle" / "calibration.json").unlink()
+    message = refused(CalibrationError, tmp_path / "bundle", tmp_path / "out")
+    assert "calibration.json" in message
+    assert "--calibration FILE" in message
+
+
+def test_one_camera_without_a_calibrated_projector_is_refused(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "bundle")
+    path = tmp_path / "bundle" / "calibration.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"projector": None}))
+    assert "calibrate the projector" in refused(CalibrationError, tmp_path / "bundle", tmp_path / "out")
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_frames_of_one_level_are_refused_with_their_figures(recorded: Path, tmp_path: Path, level: int) -> None:
+    def flat(shot: Shot, capture: Capture) -> Shot:
+        value = level * capture.cameras[shot.camera].full_scale // 255
+        return replace(shot, image=np.full_like(shot.image, value))
+
+    bundle = changed(recorded, tmp_path / "flat", flat)
+    message = refused(NothingToReconstructError, bundle, tmp_path / "out")
+    assert "no pixel could be decoded" in message
+    assert "lens cap" in message
+    assert str(bundle) in message
+
+
+def test_lines_that_were_never_shown_are_refused(recorded: Path, tmp_path: Path) -> None:
+    dark = {shot.camera: shot.image for shot in read_bundle(recorded).capture.shots if shot.pattern == 1}
+
+    def no_lines(shot: Shot, capture: Capture) -> Shot:
+        is_line = isinstance(capture.patterns[shot.pattern], LineShift)
+        return replace(shot, image=dark[shot.camera]) if is_line else shot
+
+    bundle = changed(recorded, tmp_path / "no-lines", no_lines)
+    assert "no stripe was found" in refused(NothingToReconstructError, bundle, tmp_path / "out")
+
+
+def test_a_missing_bit_is_named(recorded: Path, tmp_path: Path) -> None:
+    def without_bit_two(shot: Shot, capture: Capture) -> Shot | None:
+        pattern = capture.patterns[shot.pattern]
+        return None if isinstance(pattern, Gray) and pattern.bit == 2 else shot
+
+    bundle = changed(recorded, tmp_path / "missing", without_bit_two)
+    assert "bits [2]" in refused(PatternError, bundle, tmp_path / "out")
+
+
+def test_without_white_and_black_the_inverses_do(recorded: Path, tmp_path: Path) -> None:
+    def no_pair(shot: Shot, capture: Capture) -> Shot | None:
+        return None if capture.patterns[shot.pattern].kind in ("white", "black") else shot
+
+    report = run(changed(recorded, tmp_path / "no-pair", no_pair), tmp_path / "out")
+    assert report["mesh"]["points"] > 1000  # type: ignore[index]
+
+
+def test_nothing_tells_lit_from_dark_without_white_black_and_inverses(recorded: Path, tmp_path: Path) -> None:
+    def bare(shot: Shot, capture: Capture) -> Shot | None:
+        pattern = capture.patterns[shot.pattern]
+        dropped = isinstance(pattern, White) or (isinstance(pattern, Gray) and pattern.inverted)
+        return None if dropped else shot
+
+    bundle = changed(recorded, tmp_path / "bare", bare)
+    assert "nothing tells lit from dark" in refused(PatternError, bundle, tmp_path / "out")
+
+
+def test_a_projector_smaller_than_the_code_is_refused(recorded: Path, tmp_path: Path) -> None:
+    bundle = read_bundle(recorded)
+    small = replace(bundle.capture, projector=Size(100, 80))
+    write_bundle(tmp_path / "small", small, None)
+    calibration = json.loads((recorded / "calibration.json").read_text())
+    calibration["projector"]["size_px"] = [100, 80]
+    (tmp_path / "small" / "calibration.json").write_text(json.dumps(calibration))
+    assert "projector is smaller than the code" in refused(PatternError, tmp_path / "small", tmp_path / "out")
+
+
+def test_a_missing_frame_file_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded, tmp_path / "bundle")
+    next((tmp_path / "bundle" / "frames").rglob("*.*")).unlink()
+    refused(BundleError, tmp_path / "bundle", tmp_path / "out")
+
+
+def test_a_cancelled_reconstruction_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
+    calls = []
+
+    def cancelled() -> bool:
+        calls.append(None)
+        return len(calls) > 3
+
+    with pytest.raises(ScanCancelledError):
+        reconstruct_bundle(
+            recorded, tmp_path / "out", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=cancelled
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cancelled_capture_leaves_nothing(tmp_path: Path) -> None:
+    with open_rig(read_rig(RIG)) as rig, pytest.raises(ScanCancelledError):
+        capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: True)
+    assert list(tmp_path.iterdir()) == []
