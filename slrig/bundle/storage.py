@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import uuid
 from collections.abc import Iterator
@@ -10,6 +11,16 @@ from pathlib import Path
 
 from slrig.errors import StorageError
 
+_REMEDIES = {
+    errno.ENOSPC: "free some space there",
+    errno.EDQUOT: "free some space there",
+    errno.EACCES: "allow writing there, or choose another folder",
+    errno.EPERM: "allow writing there, or choose another folder",
+    errno.EROFS: "the disk is mounted read-only; choose another folder",
+    errno.ENOENT: "create the folder first",
+    errno.ENOTDIR: "a part of the path is a file; choose another folder",
+}
+
 
 @contextmanager
 def refusals_of(path: Path) -> Iterator[None]:
@@ -17,10 +28,8 @@ def refusals_of(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as cause:
-        message = (
-            f"{path}: the disk refused: {cause.strerror or cause}; nothing of it was kept: "
-            "free some space or choose another folder"
-        )
+        remedy = _REMEDIES.get(cause.errno or 0, "free some space or choose another folder")
+        message = f"{path}: the disk refused: {cause.strerror or cause}; nothing of it was kept: {remedy}"
         raise StorageError(message) from cause
 
 

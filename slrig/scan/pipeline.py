@@ -21,10 +21,10 @@ from slrig.errors import CalibrationError, NothingToReconstructError, PatternErr
 from slrig.meshing.initial import InitialMesh, initial_mesh
 from slrig.meshing.quality import score
 from slrig.meshing.topology import compact
-from slrig.model import Axis, Calibration, Gray, Mesh, Pinhole, PointCurves
+from slrig.model import Axis, Calibration, Gray, Mesh, Pinhole, Pixels, PointCurves
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
-from slrig.reconstruction.frames import AxisFrames, axis_frames
+from slrig.reconstruction.frames import AxisFrames, Image, axis_frames
 from slrig.reconstruction.merging import MergedCurves, merged
 from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
@@ -98,7 +98,7 @@ def reconstruct_bundle(
 ) -> dict[str, object]:
     """Reconstruct a recorded bundle into `output` and return the report.
 
-    Writes mesh.ply, mesh.glb, mesh.stl, mesh.obj, points.ply, report.json, preview.png and a picture of the refused
+    Writes mesh.ply, mesh.glb, mesh.stl, points.ply, report.json, preview.png and a picture of the refused
     pixels per camera. `output` appears whole or not at all; results of an earlier run there are replaced.
 
     Raises
@@ -145,10 +145,13 @@ def reconstruct_bundle(
         write_mesh(mesh, staging)
         write_points(curves, staging / "points.ply")
         entered("pictures", 0.85, "")
-        white = np.clip(np.rint(first.frames.white), 0, 65535).astype(np.uint16)
+        white = _displayable(first.frames.white)
         write_png(staging / "preview.png", preview(mesh, first.device, white, int(first.frames.full_scale)))
         for seen in cameras:
-            write_png(staging / f"rejected-{seen.name}.png", rejection_picture(seen.curves.refusal))
+            write_png(
+                staging / f"rejected-{seen.name}.png",
+                rejection_picture(seen.curves.refusal, _displayable(seen.frames.white), int(seen.frames.full_scale)),
+            )
         truth = read_truth(bundle)
         known: Mapping[str, object] | None = None
         if truth is not None:
@@ -278,6 +281,11 @@ def _finished(
         stripe=np.floor(points.position_px[points.curve_of_point()[used]]).astype(np.int32),
     )
     return mesh, curves
+
+
+def _displayable(image: Image) -> Pixels:
+    """(H, W) uint16: a frame averaged or fused as float32, back in camera units."""
+    return np.clip(np.rint(image), 0, np.iinfo(np.uint16).max).astype(np.uint16)
 
 
 def _require(holds: bool, recorded: Bundle, what: str, cameras: list[_Seen]) -> None:

@@ -175,7 +175,7 @@ def test_a_missing_frame_file_leaves_nothing(recorded: Path, tmp_path: Path) -> 
 
 
 def test_a_cancelled_reconstruction_leaves_nothing(recorded: Path, tmp_path: Path) -> None:
-    calls = []
+    calls: list[None] = []
 
     def cancelled() -> bool:
         calls.append(None)

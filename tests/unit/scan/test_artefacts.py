@@ -1,0 +1,219 @@
+"""The files of a scan, read back by another program, and what happens when the disk refuses."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from slrig.errors import StorageError
+from slrig.model import Mesh, PointCurves, Refusal, Size
+from slrig.scan.artefacts import (
+    encode_mesh_glb,
+    encode_mesh_ply,
+    encode_mesh_stl,
+    encode_points_ply,
+    write_mesh,
+    write_points,
+    write_report,
+)
+
+ENCODERS = (encode_mesh_ply, encode_mesh_glb, encode_mesh_stl)
+
+
+def example_mesh(seed: int = 0) -> Mesh:
+    """A pyramid of four faces, its corners in no special place."""
+    random = np.random.default_rng(seed)
+    normals = random.normal(size=(5, 3))
+    return Mesh(
+        vertices_mm=(random.normal(size=(5, 3)) * 100).astype(np.float32),
+        faces=np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32),
+        normals=(normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+        grey=np.array([0, 10, 100, 200, 255], dtype=np.uint8),
+        sigma_mm=np.array([0.01, 0.02, np.nan, 0.04, 0.05], dtype=np.float32),
+        stripe=np.array([7, 8, 9, 10, 1023], dtype=np.int32),
+    )
+
+
+def example_curves() -> PointCurves:
+    return PointCurves(
+        offsets=np.array([0, 3, 3, 5], dtype=np.int32),
+        column_px=np.array([4.0, 5.5, 7.5]),
+        points_mm=np.arange(15, dtype=np.float64).reshape(5, 3) / 7,
+        sigma_mm=np.array([0.1, 0.2, 0.3, 0.4, np.nan]),
+        bridge_after=np.array([True, False, False, False, True]),
+        source=np.array([0, 1, 2, 0, 1], dtype=np.uint8),
+        grey=np.array([1, 2, 3, 4, 255], dtype=np.uint8),
+    )
+
+
+def load(path: Path) -> Any:
+    return trimesh.load(path, process=False)
+
+
+def test_ply_holds_every_property_of_the_mesh(tmp_path: Path) -> None:
+    mesh = example_mesh()
+    write_mesh(mesh, tmp_path)
+    found = load(tmp_path / "mesh.ply")
+    data = found.metadata["_ply_raw"]["vertex"]["data"]
+    assert np.array_equal(found.vertices, mesh.vertices_mm)
+    assert np.array_equal(found.faces, mesh.faces)
+    for axis, name in enumerate(("nx", "ny", "nz")):
+        assert np.array_equal(data[name].ravel(), mesh.normals[:, axis])
+    for name in ("red", "green", "blue"):
+        assert np.array_equal(data[name].ravel(), mesh.grey)
+    assert np.array_equal(data["sigma_mm"].ravel(), mesh.sigma_mm, equal_nan=True)
+    assert np.array_equal(data["stripe"].ravel(), mesh.stripe)
+
+
+def test_ply_header_names_the_unit_and_the_layout() -> None:
+    header = encode_mesh_ply(example_mesh()).split(b"end_header\n")[0].decode("ascii").splitlines()
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert "comment unit mm" in header
+    assert "element vertex 5" in header
+    assert header[-2:] == ["element face 4", "property list uchar int vertex_indices"]
+    assert [line.split()[1:] for line in header if line.startswith("property") and "list" not in line] == [
+        *(["float", name] for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *(["uchar", name] for name in ("red", "green", "blue")),
+        ["float", "sigma_mm"],
+        ["int", "stripe"],
+    ]
+
+
+def test_glb_is_in_metres_with_normals_and_colours(tmp_path: Path) -> None:
+    mesh = example_mesh()
+    write_mesh(mesh, tmp_path)
+    scene = load(tmp_path / "mesh.glb")
+    (placed,) = scene.dump()
+    assert placed.vertices == pytest.approx(mesh.vertices_mm * 1e-3, rel=1e-6)
+    (stored,) = scene.geometry.values()
+    assert np.array_equal(stored.vertices, mesh.vertices_mm)
+    assert np.array_equal(stored.faces, mesh.faces)
+    assert stored.vertex_normals == pytest.approx(mesh.normals, abs=1e-6)
+
+
+def glb_tree(data: bytes) -> Any:
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def test_glb_has_a_dull_material_and_colours_and_leaves_unknown_normals_out() -> None:
+    mesh = example_mesh()
+    tree = glb_tree(encode_mesh_glb(mesh))
+    (primitive,) = tree["meshes"][0]["primitives"]
+    assert {"POSITION", "NORMAL", "COLOR_0"} <= primitive["attributes"].keys()
+    assert tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
+    unknown = mesh.normals.copy()
+    unknown[2] = np.nan
+    (primitive,) = glb_tree(encode_mesh_glb(replace(mesh, normals=unknown)))["meshes"][0]["primitives"]
+    assert "NORMAL" not in primitive["attributes"]
+
+
+def test_stl_is_in_millimetres(tmp_path: Path) -> None:
+    mesh = example_mesh()
+    write_mesh(mesh, tmp_path)
+    stl = load(tmp_path / "mesh.stl")
+    assert np.array_equal(stl.triangles.astype(np.float32), mesh.vertices_mm[mesh.faces])
+
+
+def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:
+    curves = example_curves()
+    write_points(curves, tmp_path / "points.ply")
+    found = load(tmp_path / "points.ply")
+    data = found.metadata["_ply_raw"]["vertex"]["data"]
+    assert found.vertices == pytest.approx(curves.points_mm, rel=1e-6)
+    assert data["stripe"].ravel().tolist() == [4, 4, 4, 7, 7]
+    assert data["source"].ravel().tolist() == curves.source.tolist()
+    assert data["bridge_after"].ravel().tolist() == [1, 0, 0, 0, 1]
+    assert data["green"].ravel().tolist() == curves.grey.tolist()
+    assert data["sigma_mm"].ravel() == pytest.approx(curves.sigma_mm, nan_ok=True)
+
+
+def digest() -> str:
+    """Of every file that these values give."""
+    mesh, curves = example_mesh(), example_curves()
+    data = b"".join(encode(mesh) for encode in ENCODERS) + encode_points_ply(curves)
+    return hashlib.sha256(data).hexdigest()
+
+
+def test_the_same_values_give_the_same_bytes_here_and_in_another_process() -> None:
+    code = "from tests.unit.scan.test_artefacts import digest; print(digest())"
+    environment = {**os.environ, "PYTHONHASHSEED": "12345"}
+    other = subprocess.run(  # noqa: S603
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).parents[3],
+        env=environment,
+    )
+    assert digest() == digest() == other.stdout.strip()
+
+
+@pytest.mark.parametrize("encode", ENCODERS)
+def test_another_mesh_gives_other_bytes(encode: Any) -> None:
+    assert encode(example_mesh(0)) != encode(example_mesh(1))
+
+
+def test_a_mesh_without_triangles_can_be_written(tmp_path: Path) -> None:
+    mesh = replace(example_mesh(), faces=np.zeros((0, 3), dtype=np.int32))
+    write_mesh(mesh, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.glb", "mesh.ply", "mesh.stl"]
+    assert (tmp_path / "mesh.stl").stat().st_size == 84
+
+
+class _Kind(StrEnum):
+    GRAY = "gray"
+
+
+def test_a_report_is_plain_json_in_the_order_given(tmp_path: Path) -> None:
+    report = {
+        "z": np.float64(1.5),
+        "a": np.int32(3),
+        "nan": np.float32("nan"),
+        "list": (1, float("inf"), np.bool_(True), None),
+        "array": np.array([[1.0, np.nan]]),
+        "nested": {Refusal.NOT_LIT.name.lower(): 4, "kind": _Kind.GRAY, "cause": Refusal.SATURATED},
+        "size": Size(4, 3),
+        "file": Path("frames") / "0.png",
+        "name": "Übung",
+    }
+    write_report(report, tmp_path / "report.json")
+    text = (tmp_path / "report.json").read_text("utf-8")
+    found = json.loads(text)
+    assert list(found) == list(report)
+    assert found == {
+        "z": 1.5,
+        "a": 3,
+        "nan": None,
+        "list": [1, None, True, None],
+        "array": [[1.0, None]],
+        "nested": {"not_lit": 4, "kind": "gray", "cause": "saturated"},
+        "size": {"width_px": 4, "height_px": 3},
+        "file": "frames/0.png",
+        "name": "Übung",
+    }
+    assert "Übung" in text
+    assert text.endswith("}\n")
+
+
+def test_a_report_says_where_it_cannot_be_written_as_json(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"report\.stages\[1\]: JSON has no form for a set"):
+        write_report({"stages": [1, {2}]}, tmp_path / "report.json")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"")
+    with pytest.raises(StorageError, match="a part of the path is a file"):
+        write_mesh(example_mesh(), file)

@@ -1,0 +1,243 @@
+"""Pictures whose content is known: where the mesh falls, how it is lit, what the legend shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.errors import StorageError
+from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
+from slrig.scan.pictures import _COLOURS, preview, rejection_picture, write_png
+
+SIZE = Size(640, 480)
+PANEL = Size(520, 390)
+TOP = LEFT = 10
+BACKDROP = (74, 67, 63)
+
+
+def camera(distortion: tuple[float, ...] = (0, 0, 0, 0, 0), size: Size = SIZE) -> Pinhole:
+    """At the origin, looking along z, 500 px focal length."""
+    matrix = np.array([[500, 0, (size.width_px - 1) / 2], [0, 500, (size.height_px - 1) / 2], [0, 0, 1]], dtype=float)
+    return Pinhole(size, matrix, np.array(distortion, dtype=float), np.eye(3), np.zeros(3))
+
+
+def patch(centre_mm: tuple[float, float, float], half_mm: float, *, slope: float = 0.0, turned: bool = False) -> Mesh:
+    """A square of 20 x 20 cells, at `centre_mm`, z rising by `slope` per mm of x; its front towards the camera."""
+    side = np.linspace(-half_mm, half_mm, 21)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    vertices = np.stack((x, y, slope * x), axis=1) + centre_mm
+    index = np.arange(21 * 21, dtype=np.int32).reshape(21, 21)
+    a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
+    faces = np.concatenate((np.stack((a, c, b), 1), np.stack((b, c, d), 1)))
+    normal = np.array((slope, 0.0, -1.0)) / np.hypot(slope, 1)
+    return Mesh(
+        vertices_mm=vertices.astype(np.float32),
+        faces=np.ascontiguousarray(faces[:, ::-1]) if turned else faces,
+        normals=np.tile(-normal if turned else normal, (len(x), 1)).astype(np.float32),
+        grey=np.zeros(len(x), dtype=np.uint8),
+        sigma_mm=np.zeros(len(x), dtype=np.float32),
+        stripe=np.zeros(len(x), dtype=np.int32),
+    )
+
+
+def white(size: Size = SIZE) -> NDArray[np.uint8]:
+    return np.full(size.shape, 200, dtype=np.uint8)
+
+
+def panel(picture: NDArray[np.uint8], number: int) -> NDArray[np.uint8]:
+    """The picture of one panel, without its caption."""
+    left = LEFT + number * (PANEL.width_px + LEFT)
+    return picture[TOP : TOP + PANEL.height_px, left : left + PANEL.width_px]
+
+
+def covered(area: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Where something else than backdrop is, the scale bar in the lower left corner left out."""
+    found = (area != np.array(BACKDROP, dtype=np.uint8)).any(axis=2)
+    found[-50:, :200] = False
+    return np.asarray(found)
+
+
+def bounds(mask: NDArray[np.bool_]) -> FloatArray:
+    rows, columns = np.nonzero(mask)
+    return np.array((columns.min(), rows.min(), columns.max(), rows.max()), dtype=np.float64)
+
+
+def test_three_panels_of_sensible_width() -> None:
+    picture = preview(patch((0, 0, 500), 100), camera(), white(), 255)
+    assert picture.dtype == np.uint8
+    assert picture.shape[1] == 3 * PANEL.width_px + 4 * LEFT <= 1600
+    assert (panel(picture, 0) == 200).all()
+
+
+@pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0, 0.0), (-0.4, 0.1, 0.002, 0.001, 0.0)])
+def test_the_mesh_lies_where_the_camera_sees_it(distortion: tuple[float, ...]) -> None:
+    mesh, seen_by = patch((60, 40, 500), 80), camera(distortion)
+    rays = mesh.vertices_mm[:, :2] / mesh.vertices_mm[:, 2:]
+    k1, k2, p1, p2, _ = distortion
+    square = (rays**2).sum(axis=1)
+    x, y = rays.T
+    lens = (1 + k1 * square + k2 * square**2)[:, None] * rays
+    lens += np.stack((2 * p1 * x * y + p2 * (square + 2 * x**2), p1 * (square + 2 * y**2) + 2 * p2 * x * y), axis=1)
+    pixels = lens * 500 + (319.5, 239.5)
+    scale = PANEL.width_px / SIZE.width_px
+    expected = (np.concatenate((pixels.min(axis=0), pixels.max(axis=0))) + 0.5) * scale - 0.5
+    found = bounds(covered(panel(preview(mesh, seen_by, white(), 255), 1)))
+    assert found == pytest.approx(expected, abs=1.0)
+
+
+def joined(first: Mesh, second: Mesh) -> Mesh:
+    return Mesh(
+        np.concatenate((first.vertices_mm, second.vertices_mm)),
+        np.concatenate((first.faces, second.faces + np.int32(len(first.vertices_mm)))),
+        np.concatenate((first.normals, second.normals)),
+        np.concatenate((first.grey, second.grey)),
+        np.concatenate((first.sigma_mm, second.sigma_mm)),
+        np.concatenate((first.stripe, second.stripe)),
+    )
+
+
+def test_light_falls_from_the_side_to_which_the_surface_leans() -> None:
+    def brightness(mesh: Mesh) -> FloatArray:
+        area = panel(preview(mesh, camera(), white(), 255), 1)
+        return np.array((area[190:200, 175:185].mean(), area[190:200, 335:345].mean()))
+
+    # A roof: a large half leans to one side (normal x has the sign of the slope), a small one to the other.
+    large_left = joined(patch((-100, 0, 500), 90, slope=-0.5), patch((100, 0, 500), 50, slope=0.5))
+    large_right = joined(patch((100, 0, 500), 90, slope=0.5), patch((-100, 0, 500), 50, slope=-0.5))
+    left, right = brightness(large_left)
+    assert left > right + 20
+    assert brightness(large_right) == pytest.approx((right, left), abs=1)
+
+
+def test_backs_are_red() -> None:
+    def middle(*, turned: bool) -> NDArray[np.float64]:
+        area = panel(preview(patch((0, 0, 500), 60, turned=turned), camera(), white(), 255), 1)
+        return np.asarray(area[190:200, 255:265].reshape(-1, 3).mean(axis=0))
+
+    blue, green, red = middle(turned=True)
+    assert red > 1.5 * green
+    assert red > 1.5 * blue
+    blue, green, red = middle(turned=False)
+    assert red < 1.2 * green
+
+
+def test_the_turned_view_shows_depth_that_the_camera_cannot_see() -> None:
+    near, far = patch((0, 0, 500), 40), patch((0, 0, 560), 20)
+    both = joined(near, far)
+    alone = preview(near, camera(), white(), 255)
+    together = preview(both, camera(), white(), 255)
+    assert np.array_equal(covered(panel(alone, 1)), covered(panel(together, 1)))
+    assert not np.array_equal(covered(panel(alone, 2)), covered(panel(together, 2)))
+
+
+def test_stray_vertices_do_not_move_the_turned_view() -> None:
+    mesh = patch((0, 0, 500), 40)
+    stray = np.array([[4000, 4000, 600], [4000, 4001, 600], [4001, 4000, 600]], dtype=np.float32)
+    spoilt = Mesh(
+        np.concatenate((mesh.vertices_mm, stray)),
+        np.concatenate((mesh.faces, [[441, 442, 443]])).astype(np.int32),
+        np.concatenate((mesh.normals, mesh.normals[:3])),
+        np.zeros(444, dtype=np.uint8),
+        np.zeros(444, dtype=np.float32),
+        np.zeros(444, dtype=np.int32),
+    )
+    one = bounds(covered(panel(preview(mesh, camera(), white(), 255), 2)))
+    other = bounds(covered(panel(preview(spoilt, camera(), white(), 255), 2)))
+    assert other == pytest.approx(one, abs=2)
+
+
+def test_a_dark_white_image_is_brightened_and_a_deep_one_scaled() -> None:
+    mesh = patch((0, 0, 500), 60)
+    deep = np.full(SIZE.shape, 2048, dtype=np.uint16)
+    assert panel(preview(mesh, camera(), deep, 2047), 0).min() == 255
+    dark = panel(preview(mesh, camera(), np.full(SIZE.shape, 51, dtype=np.uint8), 255), 0)
+    assert dark == pytest.approx(np.full(dark.shape, 0.9 * 255), abs=1)
+    # No light at all: nothing to divide by, and black stays black.
+    assert panel(preview(mesh, camera(), np.zeros(SIZE.shape, dtype=np.uint8), 255), 0).max() == 0
+
+
+def test_a_mesh_without_triangles_gives_two_panels() -> None:
+    none = Mesh(
+        np.zeros((0, 3), dtype=np.float32),
+        np.zeros((0, 3), dtype=np.int32),
+        np.zeros((0, 3), dtype=np.float32),
+        np.zeros(0, dtype=np.uint8),
+        np.zeros(0, dtype=np.float32),
+        np.zeros(0, dtype=np.int32),
+    )
+    picture = preview(none, camera(), white(), 255)
+    assert picture.shape[1] == 2 * PANEL.width_px + 3 * LEFT
+    assert not covered(panel(picture, 1)).any()
+
+
+@pytest.mark.parametrize("size", [Size(64, 48), Size(300, 4000), Size(5000, 800)])
+def test_odd_cameras_give_a_picture_too(size: Size) -> None:
+    picture = preview(patch((0, 0, 500), 20), camera(size=size), white(size), 255)
+    assert picture.shape[1] <= 1600
+    assert picture.shape[0] <= 700
+
+
+def test_the_same_scan_gives_the_same_picture() -> None:
+    mesh = patch((0, 0, 500), 60, slope=0.3)
+    assert np.array_equal(preview(mesh, camera(), white(), 255), preview(mesh, camera(), white(), 255))
+
+
+def test_every_cause_has_a_colour_of_its_own() -> None:
+    assert set(_COLOURS) == set(Refusal)
+    assert len(set(_COLOURS.values())) == len(Refusal)
+
+
+def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:
+    refusals = np.zeros((600, 800), dtype=np.uint8)
+    for cause in Refusal:
+        refusals[50 * cause : 50 * cause + 40, 100:300] = cause
+    picture = rejection_picture(refusals, np.full((600, 800), 180, dtype=np.uint8), 255)
+    legend = picture[:, 800:]
+    for cause in Refusal:
+        swatch = (legend == np.array(_COLOURS[cause], dtype=np.uint8)).all(axis=2)
+        assert swatch.sum() >= 100, cause.name
+        if cause is not Refusal.NONE:
+            assert tuple(picture[50 * cause + 20, 200]) == _COLOURS[cause]
+    assert tuple(picture[599, 799]) == (180, 180, 180)
+
+
+def test_the_legend_depends_on_the_counts() -> None:
+    few, many = np.zeros((500, 500), dtype=np.uint8), np.zeros((500, 500), dtype=np.uint8)
+    few[0, 0], many[:, :] = Refusal.SATURATED, Refusal.SATURATED
+    assert not np.array_equal(rejection_picture(few)[:, 500:], rejection_picture(many)[:, 500:])
+
+
+@pytest.mark.parametrize("shape", [(12, 16), (1024, 1280), (3000, 4096), (40, 3000)])
+def test_a_rejection_picture_of_any_camera_is_legible(shape: tuple[int, int]) -> None:
+    picture = rejection_picture(np.full(shape, Refusal.SHADOW_EDGE, dtype=np.uint8))
+    assert 330 < picture.shape[1] <= 1600
+    assert picture.shape[0] >= 30 * len(Refusal)
+    assert tuple(picture[0, 0]) == _COLOURS[Refusal.SHADOW_EDGE]
+
+
+def test_a_png_is_read_back_as_it_was(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (20, 30, 3)).astype(np.uint8)
+    write_png(tmp_path / "a.png", picture)
+    found = np.asarray(cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED))
+    assert np.array_equal(found, picture)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_a_png_that_cannot_be_encoded_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> tuple[bool, None]:
+        return False, None
+
+    monkeypatch.setattr(cv2, "imencode", refuse)
+    with pytest.raises(StorageError, match="could not encode"):
+        write_png(tmp_path / "a.png", np.zeros((2, 2, 3), dtype=np.uint8))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_png_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="create the folder first"):
+        write_png(tmp_path / "nowhere" / "a.png", np.zeros((2, 2, 3), dtype=np.uint8))
