@@ -18,6 +18,7 @@ from slrig.meshing.topology import (
 )
 from slrig.model import FloatArray, IntArray, Mesh, Surface
 
+_VISIBLE_SAMPLES = 60_000
 _GROSS_MM = 1.0
 _FALSE_MM = 0.5
 _WELD_MM = 1e-3
@@ -157,9 +158,9 @@ def score(
     error_mm = truth.distances_mm(_points_on(corners, area_mm2, sample_count, random))
     near = error_mm < _GROSS_MM
     p50, p95, p99 = np.percentile(error_mm, (50, 95, 99)) if len(error_mm) else (np.nan, np.nan, np.nan)
-    first_mm, gap_mm, layers = _seen_through(
-        found, truth, np.asarray(visible_points_mm, dtype=np.float64), eye_mm, random
-    )
+    # Every so many of the visible points: a share of 60 000 is known to 0.2 %, and rays are what takes the time.
+    visible = np.asarray(visible_points_mm[:: max(1, len(visible_points_mm) // _VISIBLE_SAMPLES)], dtype=np.float64)
+    first_mm, gap_mm, layers = _seen_through(found, truth, visible, eye_mm, random)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = np.einsum("ij,ij->i", eye_mm - corners.mean(axis=1), normals) > 0
     return TruthScore(
