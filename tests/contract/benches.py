@@ -1,0 +1,87 @@
+"""Every driver that runs without hardware, each as a bench for the contract suite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from drivers import replay
+from simulated_rig import device
+from slrig.bundle import write_bundle
+from slrig.capture.sequencer import capture
+from slrig.model import Capture, PatternSequence, Size
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.suite import Bench, rig_of
+
+PROJECTOR = Size(96, 72)
+
+PLATE = """
+name = "plate"
+
+[[object]]
+name = "plate"
+shape = "plane"
+size_mm = [400.0, 400.0]
+rotation_deg = [6.0, -10.0, 0.0]
+albedo = 0.8
+"""
+
+
+def sequence() -> PatternSequence:
+    patterns = scan_patterns(
+        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return encode(patterns, PROJECTOR)
+
+
+def _eye(name: str, x_mm: float, **options: object) -> dict[str, object]:
+    return {
+        "name": name,
+        "size_px": [160, 120],
+        "focal_px": [800.0, 800.0],
+        "position_mm": [x_mm, 0.0, -500.0],
+        "target_mm": [0.0, 0.0, 0.0],
+        "saturation_s": 0.03,
+        "blur_px": 0.5,
+        **options,
+    }
+
+
+def simulated(folder: Path, *, realtime: bool = False, **head: object) -> Bench:
+    """The rendered rig: two cameras, one of 8 and one of 12 bit, before a plate."""
+    (folder / "plate.toml").write_text(PLATE)
+    options: dict[str, object] = {
+        "scene": "plate.toml",
+        "realtime": realtime,
+        "ambient": 0.02,
+        "projector": {
+            "size_px": [PROJECTOR.width_px, PROJECTOR.height_px],
+            "focal_px": [440.0, 440.0],
+            "position_mm": [90.0, 0.0, -500.0],
+            "target_mm": [0.0, 0.0, 0.0],
+            "blur_px": 0.4,
+            "latency_s": 0.005,
+        },
+        "camera": [_eye("left", -60.0), _eye("right", 180.0, bit_depth=12)],
+        **head,
+    }
+    return Bench(partial(device.open_head, options, folder), sequence())
+
+
+def replayed(folder: Path) -> Bench:
+    """A recording, made here on the rendered rig, with the times and exposures of its frames."""
+    bench = simulated(folder)
+    with bench.head() as head:
+        shots = tuple(capture(rig_of(head), bench.sequence))
+        formats = {name: camera.info.format for name, camera in head.cameras.items()}
+        recorded = Capture(PROJECTOR, bench.sequence.patterns, formats, shots)
+        write_bundle(folder / "recording", recorded, head.calibration)
+    return Bench(partial(replay.open_head, {"bundle": "recording"}, folder), bench.sequence)
+
+
+BENCHES: dict[str, Callable[[Path], Bench]] = {
+    "simulated": simulated,
+    "simulated in real time": partial(simulated, realtime=True),
+    "replay": replayed,
+}

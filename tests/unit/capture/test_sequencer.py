@@ -1,0 +1,315 @@
+"""The sequencer on a rig in memory: what it delivers, what it refuses, and that it always leaves the rig dark."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from slrig.capture.evidence import Evidence
+from slrig.capture.sequencer import capture
+from slrig.devices import CameraSettings, Trigger
+from slrig.errors import (
+    DeviceGoneError,
+    FrameTimeoutError,
+    ScanCancelledError,
+    ScanEvidenceError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Shot, Size
+from slrig.patterns.sequence import encode
+from tests.unit.capture.fake_rig import PROJECTOR, CameraFaults, FakeRig, fake_rig, patterns_for
+
+PATTERNS = patterns_for()
+SEQUENCE = encode(PATTERNS, PROJECTOR)
+COUNT = len(SEQUENCE)
+FREE = frozenset({Trigger.FREE})
+HARDWARE = frozenset({Trigger.HARDWARE})
+EVERY = frozenset(Trigger)
+
+
+def run(fake: FakeRig, *, cancelled: Callable[[], bool] = lambda: False) -> list[Shot]:
+    return list(capture(fake.rig, SEQUENCE, cancelled=cancelled))
+
+
+def faulty(**faults: object) -> FakeRig:
+    return fake_rig(faults={"right": CameraFaults(**faults)})  # type: ignore[arg-type]
+
+
+def assert_refused(fake: FakeRig, kind: type[BaseException], words: str) -> None:
+    with pytest.raises(kind, match=words):
+        run(fake)
+    assert fake.at_rest
+
+
+# ---- a sound rig
+
+
+def test_every_camera_gives_every_pattern_in_order() -> None:
+    fake = fake_rig()
+    shots = run(fake)
+    assert [(shot.pattern, shot.camera) for shot in shots] == [(i, c) for i in range(COUNT) for c in ("left", "right")]
+    assert fake.at_rest
+
+
+def test_times_count_from_the_first_frame_and_rise() -> None:
+    times = [shot.time_s for shot in run(fake_rig(cameras=["left"]))]
+    assert times[0] == 0.0
+    assert all(b > a for a, b in pairwise(times) if a is not None and b is not None)
+    assert all(shot.exposure_s == 0.01 for shot in run(fake_rig(cameras=["left"])))
+
+
+def test_nothing_moves_before_the_first_frame_is_asked_for() -> None:
+    fake = fake_rig()
+    frames = capture(fake.rig, SEQUENCE)
+    assert fake.world.calls == []
+    next(iter(frames))
+    assert "show 0" in fake.world.calls
+    assert "show 1" not in fake.world.calls
+
+
+def test_the_evidence_given_tells_afterwards_what_was_proven() -> None:
+    fake = fake_rig()
+    evidence = Evidence(PATTERNS, {name: camera.info.format for name, camera in fake.cameras.items()})
+    list(capture(fake.rig, SEQUENCE, evidence=evidence))
+    summary = evidence.summary()
+    assert (summary.verified, summary.patterns, summary.faults) == (COUNT, COUNT, ())
+
+
+def test_frames_carry_the_name_that_the_rig_gives_the_camera() -> None:
+    fake = fake_rig(cameras=["left"])
+    renamed = replace(fake.rig, cameras={"top": fake.cameras["left"]}, settings={"top": CameraSettings(0.01)})
+    assert {shot.camera for shot in capture(renamed, SEQUENCE)} == {"top"}
+
+
+# ---- triggers
+
+
+@pytest.mark.parametrize(
+    ("plays", "left", "right", "armed"),
+    [
+        (False, EVERY, EVERY, ["software", "software"]),
+        (True, EVERY, EVERY, ["hardware", "hardware"]),
+        (True, EVERY, frozenset({Trigger.SOFTWARE, Trigger.FREE}), ["software", "software"]),
+        (False, FREE, EVERY, ["free", "software"]),
+        (True, FREE, EVERY, ["free", "software"]),
+    ],
+)
+def test_the_best_trigger_that_all_can_do_is_used(
+    plays: bool, left: frozenset[Trigger], right: frozenset[Trigger], armed: list[str]
+) -> None:
+    fake = fake_rig(projector={"plays": plays}, triggers={"left": left, "right": right})
+    shots = run(fake)
+    assert len(shots) == 2 * COUNT
+    calls = [call for call in fake.world.calls if call.startswith("arm")]
+    assert calls == [f"arm left {armed[0]}", f"arm right {armed[1]}"]
+    assert ("play" in fake.world.calls) == (armed[0] == "hardware")
+    assert fake.at_rest
+
+
+def test_a_camera_for_wires_only_needs_a_projector_that_plays() -> None:
+    assert_refused(fake_rig(triggers={"right": HARDWARE}), UnsupportedByDeviceError, "camera 'right' can be trig.*wire")
+
+
+def test_a_rig_without_cameras_is_refused() -> None:
+    assert_refused(fake_rig(cameras=[]), UnsupportedByDeviceError, "has no camera")
+
+
+def wired(**faults: object) -> FakeRig:
+    return fake_rig(
+        projector={"plays": True},
+        triggers={"left": HARDWARE, "right": HARDWARE},
+        faults={"right": CameraFaults(**faults)},  # type: ignore[arg-type]
+    )
+
+
+def test_a_missing_trigger_pulse_is_told() -> None:
+    fake = fake_rig(
+        projector={"plays": True, "missing_pulses": frozenset({4})},
+        triggers={"left": HARDWARE, "right": HARDWARE},
+    )
+    assert_refused(fake, SlrigError, r"pulse|Gray bit")
+
+
+def test_a_gap_between_wired_frames_is_refused() -> None:
+    assert_refused(wired(drop=frozenset({6})), ScanEvidenceError, r"frame number 7 follows 5, 1 were lost")
+
+
+def test_wired_cameras_must_have_an_exposure() -> None:
+    fake = wired()
+    unset = replace(fake, rig=replace(fake.rig, settings={"left": CameraSettings(0.01)}))
+    assert_refused(unset, UnsupportedByDeviceError, r"\['right'\] have no exposure set")
+
+
+# ---- settings
+
+
+def test_a_read_back_that_differs_is_refused_with_both_numbers() -> None:
+    assert_refused(
+        faulty(readback=1.02), UnsupportedByDeviceError, r"'right': asked for exposure 0.01 s, it uses 0.0102"
+    )
+
+
+def test_a_read_back_within_one_percent_passes() -> None:
+    assert len(run(faulty(readback=1.008))) == 2 * COUNT
+
+
+def test_a_sequence_for_another_projector_is_refused() -> None:
+    fake = fake_rig()
+    with pytest.raises(UnsupportedByDeviceError, match="64 x 48"):
+        list(capture(fake.rig, encode(patterns_for(Size(64, 48)), Size(64, 48))))
+    assert fake.at_rest
+
+
+# ---- faults
+
+
+def test_a_dropped_frame_is_asked_for_once_more() -> None:
+    fake = faulty(drop=frozenset({5}))
+    shots = run(fake)
+    assert [shot.pattern for shot in shots if shot.camera == "right"] == list(range(COUNT))
+    assert fake.world.calls.count("show 5") == 2
+    assert sum(call.startswith("show") for call in fake.world.calls) == COUNT + 1
+    assert fake.at_rest
+
+
+def test_a_frame_that_never_comes_names_pattern_camera_and_times() -> None:
+    assert_refused(
+        faulty(drop=frozenset({5, 6})),
+        FrameTimeoutError,
+        r"camera 'right' gave no frame of pattern 5 \(column Gray bit 1 of 5, inverse\), visible since \d+ ns ± 1000 ns"
+        r": waited 2.010 s, 2 times",
+    )
+
+
+@pytest.mark.parametrize(
+    ("faults", "words"),
+    [
+        ({"stale": frozenset({5})}, r"camera 'right', pattern 5 .*(same|equals)"),
+        ({"stale": frozenset({15})}, r"camera 'right', pattern 15 .*equals that of pattern 14"),
+        ({"early": frozenset({7})}, r"camera 'right', pattern 7 .*stable from \d+ ns only.*stale"),
+        ({"same_number": frozenset({7})}, r"frame number 6 came after number 6"),
+        ({"garbled": frozenset({8})}, r"camera 'right', pattern 9 .* beside pattern 8 "),
+        ({"garbled": frozenset({17})}, r"camera 'right', pattern 17 "),
+        ({"over_exposed": frozenset({3})}, r"exposed for 0.015 s, set to 0.01 s"),
+    ],
+)
+def test_a_camera_that_delivers_wrong_frames_is_refused(faults: dict[str, object], words: str) -> None:
+    assert_refused(faulty(**faults), ScanEvidenceError, words)
+
+
+def test_a_frame_that_was_refused_is_not_delivered() -> None:
+    frames = capture(faulty(early=frozenset({7})).rig, SEQUENCE)
+    seen: list[Shot] = []
+
+    def consume() -> None:
+        for shot in frames:
+            seen.append(shot)  # noqa: PERF402
+
+    with pytest.raises(ScanEvidenceError):
+        consume()
+    assert (seen[-1].pattern, seen[-1].camera) == (7, "left")
+
+
+@pytest.mark.parametrize(
+    ("projector", "words"),
+    [
+        ({"lamp_off": True}, "lamp"),
+        ({"inverted": True}, "white is darker than black.*inverted"),
+        ({"swaps": {4: 5, 5: 4}}, "exchanged with its inverse"),
+        ({"swaps": {5: 4}}, "the frame and its inverse show the same"),
+        ({"swaps": {13: 16, 16: 13}}, "lines are not where|out of order"),
+        ({"swaps": {0: 1, 1: 0}}, "white is darker than black"),
+    ],
+)
+def test_a_projector_that_shows_something_else_is_refused(projector: dict[str, object], words: str) -> None:
+    assert_refused(fake_rig(projector=projector), ScanEvidenceError, words)
+
+
+def test_a_camera_unplugged_mid_sequence() -> None:
+    fake = faulty(unplug_at=9)
+    assert_refused(fake, DeviceGoneError, "camera 'right' is gone")
+    assert "disarm left" in fake.world.calls
+
+
+def test_a_projector_unplugged_mid_sequence() -> None:
+    assert_refused(fake_rig(projector={"gone_at_show": 6}), DeviceGoneError, "the projector is gone")
+
+
+def test_a_projector_that_is_gone_when_it_should_go_dark_is_no_success() -> None:
+    fake = fake_rig()
+    frames = capture(fake.rig, SEQUENCE)
+    for _ in range(2 * COUNT):
+        next(frames)
+    fake.projector.gone = True
+    with pytest.raises(DeviceGoneError):
+        next(frames)
+    assert all(camera.armed is None for camera in fake.cameras.values())
+
+
+# ---- other ways out
+
+
+def test_cancel_stops_within_one_frame() -> None:
+    fake = fake_rig()
+    asked = iter([*[False] * 20, True])
+    with pytest.raises(ScanCancelledError, match=r"cancelled at pattern \d+ .* of 22"):
+        run(fake, cancelled=lambda: next(asked))
+    assert fake.at_rest
+
+
+def test_cancel_before_the_first_pattern_shows_nothing() -> None:
+    fake = fake_rig()
+    with pytest.raises(ScanCancelledError):
+        run(fake, cancelled=lambda: True)
+    assert not any(call.startswith("show") for call in fake.world.calls)
+    assert fake.at_rest
+
+
+def test_a_consumer_that_stops_leaves_the_rig_dark() -> None:
+    fake = fake_rig()
+    frames = capture(fake.rig, SEQUENCE)
+    next(frames)
+    assert fake.projector.lit
+    assert isinstance(frames, Iterator)
+    frames.close()  # type: ignore[attr-defined]
+    assert fake.at_rest
+
+
+def test_a_consumer_that_forgets_the_frames_leaves_the_rig_dark() -> None:
+    fake = fake_rig()
+    for shot in capture(fake.rig, SEQUENCE):
+        if shot.pattern == 4:
+            break
+    del shot
+    assert fake.at_rest
+
+
+def test_a_consumer_that_fails_leaves_the_rig_dark() -> None:
+    fake = fake_rig()
+
+    def consume() -> None:
+        for _ in capture(fake.rig, SEQUENCE):
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        consume()
+    assert fake.at_rest
+
+
+def test_an_interrupt_leaves_the_rig_dark() -> None:
+    fake = fake_rig(projector={"interrupt_at_show": 3})
+    with pytest.raises(KeyboardInterrupt):
+        run(fake)
+    assert fake.at_rest
+
+
+def test_the_rig_works_again_after_each_way_out() -> None:
+    fake = fake_rig()
+    next(capture(fake.rig, SEQUENCE))
+    with pytest.raises(ScanCancelledError):
+        run(fake, cancelled=lambda: True)
+    assert len(run(fake)) == 2 * COUNT
