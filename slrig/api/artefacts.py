@@ -1,0 +1,186 @@
+"""The files of a scan: mesh, points, report, pictures, and the bundle as one zip."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Header, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import FileResponse, StreamingResponse
+
+from slrig.api.openapi import problems
+from slrig.api.service import Service, Serving
+from slrig.bundle.description import CAMERA_NAME
+from slrig.errors import ArtefactNotReadyError
+from slrig.scan.folder import DataFolder
+from slrig.scan.records import ScanRecord, ScanState
+
+MEDIA_TYPES = {
+    "mesh.ply": "application/octet-stream",
+    "mesh.glb": "model/gltf-binary",
+    "mesh.stl": "model/stl",
+    "points.ply": "application/octet-stream",
+    "report.json": "application/json",
+    "preview.png": "image/png",
+}
+BUNDLE_ZIP = "bundle.zip"
+
+_CHUNK_BYTES = 2**20
+_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+router = APIRouter(prefix="/scan/{scan_id}", tags=["files"])
+
+KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an ETag; 304 if it still holds")]
+
+
+def ready_files(folder: DataFolder, record: ScanRecord) -> dict[str, str]:
+    """Name to URL path of each file of a scan that can be fetched now."""
+    place = folder.scan(record.id)
+    if not record.state.final or not place.is_dir():
+        return {}
+    names = sorted(path.name for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png")
+    if (place / "bundle").is_dir():
+        names.append(BUNDLE_ZIP)
+    return {name: f"/scan/{record.id}/{name}" for name in names}
+
+
+def _refuse_absent(record: ScanRecord, name: str) -> None:
+    if not record.state.final:
+        message = (
+            f"{name} of scan {record.id} is not ready: the scan is {record.state}. "
+            f"Follow /scan/{record.id}/events until it is over."
+        )
+    elif record.state is ScanState.SUCCEEDED:
+        message = f"Scan {record.id} has no file {name}. GET /scan/{record.id} names those it has."
+    else:
+        why = "" if record.fault is None else f" ({record.fault.message})"
+        message = f"Scan {record.id} was {record.state}, so {name} will never be made{why}. Scan again."
+    raise ArtefactNotReadyError(message)
+
+
+def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: str | None) -> Response:
+    record = service.store.get(scan_id)
+    path = service.folder.scan(scan_id) / name
+    if not record.state.final or not path.is_file():
+        _refuse_absent(record, name)
+    headers = _headers(scan_id, name)
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return FileResponse(path, media_type=media_type, filename=name, content_disposition_type="inline", headers=headers)
+
+
+def _headers(scan_id: UUID, name: str) -> dict[str, str]:
+    # A scan's files never change once they are there, and an id is never given twice.
+    return {"ETag": f'"{scan_id}/{name}"', "Cache-Control": "private, no-cache"}
+
+
+def _still_known(known: str | None, tag: str) -> bool:
+    if known is None:
+        return False
+    tags = [candidate.strip().removeprefix("W/") for candidate in known.split(",")]
+    return "*" in tags or tag in tags
+
+
+def _serve(name: str, media_type: str) -> Callable[..., Response]:
+    def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+        return _file(service, scan_id, name, media_type, known)
+
+    fetch.__doc__ = f"Return {name} of a scan that succeeded. Ranges and ETags are honoured."
+    return fetch
+
+
+def _answers(media_type: str) -> dict[int | str, dict[str, Any]]:
+    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    return {
+        200: {"description": "the file", "content": content},
+        206: {"description": "the range that was asked for", "content": content},
+        304: {"description": "the file is the one whose ETag was sent"},
+        **problems(404, 409, 416, 422),
+    }
+
+
+for _name, _media_type in MEDIA_TYPES.items():
+    router.add_api_route(
+        f"/{_name}",
+        _serve(_name, _media_type),
+        methods=["GET"],
+        response_class=Response,
+        responses=_answers(_media_type),
+        operation_id=f"fetch_{_name.replace('.', '_')}",
+        summary=f"Fetch {_name}",
+    )
+
+
+@router.get("/rejected-{camera}.png", response_class=Response, responses=_answers("image/png"))
+def fetch_rejected(
+    service: Serving,
+    scan_id: UUID,
+    camera: Annotated[str, PathParameter(pattern=CAMERA_NAME)],
+    known: KnownTag = None,
+) -> Response:
+    """Return the picture of a camera's refused pixels, one colour per cause."""
+    return _file(service, scan_id, f"rejected-{camera}.png", "image/png", known)
+
+
+@router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses=_answers("application/zip"))
+def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+    """Return the recorded frames and all that belongs to them; unzipped, `slrig reconstruct` reads them.
+
+    A scan whose reconstruction failed has its bundle, too.
+    """
+    record = service.store.get(scan_id)
+    bundle = service.folder.scan(scan_id) / "bundle"
+    if not record.state.final or not bundle.is_dir():
+        _refuse_absent(record, BUNDLE_ZIP)
+    headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)
+
+
+class _Outlet:
+    """A file that only grows: what was written is taken out as it comes."""
+
+    def __init__(self) -> None:
+        self._waiting = bytearray()
+        self._offset = 0
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        self._offset += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._offset
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def take(self) -> bytes:
+        taken = bytes(self._waiting)
+        self._waiting.clear()
+        return taken
+
+
+def zipped(folder: Path) -> Iterator[bytes]:
+    """The files of a folder as the bytes of a zip, stored (frames are compressed already), a piece at a time.
+
+    The same files give the same bytes: names are sorted, and all times are the zip format's first.
+    """
+    outlet = _Outlet()
+    with zipfile.ZipFile(outlet, "w") as archive:  # type: ignore[call-overload] # write, tell and flush are enough
+        for path in sorted(folder.rglob("*")):
+            if not path.is_file():
+                continue
+            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), _ZIP_EPOCH)
+            entry.external_attr = 0o644 << 16
+            with path.open("rb") as source, archive.open(entry, "w", force_zip64=True) as member:
+                while piece := source.read(_CHUNK_BYTES):
+                    member.write(piece)
+                    yield outlet.take()
+            yield outlet.take()
+    yield outlet.take()

@@ -1,0 +1,105 @@
+"""/scan/{id}/events: what happens to a scan, as server-sent events that can be resumed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Header, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.exceptions import HTTPException
+
+from slrig.api.openapi import problems
+from slrig.api.problems import fault_problem
+from slrig.api.service import Serving
+from slrig.scan.faults import ScanFault
+from slrig.scan.records import ScanEvent
+from slrig.scan.store import ScanStore
+
+router = APIRouter(prefix="/scan", tags=["scan"])
+
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "`progress` events with stage, fraction and detail; `state` events with the new state. The "
+        "stream ends after the event of a final state.",
+        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+    },
+    204: {"description": "nothing has happened since the event that was named, and nothing more will"},
+}
+
+
+class OpenStreams:
+    """How many event streams are open. Lives on the event loop's thread."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._count = 0
+
+    def require_room(self) -> None:
+        """Raise HTTPException 429 when as many streams are open as may."""
+        if self._count >= self._limit:
+            detail = (
+                f"{self._count} event streams are open, as many as may. Close one, or ask for GET /scan/ID instead."
+            )
+            raise HTTPException(429, detail, headers={"Retry-After": "5"})
+
+    def __enter__(self) -> None:
+        self._count += 1
+
+    def __exit__(self, *_: object) -> None:
+        self._count -= 1
+
+
+@router.get("/{scan_id}/events", response_class=Response, responses={**_STREAM, **problems(404, 422, 429)})
+async def follow_scan(
+    request: Request,
+    service: Serving,
+    scan_id: UUID,
+    last_event_id: Annotated[
+        int, Header(ge=0, le=2**53, description="number of the last event that was seen; those after it follow")
+    ] = 0,
+) -> Response:
+    """Follow a scan until it is over. Events that happened before come first."""
+    streams: OpenStreams = request.app.state.streams
+    record = await run_in_threadpool(service.store.get, scan_id)
+    if record.state.final and not await run_in_threadpool(service.store.events, scan_id, after=last_event_id):
+        # An EventSource that reconnects after the last event is told by 204 to stop trying.
+        return Response(status_code=204)
+    streams.require_room()
+    return EventSourceResponse(
+        _told(service.store, scan_id, last_event_id, streams), ping=service.settings.keepalive_s, sep="\n"
+    )
+
+
+async def _told(store: ScanStore, scan_id: UUID, after: int, streams: OpenStreams) -> AsyncIterator[ServerSentEvent]:
+    loop = asyncio.get_running_loop()
+    news = asyncio.Event()
+
+    def wake() -> None:
+        loop.call_soon_threadsafe(news.set)
+
+    unwatch = store.watch(scan_id, wake)
+    with streams:
+        try:
+            while True:
+                news.clear()
+                for event in await run_in_threadpool(store.events, scan_id, after=after):
+                    after = event.number
+                    yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(event.number), sep="\n")
+                    if event.last:
+                        return
+                await news.wait()
+        finally:
+            unwatch()
+
+
+def _data(event: ScanEvent) -> dict[str, Any]:
+    data = dict(event.data)
+    fault = data.get("error")
+    if fault is not None:
+        data["error"] = fault_problem(ScanFault(fault["kind"], fault["message"]))
+    return data

@@ -1,0 +1,65 @@
+"""The description of the interface. `python -m slrig.api.openapi` prints it, kept as config/openapi.json."""
+
+from __future__ import annotations
+
+import json
+import sys
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from slrig.api.problems import MEDIA_TYPE, Problem
+
+_PROBLEM = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+_EVERYWHERE = (400, 401, 413, 500)
+
+
+def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route that may answer with problems of these statuses."""
+    return {status: {"description": HTTPStatus(status).phrase, "content": _PROBLEM} for status in statuses}
+
+
+def describe(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document of the service: every refusal is a problem, and everything but the probes needs the key."""
+    if app.openapi_schema:
+        return app.openapi_schema
+    document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
+    components = document.setdefault("components", {})
+    schemas = components.setdefault("schemas", {})
+    for unused in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(unused, None)
+    definition = Problem.model_json_schema(ref_template="#/components/schemas/{model}")
+    schemas.update(definition.pop("$defs", {}))
+    schemas["Problem"] = definition
+    components["securitySchemes"] = {
+        "bearer": {"type": "http", "scheme": "bearer"},
+        "header": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
+    }
+    document["security"] = [{"bearer": []}, {"header": []}]
+    for path in document["paths"].values():
+        for operation in path.values():
+            answers = operation["responses"]
+            for status, found in list(answers.items()):
+                if "HTTPValidationError" in json.dumps(found):
+                    del answers[status]
+            needed = [status for status in _EVERYWHERE if status != 401 or operation.get("security") != []]
+            if "parameters" in operation or "requestBody" in operation:
+                needed.append(422)
+            for status in needed:
+                answers.setdefault(str(status), problems(status)[status])
+            operation["responses"] = dict(sorted(answers.items()))
+    app.openapi_schema = document
+    return document
+
+
+def text(app: FastAPI) -> str:
+    """The document as it is kept in config/openapi.json."""
+    return json.dumps(describe(app), indent=2, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    from slrig.api.app import bare_app
+
+    sys.stdout.write(text(bare_app()))

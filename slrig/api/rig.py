@@ -1,0 +1,83 @@
+"""/rig and /device: the rig as it is held, and what else is installed and plugged in."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from fastapi import APIRouter
+
+from slrig.api.schemas import CameraBody, DeviceBody, DeviceList, DriverBody, ProjectorBody, RigBody
+from slrig.api.service import Serving
+from slrig.devices import CameraInfo, ProjectorInfo
+from slrig.discovery import found_devices, installed_drivers
+from slrig.model import Size
+
+router = APIRouter(tags=["rig"])
+
+
+@router.get("/rig")
+def look_at_rig(service: Serving) -> RigBody:
+    """Return the rig: its devices, who holds it, and how many scans wait. Touches no device."""
+    status = service.runner.status()
+    facts = status.facts
+    return RigBody(
+        name=status.rig,
+        open=facts is not None and status.fault is None,
+        error=status.fault,
+        calibrated=None if facts is None else facts.calibrated,
+        cameras=[] if facts is None else [_camera(name, camera) for name, camera in facts.cameras.items()],
+        projector=None if facts is None else _projector(facts.projector),
+        holder=status.holder,
+        since=status.since,
+        waiting=status.waiting,
+        queue_length=status.queue_length,
+        scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
+    )
+
+
+@router.get("/device")
+def list_devices() -> DeviceList:
+    """Return the drivers that are installed and the devices that are plugged in."""
+    found = found_devices()
+    return DeviceList(
+        drivers=[
+            DriverBody(
+                kind=driver.kind,
+                name=driver.name,
+                package=driver.package,
+                version=driver.version,
+                fault=driver.fault,
+            )
+            for driver in installed_drivers()
+        ],
+        devices=[DeviceBody(**asdict(device)) for device in found.devices],
+        faults=[str(fault) for fault in found.faults],
+    )
+
+
+def _camera(name: str, camera: CameraInfo) -> CameraBody:
+    return CameraBody(
+        name=name,
+        model=camera.model,
+        serial=camera.serial,
+        size_px=_extent(camera.format.size),
+        bit_depth=camera.format.bit_depth,
+        triggers=sorted(camera.triggers),
+        exposure_range_s=camera.exposure_range_s,
+        gain_range=camera.gain_range,
+    )
+
+
+def _projector(projector: ProjectorInfo) -> ProjectorBody:
+    return ProjectorBody(
+        name=projector.name,
+        model=projector.model,
+        serial=projector.serial,
+        size_px=_extent(projector.size),
+        plays=projector.plays,
+        latency_s=projector.latency_s,
+    )
+
+
+def _extent(size: Size) -> tuple[int, int]:
+    return (size.width_px, size.height_px)

@@ -1,0 +1,245 @@
+"""What requests may say and what answers hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from datetime import datetime
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
+
+from slrig.api.problems import fault_problem
+from slrig.config import ScanDefaults
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.records import ScanRecord, ScanState
+
+MOST_EXPOSURE_S = 60.0
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class PatternRequest(_Strict):
+    """Which patterns to play. What is absent or null is as the rig file says, and else the default."""
+
+    line_shift: bool | None = Field(default=None, description="false: Gray code only. Default true")
+    line_shift_period_px: Annotated[int, Field(ge=4, le=1024)] | None = Field(
+        default=None, description="distance of two lines in one frame, and the number of line frames. Default 8"
+    )
+    line_width_px: Annotated[int, Field(ge=1, le=256)] | None = Field(default=None, description="Default 1")
+    gray_cell_px: Annotated[int, Field(ge=1, le=1024)] | None = Field(
+        default=None, description="width of the finest Gray cell. Default: half the line period, or 1 without lines"
+    )
+    gray_offset_px: Annotated[int, Field(ge=0, le=65535)] | None = Field(
+        default=None, description="moves the edges of the Gray cells. Default 0"
+    )
+    rows: bool | None = Field(default=None, description="play the row axis as well. Default false")
+
+
+class ReconstructionRequest(_Strict):
+    """How frames become a mesh. What is absent or null is as the rig file says, and else the default."""
+
+    keep_holes: bool | None = Field(
+        default=None, description="drop triangles that span a gap between two stripes of one code. Default false"
+    )
+    depth_edge_ratio: Annotated[float, Field(gt=1, le=1000)] | None = Field(
+        default=None,
+        description="a triangle edge longer than this many times the local sampling distance crosses a depth edge. "
+        "Default 6",
+    )
+    max_code_gap: Annotated[int, Field(ge=1, le=64)] | None = Field(
+        default=None,
+        description="stripes whose columns differ by at most this many steps are meshed together. Default 1",
+    )
+
+
+class ScanRequest(_Strict):
+    """A scan. An empty request is a scan as the rig file describes it."""
+
+    label: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
+        default=None, description="free text, to find the scan again"
+    )
+    patterns: PatternRequest = Field(default_factory=PatternRequest)
+    reconstruction: ReconstructionRequest = Field(default_factory=ReconstructionRequest)
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = Field(
+        default=None, description="exposure time of every camera, seconds. Default: as the rig file says per camera"
+    )
+    if_busy: Literal["reject", "queue"] = Field(
+        default="reject", description="what to do while the rig is held: answer 409, or wait in line"
+    )
+
+
+def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
+    """The plan that a request means on a rig with these defaults.
+
+    The rig file's exposure is no part of it: it is among the settings that each camera was opened with.
+
+    >>> scan_plan(ScanRequest(), ScanDefaults(line_shift_period_px=12)).patterns.line_shift_period_px
+    12
+    """
+    return ScanPlan(
+        patterns=PatternPlan(**_chosen(PatternPlan, request.patterns, defaults)),
+        reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, defaults)),
+        exposure_s=request.exposure_s,
+    )
+
+
+def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict[str, Any]:
+    chosen = {}
+    for field in fields(plan):
+        asked = getattr(request, field.name)
+        value = asked if asked is not None else getattr(defaults, field.name)
+        if value is not None:
+            chosen[field.name] = value
+    return chosen
+
+
+class ProgressBody(BaseModel):
+    """How far a scan is: 0 to 1 of the whole."""
+
+    stage: str
+    fraction: float
+    detail: str
+
+
+class ScanLinks(BaseModel):
+    """Where to go from here. `files` holds those that are ready."""
+
+    self: str
+    events: str
+    cancel: str
+    files: dict[str, str]
+
+
+FaultBody = Annotated[
+    dict[str, Any] | None,
+    # Already a document, without the members that do not apply; described as what it is.
+    WithJsonSchema({"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]}),
+    Field(description="why the scan did not succeed"),
+]
+
+
+class ScanBody(BaseModel):
+    """A scan on record."""
+
+    id: UUID
+    state: ScanState
+    label: str | None
+    rig: str
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    plan: ScanPlan
+    progress: ProgressBody
+    error: FaultBody
+    summary: dict[str, Any] | None = Field(description="the plain figures of report.json")
+    links: ScanLinks
+
+
+class ScanPage(BaseModel):
+    """Scans from new to old. `next` asks for the page after this one, null on the last."""
+
+    scans: list[ScanBody]
+    next: str | None
+
+
+def scan_body(record: ScanRecord, files: Mapping[str, str]) -> ScanBody:
+    """A record as an answer; `files` maps the names of those that are ready to their paths."""
+    here = f"/scan/{record.id}"
+    return ScanBody(
+        id=record.id,
+        state=record.state,
+        label=record.label,
+        rig=record.rig,
+        created_at=record.created_at,
+        started_at=record.started_at,
+        finished_at=record.finished_at,
+        plan=record.plan,
+        progress=ProgressBody(**record.progress.as_json()),
+        error=None if record.fault is None else fault_problem(record.fault),
+        summary=None if record.summary is None else dict(record.summary),
+        links=ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=dict(files)),
+    )
+
+
+class CameraBody(BaseModel):
+    """A camera of the rig, as it declares itself."""
+
+    name: str
+    model: str
+    serial: str
+    size_px: tuple[int, int]
+    bit_depth: int
+    triggers: list[str]
+    exposure_range_s: tuple[float, float]
+    gain_range: tuple[float, float]
+
+
+class ProjectorBody(BaseModel):
+    """The projector of the rig, as it declares itself."""
+
+    name: str
+    model: str
+    serial: str
+    size_px: tuple[int, int]
+    plays: bool
+    latency_s: float
+
+
+class RigBody(BaseModel):
+    """The rig: what is known of its devices, who holds it, and how many scans wait."""
+
+    name: str
+    open: bool = Field(description="every device is open and was well when last used")
+    error: str | None = Field(description="why it is not open; the next scan tries again")
+    calibrated: bool | None = Field(description="null before the rig was first open")
+    cameras: list[CameraBody]
+    projector: ProjectorBody | None
+    holder: UUID | None = Field(description="the scan that holds the rig")
+    since: datetime | None
+    waiting: int
+    queue_length: int
+    scan_defaults: dict[str, Any] = Field(description="what the rig file says; a request may say otherwise")
+
+
+class DriverBody(BaseModel):
+    """A driver that an installed package declares."""
+
+    kind: str
+    name: str
+    package: str
+    version: str
+    fault: str | None = Field(description="why it cannot be loaded")
+
+
+class DeviceBody(BaseModel):
+    """A device that is plugged in."""
+
+    driver: str
+    device: str = Field(description="what to write into a rig file")
+    label: str
+
+
+class DeviceList(BaseModel):
+    """What is installed and what is plugged in."""
+
+    drivers: list[DriverBody]
+    devices: list[DeviceBody]
+    faults: list[str]
+
+
+class Probe(BaseModel):
+    """The answer of a probe: each thing that was looked at, "ok" or what is wrong."""
+
+    checks: dict[str, str]
+
+
+class Explanation(BaseModel):
+    """What a kind of problem means."""
+
+    type: str
+    title: str
+    description: str

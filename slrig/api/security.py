@@ -1,0 +1,78 @@
+"""Who may talk to the service: whoever has the key, by a name that the service knows itself by."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+from pathlib import Path
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from slrig.api.problems import answer, problem
+from slrig.bundle.storage import write_file
+
+KEY_VARIABLE = "SLRIG_API_KEY"
+"""Where a client keeps its key, and where a service may be given one instead of making its own."""
+
+OPEN_PATHS = frozenset({"/livez", "/readyz"})
+"""What answers without a key: probes, which tell nothing about scans."""
+
+LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
+
+
+def digest(key: str) -> str:
+    """What is kept of a key: its SHA-256. A key has 256 random bits, so it needs no salt and no slow hash."""
+    return hashlib.sha256(key.encode()).hexdigest()
+
+
+def claim_key(path: Path, *, given: str | None, fresh: bool) -> tuple[str, str | None]:
+    """Return the digest of the service's key, and the key itself if it was made just now, to be shown once.
+
+    `given` is a key from the environment, used as it is and kept nowhere; else the digest in `path`; `fresh`, or no
+    such file, makes a new key.
+
+    Raises
+    ------
+    StorageError
+        The digest cannot be written.
+    """
+    if given:
+        return digest(given), None
+    if not fresh and path.is_file():
+        return path.read_text(encoding="ascii").strip(), None
+    key = secrets.token_urlsafe(32)
+    write_file(path, f"{digest(key)}\n".encode("ascii"))
+    path.chmod(0o600)
+    return digest(key), key
+
+
+class KeyCheck:
+    """Middleware that lets only requests with the key pass: `Authorization: Bearer KEY` or `X-API-Key: KEY`."""
+
+    def __init__(self, app: ASGIApp, *, key_digest: str) -> None:
+        self._app = app
+        self._digest = key_digest
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
+            sent = _sent_key(Headers(scope=scope))
+            if sent is None or not hmac.compare_digest(digest(sent), self._digest):
+                detail = (
+                    f"This service needs its API key, and the request has {'none' if sent is None else 'another one'}. "
+                    "Send the key that was printed at the first start as 'Authorization: Bearer KEY' or 'X-API-Key: "
+                    "KEY'; if it is lost, start the service with --new-key."
+                )
+                refusal = answer(problem(401, "Unauthorized", detail), headers={"WWW-Authenticate": "Bearer"})
+                await refusal(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+
+def _sent_key(headers: Headers) -> str | None:
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer" and token.strip():
+        return token.strip()
+    return headers.get("x-api-key")

@@ -1,0 +1,200 @@
+"""The service as a process: claim the data folder, sweep it, open the port, serve until told to stop."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import structlog
+import uvicorn
+
+from slrig.api.app import create_app
+from slrig.api.security import KEY_VARIABLE, claim_key
+from slrig.api.service import Service
+from slrig.bundle.storage import write_file
+from slrig.config import RigConfig, ServiceSettings, is_loopback
+from slrig.devices import Rig
+from slrig.discovery import open_rig
+from slrig.errors import ServiceError
+from slrig.scan.folder import DataFolder
+from slrig.scan.holding import HeldRig
+from slrig.scan.plan import ScanPlan
+from slrig.scan.runner import Runner
+from slrig.scan.store import ScanStore
+from slrig.scan.sweep import sweep
+from slrig.scan.worker import ReconstructionWorker, prepare_kernel_cache
+
+ADDRESS_FILE = "service.json"
+"""Where in the data folder a running service tells its URL and process id."""
+
+_log = structlog.get_logger(__name__)
+
+
+def open_service(settings: ServiceSettings, rig: RigConfig) -> Service:
+    """Claim the data folder, bring it in order, and return a service that is ready to be started.
+
+    Raises
+    ------
+    StorageError
+        The folder is in use, or the disk refused.
+    """
+    folder = DataFolder(settings.data_dir)
+    try:
+        prepare_kernel_cache(folder.root / "cache")
+        store = ScanStore(folder.database, key_life_s=settings.idempotency_keep_s)
+        swept = sweep(store, folder)
+    except BaseException:
+        folder.release()
+        raise
+    for what, found in (
+        ("interrupted", swept.interrupted),
+        ("recovered", swept.recovered),
+        ("without files", swept.lost),
+        ("put aside", swept.put_aside),
+    ):
+        for name in found:
+            _log.warning("left by the last run", scan=str(name), found=what)
+    runner = Runner(
+        store,
+        folder,
+        HeldRig(rig.name, lambda: open_rig(rig)),
+        ReconstructionWorker(),
+        capture=_capture,
+        queue_length=settings.queue_length,
+        spare_bytes=settings.min_free_bytes,
+    )
+    return Service(settings, rig.scan, folder, store, runner)
+
+
+def _capture(
+    rig: Rig,
+    plan: ScanPlan,
+    folder: Path,
+    /,
+    *,
+    progress: Callable[[str, float, str], None],
+    cancelled: Callable[[], bool],
+) -> None:
+    # Brings in the whole of reconstruction with its kernels: not before the first scan needs it.
+    from slrig.scan.pipeline import capture_bundle
+
+    capture_bundle(rig, plan, folder, progress=progress, cancelled=cancelled)
+
+
+def serve(
+    settings: ServiceSettings,
+    rig: RigConfig,
+    *,
+    new_key: bool = False,
+    until_eof: bool = False,
+    say: Callable[[str], None],
+) -> None:
+    """Serve until SIGTERM or Ctrl-C. `say` tells a person where the service is and, once, its key.
+
+    `until_eof` stops it as well when standard input ends: a service that another program started does not outlive it,
+    however that program came to its end.
+
+    Raises
+    ------
+    StorageError
+        The data folder is in use, or the disk refused.
+    ServiceError
+        The address is taken.
+    """
+    _set_up_logs(settings.log_level)
+    # uvicorn catches SIGTERM while it serves, ends in good order, and then raises it again: here it must not kill the
+    # process before the rest of this function has run.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    if until_eof:
+        threading.Thread(target=_stop_at_eof, name="slrig-stdin", daemon=True).start()
+    listener = _listener(settings)
+    host, port = listener.getsockname()[:2]
+    url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    try:
+        service = open_service(settings, rig)
+    except BaseException:
+        listener.close()
+        raise
+    address = service.folder.root / ADDRESS_FILE
+    try:
+        key_digest, key = None, None
+        if settings.require_key:
+            key_digest, key = claim_key(settings.key_path, given=os.environ.get(KEY_VARIABLE), fresh=new_key)
+        say(f"slrig serves rig '{rig.name}' at {url}, data in {service.folder.root}. Ctrl-C stops it.")
+        if key is not None:
+            say(f"API key, shown only now: {key}\nIn the terminal of the client: export {KEY_VARIABLE}={key}")
+        if not is_loopback(settings.host):
+            say("Other machines can reach it. Keys and scans travel unencrypted: put a TLS proxy in front.")
+        write_file(address, json.dumps({"url": url, "process_id": os.getpid()}).encode())
+        config = uvicorn.Config(
+            create_app(service, key_digest=key_digest),
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            # sse-starlette ends event streams by itself; this is for every other request under way.
+            timeout_graceful_shutdown=1,
+        )
+        with suppress(KeyboardInterrupt):
+            uvicorn.Server(config).run(sockets=[listener])
+    finally:
+        service.close()
+        with suppress(OSError):
+            address.unlink(missing_ok=True)
+
+
+def _stop_at_eof() -> None:
+    while os.read(sys.stdin.fileno(), 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _listener(settings: ServiceSettings) -> socket.socket:
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((settings.host, settings.port))
+        # From now on a client that was told the address may connect: it is answered once the service is up.
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        message = (
+            f"The service cannot listen on {settings.host} port {settings.port}: {error.strerror}. Stop what uses that "
+            "port, choose another with --port, or any free one with --port 0."
+        )
+        raise ServiceError(message) from error
+    listener.set_inheritable(False)
+    return listener
+
+
+def _set_up_logs(level: str) -> None:
+    on_terminal = sys.stderr.isatty()
+    renderer: structlog.typing.Processor = (
+        structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
+        if on_terminal
+        else structlog.processors.JSONRenderer()
+    )
+    trace = [] if on_terminal else [structlog.processors.format_exc_info]
+    structlog.configure(
+        processors=[
+            structlog.contextvars.merge_contextvars,
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            *trace,
+            renderer,
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=False,
+    )
+
+
+__all__ = ["ADDRESS_FILE", "open_service", "serve"]

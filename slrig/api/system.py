@@ -1,0 +1,67 @@
+"""Probes, and what each kind of problem means."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path, Response
+from starlette.exceptions import HTTPException
+
+from slrig.api.openapi import problems
+from slrig.api.problems import answer, explanations, problem
+from slrig.api.schemas import Explanation, Probe
+from slrig.api.service import Service, Serving
+from slrig.errors import StorageError
+
+router = APIRouter(tags=["system"])
+
+
+@router.get("/livez", openapi_extra={"security": []})
+async def livez() -> Probe:
+    """Tell that the process answers."""
+    return Probe(checks={"process": "ok"})
+
+
+@router.get("/readyz", response_model=Probe, responses=problems(503), openapi_extra={"security": []})
+def readyz(service: Serving) -> Response | Probe:
+    """Tell whether a scan could start: records, disk and rig. Touches no device; a rig that is held is well."""
+    checks = {"records": _records(service), "disk": _disk(service), "rig": _rig(service)}
+    if all(found == "ok" for found in checks.values()):
+        return Probe(checks=checks)
+    wrong = "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
+    return answer(problem(503, "NotReady", f"The service runs and cannot scan: {wrong}", checks=checks))
+
+
+@router.get("/problems/{name}", responses=problems(404, 422))
+def explain_problem(name: Annotated[str, Path(max_length=64)]) -> Explanation:
+    """Explain a kind of problem: what `type` in an error leads to."""
+    text = explanations().get(name)
+    if text is None:
+        detail = f"There is no kind of problem '{name}'."
+        raise HTTPException(404, detail)
+    return Explanation(type=f"/problems/{name}", title=name.replace("-", " ").capitalize(), description=text)
+
+
+def _records(service: Service) -> str:
+    try:
+        service.store.check()
+    except StorageError as error:
+        return str(error)
+    return "ok"
+
+
+def _disk(service: Service) -> str:
+    try:
+        service.folder.require_space(service.settings.min_free_bytes)
+    except StorageError as error:
+        return str(error)
+    return "ok"
+
+
+def _rig(service: Service) -> str:
+    status = service.runner.status()
+    if status.ending:
+        return "the service is ending"
+    if status.fault is not None:
+        return status.fault
+    return "ok" if status.facts is not None else "the rig is being opened"

@@ -1,0 +1,167 @@
+"""slrig's commands and their exit codes: 0 well, 1 a defect of slrig, 2 something to be put right, 130 Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import typer.core
+
+from slrig.errors import SlrigError
+
+INTERRUPTED = 130
+
+
+class _Commands(typer.core.TyperGroup):
+    """Ends every command that raises a SlrigError with its message on stderr and exit code 2."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except SlrigError as error:
+            typer.secho("error: ", fg="red", bold=True, err=True, nl=False)
+            typer.echo(str(error), err=True)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(INTERRUPTED) from None
+
+
+app = typer.Typer(
+    cls=_Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Structured-light scanning: from a projector and cameras to a triangle mesh in millimetres.",
+    epilog="Start with: slrig demo",
+)
+
+Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")]
+KeyFile = Annotated[
+    Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
+]
+USUAL_URL = "http://127.0.0.1:8731"
+
+
+@app.command()
+def demo(
+    rig: Annotated[
+        Path | None, typer.Argument(help="Rig file. Default: config/rigs/demo.toml, a rendered rig.")
+    ] = None,
+    output: Annotated[Path, typer.Option(help="Folder for mesh, preview and report.")] = Path("scans/demo"),
+) -> None:
+    """Scan once through the real service on a rendered rig, and compare the mesh with the known truth."""
+    from slrig.cli.demo import run_demo
+
+    run_demo(rig, output)
+
+
+@app.command()
+def serve(
+    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    host: Annotated[
+        str | None, typer.Option(help="Address to listen on. Default 127.0.0.1: this machine only.")
+    ] = None,
+    port: Annotated[int | None, typer.Option(help="Port; 0 takes any free one. Default 8731.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder for scans and records. Default: ~/.local/share/slrig.")
+    ] = None,
+    settings: Annotated[Path | None, typer.Option(help="TOML file with settings of the service.")] = None,
+    allow_host: Annotated[
+        list[str] | None, typer.Option(help="A name by which clients may call this machine; may be repeated.")
+    ] = None,
+    new_key: Annotated[bool, typer.Option("--new-key", help="Make a new API key; the old one stops working.")] = False,
+    no_key: Annotated[bool, typer.Option("--no-key", help="Ask for no API key; only on this machine.")] = False,
+    until_eof: Annotated[bool, typer.Option("--until-eof", help="Stop when standard input ends.")] = False,
+) -> None:
+    """Start the service: it holds the rig and takes scans over HTTP."""
+    from slrig.api.server import serve as run_service
+    from slrig.config import read_rig, read_settings
+
+    given: dict[str, object] = {"host": host, "port": port, "data_dir": data}
+    if allow_host:
+        given["allowed_hosts"] = tuple(allow_host)
+    if no_key:
+        given["require_key"] = False
+    chosen = read_settings(settings, **{name: value for name, value in given.items() if value is not None})
+    run_service(chosen, read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
+
+
+@app.command()
+def scan(
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+    output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("scans/latest"),
+    file: Annotated[
+        list[str] | None,
+        typer.Option(help="File to fetch; may be repeated. Default: mesh.ply, preview.png, report.json."),
+    ] = None,
+    label: Annotated[str | None, typer.Option(help="Free text, to find the scan again.")] = None,
+    exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera, seconds.")] = None,
+    period_px: Annotated[int | None, typer.Option(help="Distance of two lines in one frame, projector pixels.")] = None,
+    line_width_px: Annotated[int | None, typer.Option(help="Width of a line, projector pixels.")] = None,
+    gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
+    gray_only: Annotated[bool, typer.Option("--gray-only", help="Play the Gray code without shifted lines.")] = False,
+    rows: Annotated[bool, typer.Option("--rows", help="Play the row axis as well.")] = False,
+    keep_holes: Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")] = False,
+    queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
+) -> None:
+    """Scan with a running service, follow the progress, and fetch the mesh."""
+    from slrig.cli.client import ServiceClient, read_key
+    from slrig.cli.scan import FILES, scan_with, tell_result
+
+    patterns = {
+        "line_shift_period_px": period_px,
+        "line_width_px": line_width_px,
+        "gray_cell_px": gray_cell_px,
+        "line_shift": False if gray_only else None,
+        "rows": rows or None,
+    }
+    request = {
+        "label": label,
+        "exposure_s": exposure_s,
+        "if_busy": "queue" if queue else "reject",
+        "patterns": {name: value for name, value in patterns.items() if value is not None},
+        "reconstruction": {"keep_holes": True} if keep_holes else {},
+    }
+    with ServiceClient(url, read_key(key_file)) as client:
+        result = scan_with(client, request, output, files=tuple(file or FILES))
+    tell_result(result, output)
+
+
+@app.command()
+def reconstruct(
+    bundle: Annotated[Path, typer.Argument(help="Folder with bundle.json and its frames.")],
+    output: Annotated[Path, typer.Option(help="Folder for mesh, points, report and pictures.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration to use in place of the bundle's calibration.json.")
+    ] = None,
+    keep_holes: Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")] = False,
+) -> None:
+    """Make a mesh from a recorded scan. Needs no service and no rig."""
+    from slrig.cli.reconstruct import reconstruct_with_progress
+
+    reconstruct_with_progress(bundle, output, calibration=calibration, keep_holes=keep_holes)
+
+
+@app.command()
+def devices(
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """List the drivers that are installed and the devices that are plugged in."""
+    from slrig.cli.devices import list_devices
+
+    list_devices(as_json=as_json)
+
+
+def main() -> None:
+    """Run the command that the arguments name."""
+    # A reader that has seen enough (slrig devices | head) closes the pipe: that is no error.
+    try:
+        app(prog_name="slrig")
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)

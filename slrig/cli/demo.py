@@ -1,0 +1,151 @@
+"""`slrig demo`: the whole walk on a rendered rig, through the real service in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+
+import slrig
+from slrig.bundle.storage import refusals_of
+from slrig.cli.client import KEY_VARIABLE, ServiceClient
+from slrig.cli.display import progress_shown
+from slrig.cli.scan import scan_with, tell_result
+from slrig.errors import ConfigError, ServiceError
+
+START_LIMIT_S = 120.0
+STOP_LIMIT_S = 10.0
+_POLL_S = 0.05
+_SERVICE_SHARE = 0.05
+
+
+def run_demo(rig: Path | None, output: Path) -> None:
+    """Start a service, scan, fetch, compare, tell; the service is gone afterwards.
+
+    Raises
+    ------
+    ConfigError
+        There is no such rig file.
+    ServiceError
+        The service did not start, or the scan failed.
+    """
+    rig = _rig_file(rig)
+    data = output / "service"
+    with refusals_of(data):
+        data.mkdir(parents=True, exist_ok=True)
+    key = secrets.token_urlsafe(32)
+    with progress_shown() as display:
+        display("starting the service", 0.0, str(rig))
+        with _service(rig, data, key) as process, ServiceClient(_url(process, data), key) as client:
+            _await_ready(process, client, data)
+            earlier = client.get("/scan?limit=200")["scans"]
+
+            def shown(stage: str, fraction: float, detail: str) -> None:
+                display(stage, _SERVICE_SHARE + (1 - _SERVICE_SHARE) * fraction, detail)
+
+            scan = scan_with(client, {"label": "demo"}, output, display=shown)
+            for old in earlier:
+                client.delete(old)
+    tell_result(scan, output)
+    bundle = data / "scans" / scan["id"] / "bundle"
+    _tell_next(rig, bundle, output)
+
+
+def _rig_file(given: Path | None) -> Path:
+    if given is not None:
+        candidates = [given]
+    else:
+        here = Path("config/rigs/demo.toml")
+        candidates = [here, Path(slrig.__file__).resolve().parent.parent / here]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    message = (
+        f"There is no rig file {candidates[0]}. Run the demo in slrig's checkout, or name a rig file: slrig demo RIG."
+    )
+    raise ConfigError(message)
+
+
+@contextmanager
+def _service(rig: Path, data: Path, key: str) -> Iterator[subprocess.Popen[bytes]]:
+    (data / "service.json").unlink(missing_ok=True)
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--until-eof"]
+    with (data / "service.log").open("wb") as log:
+        process = subprocess.Popen(  # noqa: S603 - our own command
+            [*command, "--host", "127.0.0.1", "--data", str(data)],
+            # Nothing is ever written: the pipe ends with this process, and the service with the pipe.
+            stdin=subprocess.PIPE,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, KEY_VARIABLE: key},
+            # Ctrl-C is for the client: it cancels the scan, and then ends the service.
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        if process.stdin is not None:
+            process.stdin.close()
+        process.terminate()
+        try:
+            process.wait(STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _url(process: subprocess.Popen[bytes], data: Path) -> str:
+    address = data / "service.json"
+    deadline = time.monotonic() + START_LIMIT_S
+    while not address.is_file():
+        _require_alive(process, data, deadline)
+        time.sleep(_POLL_S)
+    url: str = json.loads(address.read_text(encoding="utf-8"))["url"]
+    return url
+
+
+def _await_ready(process: subprocess.Popen[bytes], client: ServiceClient, data: Path) -> None:
+    deadline = time.monotonic() + START_LIMIT_S
+    while not client.is_ready():
+        _require_alive(process, data, deadline)
+        time.sleep(_POLL_S)
+
+
+def _require_alive(process: subprocess.Popen[bytes], data: Path, deadline: float) -> None:
+    log = data / "service.log"
+    if process.poll() is not None:
+        tail = "\n".join(log.read_text(encoding="utf-8", errors="replace").splitlines()[-8:])
+        message = f"The service ended before it was ready, with exit code {process.returncode}. Its last words:\n{tail}"
+        raise ServiceError(message)
+    if time.monotonic() > deadline:
+        message = f"The service was not ready within {START_LIMIT_S:.0f} s. Its log is {log}."
+        raise ServiceError(message)
+
+
+def _tell_next(rig: Path, bundle: Path, output: Path) -> None:
+    again = output.parent / f"{output.name}-again"
+    live = output.parent / f"{output.name}-live"
+    # Paths in a rig file are relative to it, so that a copy belongs beside it.
+    own = shlex.quote(str(rig.with_name("my-rig.toml")))
+    rig_text, bundle_text = shlex.quote(str(rig)), shlex.quote(str(bundle))
+    typer.echo(
+        f"""
+Next:
+  1. Your own rig: copy a rig file, change it, and run it.
+       cp {rig_text} {own}
+       slrig demo {own}
+  2. A live service: start it, and scan with it from another terminal, with the key that it prints.
+       slrig serve {rig_text}
+       {KEY_VARIABLE}=KEY slrig scan --output {shlex.quote(str(live))}
+  3. A recorded bundle: reconstruct this scan, or one of yours, again.
+       slrig reconstruct {bundle_text} --output {shlex.quote(str(again))}"""
+    )

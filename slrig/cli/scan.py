@@ -1,0 +1,101 @@
+"""`slrig scan`: one scan with a running service."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from slrig.bundle.storage import refusals_of
+from slrig.cli.client import ServiceClient
+from slrig.cli.display import progress_shown
+from slrig.errors import ScanCancelledError, ServiceError
+
+_STATES = {"queued": "waiting for the rig", "capturing": "preparing the rig", "reconstructing": "reconstructing"}
+
+FILES = ("mesh.ply", "preview.png", "report.json")
+
+
+def scan_with(
+    client: ServiceClient,
+    request: Mapping[str, Any],
+    output: Path,
+    *,
+    files: tuple[str, ...] = FILES,
+    display: Callable[[str, float, str], None] | None = None,
+) -> dict[str, Any]:
+    """Scan, fetch the files into `output`, and return the finished scan. Ctrl-C cancels the scan.
+
+    Raises
+    ------
+    ServiceError
+        The service refused, is gone, or the scan failed.
+    ScanCancelledError
+        Somebody else cancelled it.
+    """
+    if display is None:
+        with progress_shown() as own:
+            return scan_with(client, request, output, files=files, display=own)
+    started = client.start(request)
+    fraction = 0.0
+    try:
+        for event in client.follow(started):
+            if event["kind"] == "progress":
+                fraction = event["fraction"]
+                display(event["stage"], fraction, event["detail"])
+            elif event["state"] in _STATES:
+                display(_STATES[event["state"]], fraction, "")
+    except KeyboardInterrupt:
+        with suppress(ServiceError):
+            client.cancel(started)
+        raise
+    scan = client.get(started["links"]["self"])
+    if scan["state"] == "cancelled":
+        message = f"Scan {scan['id']} was cancelled by another client."
+        raise ScanCancelledError(message)
+    if scan["state"] != "succeeded":
+        message = f"Scan {scan['id']} {scan['state']}: {scan['error']['detail']}"
+        raise ServiceError(message)
+    offered = scan["links"]["files"]
+    missing = [name for name in files if name not in offered]
+    if missing:
+        message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
+        raise ServiceError(message)
+    with refusals_of(output):
+        output.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        display(f"fetching {name}", 1.0, "")
+        client.fetch(offered[name], output / name)
+    display("done", 1.0, "")
+    return scan
+
+
+def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...] = FILES) -> None:
+    """Print where the files of a scan lie and how good the mesh is."""
+    names = {"mesh.ply": "mesh", "preview.png": "preview", "report.json": "report"}
+    for name in files:
+        if (output / name).is_file():
+            typer.echo(f"{names.get(name, name):<10}{output / name}")
+    for line in quality_lines(scan.get("summary") or {}):
+        typer.echo(line)
+
+
+def quality_lines(summary: Mapping[str, Any]) -> list[str]:
+    """What a report's summary says about the mesh and its error, one line each."""
+    lines = []
+    mesh = summary.get("mesh") or {}
+    figures = mesh.get("figures") or {}
+    if figures.get("triangles") is not None:
+        lines.append(f"{'size':<10}{figures['vertices']:,} vertices, {figures['triangles']:,} triangles")
+    sigma = (mesh.get("sigma_mm") or {}).get("p50")
+    if sigma is not None:
+        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median)")
+    truth = summary.get("truth") or {}
+    if truth.get("rms_mm") is not None:
+        complete = truth.get("complete_0.3mm")
+        covered = "" if complete is None else f", {complete:.1%} of the visible surface within 0.3 mm"
+        lines.append(f"{'error':<10}rms {truth['rms_mm']:.4f} mm against the known truth{covered}")
+    return lines

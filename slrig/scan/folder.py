@@ -1,0 +1,158 @@
+"""The data folder: where scans lie, how they get there in one rename, and who may use it.
+
+DATA/lock            held by the one process that owns the folder; holds its process id
+DATA/slrig.sqlite    the records
+DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
+DATA/.incoming/ID/   a scan being made; swept at the next start
+DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work
+DATA/cache/          compiled kernels, where the package's own folder cannot be written
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from uuid import UUID
+
+from slrig.errors import StorageError
+from slrig.scan.faults import disk_errors
+
+
+def free_bytes(folder: Path) -> int:
+    """Bytes that may still be written below `folder`."""
+    return shutil.disk_usage(folder).free
+
+
+class DataFolder:
+    """The data folder, held by this process from construction until `release`.
+
+    Raises
+    ------
+    StorageError
+        Another process holds it, or it cannot be made.
+    """
+
+    def __init__(self, root: Path, *, free: Callable[[Path], int] = free_bytes) -> None:
+        self.root = root.resolve()
+        self._free = free
+        with disk_errors(self.root):
+            for folder in (self.root, self.scans, self.incoming):
+                folder.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(self.root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.read(self._lock, 32).decode("ascii", "replace").strip() or "unknown"
+            os.close(self._lock)
+            message = (
+                f"The data folder {self.root} is in use by the slrig service with process id {holder}. "
+                "Stop that service, or give this one another folder with --data."
+            )
+            raise StorageError(message) from error
+        os.ftruncate(self._lock, 0)
+        os.pwrite(self._lock, f"{os.getpid()}\n".encode("ascii"), 0)
+
+    @property
+    def scans(self) -> Path:
+        """Where finished scans lie."""
+        return self.root / "scans"
+
+    @property
+    def incoming(self) -> Path:
+        """Where scans are made."""
+        return self.root / ".incoming"
+
+    @property
+    def orphans(self) -> Path:
+        """Where files without a record are put aside."""
+        return self.root / ".orphans"
+
+    @property
+    def database(self) -> Path:
+        """The records."""
+        return self.root / "slrig.sqlite"
+
+    def release(self) -> None:
+        """Let another process have the folder. Idempotent."""
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+
+    def require_space(self, needed_bytes: int) -> None:
+        """Raise StorageError unless `needed_bytes` can be written."""
+        free = self._free(self.root)
+        if free < needed_bytes:
+            message = (
+                f"This scan may need {needed_bytes / 1e6:.0f} MB in {self.root}, and {free / 1e6:.0f} MB are free. "
+                "Delete scans that are no longer wanted (DELETE /scan/ID), or move the data folder to a larger disk."
+            )
+            raise StorageError(message)
+
+    def scan(self, scan_id: UUID) -> Path:
+        """Where the files of a finished scan lie."""
+        return self.scans / str(scan_id)
+
+    def staging(self, scan_id: UUID) -> Path:
+        """Where the files of a running scan are made."""
+        return self.incoming / str(scan_id)
+
+    def stage(self, scan_id: UUID) -> Path:
+        """Make the staging folder of a scan, empty."""
+        folder = self.staging(scan_id)
+        with disk_errors(folder):
+            folder.mkdir()
+        return folder
+
+    def commit(self, scan_id: UUID) -> None:
+        """Move a staged scan to its place, whole and durable: fsync everything, then one rename.
+
+        The reconstruction's own folder `result` is dissolved, so that its files lie beside the bundle.
+        """
+        staged = self.staging(scan_id)
+        with disk_errors(staged):
+            result = staged / "result"
+            if result.is_dir():
+                for file in sorted(result.iterdir()):
+                    file.rename(staged / file.name)
+                result.rmdir()
+            sync_tree(staged)
+            staged.rename(self.scan(scan_id))
+            _sync(self.scans)
+            _sync(self.incoming)
+
+    def keep_bundle(self, scan_id: UUID) -> None:
+        """Commit the bundle of a scan that got no mesh, and nothing else of it."""
+        staged = self.staging(scan_id)
+        for other in staged.iterdir():
+            if other.name != "bundle":
+                shutil.rmtree(other) if other.is_dir() else other.unlink()
+        self.commit(scan_id)
+
+    def discard(self, scan_id: UUID) -> None:
+        """Remove what was staged for a scan. Idempotent."""
+        shutil.rmtree(self.staging(scan_id), ignore_errors=True)
+
+    def withdraw(self, scan_id: UUID) -> None:
+        """Take a finished scan's files back into staging by one rename: the first half of a deletion."""
+        if self.scan(scan_id).is_dir():
+            with disk_errors(self.scans):
+                self.scan(scan_id).rename(self.staging(scan_id))
+
+
+def sync_tree(folder: Path) -> None:
+    """Make every file below `folder`, and every folder, durable."""
+    for place, _, files in os.walk(folder):
+        for name in files:
+            _sync(Path(place, name))
+        _sync(Path(place))
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,129 @@
+"""The service as a process of its own, over a small rendered rig."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from slrig.cli.client import ServiceClient
+
+KEY = "the key of the tests"
+STOP_LIMIT_S = 5.0
+"""How long the service may take to end after SIGTERM."""
+
+SCENE = """
+name = "plate"
+[[object]]
+name = "plate"
+shape = "plane"
+size_mm = [160.0, 130.0]
+rotation_deg = [8.0, -12.0, 0.0]
+albedo = 0.8
+"""
+
+RIG = """
+name = "small"
+[head]
+driver = "simulated"
+scene = "scene.toml"
+samples_per_axis = 2
+{head}
+[head.projector]
+size_px = [256, 192]
+focal_px = [1100.0, 1101.0]
+position_mm = [105.0, -10.0, -590.0]
+target_mm = [0.0, 0.0, 0.0]
+blur_px = 0.6
+gamma = 1.8
+[[head.camera]]
+name = "left"
+size_px = [240, 192]
+saturation_s = 0.02
+focal_px = [950.0, 951.0]
+position_mm = [-150.0, -12.0, -560.0]
+target_mm = [0.0, 0.0, 0.0]
+blur_px = 0.6
+{faults}
+"""
+
+
+def write_rig(folder: Path, *, head: str = "", faults: str = "") -> Path:
+    """Write a small rendered rig and its scene into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "scene.toml").write_text(SCENE)
+    rig = folder / "rig.toml"
+    rig.write_text(RIG.format(head=head, faults=faults))
+    return rig
+
+
+class ServiceProcess:
+    """A running `slrig serve`; `url` is where it said that it is."""
+
+    def __init__(self, rig: Path, data: Path) -> None:
+        self.data = data
+        command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(data)]
+        self.log = data.with_suffix(".log")
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(  # noqa: S603 - our own command
+                command,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env={**os.environ, "SLRIG_API_KEY": KEY, "SLRIG_MIN_FREE_BYTES": "0", "PYTHONUNBUFFERED": "1"},
+            )
+        assert self.process.stdout is not None
+        greeting = self.process.stdout.readline().decode()
+        assert " at http://" in greeting, self.log.read_text()
+        self.url = greeting.split(" at ")[1].split(",")[0]
+
+    def client(self, key: str | None = KEY) -> ServiceClient:
+        return ServiceClient(self.url, key)
+
+    def worker_id(self) -> int:
+        """The process id of the reconstruction process."""
+        for line in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
+            for child in line.read_text().split():
+                if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                    return int(child)
+        message = "the service has no reconstruction process"
+        raise AssertionError(message)
+
+    def stop(self) -> int:
+        """End it as a service manager would, and return its exit code."""
+        self.process.send_signal(signal.SIGTERM)
+        return self._gone(STOP_LIMIT_S)
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        self.process.kill()
+        self._gone(STOP_LIMIT_S)
+
+    def _gone(self, limit_s: float) -> int:
+        code = self.process.wait(limit_s)
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+        return code
+
+
+Start = Callable[..., ServiceProcess]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start a service on a rig and a data folder; whatever still runs at the end of the test is killed."""
+    running: list[ServiceProcess] = []
+
+    def started(rig: Path, data: Path = tmp_path / "data") -> ServiceProcess:
+        service = ServiceProcess(rig, data)
+        running.append(service)
+        return service
+
+    yield started
+    for service in running:
+        if service.process.poll() is None:
+            service.kill()

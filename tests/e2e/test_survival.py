@@ -1,0 +1,153 @@
+"""What the service bears: killed processes, unplugged cameras, restarts, and a stop in the middle of everything."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from slrig.cli.client import ServiceClient
+from slrig.errors import ServiceError
+from tests.e2e.conftest import STOP_LIMIT_S, Start, write_rig
+
+pytestmark = pytest.mark.slow
+
+# Takes as long as the frames of a real camera at a low rate, so that there is a middle to be stopped in.
+SLOW = "realtime = true"
+
+
+def followed_to(client: ServiceClient, scan: dict[str, Any], stage: str) -> None:
+    """Return once the scan has told of this stage or state."""
+    for event in client.follow(scan):
+        if stage in {event.get("stage"), event.get("state")}:
+            return
+    message = f"the scan ended without {stage}"
+    raise AssertionError(message)
+
+
+def ended(client: ServiceClient, scan: dict[str, Any]) -> dict[str, Any]:
+    """The scan once it is over."""
+    for _ in client.follow(scan):
+        pass
+    return client.get(scan["links"]["self"])
+
+
+def test_killed_service_remembers_its_scans(start: Start, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig", head=SLOW)
+    first = start(rig)
+    with first.client() as client:
+        scan = client.start({})
+        followed_to(client, scan, "capture")
+        first.kill()
+    second = start(rig)
+    with second.client() as client:
+        record = client.get(scan["links"]["self"])
+        assert record["state"] == "interrupted"
+        assert record["error"]["type"] == "/problems/scan-interrupted"
+        assert list((second.data / ".incoming").iterdir()) == []
+        assert ended(client, client.start({}))["state"] == "succeeded"
+    assert second.stop() == 0
+
+
+def test_stop_in_the_middle_is_quick_and_on_record(start: Start, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig", head=SLOW)
+    first = start(rig)
+    with first.client() as client:
+        scan = client.start({})
+        begun = threading.Event()
+
+        def follow() -> None:
+            try:
+                with first.client() as follower:
+                    for event in follower.follow(scan):
+                        if event.get("stage") == "capture":
+                            begun.set()
+            except ServiceError:
+                return
+
+        # The stream stays open while the service is told to stop.
+        thread = threading.Thread(target=follow, daemon=True)
+        thread.start()
+        assert begun.wait(60)
+        assert first.stop() == 0
+    assert not (first.data / "service.json").exists()
+    second = start(rig)
+    with second.client() as client:
+        assert client.get(scan["links"]["self"])["state"] == "interrupted"
+    assert second.stop() == 0
+
+
+def test_killed_reconstruction_fails_its_scan_and_the_next_one_succeeds(start: Start, tmp_path: Path) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    with service.client() as client:
+        assert ended(client, client.start({}))["state"] == "succeeded"
+        worker = service.worker_id()
+        os.kill(worker, signal.SIGSTOP)
+        scan = client.start({})
+        followed_to(client, scan, "reconstructing")
+        os.kill(worker, signal.SIGKILL)
+        record = ended(client, scan)
+        assert record["state"] == "failed"
+        assert record["error"]["type"] == "/problems/worker-lost"
+        assert list(record["links"]["files"]) == ["bundle.zip"]
+        assert ended(client, client.start({}))["state"] == "succeeded"
+
+
+def test_cancelled_scan_leaves_the_rig_ready(start: Start, tmp_path: Path) -> None:
+    service = start(write_rig(tmp_path / "rig", head=SLOW))
+    with service.client() as client:
+        scan = client.start({})
+        followed_to(client, scan, "capture")
+        client.cancel(scan)
+        assert ended(client, scan)["state"] == "cancelled"
+        assert ended(client, client.start({}))["state"] == "succeeded"
+
+
+def test_unplugged_camera_is_opened_again(start: Start, tmp_path: Path) -> None:
+    service = start(write_rig(tmp_path / "rig", faults="[head.faults]\nunplug_camera_at_frame = 5"))
+    with service.client() as client:
+        for _ in range(2):
+            record = ended(client, client.start({}))
+            assert record["state"] == "failed"
+            assert record["error"]["type"] == "/problems/device-gone"
+        assert client.get("/rig")["open"] is False
+
+
+def test_service_does_not_outlive_the_program_that_started_it(tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig")
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(tmp_path / "data")]
+    with subprocess.Popen(  # noqa: S603 - our own command
+        [*command, "--until-eof"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as service:
+        assert service.stdin is not None
+        assert service.stdout is not None
+        assert b" at http://" in service.stdout.readline()
+        assert b"API key, shown only now: " in service.stdout.readline()
+        service.stdin.close()
+        assert service.wait(STOP_LIMIT_S) == 0
+
+
+def test_second_service_on_one_data_folder_is_refused(start: Start, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig")
+    service = start(rig)
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(service.data)]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
+    assert second.returncode == 2
+    assert f"process id {service.process.pid}" in second.stderr
+    assert "Traceback" not in second.stderr
+
+
+def test_address_in_use_is_refused(start: Start, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig")
+    service = start(rig)
+    port = service.url.rsplit(":", 1)[1]
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", port, "--data", str(tmp_path / "other")]
+    second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
+    assert second.returncode == 2
+    assert "--port 0" in second.stderr

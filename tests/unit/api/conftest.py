@@ -1,0 +1,80 @@
+"""A service over a tame bench, and a client that holds its key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from slrig.api.app import create_app
+from slrig.api.security import digest
+from slrig.api.service import Service
+from slrig.config import ScanDefaults, ServiceSettings
+from slrig.scan.folder import DataFolder
+from slrig.scan.holding import HeldRig
+from slrig.scan.runner import Runner
+from slrig.scan.store import ScanStore
+from slrig.scan.worker import ReconstructionWorker
+from tests.unit.scan.fakes import WAIT_S, TameBench
+
+KEY = "the key of the tests"
+
+
+class ServedBench(TameBench):
+    """A service over a tame bench."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__()
+        self.free_bytes = 10**12
+        settings = ServiceSettings(data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096)
+        folder = DataFolder(root, free=lambda _: self.free_bytes)
+        store = ScanStore(folder.database)
+        self.worker = ReconstructionWorker("tests.unit.scan.fake_pipeline:reconstruct_bundle")
+        rig = HeldRig("bench", self.open_rig)
+        runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
+        defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
+        self.service = Service(settings, defaults, folder, store, runner)
+        self.app: FastAPI = create_app(self.service, key_digest=digest(KEY))
+
+    def held(self, client: TestClient) -> dict[str, Any]:
+        """Start a scan that captures until `gate` is set."""
+        self.began.clear()
+        self.gate.clear()
+        scan: dict[str, Any] = client.post("/scan").json()
+        assert self.began.wait(WAIT_S)
+        return scan
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> ServedBench:
+    return ServedBench(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def session(served: ServedBench) -> Iterator[TestClient]:
+    headers = {"Authorization": f"Bearer {KEY}"}
+    with TestClient(served.app, base_url="http://127.0.0.1", headers=headers, raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture
+def client(session: TestClient, served: ServedBench) -> Iterator[TestClient]:
+    served.order = "finish"
+    served.gate.set()
+    yield session
+    served.gate.set()
+    for scan in session.get("/scan").json()["scans"]:
+        session.post(f"/scan/{scan['id']}/cancel")
+        ended(session, scan["id"])
+        session.delete(f"/scan/{scan['id']}")
+
+
+def ended(client: TestClient, scan_id: str) -> dict[str, Any]:
+    """The scan once its event stream has closed."""
+    client.get(f"/scan/{scan_id}/events")
+    scan: dict[str, Any] = client.get(f"/scan/{scan_id}").json()
+    return scan

@@ -1,0 +1,198 @@
+"""Every refusal is a problem that says what to do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from slrig.api.app import bare_app
+from slrig.api.openapi import text
+from slrig.api.problems import STATUS, explanations, slug
+from slrig.api.security import claim_key, digest
+from slrig.scan.faults import error_classes
+from tests.unit.api.conftest import KEY, ServedBench
+
+OPENAPI = Path(__file__).resolve().parents[3] / "config" / "openapi.json"
+
+
+def test_table_of_statuses_is_the_whole_error_tree() -> None:
+    tree = {error for name, error in error_classes().items() if error.__module__.startswith("slrig.")}
+    assert set(STATUS) == tree
+
+
+def test_every_error_class_says_when_to_raise_it() -> None:
+    for name, error in error_classes().items():
+        assert error.__doc__, name
+
+
+def test_openapi_document_in_config_is_up_to_date() -> None:
+    assert OPENAPI.read_text(encoding="utf-8") == text(bare_app()), (
+        "run: python -m slrig.api.openapi > config/openapi.json"
+    )
+
+
+def test_every_refusal_is_documented_as_a_problem() -> None:
+    document = json.loads(OPENAPI.read_text(encoding="utf-8"))
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            for status, found in operation["responses"].items():
+                if int(status) >= 400:
+                    assert list(found["content"]) == ["application/problem+json"], (path, method, status)
+            if path not in {"/livez", "/readyz"}:
+                assert "401" in operation["responses"], (path, method)
+
+
+@pytest.mark.parametrize(
+    ("request_body", "fields"),
+    [
+        ({"exposure_s": -1}, ["exposure_s"]),
+        ({"exposure_s": 1e9}, ["exposure_s"]),
+        ({"exposure_s": "0.1"}, ["exposure_s"]),
+        ({"patterns": {"line_shift_period_px": 3}}, ["patterns.line_shift_period_px"]),
+        ({"patterns": {"line_shift_period_px": 8.5}}, ["patterns.line_shift_period_px"]),
+        ({"patterns": {"rows": 1}}, ["patterns.rows"]),
+        ({"patterns": {"gray_cells": 4}}, ["patterns.gray_cells"]),
+        ({"reconstruction": {"max_code_gap": 0}}, ["reconstruction.max_code_gap"]),
+        ({"if_busy": "wait"}, ["if_busy"]),
+        ({"label": ""}, ["label"]),
+        ({"label": "x" * 201}, ["label"]),
+        ({"exposure_s": 0, "if_busy": 1, "colour": "red"}, ["exposure_s", "if_busy", "colour"]),
+        ([], ["body"]),
+    ],
+)
+def test_absurd_request_is_refused_with_every_fault_named(
+    client: TestClient, request_body: Any, fields: list[str]
+) -> None:
+    response = client.post("/scan", json=request_body)
+    assert response.status_code == 422
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert problem["type"] == "/problems/invalid-request"
+    assert [fault["field"] for fault in problem["errors"]] == fields
+    assert all(fault["message"] for fault in problem["errors"])
+    assert client.get("/scan").json()["scans"] == []
+
+
+def test_numbers_beyond_json_are_refused(client: TestClient) -> None:
+    headers = {"Content-Type": "application/json"}
+    for number in ("NaN", "Infinity", "1e999"):
+        response = client.post("/scan", content=f'{{"exposure_s": {number}}}', headers=headers)
+        assert response.status_code == 422, number
+        assert response.json()["errors"][0]["field"] == "exposure_s"
+
+
+@pytest.mark.parametrize(("content", "kind"), [('{"label": "a"}', "text/plain"), ("{", "application/json")])
+def test_body_that_is_no_json_is_refused(client: TestClient, content: str, kind: str) -> None:
+    response = client.post("/scan", content=content, headers={"Content-Type": kind})
+    assert (response.status_code, response.headers["content-type"]) == (422, "application/problem+json")
+
+
+def test_pattern_that_the_projector_cannot_show_is_refused(client: TestClient) -> None:
+    client.get(f"{client.post('/scan').json()['links']['events']}")
+    response = client.post("/scan", json={"patterns": {"gray_cell_px": 64}})
+    assert (response.status_code, response.json()["type"]) == (422, "/problems/pattern")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status", "kind"),
+    [
+        ("GET", "/nothing", 404, "not-found"),
+        ("PUT", "/scan", 405, "method-not-allowed"),
+        ("GET", "/scan/not-an-id", 422, "invalid-request"),
+        ("GET", "/scan?cursor=x", 422, "invalid-request"),
+        ("GET", "/scan?limit=0", 422, "invalid-request"),
+        ("GET", "/problems/none-such", 404, "not-found"),
+        ("GET", "/docs", 404, "not-found"),
+    ],
+)
+def test_refusals_of_http_itself_are_problems(
+    client: TestClient, method: str, path: str, status: int, kind: str
+) -> None:
+    response = client.request(method, path)
+    assert (response.status_code, response.headers["content-type"]) == (status, "application/problem+json")
+    assert response.json()["type"] == f"/problems/{kind}"
+    assert response.json()["status"] == status
+    assert response.json()["detail"]
+
+
+def test_body_beyond_the_limit_is_refused_however_it_is_sent(client: TestClient) -> None:
+    for content in (b" " * 5000, iter([b" " * 3000, b" " * 3000])):
+        response = client.post("/scan", content=content, headers={"Content-Type": "application/json"})
+        assert (response.status_code, response.headers["content-type"]) == (413, "application/problem+json")
+        assert response.json()["type"] == "/problems/content-too-large"
+
+
+def test_foreign_host_name_is_refused(client: TestClient) -> None:
+    for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example"):
+        response = client.get("/livez", headers={"Host": host})
+        assert (response.status_code, response.headers["content-type"]) == (400, "application/problem+json"), host
+        assert "--allow-host" in response.json()["detail"]
+    for host in ("localhost", "localhost:8731", "127.0.0.1:1", "[::1]:8731"):
+        assert client.get("/livez", headers={"Host": host}).status_code == 200, host
+
+
+def test_key_is_needed_for_all_but_the_probes(client: TestClient, served: ServedBench) -> None:
+    stranger = TestClient(served.app, base_url="http://127.0.0.1")
+    for path in ("/scan", "/rig", "/device", "/openapi.json", "/nothing", "/problems/rig-busy"):
+        response = stranger.get(path)
+        assert (response.status_code, response.headers["content-type"]) == (401, "application/problem+json"), path
+        assert response.headers["WWW-Authenticate"] == "Bearer"
+    assert stranger.post("/scan").status_code == 401
+    for path in ("/livez", "/readyz"):
+        assert stranger.get(path).status_code in {200, 503}
+    for headers in (
+        {"Authorization": "Bearer wrong"},
+        {"Authorization": f"Basic {KEY}"},
+        {"Authorization": "Bearer "},
+        {"X-API-Key": ""},
+        {"X-API-Key": f"{KEY} "[:-2]},
+    ):
+        assert stranger.get("/scan", headers=headers).status_code == 401, headers
+    assert stranger.get("/scan", headers={"X-API-Key": KEY}).status_code == 200
+    assert client.get("/scan").status_code == 200
+
+
+def test_no_foreign_page_may_read_the_answers(client: TestClient) -> None:
+    response = client.get("/scan", headers={"Origin": "https://evil.example"})
+    assert "access-control-allow-origin" not in response.headers
+
+
+def test_every_kind_of_problem_is_explained(client: TestClient) -> None:
+    for name in error_classes():
+        found = client.get(f"/problems/{slug(name)}").json()
+        assert found["description"], name
+    assert {"invalid-request", "unauthorized", "not-found", "content-too-large"} <= set(explanations())
+
+
+def test_unexpected_error_tells_no_secrets(
+    client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(**_: object) -> None:
+        message = "secret"
+        raise RuntimeError(message)
+
+    monkeypatch.setattr(type(served.service.store), "page", broken)
+    response = client.get("/scan")
+    monkeypatch.undo()
+    assert (response.status_code, response.headers["content-type"]) == (500, "application/problem+json")
+    assert response.json()["type"] == "/problems/unexpected"
+    assert "secret" not in response.text
+
+
+def test_key_is_made_once_shown_once_and_kept_as_a_digest(tmp_path: Path) -> None:
+    path = tmp_path / "key.sha256"
+    kept, shown = claim_key(path, given=None, fresh=False)
+    assert shown is not None
+    assert kept == digest(shown)
+    assert shown not in path.read_text()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert claim_key(path, given=None, fresh=False) == (kept, None)
+    other, shown_again = claim_key(path, given=None, fresh=True)
+    assert shown_again is not None
+    assert other != kept
+    assert claim_key(path, given="mine", fresh=False) == (digest("mine"), None)
+    assert path.read_text().strip() == other

@@ -1,0 +1,273 @@
+"""POST /scan and all that follows from it."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from fastapi.testclient import TestClient
+
+from slrig.api.scans import fingerprint
+from slrig.api.schemas import ScanRequest
+from tests.unit.api.conftest import ServedBench, ended
+
+
+def events_of(text: str) -> list[dict[str, Any]]:
+    """The events of a stream: id, kind and data."""
+    found = []
+    for block in text.split("\n\n"):
+        lines = dict(line.split(": ", 1) for line in block.splitlines() if line and not line.startswith(":"))
+        if lines:
+            found.append({"id": int(lines["id"]), "kind": lines["event"], **json.loads(lines["data"])})
+    return found
+
+
+def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
+    accepted = client.post("/scan", json={"label": "cup", "patterns": {"line_width_px": 2}})
+    assert accepted.status_code == 202
+    scan = accepted.json()
+    assert accepted.headers["Location"] == scan["links"]["self"] == f"/scan/{scan['id']}"
+    assert (scan["state"], scan["label"], scan["rig"]) == ("queued", "cup", "bench")
+
+    stream = client.get(scan["links"]["events"])
+    assert stream.headers["content-type"].startswith("text/event-stream")
+    events = events_of(stream.text)
+    assert [event["id"] for event in events] == list(range(1, len(events) + 1))
+    assert events[-1]["state"] == "succeeded"
+    assert {event["stage"] for event in events if event["kind"] == "progress"} >= {"capture", "decode"}
+
+    done = client.get(scan["links"]["self"]).json()
+    assert done["state"] == "succeeded"
+    assert done["error"] is None
+    assert done["summary"] == {"seconds": 1.5, "truth": {"rms_mm": 0.01}}
+    files = done["links"]["files"]
+    assert set(files) == {
+        "bundle.zip",
+        "mesh.glb",
+        "mesh.ply",
+        "mesh.stl",
+        "points.ply",
+        "preview.png",
+        "report.json",
+    }
+    for name, path in files.items():
+        assert client.get(path).status_code == 200, name
+    assert client.get(files["report.json"]).json()["truth"] == {"rms_mm": 0.01}
+
+
+def test_plan_is_request_over_rig_file_over_default(client: TestClient) -> None:
+    request = {"patterns": {"line_width_px": 2}, "reconstruction": {"keep_holes": True}}
+    plan = client.post("/scan", json=request).json()["plan"]
+    assert plan["patterns"]["line_width_px"] == 2
+    assert plan["patterns"]["line_shift_period_px"] == 6
+    assert plan["patterns"]["rows"] is False
+    assert plan["reconstruction"] == {"keep_holes": True, "depth_edge_ratio": 6.0, "max_code_gap": 1}
+    # The rig file's exposure belongs to its cameras, not to the plan.
+    assert plan["exposure_s"] is None
+
+
+def test_stream_resumes_after_the_event_that_was_seen(client: TestClient) -> None:
+    scan = client.post("/scan").json()
+    path = scan["links"]["events"]
+    everything = events_of(client.get(path).text)
+    rest = events_of(client.get(path, headers={"Last-Event-ID": "3"}).text)
+    assert rest == everything[3:]
+    over = client.get(path, headers={"Last-Event-ID": str(everything[-1]["id"])})
+    assert (over.status_code, over.content) == (204, b"")
+
+
+def test_busy_rig_names_its_holder(client: TestClient, served: ServedBench) -> None:
+    holder = served.held(client)
+    busy = client.post("/scan")
+    assert busy.status_code == 409
+    problem = busy.json()
+    assert problem["type"] == "/problems/rig-busy"
+    assert problem["holder"] == holder["id"]
+    assert problem["since"].startswith("20")
+    assert busy.headers["Retry-After"] == "5"
+    assert client.get("/rig").json()["holder"] == holder["id"]
+
+
+def test_queue_takes_what_it_may_and_no_more(client: TestClient, served: ServedBench) -> None:
+    served.held(client)
+    queued = client.post("/scan", json={"if_busy": "queue"})
+    assert queued.status_code == 202
+    full = client.post("/scan", json={"if_busy": "queue"})
+    assert (full.status_code, full.json()["type"]) == (429, "/problems/queue-full")
+    assert full.headers["Retry-After"] == "30"
+    served.gate.set()
+    assert ended(client, queued.json()["id"])["state"] == "succeeded"
+
+
+def test_cancel_may_be_repeated(client: TestClient, served: ServedBench) -> None:
+    scan = served.held(client)
+    assert client.post(scan["links"]["cancel"]).status_code == 202
+    assert ended(client, scan["id"])["state"] == "cancelled"
+    again = client.post(scan["links"]["cancel"])
+    assert (again.status_code, again.json()["state"]) == (202, "cancelled")
+
+
+def test_delete_waits_for_the_end_and_is_final(client: TestClient, served: ServedBench) -> None:
+    scan = served.held(client)
+    refused = client.delete(scan["links"]["self"])
+    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/scan-state")
+    served.gate.set()
+    ended(client, scan["id"])
+    assert client.delete(scan["links"]["self"]).status_code == 204
+    assert client.get(scan["links"]["self"]).status_code == 404
+    assert client.delete(scan["links"]["self"]).status_code == 404
+
+
+def test_repeated_request_gets_the_same_scan_and_the_same_answer(client: TestClient) -> None:
+    headers = {"Idempotency-Key": "night-run"}
+    first = client.post("/scan", json={"label": "a"}, headers=headers)
+    ended(client, first.json()["id"])
+    second = client.post("/scan", json={"label": "a"}, headers=headers)
+    assert (second.status_code, second.headers["Location"]) == (202, first.headers["Location"])
+    assert second.json() == first.json()
+    other = client.post("/scan", json={"label": "b"}, headers=headers)
+    assert (other.status_code, other.json()["type"]) == (422, "/problems/idempotency")
+    assert len(client.get("/scan").json()["scans"]) == 1
+
+
+def test_refused_request_leaves_its_key_free(client: TestClient, served: ServedBench) -> None:
+    holder = served.held(client)
+    headers = {"Idempotency-Key": "try-again"}
+    assert client.post("/scan", headers=headers).status_code == 409
+    served.gate.set()
+    ended(client, holder["id"])
+    assert client.post("/scan", headers=headers).status_code == 202
+
+
+def test_key_in_flight_is_refused_for_a_moment(client: TestClient, served: ServedBench) -> None:
+    served.service.store.reserve_key("slow", fingerprint(ScanRequest()))
+    refused = client.post("/scan", headers={"Idempotency-Key": "slow"})
+    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/key-in-flight")
+    assert refused.headers["Retry-After"] == "1"
+    served.service.store.release_keys()
+    assert client.post("/scan", headers={"Idempotency-Key": "slow"}).status_code == 202
+
+
+def test_list_is_paged_from_new_to_old(client: TestClient) -> None:
+    made = []
+    for _ in range(3):
+        made.append(client.post("/scan").json()["id"])
+        ended(client, made[-1])
+    first = client.get("/scan", params={"limit": 2})
+    page = first.json()
+    assert [scan["id"] for scan in page["scans"]] == [made[2], made[1]]
+    assert first.headers["Link"] == f'<{page["next"]}>; rel="next"'
+    last = client.get(page["next"])
+    assert [scan["id"] for scan in last.json()["scans"]] == [made[0]]
+    assert last.json()["next"] is None
+    assert "Link" not in last.headers
+
+
+def test_file_is_not_ready_until_it_is(client: TestClient, served: ServedBench) -> None:
+    scan = served.held(client)
+    early = client.get(f"/scan/{scan['id']}/mesh.ply")
+    assert (early.status_code, early.json()["type"]) == (409, "/problems/artefact-not-ready")
+    assert "capturing" in early.json()["detail"]
+    assert client.get(f"/scan/{scan['id']}/bundle.zip").status_code == 409
+
+
+def test_failed_scan_tells_why_and_gives_its_bundle(client: TestClient, served: ServedBench) -> None:
+    served.order = "fail"
+    scan = ended(client, client.post("/scan").json()["id"])
+    assert scan["state"] == "failed"
+    assert scan["error"]["type"] == "/problems/nothing-to-reconstruct"
+    assert scan["error"]["detail"] == "No stripe was found in any frame."
+    assert list(scan["links"]["files"]) == ["bundle.zip"]
+    never = client.get(f"/scan/{scan['id']}/mesh.ply")
+    assert never.status_code == 409
+    assert "No stripe was found" in never.json()["detail"]
+    last = events_of(client.get(scan["links"]["events"]).text)[-1]
+    assert last["error"] == scan["error"]
+
+
+def test_bundle_comes_as_a_zip_that_is_the_same_twice(client: TestClient, served: ServedBench) -> None:
+    scan = ended(client, client.post("/scan").json()["id"])
+    first = client.get(scan["links"]["files"]["bundle.zip"])
+    assert first.headers["content-type"] == "application/zip"
+    assert first.headers["content-disposition"] == f'attachment; filename="{scan["id"]}.zip"'
+    assert client.get(scan["links"]["files"]["bundle.zip"]).content == first.content
+    with zipfile.ZipFile(io.BytesIO(first.content)) as archive:
+        assert archive.testzip() is None
+        assert archive.namelist() == ["bundle.json", "frames/000.png", "order"]
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+        stored = served.service.folder.scans / scan["id"] / "bundle" / "frames" / "000.png"
+        assert archive.read("frames/000.png") == stored.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "bundle.zip"])
+def test_known_file_is_not_sent_again(client: TestClient, name: str) -> None:
+    scan = ended(client, client.post("/scan").json()["id"])
+    path = scan["links"]["files"][name]
+    tag = client.get(path).headers["ETag"]
+    for known in (tag, f'"other", W/{tag}', "*"):
+        again = client.get(path, headers={"If-None-Match": known})
+        assert (again.status_code, again.content, again.headers["ETag"]) == (304, b"", tag)
+    assert client.get(path, headers={"If-None-Match": '"other"'}).status_code == 200
+
+
+def test_part_of_a_file_may_be_asked_for(client: TestClient) -> None:
+    scan = ended(client, client.post("/scan").json()["id"])
+    path = scan["links"]["files"]["mesh.ply"]
+    whole = client.get(path).content
+    part = client.get(path, headers={"Range": "bytes=3-5"})
+    assert (part.status_code, part.content) == (206, whole[3:6])
+    beyond = client.get(path, headers={"Range": "bytes=99999-"})
+    assert (beyond.status_code, beyond.headers["content-type"]) == (416, "application/problem+json")
+    assert beyond.headers["content-range"] == f"bytes */{len(whole)}"
+
+
+def test_picture_of_refused_pixels_goes_by_camera(client: TestClient, served: ServedBench) -> None:
+    scan = ended(client, client.post("/scan").json()["id"])
+    (served.service.folder.scans / scan["id"] / "rejected-left.png").write_bytes(b"png")
+    assert client.get(f"/scan/{scan['id']}/rejected-left.png").content == b"png"
+    assert client.get(f"/scan/{scan['id']}/rejected-right.png").status_code == 409
+    assert client.get(f"/scan/{scan['id']}/rejected-..%2Fmesh.png").status_code in {404, 422}
+
+
+def test_unknown_scan_is_not_found_anywhere(client: TestClient) -> None:
+    unknown = uuid4()
+    for path in ("", "/events", "/mesh.ply", "/bundle.zip"):
+        response = client.get(f"/scan/{unknown}{path}")
+        assert (response.status_code, response.json()["type"]) == (404, "/problems/scan-not-found"), path
+    assert client.post(f"/scan/{unknown}/cancel").status_code == 404
+
+
+def test_disk_without_room_is_told_before_the_scan(client: TestClient, served: ServedBench) -> None:
+    ended(client, client.post("/scan").json()["id"])
+    served.free_bytes = 10
+    refused = client.post("/scan")
+    ready = client.get("/readyz")
+    served.free_bytes = 10**12
+    assert (refused.status_code, refused.json()["type"]) == (507, "/problems/storage")
+    assert (ready.status_code, ready.json()["type"]) == (503, "/problems/not-ready")
+    assert ready.json()["checks"]["rig"] == "ok"
+    assert "are free" in ready.json()["checks"]["disk"]
+
+
+def test_rig_says_what_it_is(client: TestClient) -> None:
+    ended(client, client.post("/scan").json()["id"])
+    rig = client.get("/rig").json()
+    assert (rig["name"], rig["open"], rig["error"], rig["holder"]) == ("bench", True, None, None)
+    assert rig["cameras"][0]["size_px"] == [64, 48]
+    assert rig["projector"]["size_px"] == [64, 40]
+    assert rig["scan_defaults"] == {"line_shift_period_px": 6, "exposure_s": 0.5}
+
+
+def test_drivers_and_devices_are_listed(client: TestClient) -> None:
+    found = client.get("/device").json()
+    assert ("head", "simulated", None) in [(each["kind"], each["name"], each["fault"]) for each in found["drivers"]]
+
+
+def test_probes_are_well(client: TestClient) -> None:
+    ended(client, client.post("/scan").json()["id"])
+    assert client.get("/livez").json() == {"checks": {"process": "ok"}}
+    assert client.get("/readyz").json() == {"checks": {"records": "ok", "disk": "ok", "rig": "ok"}}

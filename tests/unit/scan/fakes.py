@@ -1,0 +1,144 @@
+"""A rig of two tame devices, a capture that a test steers, and a clock that a test sets."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
+from slrig.errors import ScanCancelledError
+from slrig.model import CameraFormat, Frame, PatternSequence, Size
+from slrig.scan.plan import ScanPlan
+
+WAIT_S = 20.0
+"""How long a test waits for an event that must come; a pass never waits for it to run out."""
+
+
+class SetClock:
+    """A clock that stands still until it is moved."""
+
+    def __init__(self) -> None:
+        self.now = datetime(2026, 11, 21, 12, 0, tzinfo=UTC)
+
+    def __call__(self) -> datetime:
+        return self.now
+
+    def move(self, **by: float) -> None:
+        """Move the clock on by a timedelta's arguments."""
+        self.now += timedelta(**by)
+
+
+class TameCamera:
+    """A camera that is never exposed: the fake capture reads none."""
+
+    def __init__(self) -> None:
+        self.closed = False
+        self.info = CameraInfo(
+            name="cam0",
+            model="tame",
+            serial="1",
+            format=CameraFormat(Size(64, 48), 8),
+            triggers=frozenset({Trigger.SOFTWARE}),
+            exposure_range_s=(0.001, 1.0),
+            gain_range=(1.0, 1.0),
+        )
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        return AppliedSettings(settings.exposure_s, settings.gain)
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        raise AssertionError((count, trigger))
+
+    def trigger(self) -> None:
+        raise AssertionError
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        raise AssertionError((after_ns, timeout_s))
+
+    def disarm(self) -> None:
+        raise AssertionError
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class TameProjector:
+    """A projector that remembers whether it is dark."""
+
+    def __init__(self) -> None:
+        self.dark = True
+        self.closed = False
+        self.info = ProjectorInfo("projector", "tame", "2", Size(64, 40), plays=False, latency_s=0.0)
+
+    def load(self, sequence: PatternSequence) -> None:
+        raise AssertionError(sequence)
+
+    def show(self, index: int) -> Shown:
+        self.dark = False
+        return Shown(index, 0, 0)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        raise AssertionError((exposure_s, period_s))
+
+    def stop(self) -> None:
+        self.dark = True
+
+    def blank(self) -> None:
+        self.dark = True
+
+    def close(self) -> None:
+        self.dark = self.closed = True
+
+
+class TameBench:
+    """Opens rigs, and captures with them as told.
+
+    `order` is what the fake reconstruction will read; `error` is raised in place of the next capture. While `gate`
+    is clear a capture holds the rig, with its light on; `began` is set when one does.
+    """
+
+    def __init__(self) -> None:
+        self.order = "finish"
+        self.error: Exception | None = None
+        self.open_error: Exception | None = None
+        self.began = threading.Event()
+        self.gate = threading.Event()
+        self.gate.set()
+        self.opened: list[tuple[TameCamera, TameProjector]] = []
+
+    def open_rig(self) -> Rig:
+        if self.open_error is not None:
+            raise self.open_error
+        camera, projector = TameCamera(), TameProjector()
+        self.opened.append((camera, projector))
+        return Rig("bench", {"cam0": camera}, projector, {"cam0": CameraSettings(0.01)})
+
+    def capture(
+        self,
+        rig: Rig,
+        plan: ScanPlan,
+        folder: Path,
+        /,
+        *,
+        progress: Callable[[str, float, str], None],
+        cancelled: Callable[[], bool],
+    ) -> None:
+        rig.projector.show(0)
+        progress("capture", 0.0, "frame 1 of 2")
+        self.began.set()
+        while not self.gate.wait(0.01):
+            if cancelled():
+                message = "The scan was cancelled."
+                raise ScanCancelledError(message)
+        if self.error is not None:
+            error, self.error = self.error, None
+            raise error
+        folder.mkdir()
+        (folder / "order").write_text(self.order)
+        (folder / "bundle.json").write_text(json.dumps({"exposure_s": plan.exposure_s}))
+        (folder / "frames").mkdir()
+        (folder / "frames" / "000.png").write_bytes(bytes(100))
+        progress("capture", 1.0, "frame 2 of 2")

@@ -1,0 +1,282 @@
+"""One rig, one scan at a time, every scan ends in a final state, and the projector is dark afterwards."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+
+from slrig.errors import (
+    BundleError,
+    DeviceGoneError,
+    PatternError,
+    QueueFullError,
+    RigBusyError,
+    ScanStateError,
+    StorageError,
+    UnsupportedByDeviceError,
+)
+from slrig.scan.faults import ScanInterruptedError
+from slrig.scan.folder import DataFolder
+from slrig.scan.holding import HeldRig
+from slrig.scan.plan import PatternPlan, ScanPlan
+from slrig.scan.records import ScanRecord, ScanState
+from slrig.scan.runner import Runner
+from slrig.scan.store import ScanStore
+from slrig.scan.worker import ReconstructionWorker
+from tests.unit.scan.fakes import WAIT_S, TameBench
+
+TASK = "tests.unit.scan.fake_pipeline:reconstruct_bundle"
+
+
+class Bench(TameBench):
+    """A runner over a tame bench."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        super().__init__()
+        self.free_bytes = 10**9
+        self.folder = DataFolder(tmp_path / "data", free=lambda _: self.free_bytes)
+        self.store = ScanStore(self.folder.database)
+        self.worker = ReconstructionWorker(TASK)
+        self.runner = Runner(
+            self.store,
+            self.folder,
+            HeldRig("bench", self.open_rig),
+            self.worker,
+            capture=self.capture,
+            queue_length=1,
+        )
+
+    def scan(self, *, wait: bool = False) -> ScanRecord:
+        return self.runner.submit(ScanPlan(), label=None, wait=wait)
+
+    def held(self) -> ScanRecord:
+        """A scan that has begun to capture and goes on until `gate` is set."""
+        self.began.clear()
+        self.gate.clear()
+        scan = self.scan()
+        assert self.began.wait(WAIT_S)
+        return scan
+
+    def until(self, scan_id: UUID, state: ScanState | None = None) -> ScanRecord:
+        """The scan once it has reached `state`, or any final state."""
+        reached = threading.Event()
+        states = {state} if state is not None else {state for state in ScanState if state.final}
+
+        def look() -> None:
+            if self.store.get(scan_id).state in states:
+                reached.set()
+
+        unwatch = self.store.watch(scan_id, look)
+        look()
+        assert reached.wait(WAIT_S)
+        unwatch()
+        return self.store.get(scan_id)
+
+    def close(self) -> None:
+        self.gate.set()
+        self.runner.close()
+        self.store.close()
+        self.folder.release()
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    bench = Bench(tmp_path)
+    bench.runner.start()
+    yield bench
+    bench.close()
+
+
+def fault_kind(record: ScanRecord) -> str | None:
+    return None if record.fault is None else record.fault.kind
+
+
+def test_scan_walks_to_its_mesh(bench: Bench) -> None:
+    record = bench.until(bench.scan().id)
+    assert record.state is ScanState.SUCCEEDED
+    assert record.progress.fraction == 1.0
+    assert record.summary == {"seconds": 1.5, "truth": {"rms_mm": 0.01}}
+    files = {path.name for path in bench.folder.scan(record.id).iterdir()}
+    assert files >= {"bundle", "mesh.ply", "report.json", "preview.png"}
+    assert list(bench.folder.incoming.iterdir()) == []
+    events = bench.store.events(record.id, after=0)
+    assert [event.data["state"] for event in events if event.kind == "state"] == [
+        "queued",
+        "capturing",
+        "reconstructing",
+        "succeeded",
+    ]
+    fractions = [event.data["fraction"] for event in events if event.kind == "progress"]
+    assert fractions == sorted(fractions)
+    assert bench.opened[0][1].dark
+
+
+def test_held_rig_is_refused_by_the_name_of_its_holder(bench: Bench) -> None:
+    holder = bench.held()
+    with pytest.raises(RigBusyError) as busy:
+        bench.scan()
+    assert busy.value.holder == str(holder.id)
+    started = bench.store.get(holder.id).started_at
+    assert started is not None
+    assert busy.value.since == started.isoformat(timespec="seconds")
+    assert bench.runner.status().holder == holder.id
+    bench.gate.set()
+    bench.until(holder.id)
+    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+
+
+def test_queue_is_short_and_served_in_order(bench: Bench) -> None:
+    first = bench.held()
+    second = bench.scan(wait=True)
+    with pytest.raises(QueueFullError):
+        bench.scan(wait=True)
+    assert bench.store.get(second.id).state is ScanState.QUEUED
+    bench.gate.set()
+    later = bench.until(second.id)
+    earlier = bench.store.get(first.id)
+    assert later.state is earlier.state is ScanState.SUCCEEDED
+    assert earlier.finished_at is not None
+    assert later.started_at is not None
+    assert earlier.finished_at <= later.started_at
+
+
+def test_cancel_stops_a_capture_and_darkens_the_projector(bench: Bench) -> None:
+    scan = bench.held()
+    bench.runner.cancel(scan.id)
+    assert bench.until(scan.id).state is ScanState.CANCELLED
+    assert bench.opened[0][1].dark
+    assert not bench.opened[0][1].closed
+    assert list(bench.folder.incoming.iterdir()) == []
+    assert bench.runner.cancel(scan.id).state is ScanState.CANCELLED
+
+
+def test_cancel_takes_a_waiting_scan_out_of_the_line(bench: Bench) -> None:
+    first = bench.held()
+    second = bench.scan(wait=True)
+    assert bench.runner.cancel(second.id).state is ScanState.CANCELLED
+    bench.gate.set()
+    assert bench.until(first.id).state is ScanState.SUCCEEDED
+
+
+def test_cancel_reaches_the_reconstruction(bench: Bench) -> None:
+    bench.order = "hang"
+    scan = bench.scan()
+    bench.until(scan.id, ScanState.RECONSTRUCTING)
+    bench.runner.cancel(scan.id)
+    assert bench.until(scan.id).state is ScanState.CANCELLED
+    assert not bench.folder.scan(scan.id).exists()
+
+
+def test_failed_reconstruction_keeps_the_bundle_for_a_second_look(bench: Bench) -> None:
+    bench.order = "fail"
+    record = bench.until(bench.scan().id)
+    assert (record.state, fault_kind(record)) == (ScanState.FAILED, "NothingToReconstructError")
+    assert [path.name for path in bench.folder.scan(record.id).iterdir()] == ["bundle"]
+
+
+def test_lost_worker_fails_its_scan_and_no_other(bench: Bench) -> None:
+    bench.order = "die"
+    record = bench.until(bench.scan().id)
+    assert (record.state, fault_kind(record)) == (ScanState.FAILED, "WorkerLostError")
+    bench.order = "finish"
+    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+
+
+def test_defect_is_told_without_its_traceback(bench: Bench) -> None:
+    bench.order = "break"
+    record = bench.until(bench.scan().id)
+    assert record.fault is not None
+    assert record.fault.kind == "UnexpectedError"
+    assert "Traceback" not in record.fault.message
+
+
+def test_vanished_device_is_opened_again_for_the_next_scan(bench: Bench) -> None:
+    bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
+    record = bench.until(bench.scan().id)
+    assert (record.state, fault_kind(record)) == (ScanState.FAILED, "DeviceGoneError")
+    assert bench.opened[0][1].closed
+    assert bench.runner.status().fault == "Camera 'cam0' was unplugged."
+    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert len(bench.opened) == 2
+    assert bench.runner.status().fault is None
+
+
+def test_fault_in_the_frames_leaves_the_rig_open(bench: Bench) -> None:
+    bench.error = BundleError("Frame 3 equals frame 2.")
+    bench.until(bench.scan().id)
+    bench.until(bench.scan().id)
+    assert len(bench.opened) == 1
+
+
+def test_rig_that_cannot_be_opened_fails_the_scan_with_its_cause(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.open_error = DeviceGoneError("No camera on usb-3.")
+    bench.runner.start()
+    record = bench.until(bench.scan().id)
+    assert fault_kind(record) == "DeviceGoneError"
+    bench.open_error = None
+    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    bench.close()
+
+
+def test_plan_is_held_against_the_open_rig(bench: Bench) -> None:
+    bench.until(bench.scan().id)
+    with pytest.raises(PatternError):
+        bench.runner.submit(ScanPlan(patterns=PatternPlan(gray_cell_px=7)), label=None, wait=False)
+    with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s: 5 s .*'cam0' can do 0\.001 s to 1 s"):
+        bench.runner.submit(ScanPlan(exposure_s=5.0), label=None, wait=False)
+
+
+def test_small_disk_is_noticed_before_the_scan(bench: Bench) -> None:
+    bench.until(bench.scan().id)
+    bench.free_bytes = 1000
+    with pytest.raises(StorageError, match="are free"):
+        bench.scan()
+    assert len(bench.store.page(before=None, limit=10)) == 1
+
+
+def test_full_disk_in_the_middle_is_a_storage_error(bench: Bench) -> None:
+    bench.error = OSError(errno.ENOSPC, "No space left on device")
+    record = bench.until(bench.scan().id)
+    assert fault_kind(record) == "StorageError"
+    assert list(bench.folder.incoming.iterdir()) == []
+
+
+def test_delete_removes_record_and_files_once_a_scan_is_over(bench: Bench) -> None:
+    scan = bench.held()
+    with pytest.raises(ScanStateError, match="capturing"):
+        bench.runner.delete(scan.id)
+    bench.gate.set()
+    bench.until(scan.id)
+    bench.runner.delete(scan.id)
+    assert not bench.folder.scan(scan.id).exists()
+    assert list(bench.folder.incoming.iterdir()) == []
+    assert bench.store.page(before=None, limit=10) == []
+
+
+def test_closing_interrupts_what_runs_and_what_waits(bench: Bench) -> None:
+    active = bench.held()
+    waiting = bench.scan(wait=True)
+    bench.runner.close()
+    for scan in (active, waiting):
+        record = bench.store.get(scan.id)
+        assert (record.state, fault_kind(record)) == (ScanState.INTERRUPTED, "ScanInterruptedError")
+    _, projector = bench.opened[0]
+    assert projector.dark
+    assert projector.closed
+    with pytest.raises(ScanInterruptedError):
+        bench.scan()
+
+
+def test_closing_ends_a_reconstruction_and_keeps_its_bundle(bench: Bench) -> None:
+    bench.order = "hang-deaf"
+    scan = bench.scan()
+    bench.until(scan.id, ScanState.RECONSTRUCTING)
+    bench.runner.close()
+    assert bench.store.get(scan.id).state is ScanState.INTERRUPTED
+    assert (bench.folder.scan(scan.id) / "bundle" / "bundle.json").is_file()

@@ -1,0 +1,313 @@
+"""The command line: its exit codes, what it says, and how its client bears a bad connection."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from typer.testing import CliRunner
+
+from slrig.cli import client as client_module
+from slrig.cli.client import ServiceClient, read_key
+from slrig.cli.commands import INTERRUPTED, app
+from slrig.cli.display import ProgressDisplay
+from slrig.cli.scan import quality_lines, scan_with
+from slrig.errors import ConfigError, ScanCancelledError, ServiceError
+
+SCAN = {
+    "id": "5f",
+    "state": "succeeded",
+    "summary": {
+        "mesh": {"figures": {"vertices": 1200, "triangles": 2301}, "sigma_mm": {"p50": 0.0079}},
+        "truth": {"rms_mm": 0.0123, "complete_0.3mm": 0.97},
+    },
+    "error": None,
+    "links": {
+        "self": "/scan/5f",
+        "events": "/scan/5f/events",
+        "cancel": "/scan/5f/cancel",
+        "files": {"mesh.ply": "/scan/5f/mesh.ply"},
+    },
+}
+Handler = Callable[[httpx2.Request], httpx2.Response]
+
+
+def client_of(handler: Handler, pauses: list[float] | None = None) -> ServiceClient:
+    pause = (lambda _s: None) if pauses is None else pauses.append
+    return ServiceClient("http://127.0.0.1:1", "key", pause=pause, transport=httpx2.MockTransport(handler))
+
+
+def stream(*events: dict[str, Any]) -> bytes:
+    """Server-sent events as they travel."""
+    blocks = []
+    for event in events:
+        data = {name: value for name, value in event.items() if name not in {"id", "kind"}}
+        blocks.append(f"id: {event['id']}\nevent: {event['kind']}\ndata: {json.dumps(data)}\n\n")
+    return "".join(blocks).encode()
+
+
+def event_answer(content: bytes | Iterator[bytes]) -> httpx2.Response:
+    return httpx2.Response(200, headers={"Content-Type": "text/event-stream"}, content=content)
+
+
+def ignore(_stage: str, _fraction: float, _detail: str) -> None:
+    return
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, slrig.cli\n"
+        "heavy = {'numba', 'numpy', 'cv2', 'fastapi', 'sqlalchemy', 'scipy', 'trimesh', 'pydantic', 'httpx2'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
+    assert found.stdout.strip() == "[]"
+
+
+def test_error_of_ours_is_one_screen_and_exit_code_2(tmp_path: Path) -> None:
+    for arguments in (
+        ["serve", str(tmp_path / "absent.toml")],
+        ["reconstruct", str(tmp_path / "absent"), "--output", str(tmp_path / "out")],
+        ["scan", "--url", "http://127.0.0.1:9", "--output", str(tmp_path / "out")],
+        ["scan", "--url", "http://127.0.0.1:9", "--key-file", str(tmp_path / "absent.key")],
+        ["demo", str(tmp_path / "absent.toml"), "--output", str(tmp_path / "out")],
+    ):
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 2, arguments
+        assert result.stderr.count("error: ") == 1, arguments
+        assert "Traceback" not in result.stderr, arguments
+        assert len(result.stderr.splitlines()) < 20, arguments
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_option_is_exit_code_2() -> None:
+    assert CliRunner().invoke(app, ["scan", "--colour", "red"]).exit_code == 2
+
+
+def test_interruption_is_exit_code_130(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(**_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("slrig.cli.devices.list_devices", interrupted)
+    assert CliRunner().invoke(app, ["devices"]).exit_code == INTERRUPTED
+
+
+def test_devices_lists_the_rendered_rig_for_people_and_programs() -> None:
+    shown = CliRunner().invoke(app, ["devices"])
+    assert shown.exit_code == 0
+    assert "simulated" in shown.stdout
+    document = json.loads(CliRunner().invoke(app, ["devices", "--json"]).stdout)
+    assert ("head", "simulated", None) in [
+        (driver["kind"], driver["name"], driver["fault"]) for driver in document["drivers"]
+    ]
+
+
+def test_key_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SLRIG_API_KEY", "from the environment")
+    assert read_key(None) == "from the environment"
+    (tmp_path / "key").write_text("from a file\n")
+    assert read_key(tmp_path / "key") == "from a file"
+    monkeypatch.delenv("SLRIG_API_KEY")
+    assert read_key(None) is None
+
+
+def test_request_carries_the_key_and_an_idempotency_key() -> None:
+    seen: list[httpx2.Request] = []
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        seen.append(request)
+        if len(seen) == 1:
+            message = "the connection broke"
+            raise httpx2.ReadError(message)
+        return httpx2.Response(202, json=SCAN)
+
+    with client_of(handler) as client:
+        assert client.start({"label": "cup"})["id"] == "5f"
+    assert [request.headers["Authorization"] for request in seen] == ["Bearer key"] * 2
+    first, second = (request.headers["Idempotency-Key"] for request in seen)
+    assert first == second
+    assert json.loads(seen[1].content) == {"label": "cup"}
+
+
+def test_broken_stream_goes_on_after_the_last_event_seen() -> None:
+    asked: list[str] = []
+    pauses: list[float] = []
+
+    def cut() -> Iterator[bytes]:
+        yield stream({"id": 1, "kind": "state", "state": "queued"}, {"id": 2, "kind": "progress", "fraction": 0.5})
+        message = "the connection broke"
+        raise httpx2.ReadError(message)
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        asked.append(request.headers["Last-Event-ID"])
+        if len(asked) == 1:
+            return event_answer(cut())
+        if len(asked) == 2:
+            return event_answer(stream({"id": 3, "kind": "state", "state": "succeeded"}))
+        return httpx2.Response(204)
+
+    with client_of(handler, pauses) as client:
+        events = list(client.follow(SCAN))
+    assert [event.get("state") for event in events] == ["queued", None, "succeeded"]
+    assert asked == ["0", "2", "3"]
+    assert len(pauses) == 1
+
+
+def test_service_that_stays_away_is_given_up() -> None:
+    pauses: list[float] = []
+
+    def handler(_request: httpx2.Request) -> httpx2.Response:
+        message = "refused"
+        raise httpx2.ConnectError(message)
+
+    with client_of(handler, pauses) as client, pytest.raises(ServiceError, match="slrig serve RIG"):
+        list(client.follow(SCAN))
+    assert sum(pauses) == pytest.approx(client_module.PATIENCE_S)
+
+
+def test_problem_is_told_with_every_fault() -> None:
+    problem = {
+        "status": 422,
+        "detail": "The request has 2 faults.",
+        "errors": [{"field": "exposure_s", "message": "too long"}, {"field": "if_busy", "message": "unknown"}],
+    }
+
+    def handler(_request: httpx2.Request) -> httpx2.Response:
+        return httpx2.Response(422, json=problem)
+
+    with client_of(handler) as client, pytest.raises(ServiceError) as refused:
+        client.start({})
+    assert str(refused.value).splitlines() == [
+        "The request has 2 faults.",
+        "  exposure_s: too long",
+        "  if_busy: unknown",
+    ]
+
+
+def test_another_program_on_the_port_is_recognised() -> None:
+    with (
+        client_of(lambda _request: httpx2.Response(404, text="<html>nginx</html>")) as client,
+        pytest.raises(ServiceError, match="Is another program listening there"),
+    ):
+        client.get("/scan")
+
+
+def test_address_that_is_no_url_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"http://127\.0\.0\.1:8731"):
+        ServiceClient("http://[", None)
+
+
+def test_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:
+    def cut() -> Iterator[bytes]:
+        yield b"half"
+        message = "the connection broke"
+        raise httpx2.ReadError(message)
+
+    with client_of(lambda _request: httpx2.Response(200, content=cut())) as client, pytest.raises(ServiceError):
+        client.fetch("/scan/5f/mesh.ply", tmp_path / "mesh.ply")
+    assert list(tmp_path.iterdir()) == []
+    with client_of(lambda _request: httpx2.Response(200, content=b"whole")) as client:
+        client.fetch("/scan/5f/mesh.ply", tmp_path / "mesh.ply")
+    assert [path.name for path in tmp_path.iterdir()] == ["mesh.ply"]
+
+
+class Walk:
+    """A service that takes one scan to the given end."""
+
+    def __init__(self, state: str, error: dict[str, Any] | None = None) -> None:
+        self.scan = {**SCAN, "state": state, "error": error}
+        self.cancelled = False
+
+    def __call__(self, request: httpx2.Request) -> httpx2.Response:
+        path = request.url.path
+        if path == "/scan":
+            return httpx2.Response(202, json=SCAN)
+        if path.endswith("/events"):
+            if request.headers["Last-Event-ID"] != "0":
+                return httpx2.Response(204)
+            return event_answer(
+                stream(
+                    {"id": 1, "kind": "state", "state": "queued"},
+                    {"id": 2, "kind": "progress", "stage": "capture", "fraction": 0.25, "detail": "frame 1 of 4"},
+                    {"id": 3, "kind": "state", "state": self.scan["state"]},
+                )
+            )
+        if path.endswith("/cancel"):
+            self.cancelled = True
+            return httpx2.Response(202, json=self.scan)
+        if path.endswith("/mesh.ply"):
+            return httpx2.Response(200, content=b"ply")
+        return httpx2.Response(200, json=self.scan)
+
+
+def test_scan_is_followed_and_fetched(tmp_path: Path) -> None:
+    told: list[tuple[str, float]] = []
+    with client_of(Walk("succeeded")) as client:
+        scan = scan_with(
+            client,
+            {},
+            tmp_path / "out",
+            files=("mesh.ply",),
+            display=lambda stage, fraction, _detail: told.append((stage, fraction)),
+        )
+    assert (tmp_path / "out" / "mesh.ply").read_bytes() == b"ply"
+    assert told == [
+        ("waiting for the rig", 0.0),
+        ("capture", 0.25),
+        ("fetching mesh.ply", 1.0),
+        ("done", 1.0),
+    ]
+    assert quality_lines(scan["summary"]) == [
+        "size      1,200 vertices, 2,301 triangles",
+        "stated    standard deviation of a point 0.0079 mm (median)",
+        "error     rms 0.0123 mm against the known truth, 97.0% of the visible surface within 0.3 mm",
+    ]
+
+
+def test_failed_scan_tells_the_cause(tmp_path: Path) -> None:
+    walk = Walk("failed", {"detail": "No stripe was found."})
+    with client_of(walk) as client, pytest.raises(ServiceError, match=r"Scan 5f failed: No stripe was found\."):
+        scan_with(client, {}, tmp_path / "out", display=ignore)
+    assert not (tmp_path / "out").exists()
+
+
+def test_scan_cancelled_elsewhere_is_told_as_such(tmp_path: Path) -> None:
+    with client_of(Walk("cancelled")) as client, pytest.raises(ScanCancelledError):
+        scan_with(client, {}, tmp_path / "out", display=ignore)
+
+
+def test_file_that_a_scan_has_not_is_told_before_anything_is_fetched(tmp_path: Path) -> None:
+    with client_of(Walk("succeeded")) as client, pytest.raises(ServiceError, match=r"no mesh\.3mf\. It has: mesh\.ply"):
+        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", "mesh.3mf"), display=ignore)
+    assert not (tmp_path / "out").exists()
+
+
+def test_ctrl_c_cancels_the_scan_on_the_service(tmp_path: Path) -> None:
+    walk = Walk("succeeded")
+
+    def interrupt(stage: str, _fraction: float, _detail: str) -> None:
+        if stage == "capture":
+            raise KeyboardInterrupt
+
+    with client_of(walk) as client, pytest.raises(KeyboardInterrupt):
+        scan_with(client, {}, tmp_path / "out", display=interrupt)
+    assert walk.cancelled
+
+
+def test_progress_off_a_terminal_is_one_line_per_stage() -> None:
+    stream_of_text = io.StringIO()
+    display = ProgressDisplay(stream_of_text)
+    display.start()
+    for stage, fraction in (("capture", 0.0), ("capture", 0.3), ("decode", 0.5), ("done", 1.0)):
+        display(stage, fraction, "")
+    display.stop()
+    lines = stream_of_text.getvalue().splitlines()
+    assert [line.split("  ")[-1] for line in lines] == ["capture", "decode", "done"]
+    assert [line.split("%")[0].split()[-1] for line in lines] == ["0", "50", "100"]
