@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 
 import structlog
 import uvicorn
@@ -21,12 +20,11 @@ from slrig.api.security import KEY_VARIABLE, claim_key
 from slrig.api.service import Service
 from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback
-from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import ServiceError
+from slrig.scan.acquisition import capture_bundle
 from slrig.scan.folder import DataFolder
 from slrig.scan.holding import HeldRig
-from slrig.scan.plan import ScanPlan
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
 from slrig.scan.sweep import sweep
@@ -67,26 +65,11 @@ def open_service(settings: ServiceSettings, rig: RigConfig) -> Service:
         folder,
         HeldRig(rig.name, lambda: open_rig(rig)),
         ReconstructionWorker(),
-        capture=_capture,
+        capture=capture_bundle,
         queue_length=settings.queue_length,
         spare_bytes=settings.min_free_bytes,
     )
     return Service(settings, rig.scan, folder, store, runner)
-
-
-def _capture(
-    rig: Rig,
-    plan: ScanPlan,
-    folder: Path,
-    /,
-    *,
-    progress: Callable[[str, float, str], None],
-    cancelled: Callable[[], bool],
-) -> None:
-    # Brings in the whole of reconstruction with its kernels: not before the first scan needs it.
-    from slrig.scan.pipeline import capture_bundle
-
-    capture_bundle(rig, plan, folder, progress=progress, cancelled=cancelled)
 
 
 def serve(

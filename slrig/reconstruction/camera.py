@@ -33,13 +33,12 @@ _LEAST_SMOOTHED_PX = 1.4
 @dataclass(frozen=True, slots=True)
 class CodeTables:
     """What the patterns mean. index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px;
-    position_of : (frames, cells) float64, px, of lines or of code edges; step_px : between neighbouring curves.
+    position_of : (frames, cells) float64, px, of lines or of code edges.
     """
 
     index_of_word: IntArray
     cell_position: FloatArray
     position_of: FloatArray
-    step_px: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,13 +27,9 @@ _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 def write_mesh(mesh: Mesh, folder: Path) -> None:
     """Write mesh.ply, mesh.glb and mesh.stl into `folder`. Raises StorageError."""
-    files = {
-        "mesh.ply": encode_mesh_ply(mesh),
-        "mesh.glb": encode_mesh_glb(mesh),
-        "mesh.stl": encode_mesh_stl(mesh),
-    }
-    for name, data in files.items():
-        write_file(folder / name, data)
+    # One at a time: each is as large as the mesh.
+    for name, encode in (("ply", encode_mesh_ply), ("glb", encode_mesh_glb), ("stl", encode_mesh_stl)):
+        write_file(folder / f"mesh.{name}", encode(mesh))
 
 
 def write_points(curves: PointCurves, path: Path) -> None:
@@ -119,11 +115,6 @@ def _made_of_plaster(tree: dict[str, Any]) -> None:
 def encode_mesh_stl(mesh: Mesh) -> bytes:
     """Binary STL, values in mm (the format has no unit)."""
     return bytes(trimesh.exchange.stl.export_stl(_trimesh(mesh)))
-
-
-def _lines(form: str, rows: NDArray[Any]) -> str:
-    """One line of this form per row."""
-    return (form + "\n") * len(rows) % tuple(rows.ravel().tolist())
 
 
 def _trimesh(mesh: Mesh) -> trimesh.Trimesh:

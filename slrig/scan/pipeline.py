@@ -1,90 +1,70 @@
-"""A scan, walked: the one file where its layers meet.
+"""The second half of a scan, walked: the one file where the rooms of its mathematics meet.
 
-`capture_bundle` plays and records, `reconstruct_bundle` turns a recorded bundle into a mesh; a live scan is one after
-the other, so that what was measured can always be computed again.
+A live scan is recorded as a bundle first (`slrig.scan.acquisition`), so that what was measured can always be computed
+again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slrig.bundle import Bundle, BundleWriter, read_bundle, read_truth, write_truth
+from slrig.bundle import Bundle, read_bundle, read_truth
 from slrig.capture.evidence import check_capture
-from slrig.capture.sequencer import capture
-from slrig.devices import Rig
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError
-from slrig.meshing.initial import InitialMesh, initial_mesh
-from slrig.meshing.quality import score
+from slrig.meshing.initial import initial_mesh
+from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.topology import compact
-from slrig.model import Axis, Calibration, Gray, Mesh, Pinhole, Pixels, PointCurves
+from slrig.model import Axis, Calibration, Gray, LineShift, Mesh, Pinhole, Pixels, PointCurves, Refusal
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
-from slrig.reconstruction.frames import AxisFrames, Image, axis_frames
+from slrig.reconstruction.frames import AxisFrames, axis_frames
 from slrig.reconstruction.merging import MergedCurves, merged
 from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
-from slrig.scan.holding import pattern_sequence
-from slrig.scan.output import staged_folder
+from slrig.scan.output import REPORT, staged_folder
 from slrig.scan.pictures import preview, rejection_picture, write_png
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
-from slrig.scan.report import Stopwatch, camera_report, mesh_report, redundancy_report, scan_report
+from slrig.scan.plan import Progress, ReconstructionPlan
+from slrig.scan.report import (
+    Stopwatch,
+    calibration_id,
+    camera_report,
+    capture_report,
+    mesh_report,
+    redundancy_report,
+)
 
 _WIDEST_GAP_PX = 4.0
 
 
-class Progress(Protocol):
-    """Told how far a scan is: the stage, the fraction done (0 to 1) of the whole call, and a few words."""
-
-    def __call__(self, stage: str, fraction: float, detail: str, /) -> None:
-        """Take note."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class _Seen:
-    """One camera: its frames, its calibration, its curves."""
+    """One camera: its calibration, its curves, and of its frames what the results still need.
+
+    white : (H, W) uint16, the white frame in camera units; refusal : (H, W) uint8, `Refusal`.
+    """
 
     name: str
     device: Pinhole
-    frames: AxisFrames
     curves: CameraCurves
+    white: Pixels
+    largest_contrast: float
+    full_scale: float
 
 
-def capture_bundle(
-    rig: Rig, plan: ScanPlan, folder: Path, *, progress: Progress, cancelled: Callable[[], bool]
-) -> None:
-    """Play the plan's patterns on the rig and record a bundle in `folder`, which must not exist.
+@dataclass(frozen=True, slots=True)
+class _Meshed:
+    """The mesh, the cameras with all their refusals, and what the report says of mesh and redundancy."""
 
-    Raises
-    ------
-    PatternError
-        The plan does not fit the projector.
-    DeviceError, ScanEvidenceError
-        The rig failed, or the frames contradict the patterns.
-    ScanCancelledError
-        `cancelled()` became true.
-    StorageError
-        The disk refused. In every case nothing is left in `folder` and the projector is dark.
-    """
-    sequence = pattern_sequence(plan.patterns, rig.projector.info.size)
-    if plan.exposure_s is not None:
-        asked = plan.exposure_s
-        rig = replace(rig, settings={name: replace(each, exposure_s=asked) for name, each in rig.settings.items()})
-    formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-    total = len(sequence) * len(formats)
-    with BundleWriter(folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration) as writer:
-        for count, shot in enumerate(capture(rig, sequence, cancelled=cancelled), start=1):
-            writer.add(shot)
-            progress("capture", count / total, f"frame {count} of {total}")
-    truth = rig.truth()
-    if truth is not None:
-        write_truth(folder, truth)
+    mesh: Mesh
+    cameras: list[_Seen]
+    figures: Mapping[str, object]
+    redundancy: Mapping[str, object]
 
 
 def reconstruct_bundle(
@@ -98,8 +78,8 @@ def reconstruct_bundle(
 ) -> dict[str, object]:
     """Reconstruct a recorded bundle into `output` and return the report.
 
-    Writes mesh.ply, mesh.glb, mesh.stl, points.ply, report.json, preview.png and a picture of the refused
-    pixels per camera. `output` appears whole or not at all; results of an earlier run there are replaced.
+    Writes mesh.ply, mesh.glb, mesh.stl, points.ply, report.json, preview.png and a picture of the refused pixels per
+    camera. `output` appears whole or not at all; results of an earlier run there are replaced.
 
     Raises
     ------
@@ -123,56 +103,40 @@ def reconstruct_bundle(
         entered("read bundle", 0.0, str(bundle))
         recorded = read_bundle(bundle, calibration_file=calibration)
         devices = _require_calibration(recorded)
-        evidence = check_capture(recorded.capture)
+        sections = _sections(recorded, devices)
         axis = _axis(recorded)
-        cameras = _seen(recorded, devices, axis, entered)
+        seen = _seen(recorded, devices, axis, entered)
+        step_px = _step_px(recorded, axis)
+        # The frames have told all they know; what follows needs their memory.
+        del recorded
         entered("triangulate", 0.6, "")
-        step_px = _tables(recorded, cameras[0].frames).step_px
-        joined_curves = _curves(cameras, devices.projector, axis)
-        points = joined_curves.curves
-        _require(len(points.points_mm) > 0, recorded, "no stripe could be triangulated", cameras)
-        entered("mesh", 0.68, f"{len(points.points_mm)} points")
-        first = cameras[0]
-        sampling = sampling_mm(points.points_mm, first.device, devices.projector, step_px)
-        surface = initial_mesh(
-            points.points_mm, points.offsets, points.position_px, points.bridge_after, sampling, first.device.centre_mm,
-            widest_step_px=step_px * plan.max_code_gap, depth_edge_ratio=plan.depth_edge_ratio,
-            keep_holes=plan.keep_holes,
-        )  # fmt: skip
-        _require(len(surface.faces) > 0, recorded, "no two neighbouring stripes could be meshed", cameras)
-        mesh, curves = _finished(points, surface, joined_curves, cameras)
+        meshed = _meshed(bundle, seen, devices.projector, axis, plan, step_px, staging, entered)
+        mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         write_mesh(mesh, staging)
-        write_points(curves, staging / "points.ply")
         entered("pictures", 0.85, "")
-        white = _displayable(first.frames.white)
-        write_png(staging / "preview.png", preview(mesh, first.device, white, int(first.frames.full_scale)))
-        for seen in cameras:
-            write_png(
-                staging / f"rejected-{seen.name}.png",
-                rejection_picture(seen.curves.refusal, _displayable(seen.frames.white), int(seen.frames.full_scale)),
-            )
-        truth = read_truth(bundle)
-        known: Mapping[str, object] | None = None
-        if truth is not None:
-            entered("compare with truth", 0.9, "")
-            known = score(mesh, truth.surface, truth.visible_points_mm, first.device.centre_mm).as_dict()
+        _write_pictures(mesh, cameras, staging)
+        known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
         entered("write report", 0.98, "")
-        report = scan_report(
-            recorded=recorded,
-            plan=plan,
-            axis=axis,
-            line_shift=len(first.frames.lines) > 0,
-            evidence=evidence,
-            cameras={seen.name: camera_report(seen.curves) for seen in cameras},
-            redundancy=redundancy_report(joined_curves, points.source),
-            mesh=mesh_report(surface, mesh, curves),
-            truth=known,
-            stages=watch.finished(),
-        )
-        write_report(report, staging / "report.json")
+        report = {
+            **sections,
+            "plan": asdict(plan),
+            "cameras": {camera.name: camera_report(camera.curves) for camera in cameras},
+            "redundancy": dict(meshed.redundancy),
+            "mesh": {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)},
+            **known,
+            "stages_s": watch.finished(),
+        }
+        write_report(report, staging / REPORT)
     progress("done", 1.0, f"{len(mesh.faces)} triangles")
     return report
+
+
+def _sections(recorded: Bundle, devices: Calibration) -> dict[str, object]:
+    """The parts of the report that the frames themselves tell."""
+    return capture_report(recorded.capture, _axis(recorded), check_capture(recorded.capture)) | {
+        "calibration": {"id": calibration_id(devices)}
+    }
 
 
 def _require_calibration(recorded: Bundle) -> Calibration:
@@ -212,8 +176,16 @@ def _tables(recorded: Bundle, frames: AxisFrames) -> CodeTables:
         index_of_word=index_of_word(frames.gray),
         cell_position=cell_positions(frames.gray, size),
         position_of=line_positions(lines, frames.gray, size) if lines else edge_positions(frames.gray, size),
-        step_px=lines[0].period_px / len(lines) if lines else float(frames.gray.cell_px),
     )
+
+
+def _step_px(recorded: Bundle, axis: Axis) -> float:
+    """Distance between neighbouring curves: of lines where there are any, of code edges otherwise."""
+    shown = {recorded.capture.patterns[shot.pattern] for shot in recorded.capture.shots}
+    lines = {p for p in shown if isinstance(p, LineShift) and p.axis is axis}
+    if lines:
+        return next(iter(lines)).period_px / len(lines)
+    return float(next(p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis))
 
 
 def _seen(
@@ -235,32 +207,71 @@ def _seen(
             message = f"{recorded.folder}: {cause}"
             raise PatternError(message) from cause
         curves = camera_curves(frames, tables, Limits(), entered=stage_entered)
-        cameras.append(_Seen(name, devices.cameras[name], frames, curves))
-    _require(any(seen.curves.decoded_pixels > 0 for seen in cameras), recorded, "no pixel could be decoded", cameras)
-    _require(any(seen.curves.stripe_count > 0 for seen in cameras), recorded, "no stripe was found", cameras)
+        cameras.append(
+            _Seen(
+                name=name,
+                device=devices.cameras[name],
+                curves=curves,
+                white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
+                largest_contrast=float(frames.contrast.max()),
+                full_scale=frames.full_scale,
+            )
+        )
+    folder = recorded.folder
+    _require(any(seen.curves.decoded_pixels > 0 for seen in cameras), folder, "no pixel could be decoded", cameras)
+    _require(any(seen.curves.stripe_count > 0 for seen in cameras), folder, "no stripe was found", cameras)
     return cameras
 
 
-def _curves(cameras: list[_Seen], projector: Pinhole | None, axis: Axis) -> MergedCurves:
+def _triangulated(cameras: list[_Seen], projector: Pinhole | None, axis: Axis) -> tuple[MergedCurves, list[_Seen]]:
+    """The curves of all cameras, and the cameras with the points that fell off the projector among their refusals."""
     if projector is not None:
         parts = [camera_projector(seen.curves.ensemble, seen.device, projector, axis) for seen in cameras]
-        return merged(parts, projector.centre_mm, widest_gap_px=_WIDEST_GAP_PX)
+        told = [
+            replace(seen, curves=replace(seen.curves, refusal=_with_dropped(seen.curves, part)))
+            for seen, part in zip(cameras, parts, strict=True)
+        ]
+        return merged(parts, projector.centre_mm, widest_gap_px=_WIDEST_GAP_PX), told
     first, *others = cameras
     parts = [camera_camera(first.curves.ensemble, seen.curves.ensemble, first.device, seen.device) for seen in others]
     # Without a projector the light sheet has no rows to merge by; the pair that gives most is used.
     best = max(parts, key=lambda part: len(part.points_mm))
-    return merged([best], first.device.centre_mm, widest_gap_px=_WIDEST_GAP_PX)
+    return merged([best], first.device.centre_mm, widest_gap_px=_WIDEST_GAP_PX), cameras
 
 
-def _finished(
-    points: SheetCurves, surface: InitialMesh, joined_curves: MergedCurves, cameras: list[_Seen]
-) -> tuple[Mesh, PointCurves]:
+def _with_dropped(curves: CameraCurves, triangulated: SheetCurves) -> NDArray[np.uint8]:
+    """The refusals with those points among them that met their light sheet where the projector has no pixel."""
+    before, after = (x + 1j * y for x, y in (curves.ensemble.points_px.T, triangulated.pixels_px.T))
+    columns, rows = np.rint(curves.ensemble.points_px[~np.isin(before, after)]).astype(int).T
+    refusal = curves.refusal.copy()
+    refusal[rows, columns] = Refusal.OFF_PROJECTOR
+    return refusal
+
+
+def _meshed(
+    folder: Path,
+    cameras: list[_Seen],
+    projector: Pinhole | None,
+    axis: Axis,
+    plan: ReconstructionPlan,
+    step_px: float,
+    staging: Path,
+    entered: Callable[[str, float, str], None],
+) -> _Meshed:
+    """Triangulate, mesh, and write the points."""
+    first = cameras[0]
+    joined_curves, cameras = _triangulated(cameras, projector, axis)
+    points = joined_curves.curves
+    _require(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
+    entered("mesh", 0.68, f"{len(points.points_mm)} points")
+    surface = initial_mesh(
+        points.points_mm, points.offsets, points.position_px, points.bridge_after,
+        sampling_mm(points.points_mm, first.device, projector, step_px), first.device.centre_mm,
+        widest_step_px=step_px * plan.max_code_gap, depth_edge_ratio=plan.depth_edge_ratio, keep_holes=plan.keep_holes,
+    )  # fmt: skip
+    _require(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
-    grey = np.zeros(len(points.points_mm), dtype=np.uint8)
-    for index, seen in enumerate(cameras):
-        mine = joined_curves.camera == index
-        columns, rows = np.rint(points.pixels_px[mine]).astype(int).T
-        grey[mine] = np.clip(np.rint(seen.frames.white[rows, columns] * (255 / seen.frames.full_scale)), 0, 255)
+    grey = _grey(joined_curves, cameras)
     curves = PointCurves(
         offsets=points.offsets,
         column_px=points.position_px,
@@ -270,6 +281,7 @@ def _finished(
         source=points.source,
         grey=grey,
     )
+    write_points(curves, staging / "points.ply")
     kept = compact(surface.faces, vertex_count=len(points.points_mm))
     used = kept.kept
     mesh = Mesh(
@@ -280,29 +292,51 @@ def _finished(
         sigma_mm=sigma[used].astype(np.float32),
         stripe=np.floor(points.position_px[points.curve_of_point()[used]]).astype(np.int32),
     )
-    return mesh, curves
+    return _Meshed(mesh, cameras, mesh_report(surface, mesh, curves), redundancy_report(joined_curves, points.source))
 
 
-def _displayable(image: Image) -> Pixels:
-    """(H, W) uint16: a frame averaged or fused as float32, back in camera units."""
-    return np.clip(np.rint(image), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+def _grey(joined_curves: MergedCurves, cameras: list[_Seen]) -> NDArray[np.uint8]:
+    """(n,) uint8: brightness of each point in the white frame of the camera whose pixel it has."""
+    pixels = joined_curves.curves.pixels_px
+    grey = np.zeros(len(pixels), dtype=np.uint8)
+    for index, seen in enumerate(cameras):
+        mine = joined_curves.camera == index
+        columns, rows = np.rint(pixels[mine]).astype(int).T
+        grey[mine] = np.clip(np.rint(seen.white[rows, columns] * (255 / seen.full_scale)), 0, 255)
+    return grey
 
 
-def _require(holds: bool, recorded: Bundle, what: str, cameras: list[_Seen]) -> None:
+def _write_pictures(mesh: Mesh, cameras: list[_Seen], staging: Path) -> None:
+    first = cameras[0]
+    write_png(staging / "preview.png", preview(mesh, first.device, first.white, int(first.full_scale)))
+    for seen in cameras:
+        picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
+        write_png(staging / f"rejected-{seen.name}.png", picture)
+
+
+def _compared_with_truth(
+    bundle: Path, mesh: Mesh, camera: Pinhole, entered: Callable[[str, float, str], None]
+) -> dict[str, object]:
+    """The report's section on truth, for bundles that bring it."""
+    truth = read_truth(bundle)
+    if truth is None:
+        return {}
+    entered("compare with truth", 0.9, "")
+    return {"truth": score(mesh, truth.surface, truth.visible_points_mm, camera.centre_mm).as_dict()}
+
+
+def _require(holds: bool, folder: Path, what: str, cameras: list[_Seen]) -> None:
     """Refuse a scan that holds no surface, with the figures that tell why."""
     if holds:
         return
-    figures = []
-    for seen in cameras:
-        contrast = seen.frames.contrast
-        lit = float((seen.curves.refusal != 1).mean())
-        figures.append(
-            f"camera '{seen.name}': white {seen.frames.white.mean():.0f}, black {seen.frames.black.mean():.0f} of "
-            f"{seen.frames.full_scale:.0f} on average, largest difference {contrast.max():.0f}, {lit:.1%} of the image "
-            f"lit, {seen.curves.decoded_pixels} pixels decoded"
-        )
+    figures = "; ".join(
+        f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
+        f"{seen.largest_contrast:.0f} above black, {(seen.curves.refusal != Refusal.NOT_LIT).mean():.1%} of the image "
+        f"lit, {seen.curves.decoded_pixels} pixels decoded"
+        for seen in cameras
+    )
     message = (
-        f"{recorded.folder}: {what}. {'; '.join(figures)}. Look whether the projector lit the object, the lens cap is "
-        "off, and the exposure leaves white below full scale and well above black"
+        f"{folder}: {what}. {figures}. Look whether the projector lit the object, the lens cap is off, and the "
+        "exposure leaves white below full scale and well above black"
     )
     raise NothingToReconstructError(message)

@@ -1,8 +1,17 @@
-"""What a scan is asked to do: frozen data, made once from a request and a rig file."""
+"""What a scan is asked to do: frozen data, made once from a request and a rig file; and whom it tells how far it is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Told how far a scan is: the stage, the fraction done (0 to 1) of the whole call, and a few words."""
+
+    def __call__(self, stage: str, fraction: float, detail: str, /) -> None:
+        """Take note."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

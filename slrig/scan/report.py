@@ -5,22 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import Bundle
 from slrig.capture.evidence import EvidenceSummary
 from slrig.meshing.initial import InitialMesh
-from slrig.meshing.quality import mesh_figures
-from slrig.model import Axis, Calibration, Mesh, Pinhole, PointCurves, Refusal, Source
+from slrig.model import Axis, Calibration, Capture, LineShift, Mesh, Pinhole, PointCurves, Refusal, Source
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.merging import MergedCurves
 from slrig.scan.output import REPORT_FORMAT
-from slrig.scan.plan import ReconstructionPlan
 
 
 class Stopwatch:
@@ -96,7 +90,7 @@ def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8]) -> dict[s
 
 
 def mesh_report(surface: InitialMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
-    """The mesh by stage (the paper's Table 1 as far as it is built), its figures, its stated error."""
+    """The mesh by stage (the paper's Table 1 as far as it is built), and its stated error."""
     sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
     return {
         "points": len(curves.points_mm),
@@ -109,27 +103,17 @@ def mesh_report(surface: InitialMesh, mesh: Mesh, curves: PointCurves) -> dict[s
             "dropped_triangles": surface.dropped_triangles,
             "triangles": len(surface.faces),
         },
-        "figures": mesh_figures(mesh.vertices_mm, mesh.faces),
         "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])},
     }
 
 
-def scan_report(
-    *,
-    recorded: Bundle,
-    plan: ReconstructionPlan,
-    axis: Axis,
-    line_shift: bool,
-    evidence: EvidenceSummary,
-    cameras: Mapping[str, object],
-    redundancy: Mapping[str, object],
-    mesh: Mapping[str, object],
-    truth: Mapping[str, object] | None,
-    stages: Mapping[str, float],
-) -> dict[str, object]:
-    """The whole report, JSON-able, in the order in which a person reads it."""
-    capture = recorded.capture
-    report: dict[str, Any] = {
+def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> dict[str, object]:
+    """What was shown and taken, and what the frames prove of themselves."""
+    line_shift = any(
+        isinstance(pattern := capture.patterns[shot.pattern], LineShift) and pattern.axis is axis
+        for shot in capture.shots
+    )
+    return {
         "format": REPORT_FORMAT,
         "version": 1,
         "method": "Gray code and line shift" if line_shift else "Gray-only",
@@ -146,17 +130,7 @@ def scan_report(
             "light_drift": dict(evidence.light_drift),
             "contradictions": list(evidence.faults),
         },
-        "plan": asdict(plan),
-        "cameras": dict(cameras),
-        "redundancy": dict(redundancy),
-        "mesh": dict(mesh),
-        "stages_s": dict(stages),
     }
-    if recorded.calibration is not None:
-        report["calibration"] = {"id": calibration_id(recorded.calibration)}
-    if truth is not None:
-        report["truth"] = dict(truth)
-    return report
 
 
 def _notes(line_shift: bool, evidence: EvidenceSummary) -> list[str]:

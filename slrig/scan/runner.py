@@ -32,7 +32,7 @@ _log = structlog.get_logger(__name__)
 
 
 class CaptureBundle(Protocol):
-    """`slrig.scan.pipeline.capture_bundle`, or what a test puts in its place."""
+    """`slrig.scan.acquisition.capture_bundle`, or what a test puts in its place."""
 
     def __call__(
         self,

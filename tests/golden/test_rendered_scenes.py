@@ -8,7 +8,7 @@ import pytest
 
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.scan.pipeline import capture_bundle
+from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import ScanPlan
 from tests.golden.test_bundles import reconstructed
 

@@ -24,7 +24,8 @@ from slrig.errors import (
     SlrigError,
 )
 from slrig.model import Capture, Gray, LineShift, Shot, Size, White
-from slrig.scan.pipeline import capture_bundle, reconstruct_bundle
+from slrig.scan.acquisition import capture_bundle
+from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 
 RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
