@@ -43,6 +43,16 @@ Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is
 KeyFile = Annotated[
     Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
 ]
+KeepHoles = Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")]
+DepthEdgeRatio = Annotated[
+    float | None,
+    typer.Option(
+        min=1.0, max=1000.0, help="Longest triangle edge, in sampling distances. Default 6; longer skins cliffs."
+    ),
+]
+MaxCodeGap = Annotated[
+    int | None, typer.Option(min=1, max=64, help="Mesh stripes up to this many columns apart. Default 1.")
+]
 USUAL_URL = "http://127.0.0.1:8731"
 
 
@@ -86,7 +96,7 @@ def serve(
         given["allowed_hosts"] = tuple(allow_host)
     if no_key:
         given["require_key"] = False
-    chosen = read_settings(settings, **{name: value for name, value in given.items() if value is not None})
+    chosen = read_settings(settings, **_given(**given))
     run_service(chosen, read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
 
 
@@ -106,26 +116,30 @@ def scan(
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
     gray_only: Annotated[bool, typer.Option("--gray-only", help="Play the Gray code without shifted lines.")] = False,
     rows: Annotated[bool, typer.Option("--rows", help="Play the row axis as well.")] = False,
-    keep_holes: Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")] = False,
+    keep_holes: KeepHoles = False,
+    depth_edge_ratio: DepthEdgeRatio = None,
+    max_code_gap: MaxCodeGap = None,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
     """Scan with a running service, follow the progress, and fetch the mesh."""
     from slrig.cli.client import ServiceClient, read_key
     from slrig.cli.scan import FILES, scan_with, tell_result
 
-    patterns = {
-        "line_shift_period_px": period_px,
-        "line_width_px": line_width_px,
-        "gray_cell_px": gray_cell_px,
-        "line_shift": False if gray_only else None,
-        "rows": rows or None,
-    }
+    patterns = _given(
+        line_shift_period_px=period_px,
+        line_width_px=line_width_px,
+        gray_cell_px=gray_cell_px,
+        line_shift=False if gray_only else None,
+        rows=rows or None,
+    )
     request = {
         "label": label,
         "exposure_s": exposure_s,
         "if_busy": "queue" if queue else "reject",
-        "patterns": {name: value for name, value in patterns.items() if value is not None},
-        "reconstruction": {"keep_holes": True} if keep_holes else {},
+        "patterns": patterns,
+        "reconstruction": _given(
+            keep_holes=keep_holes or None, depth_edge_ratio=depth_edge_ratio, max_code_gap=max_code_gap
+        ),
     }
     with ServiceClient(url, read_key(key_file)) as client:
         result = scan_with(client, request, output, files=tuple(file or FILES))
@@ -139,12 +153,15 @@ def reconstruct(
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration to use in place of the bundle's calibration.json.")
     ] = None,
-    keep_holes: Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")] = False,
+    keep_holes: KeepHoles = False,
+    depth_edge_ratio: DepthEdgeRatio = None,
+    max_code_gap: MaxCodeGap = None,
 ) -> None:
     """Make a mesh from a recorded scan. Needs no service and no rig."""
     from slrig.cli.reconstruct import reconstruct_with_progress
 
-    reconstruct_with_progress(bundle, output, calibration=calibration, keep_holes=keep_holes)
+    options = _given(keep_holes=keep_holes or None, depth_edge_ratio=depth_edge_ratio, max_code_gap=max_code_gap)
+    reconstruct_with_progress(bundle, output, calibration=calibration, options=options)
 
 
 @app.command()
@@ -155,6 +172,11 @@ def devices(
     from slrig.cli.devices import list_devices
 
     list_devices(as_json=as_json)
+
+
+def _given(**options: object) -> dict[str, object]:
+    """The options that were given; the service, or the plan, knows the others' defaults."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def main() -> None:

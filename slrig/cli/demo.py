@@ -136,16 +136,18 @@ def _tell_next(rig: Path, bundle: Path, output: Path) -> None:
     live = output.parent / f"{output.name}-live"
     # Paths in a rig file are relative to it, so that a copy belongs beside it.
     own = shlex.quote(str(rig.with_name("my-rig.toml")))
+    # As it was called: in a fresh checkout that is .venv/bin/slrig, and no slrig is on the path.
+    program = shlex.quote(sys.argv[0]) if Path(sys.argv[0]).name == "slrig" else "slrig"
     rig_text, bundle_text = shlex.quote(str(rig)), shlex.quote(str(bundle))
     typer.echo(
         f"""
 Next:
   1. Your own rig: copy a rig file, change it, and run it.
        cp {rig_text} {own}
-       slrig demo {own}
+       {program} demo {own}
   2. A live service: start it, and scan with it from another terminal, with the key that it prints.
-       slrig serve {rig_text}
-       {KEY_VARIABLE}=KEY slrig scan --output {shlex.quote(str(live))}
+       {program} serve {rig_text}
+       {KEY_VARIABLE}=KEY {program} scan --output {shlex.quote(str(live))}
   3. A recorded bundle: reconstruct this scan, or one of yours, again.
-       slrig reconstruct {bundle_text} --output {shlex.quote(str(again))}"""
+       {program} reconstruct {bundle_text} --output {shlex.quote(str(again))}"""
     )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -14,8 +16,14 @@ from slrig.scan.records import report_summary
 from slrig.scan.worker import prepare_kernel_cache
 
 
-def reconstruct_with_progress(bundle: Path, output: Path, *, calibration: Path | None, keep_holes: bool) -> None:
-    """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises."""
+def reconstruct_with_progress(
+    bundle: Path, output: Path, *, calibration: Path | None, options: Mapping[str, Any]
+) -> None:
+    """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises.
+
+    options : fields of `ReconstructionPlan` that were given.
+    """
+    plan = ReconstructionPlan(**options)
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     prepare_kernel_cache(Path(base) / "slrig")
     with progress_shown() as display:
@@ -26,7 +34,7 @@ def reconstruct_with_progress(bundle: Path, output: Path, *, calibration: Path |
         report = reconstruct_bundle(
             bundle,
             output,
-            plan=ReconstructionPlan(keep_holes=keep_holes),
+            plan=plan,
             calibration=calibration,
             progress=display,
             cancelled=lambda: False,
