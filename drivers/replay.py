@@ -24,7 +24,7 @@ from slrig.errors import (
     FrameTimeoutError,
     UnsupportedByDeviceError,
 )
-from slrig.model import Black, Calibration, Frame, Pattern, PatternSequence, Shot, Truth
+from slrig.model import Black, Calibration, Frame, Gray, LineShift, Pattern, PatternSequence, Shot, Truth, White
 
 _SAME_EXPOSURE = 0.01
 _TICK_NS = 1_000
@@ -245,9 +245,10 @@ class ReplayProjector:
             lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
             if lacking:
                 message = (
-                    f"the recording '{self._info.serial}' has no frame of {pattern} from camera "
-                    f"{', '.join(lacking)}; it has: {'; '.join(str(have) for have in self._recorded)}. Ask for the "
-                    "patterns that were recorded"
+                    f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
+                    f"{', '.join(lacking)}; it has {'; '.join(dict.fromkeys(map(_family, self._recorded)))}. Ask for what "
+                    "was recorded: gray_cell_px, line_shift_period_px and their like, in the request or in the rig "
+                    "file's [scan]"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()
@@ -368,3 +369,29 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
 
 def _recorded_ns(shot: Shot) -> int:
     return round(shot.time_s * 1e9) if shot.time_s is not None else 0
+
+
+def _member(pattern: Pattern) -> str:
+    """Which pattern of its family."""
+    match pattern:
+        case Gray():
+            return f"bit {pattern.bit} of {_family(pattern)}"
+        case LineShift():
+            return f"shift {pattern.shift} of {_family(pattern)}"
+        case _:
+            return _family(pattern)
+
+
+def _family(pattern: Pattern) -> str:
+    """What a pattern is one of, in the words of a request."""
+    match pattern:
+        case White() | Black():
+            return pattern.kind
+        case Gray():
+            inverse = ", inverted" if pattern.inverted else ""
+            offset = f", offset {pattern.offset_px} px" if pattern.offset_px else ""
+            return (
+                f"a {pattern.axis} Gray code of {pattern.bits} bits with cells of {pattern.cell_px} px{offset}{inverse}"
+            )
+        case LineShift():
+            return f"{pattern.axis} lines of {pattern.line_width_px} px, period {pattern.period_px} px"

@@ -126,7 +126,10 @@ def test_two_cameras_are_exposed_together(tmp_path: Path) -> None:
 
 def test_a_pattern_that_was_not_recorded_is_named_with_those_that_were(tmp_path: Path) -> None:
     head = head_of(tmp_path, BASIC)
-    with pytest.raises(UnsupportedByDeviceError, match=r"no frame of Gray\(.*bit=1.*it has: White.*Black.*Gray"):
+    with pytest.raises(
+        UnsupportedByDeviceError,
+        match=r"no frame of bit 1 of a column Gray code of 4 bits.*has white; black; a column Gray",
+    ):
         head.projector.load(encode([White(), Gray(Axis.COLUMN, 1, 4)], PROJECTOR))
 
 
