@@ -244,11 +244,11 @@ class ReplayProjector:
         for pattern in sequence.patterns:
             lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
             if lacking:
+                recorded = "; ".join(dict.fromkeys(map(_family, self._recorded)))
                 message = (
                     f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
-                    f"{', '.join(lacking)}; it has {'; '.join(dict.fromkeys(map(_family, self._recorded)))}. Ask for what "
-                    "was recorded: gray_cell_px, line_shift_period_px and their like, in the request or in the rig "
-                    "file's [scan]"
+                    f"{', '.join(lacking)}; it has {recorded}. Ask for what was recorded: gray_cell_px, "
+                    "line_shift_period_px and their like, in the request or in the rig file's [scan]"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()
