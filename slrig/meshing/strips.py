@@ -75,7 +75,9 @@ def to_drop(
     step = np.abs(faces - rolled) == 1
     over_bridge = (step & bridge_after[np.minimum(faces, rolled)]).any(axis=1)
     return DroppedTriangles(
-        depth_edge=longest > allowed, bridge=over_bridge if keep_holes else np.zeros(len(faces), dtype=bool)
+        # Not "longest > allowed": a triangle with an unmeasured corner goes too.
+        depth_edge=~(longest <= allowed),
+        bridge=over_bridge if keep_holes else np.zeros(len(faces), dtype=bool),
     )
 
 

@@ -107,11 +107,14 @@ def _line_stripes(
     frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
 ) -> tuple[Stripes, float]:
     contrast = frames.contrast
-    dark_variance = noise.variance(frames.black)
+    white_variance, black_variance = (noise.variance(end) / frames.ends_repeats for end in (frames.white, frames.black))
     scale_px = limits.sigma_px
     parts = []
     for index, line in enumerate(frames.lines):
-        image, deviation = normalised(line, frames.black, contrast, np.sqrt(noise.variance(line) + dark_variance))
+        # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
+        light = np.clip((line - frames.black) / np.maximum(contrast, 1), 0, 1)
+        variance = noise.variance(line) + (1 - light) ** 2 * black_variance + light**2 * white_variance
+        image, deviation = normalised(line, frames.black, contrast, np.sqrt(variance))
         if scale_px is None:
             scale_px = _matched_scale_px(measured_sigma_px(image, deviation, lit))
         parts.append(locate_stripes(image, deviation, lit, index, limits, sigma_px=scale_px))
@@ -134,7 +137,7 @@ def _edge_stripes(
     scale_px = limits.sigma_px or _FINEST_SCALE_PX
     contrast = frames.contrast
     none = np.zeros_like(contrast)
-    ends_variance = noise.variance(frames.white) + noise.variance(frames.black)
+    ends_variance = (noise.variance(frames.white) + noise.variance(frames.black)) / frames.ends_repeats
     parts = []
     for index, bit in enumerate(frames.bits):
         if frames.inverses is not None:

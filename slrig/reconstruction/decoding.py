@@ -80,7 +80,7 @@ def decode(
     # Against the middle of white and black a bit swings half as far as against its inverse.
     margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * contrast) * (1.0 if paired else 0.5)
     _decode_kernel(
-        shown, against, paired, frames.white, lit, margin.astype(np.float32), np.float32(frames.full_scale),
+        shown, against, paired, frames.white, lit, margin.astype(np.float32), np.float32(frames.clipped_at),
         index_of_word.astype(np.int32), cell_count, limits.widest_interval, lowest, highest, refusal,
     )  # fmt: skip
     return CodeMap(lowest, highest, refusal)

@@ -6,6 +6,7 @@ exposure at which nothing it showed was clipped, and values are scaled to the lo
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -24,7 +25,9 @@ class AxisFrames:
 
     bits : (B, H, W) float32, most significant first; inverses : the same, or None where none were shown.
     lines : (L, H, W) float32, one per shift; line_patterns says which.
-    full_scale : the value of a saturated sample.
+    full_scale : the value of a saturated sample of one exposure.
+    ends_repeats : white and black are means of so many times more frames than the others.
+    exposure_ratio : the longest exposure of a bracket over the shortest; 1 without a bracket.
     """
 
     axis: Axis
@@ -36,6 +39,13 @@ class AxisFrames:
     lines: NDArray[np.float32]
     line_patterns: tuple[LineShift, ...]
     full_scale: float
+    exposure_ratio: float = 1.0
+    ends_repeats: float = 1.0
+
+    @property
+    def clipped_at(self) -> float:
+        """The least value of a clipped sample: a bracket's are scaled to the longest exposure."""
+        return self.full_scale * self.exposure_ratio
 
     @property
     def contrast(self) -> Image:
@@ -51,7 +61,7 @@ def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
     PatternError
         Bits are missing or of two codes, or there is neither a white-black pair nor inverses to threshold with.
     """
-    images = _fused_images(capture, camera)
+    images, exposure_ratio = _fused_images(capture, camera)
     grays = [p for p in images if isinstance(p, Gray) and p.axis is axis]
     if not grays:
         message = (
@@ -97,7 +107,15 @@ def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
         lines=lines,
         line_patterns=line_patterns,
         full_scale=float(capture.cameras[camera].full_scale),
+        exposure_ratio=exposure_ratio,
+        ends_repeats=_ends_repeats(capture, camera, axis),
     )
+
+
+def _ends_repeats(capture: Capture, camera: str, axis: Axis) -> float:
+    counts = Counter(capture.patterns[shot.pattern] for shot in capture.shots if shot.camera == camera)
+    others = [n for p, n in counts.items() if isinstance(p, Gray | LineShift) and p.axis is axis]
+    return max(1.0, min(counts[White()], counts[Black()]) / max(others))
 
 
 def _white_and_black(
@@ -118,7 +136,8 @@ def _white_and_black(
     return (bright if white is None else white), (dark if black is None else black)
 
 
-def _fused_images(capture: Capture, camera: str) -> dict[Pattern, Image]:
+def _fused_images(capture: Capture, camera: str) -> tuple[dict[Pattern, Image], float]:
+    """The image of each pattern, and the longest exposure over the shortest."""
     shots: dict[Pattern, dict[float | None, list[Shot]]] = {}
     for shot in capture.shots:
         if shot.camera == camera:
@@ -128,14 +147,14 @@ def _fused_images(capture: Capture, camera: str) -> dict[Pattern, Image]:
         for pattern, by_exposure in shots.items()
     }
     exposures = {frozenset(by_exposure) for by_exposure in averaged.values()}
-    if all(len(each) == 1 for each in exposures):
-        return {pattern: next(iter(by_exposure.values())) for pattern, by_exposure in averaged.items()}
+    if not exposures or (len(exposures) == 1 and len(next(iter(exposures))) == 1):
+        return {pattern: next(iter(by_exposure.values())) for pattern, by_exposure in averaged.items()}, 1.0
     return _fused_bracket(averaged, camera, float(capture.cameras[camera].full_scale))
 
 
 def _fused_bracket(
     averaged: Mapping[Pattern, Mapping[float | None, Image]], camera: str, full_scale: float
-) -> dict[Pattern, Image]:
+) -> tuple[dict[Pattern, Image], float]:
     sets = {frozenset(by_exposure) for by_exposure in averaged.values()}
     if len(sets) > 1 or None in next(iter(sets)):
         message = (
@@ -149,10 +168,11 @@ def _fused_bracket(
         clipped = np.max([by_exposure[times[rank]] for by_exposure in averaged.values()], axis=0) >= full_scale
         chosen = np.where(clipped, chosen, rank)
     scale = np.array([times[0] / t for t in times], dtype=np.float32)
-    return {
+    fused = {
         pattern: np.choose(chosen, [by_exposure[t] * scale[rank] for rank, t in enumerate(times)]).astype(np.float32)
         for pattern, by_exposure in averaged.items()
     }
+    return fused, float(scale[-1])
 
 
 def _mean(repeats: list[Shot]) -> Image:

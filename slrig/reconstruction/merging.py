@@ -83,7 +83,11 @@ def _merged_pair(
     order = np.lexsort((along, curve))
     bridge = np.concatenate([first.bridge_after, second.bridge_after[alone]])[order]
     along = along[order]
-    step = np.append(np.diff(along), np.inf)
+    stripe = np.concatenate([first.stripe, second.stripe[alone] + offset])[order]
+    # A step joins two stripes when they differ; a hole that the other camera filled is no bridge any more.
+    joins = bridge | np.append(stripe[1:] != stripe[:-1], False)
+    within = np.append(np.diff(curve[order]) == 0, False)
+    wide = np.append(np.diff(along), 0.0) > widest_gap_px
     result = SheetCurves(
         offsets=np.searchsorted(curve[order], np.arange(len(positions) + 1)).astype(np.int32),
         position_px=positions,
@@ -91,9 +95,8 @@ def _merged_pair(
         deviation_mm=np.concatenate([spread, second.deviation_mm[alone]])[order],
         along_px=along,
         pixels_px=np.concatenate([first.pixels_px, second.pixels_px[alone]])[order],
-        stripe=np.concatenate([first.stripe, second.stripe[alone] + offset])[order],
-        # A hole that the other camera filled is no bridge any more.
-        bridge_after=bridge & (step > widest_gap_px),
+        stripe=stripe,
+        bridge_after=joins & within & wide,
         source=np.concatenate([source, second.source[alone]])[order],
     )
     cameras = np.concatenate([camera, np.full(int(alone.sum()), index, dtype=np.int32)])[order]

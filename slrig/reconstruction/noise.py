@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,8 +15,10 @@ from slrig.reconstruction.frames import AxisFrames
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0
 _SAMPLES = 200_000
+_LEAST_RANGE = 10.0
 _BINS = 24
 _LEAST_PER_BIN = 50
+_BOX = np.ones((3, 3), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,18 +41,18 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     the scatter between neighbouring pixels stands in (Immerkær 1996, DOI 10.1006/cviu.1996.0060).
     """
     if frames.inverses is not None and len(frames.bits) >= 3:
-        return _fitted(*_scatter_of_sums(frames.bits, frames.inverses, frames.full_scale))
+        return _fitted(*_scatter_of_sums(frames.bits, frames.inverses, frames.clipped_at))
     return _fitted(*_scatter_between_neighbours(frames))
 
 
 def _scatter_of_sums(
-    bits: NDArray[np.float32], inverses: NDArray[np.float32], full_scale: float
+    bits: NDArray[np.float32], inverses: NDArray[np.float32], clipped_at: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Levels and variances of single samples, half those of the sums."""
     step = max(1, int(np.sqrt(bits[0].size / _SAMPLES)))
     direct, inverse = bits[:, ::step, ::step], inverses[:, ::step, ::step]
     sums = direct + inverse
-    unclipped = (np.maximum(direct, inverse).max(axis=0) < full_scale) & (np.minimum(direct, inverse).min(axis=0) > 0)
+    unclipped = (np.maximum(direct, inverse).max(axis=0) < clipped_at) & (np.minimum(direct, inverse).min(axis=0) > 0)
     count = len(sums) - 1
     variance = sums.var(axis=0, ddof=1, dtype=np.float64)
     # A bin takes the median, which lies below the mean of a chi-square (Wilson-Hilferty).
@@ -62,9 +65,11 @@ def _scatter_between_neighbours(frames: AxisFrames) -> tuple[NDArray[np.float32]
     for image in (frames.white, frames.black):
         across = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
         both = across[:-2] - 2 * across[1:-1] + across[2:]
-        centre = image[1:-1, 1:-1]
-        unclipped = (centre > 0) & (centre < frames.full_scale)
-        levels.append(centre[unclipped])
+        # The mask sums to zero, so the mean of its pixels is independent of its response; the centre alone is not.
+        mean = cv2.blur(image, (3, 3))[1:-1, 1:-1]
+        lowest, highest = cv2.erode(image, _BOX)[1:-1, 1:-1], cv2.dilate(image, _BOX)[1:-1, 1:-1]
+        unclipped = (lowest > 0) & (highest < frames.clipped_at)
+        levels.append(mean[unclipped])
         # median of a squared normal = 0.4549 of its variance; the mask has norm² 36
         variances.append(both[unclipped] ** 2 / 36 / 0.4549)
     return np.concatenate(levels), np.concatenate(variances)
@@ -84,7 +89,8 @@ def _fitted(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseM
     if not points:
         return floor
     x, y, weight = np.array(points).T
-    if np.ptp(x) < 1.0:
+    # Levels that differ by little more than noise tell nothing of the slope.
+    if np.ptp(x) < _LEAST_RANGE * np.sqrt(np.median(y)):
         return NoiseModel(max(float(np.median(y)), _QUANTISATION_VARIANCE), 0.0)
     # Weighted by 1/variance: the scatter of a variance grows with the variance.
     root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)

@@ -67,19 +67,24 @@ def distort(d: Any, x: float, y: float) -> Any:
 
 @njit(cache=True, nogil=True)
 def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
-    """Undistorted normalised coordinates of a pixel, by Newton's method on the distortion."""
+    """Undistorted normalised coordinates of a pixel, by Newton's method on the distortion.
+
+    NaN for a pixel that the lens cannot light: beyond the radius where its distortion turns back there is no direction.
+    """
     yd = (v - d[4]) / d[3]
     xd = (u - d[2] - d[1] * yd) / d[0]
     x, y = xd, yd
     for _ in range(_UNDISTORT_STEPS):
         gx, gy, a, b, c, e = distort(d, x, y)
         det = a * e - b * c
+        if not det > 0:
+            break
         dx, dy = (e * (xd - gx) - b * (yd - gy)) / det, (a * (yd - gy) - c * (xd - gx)) / det
         x += dx
         y += dy
         if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
-            break
-    return x, y
+            return x, y
+    return np.nan, np.nan
 
 
 @njit(cache=True, nogil=True)

@@ -108,8 +108,11 @@ def selected(curves: SheetCurves, keep: NDArray[np.bool_], /) -> SheetCurves:
     counts = np.concatenate([[0], np.cumsum(keep)])
     # A bridge belongs to the last kept point at or before it.
     carried = np.add.reduceat(curves.bridge_after, np.flatnonzero(keep)) > 0 if keep.any() else np.zeros(0, dtype=bool)
+    offsets = counts[curves.offsets].astype(np.int32)
+    # What follows the bridge is gone to the end of the curve: no step is left that would cross it.
+    carried[offsets[1:][np.diff(offsets) > 0] - 1] = False
     return SheetCurves(
-        offsets=counts[curves.offsets].astype(np.int32),
+        offsets=offsets,
         position_px=curves.position_px,
         points_mm=curves.points_mm[keep],
         deviation_mm=curves.deviation_mm[keep],
@@ -271,6 +274,25 @@ def _side(normal: Any, d: Any) -> float:
     return float(normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2])
 
 
+@njit(cache=True, nogil=True)
+def _across(a: Any, b: Any) -> Any:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True, nogil=True)
+def _crossed(device: Any, normal: Any, u0: float, v0: float, u1: float, v1: float, out: Any) -> bool:
+    """Fill out with the ray at which the line through two pixels crosses a plane through the centre."""
+    world_ray(device, u0, v0, out)
+    f = _side(normal, out)
+    world_ray(device, u1, v1, out)
+    g = _side(normal, out)
+    if f == g:
+        return False
+    share = f / (f - g)
+    world_ray(device, u0 + share * (u1 - u0), v0 + share * (v1 - v0), out)
+    return True
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _stereo_kernel(
     camera: Any, other: Any, o1: Any, o2: Any,
@@ -298,11 +320,7 @@ def _stereo_kernel(
         for i in range(offsets[curve], offsets[curve + 1]):
             world_ray(camera, points[i, 0], points[i, 1], d)
             # Normal of the epipolar plane; the other camera's rays change side where the curve crosses it.
-            n = np.array([
-                baseline[1] * d[2] - baseline[2] * d[1],
-                baseline[2] * d[0] - baseline[0] * d[2],
-                baseline[0] * d[1] - baseline[1] * d[0],
-            ])  # fmt: skip
+            n = _across(baseline, d)
             at = -1
             last = b - a - 2
             for reach in range(b - a):
@@ -316,24 +334,24 @@ def _stereo_kernel(
             if at < 0:
                 continue
             hint = at
-            f, g = _side(n, d2[at]), _side(n, d2[at + 1])
-            share = f / (f - g)
             j = a + at
-            u = points2[j, 0] + share * (points2[j + 1, 0] - points2[j, 0])
-            v = points2[j, 1] + share * (points2[j + 1, 1] - points2[j, 1])
-            world_ray(other, u, v, crossing)
-            if not _meeting(o1, d, o2, crossing, out[i]):
+            u0, v0, u1, v1 = points2[j, 0], points2[j, 1], points2[j + 1, 0], points2[j + 1, 1]
+            if not _crossed(other, n, u0, v0, u1, v1, crossing) or not _meeting(o1, d, o2, crossing, out[i]):
                 continue
-            # Two independent errors: across the stripe in either camera.
-            world_ray(
-                camera, points[i, 0] + _PROBE_PX * normals[i, 0], points[i, 1] + _PROBE_PX * normals[i, 1], d_aside
-            )
+            # Two independent errors, across the stripe in either camera. Each moves the place at which the epipolar
+            # line crosses the other curve, the more the more obliquely it does.
+            du, dv = _PROBE_PX * normals[i, 0], _PROBE_PX * normals[i, 1]
+            world_ray(camera, points[i, 0] + du, points[i, 1] + dv, d_aside)
+            if not _crossed(other, _across(baseline, d_aside), u0, v0, u1, v1, crossing):
+                continue
             _meeting(o1, d_aside, o2, crossing, aside)
             first = np.zeros(3)
             for k in range(3):
                 first[k] = (aside[k] - out[i, k]) / _PROBE_PX * sigma[i]
-            world_ray(other, u + _PROBE_PX * normals2[j, 0], v + _PROBE_PX * normals2[j, 1], d_aside)
-            _meeting(o1, d, o2, d_aside, aside)
+            du, dv = _PROBE_PX * normals2[j, 0], _PROBE_PX * normals2[j, 1]
+            if not _crossed(other, n, u0 + du, v0 + dv, u1 + du, v1 + dv, crossing):
+                continue
+            _meeting(o1, d, o2, crossing, aside)
             squares = square = 0.0
             for k in range(3):
                 second = (aside[k] - out[i, k]) / _PROBE_PX * sigma2[j]

@@ -1,0 +1,131 @@
+"""What holds for every tetrahedron, every pair of curves and every surface of curves."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from slrig.meshing.flips import prefers_flip
+from slrig.meshing.initial import initial_mesh
+from slrig.meshing.strips import neighbouring_curves, strips, to_drop
+from slrig.meshing.topology import topology_counts
+from slrig.model import FloatArray, IntArray
+
+# The first call of a kernel compiles it.
+unhurried = settings(deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+# A lattice makes squares, collinear and coincident points common.
+lattice = arrays.arrays(np.float64, (4, 3), elements=st.integers(-2, 2).map(float))
+anywhere = arrays.arrays(np.float64, (4, 3), elements=st.floats(-1e3, 1e3))
+counts = st.lists(st.integers(0, 12), min_size=1, max_size=7)
+
+
+@unhurried
+@given(lattice | anywhere)
+def test_an_edge_never_flips_there_and_back(points: FloatArray) -> None:
+    assert not (prefers_flip(points, 0, 1, 2, 3) and prefers_flip(points, 2, 3, 0, 1))
+
+
+@unhurried
+@given(lattice.filter(lambda points: len(np.unique(points, axis=0)) == 4))
+def test_the_verdict_does_not_depend_on_names(points: FloatArray) -> None:
+    wanted = prefers_flip(points, 0, 1, 2, 3)
+    assert prefers_flip(points, 1, 0, 2, 3) == wanted
+    assert prefers_flip(points, 0, 1, 3, 2) == wanted
+
+
+def surface(lengths: list[int], seed: int) -> tuple[FloatArray, IntArray]:
+    """Wandering curves of these lengths, left to right."""
+    rng = np.random.default_rng(seed)
+    curves = [
+        np.stack([x + rng.normal(0, 0.3, n), np.cumsum(rng.uniform(0.1, 2, n)), rng.normal(0, 0.5, n)], axis=1)
+        for x, n in enumerate(lengths)
+    ]
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return np.concatenate([np.zeros((0, 3)), *curves]), offsets
+
+
+@unhurried
+@given(st.integers(1, 40), st.integers(1, 40), seeds)
+def test_a_strip_has_exactly_i_plus_j_minus_two_triangles(ours: int, theirs: int, seed: int) -> None:
+    points, offsets = surface([ours, theirs], seed)
+    faces = strips(points, offsets, np.array([[0, 1]], dtype=np.int32))
+    assert len(faces) == ours + theirs - 2
+    directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
+    assert max(directed.values(), default=1) == 1
+    assert all(directed[k, k + 1] == 1 for k in range(ours - 1))
+    assert all(directed[k + 1, k] == 1 for k in range(ours, ours + theirs - 1))
+
+
+@unhurried
+@given(counts, st.integers(1, 3), seeds)
+def test_any_curves_make_a_manifold(lengths: list[int], widest: int, seed: int) -> None:
+    points, offsets = surface(lengths, seed)
+    rng = np.random.default_rng(seed)
+    position = np.cumsum(rng.integers(1, 3, len(lengths))).astype(np.float64)
+    pairs = neighbouring_curves(position, offsets, widest_step_px=float(widest))
+    filled = [k for k, n in enumerate(lengths) if n]
+    wanted = [[a, b] for a, b in pairwise(filled) if position[b] - position[a] <= widest]
+    assert pairs.tolist() == wanted
+    faces = strips(points, offsets, pairs)
+    assert len(faces) == sum(lengths[a] + lengths[b] - 2 for a, b in wanted)
+    found = topology_counts(faces)
+    assert found.nonmanifold_edges == found.misoriented_edges == 0
+    assert found.duplicate_faces == found.degenerate_faces == 0
+
+
+@unhurried
+@given(counts, seeds, st.booleans())
+def test_what_is_dropped_leaves_a_manifold_and_is_counted(lengths: list[int], seed: int, keep_holes: bool) -> None:
+    points, offsets = surface(lengths, seed)
+    rng = np.random.default_rng(seed)
+    bridge = np.asarray(rng.random(len(points)) < 0.2)
+    bridge[offsets[1:][np.diff(offsets) > 0] - 1] = False
+    before = points.copy(), bridge.copy()
+    mesh = initial_mesh(
+        points, offsets, np.arange(len(lengths), dtype=np.float64), bridge, np.full(len(points), 0.4),
+        np.array([3.0, 5.0, -500.0]),
+        widest_step_px=1.0, depth_edge_ratio=5.0, keep_holes=keep_holes,
+    )  # fmt: skip
+    assert mesh.strip_triangles == len(mesh.faces) + mesh.dropped_triangles
+    assert mesh.dropped_triangles <= mesh.dropped_at_bridges + mesh.dropped_at_depth_edges
+    assert mesh.dropped_triangles >= max(mesh.dropped_at_bridges, mesh.dropped_at_depth_edges)
+    found = topology_counts(mesh.faces)
+    assert found.nonmanifold_edges == found.misoriented_edges == found.duplicate_faces == 0
+    corners = points[mesh.faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0)
+    assert (longest <= 5.0 * 0.4 + 1e-9).all()
+    used = np.zeros(len(points), dtype=np.bool_)
+    used[mesh.faces] = True
+    # A normal where there is a triangle with an area, none where there is no triangle.
+    assert np.isnan(mesh.normals[~used]).all()
+    if keep_holes:
+        steps = {(int(k), int(k) + 1) for k in np.flatnonzero(bridge)}
+        sides = {tuple(sorted((int(f[k]), int(f[(k + 1) % 3])))) for f in mesh.faces for k in range(3)}
+        assert not steps & sides
+    else:
+        assert mesh.dropped_at_bridges == 0
+    np.testing.assert_array_equal(points, before[0])
+    np.testing.assert_array_equal(bridge, before[1])
+
+
+@unhurried
+@given(st.integers(2, 12), st.integers(2, 12), seeds)
+def test_unmeasured_points_leave_the_mesh(ours: int, theirs: int, seed: int) -> None:
+    points, offsets = surface([ours, theirs], seed)
+    missing = seed % len(points)
+    points[missing] = np.nan
+    faces = strips(points, offsets, np.array([[0, 1]], dtype=np.int32))
+    assert len(faces) == ours + theirs - 2
+    drop = to_drop(
+        points, faces, np.zeros(len(points), dtype=np.bool_), np.ones(len(points)),
+        depth_edge_ratio=1e6, keep_holes=False,
+    )  # fmt: skip
+    with_it = (faces == missing).any(axis=1)
+    assert drop.any[with_it].all()
+    assert not drop.any[~with_it].any()

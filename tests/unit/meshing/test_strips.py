@@ -1,0 +1,225 @@
+"""Strips of triangles between neighbouring curves, and the triangles that do not belong to the surface."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.meshing.strips import neighbouring_curves, strips, to_drop
+from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.test_flips import verdict
+
+
+def curve(x: float, heights: FloatArray, *, depth: float = 0.0) -> FloatArray:
+    return np.stack([np.full(len(heights), x), heights, np.full(len(heights), depth)], axis=1)
+
+
+def offsets_of(*curves: FloatArray) -> IntArray:
+    return np.concatenate([[0], np.cumsum([len(each) for each in curves])]).astype(np.int32)
+
+
+def between(*curves: FloatArray) -> IntArray:
+    """Strips between each curve and the next."""
+    pairs = np.stack([np.arange(len(curves) - 1), np.arange(1, len(curves))], axis=1).astype(np.int32)
+    return strips(np.concatenate(curves), offsets_of(*curves), pairs)
+
+
+def wandering(seed: int, x: float, count: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    return np.stack(
+        [x + rng.normal(0, 0.2, count), np.cumsum(rng.uniform(0.2, 1.5, count)), rng.normal(0, 0.4, count)], axis=1
+    )
+
+
+def walked(first: FloatArray, second: FloatArray) -> list[tuple[int, int, int]]:
+    """Section 3.2: of the two triangles on the current edge, that which the flip rule keeps."""
+    points = np.concatenate([first, second])
+    i, j = 0, len(first)
+    triangles = []
+    while i < len(first) - 1 or j < len(points) - 1:
+        if i == len(first) - 1:
+            first_moves = False
+        elif j == len(points) - 1:
+            first_moves = True
+        else:
+            # The quadrilateral's diagonals are (i, j + 1) and (i + 1, j); the second is taken when it is better.
+            first_moves, _, _ = verdict(points[i], points[j + 1], points[j], points[i + 1])
+        triangles.append((i, i + 1, j) if first_moves else (i, j + 1, j))
+        i, j = (i + 1, j) if first_moves else (i, j + 1)
+    return triangles
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_walk_is_that_of_the_paper(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = wandering(seed, 0.0, int(rng.integers(1, 60))), wandering(seed + 50, 1.0, int(rng.integers(1, 60)))
+    assert [tuple(face) for face in between(first, second).tolist()] == walked(first, second)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(1, 1), (1, 2), (2, 1), (1, 9), (7, 1), (2, 2), (30, 4), (25, 40)])
+def test_a_strip_has_i_plus_j_minus_two_triangles_and_uses_each_step_once(ours: int, theirs: int) -> None:
+    faces = between(wandering(1, 0.0, ours), wandering(2, 1.0, theirs))
+    assert faces.shape == (ours + theirs - 2, 3)
+    assert faces.dtype == np.int32
+    directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
+    assert all(count == 1 for count in directed.values())
+    # Steps run down the first curve and up the second.
+    for step in range(ours - 1):
+        assert directed[step, step + 1] == 1
+    for step in range(ours, ours + theirs - 1):
+        assert directed[step + 1, step] == 1
+    # What is left are the edges across: all shared by two triangles, but for the two ends.
+    across = {frozenset(edge): 0 for edge in directed if (edge[0] < ours) != (edge[1] < ours)}
+    for edge in directed:
+        if frozenset(edge) in across:
+            across[frozenset(edge)] += 1
+    ends = {frozenset((0, ours)), frozenset((ours - 1, ours + theirs - 1))}
+    assert {edge for edge, count in across.items() if count == 1} == (ends if ours + theirs > 2 else set())
+    assert set(across.values()) <= {1, 2}
+
+
+def test_even_curves_give_two_triangles_per_step() -> None:
+    heights = np.arange(10.0)
+    faces = between(curve(0.0, heights), curve(1.0, heights))
+    corners = np.concatenate([curve(0.0, heights), curve(1.0, heights)])[faces]
+    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    np.testing.assert_allclose(areas, 0.5)
+
+
+def test_triangles_are_counter_clockwise_in_an_image_with_curves_running_down() -> None:
+    # x to the right, y down, seen from the front: counter-clockwise is a negative area there.
+    heights = np.arange(6.0)
+    faces = between(curve(0.0, heights), curve(1.0, heights), curve(2.5, heights[1:4]))
+    points = np.concatenate([curve(0.0, heights), curve(1.0, heights), curve(2.5, heights[1:4])])[faces]
+    normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    assert (normal[:, 2] < 0).all()
+    assert (normal[:, :2] == 0).all()
+
+
+def test_neighbouring_strips_meet_without_a_seam() -> None:
+    curves = [wandering(seed, float(seed), 20 + 3 * seed) for seed in range(5)]
+    faces = between(*curves)
+    assert len(faces) == sum(len(a) + len(b) - 2 for a, b in pairwise(curves))
+    directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
+    assert all(count == 1 for count in directed.values())
+    inner = range(int(offsets_of(*curves)[1]), int(offsets_of(*curves)[4]) - 1)
+    ends = set((offsets_of(*curves)[1:] - 1).tolist())
+    for step in inner:
+        if step not in ends:
+            assert directed[step, step + 1] == directed[step + 1, step] == 1
+
+
+def test_no_pairs_give_no_triangles() -> None:
+    none = np.zeros((0, 2), dtype=np.int32)
+    assert strips(np.zeros((0, 3)), np.zeros(1, dtype=np.int32), none).shape == (0, 3)
+    assert strips(curve(0.0, np.arange(4.0)), np.array([0, 4], dtype=np.int32), none).shape == (0, 3)
+
+
+def pairs_of(position_px: list[float], counts: list[int], *, widest_step_px: float = 1.0) -> list[list[int]]:
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    pairs: list[list[int]] = neighbouring_curves(np.array(position_px), offsets, widest_step_px=widest_step_px).tolist()
+    return pairs
+
+
+def test_neighbours_are_consecutive_codes() -> None:
+    assert pairs_of([3.0, 4.0, 5.0, 7.0, 8.0], [5, 5, 5, 5, 5]) == [[0, 1], [1, 2], [3, 4]]
+
+
+def test_a_gap_may_be_allowed() -> None:
+    assert pairs_of([3.0, 4.0, 6.0, 9.0], [5] * 4, widest_step_px=2.0) == [[0, 1], [1, 2]]
+
+
+def test_an_empty_curve_has_no_neighbours_and_may_be_stepped_over() -> None:
+    assert pairs_of([3.0, 4.0, 5.0], [5, 0, 5]) == []
+    assert pairs_of([3.0, 4.0, 5.0], [5, 0, 5], widest_step_px=2.0) == [[0, 2]]
+
+
+def test_a_step_that_is_a_third_of_a_pixel_is_not_lost_to_rounding() -> None:
+    assert len(pairs_of([k / 3 for k in range(100)], [2] * 100, widest_step_px=1 / 3)) == 99
+
+
+def test_no_curve_or_one_has_no_neighbours() -> None:
+    assert pairs_of([], []) == []
+    assert pairs_of([3.0], [9]) == []
+
+
+def dropped(
+    points: FloatArray, faces: IntArray, *, bridge_after: NDArray[np.bool_] | None = None, keep_holes: bool = False,
+    sampling: FloatArray | None = None, ratio: float = 6.0,
+) -> tuple[list[bool], list[bool], list[bool]]:  # fmt: skip
+    none = np.zeros(len(points), dtype=np.bool_)
+    spacing = np.ones(len(points)) if sampling is None else sampling
+    drop = to_drop(
+        points, faces, none if bridge_after is None else bridge_after, spacing,
+        depth_edge_ratio=ratio, keep_holes=keep_holes,
+    )  # fmt: skip
+    return drop.depth_edge.tolist(), drop.bridge.tolist(), drop.any.tolist()
+
+
+TRIANGLES = np.array([[0, 1, 2], [0, 3, 4]], dtype=np.int32)
+
+
+def test_a_triangle_with_a_long_edge_crosses_a_depth_edge() -> None:
+    # Longest edges 5 and 7, whichever of the three it is.
+    for turn in range(3):
+        points = np.array([[0.0, 0, 0], [3, 0, 0], [3, 4, 0], [0, 0, 7], [0, 1, 0]])
+        faces = np.roll(TRIANGLES, turn, axis=1)
+        assert dropped(points, faces) == ([False, True], [False, False], [False, True])
+        assert dropped(points, faces, ratio=4.9)[0] == [True, True]
+        assert dropped(points, faces, ratio=7.1)[0] == [False, False]
+
+
+def test_what_is_long_depends_on_how_finely_the_rig_samples_there() -> None:
+    points = np.array([[0.0, 0, 0], [3, 0, 0], [3, 4, 0], [0, 0, 7], [0, 1, 0]])
+    # The mean over the three corners counts.
+    assert dropped(points, TRIANGLES, sampling=np.array([1, 1, 0.6, 1.5, 1.5]))[0] == [False, False]
+    assert dropped(points, TRIANGLES, sampling=np.array([1, 1, 0.6, 1, 1]))[0] == [False, True]
+    assert dropped(points, TRIANGLES, sampling=np.array([0.9, 0.8, 0.7, 1, 1]))[0] == [True, True]
+
+
+def test_triangles_over_a_bridge_go_when_holes_are_kept() -> None:
+    first, second = curve(0.0, np.array([0, 1, 2, 3, 4, 5.0])), curve(1.0, np.array([0, 1, 2, 3, 4, 5.0]))
+    points = np.concatenate([first, second])
+    faces = between(first, second)
+    bridge = np.zeros(12, dtype=np.bool_)
+    bridge[[2, 9]] = True
+    over = [bool({2, 3} <= set(face) or {9, 10} <= set(face)) for face in faces.tolist()]
+    assert sum(over) == 2
+    assert dropped(points, faces, bridge_after=bridge, keep_holes=True) == ([False] * 10, over, over)
+    assert dropped(points, faces, bridge_after=bridge)[2] == [False] * 10
+
+
+def test_an_edge_across_is_no_step_over_a_bridge() -> None:
+    # The bridge after point 2 is to point 3; edges of 2 to other points do not use it.
+    points = np.concatenate([curve(0.0, np.arange(4.0)), curve(1.0, np.arange(4.0))])
+    bridge = np.zeros(8, dtype=np.bool_)
+    bridge[2] = True
+    faces = np.array([[1, 2, 5], [2, 6, 5], [2, 3, 6]], dtype=np.int32)
+    assert dropped(points, faces, bridge_after=bridge, keep_holes=True)[1] == [False, False, True]
+
+
+def test_both_causes_may_meet_in_one_triangle() -> None:
+    points = np.array([[0.0, 0, 0], [0, 9, 0], [1, 0, 0]])
+    faces = np.array([[0, 1, 2]], dtype=np.int32)
+    bridge = np.array([True, False, False])
+    assert dropped(points, faces, bridge_after=bridge, keep_holes=True) == ([True], [True], [True])
+
+
+def test_of_no_triangles_none_are_dropped() -> None:
+    assert dropped(np.zeros((3, 3)), np.zeros((0, 3), dtype=np.int32), keep_holes=True) == ([], [], [])
+
+
+def test_inputs_are_left_alone() -> None:
+    first, second = wandering(1, 0.0, 12), wandering(2, 1.0, 9)
+    points, offsets = np.concatenate([first, second]), offsets_of(first, second)
+    before = points.copy(), offsets.copy()
+    faces = strips(points, offsets, np.array([[0, 1]], dtype=np.int32))
+    kept = faces.copy()
+    dropped(points, faces, keep_holes=True)
+    np.testing.assert_array_equal(points, before[0])
+    np.testing.assert_array_equal(offsets, before[1])
+    np.testing.assert_array_equal(faces, kept)

@@ -1,0 +1,200 @@
+"""One camera's walk from frames to linked curves, on a scene whose projector coordinate is known everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.model import (
+    Axis,
+    CameraFormat,
+    Capture,
+    FloatArray,
+    LineShift,
+    Pattern,
+    Refusal,
+    Shot,
+    Size,
+)
+from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.patterns.sequence import encode, scan_patterns
+from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
+from slrig.reconstruction.frames import axis_frames
+from tests.unit.reconstruction.builders import grid
+
+CAMERA = Size(210, 150)
+PROJECTOR = Size(128, 96)
+SUBPIXELS = 6
+BLUR_PX = 0.9
+Scene = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def slope(x: FloatArray, y: FloatArray) -> FloatArray:
+    """A slanted plate: 0.52 projector columns per camera pixel."""
+    return np.asarray(8.0 + 0.52 * x + 0.03 * y)
+
+
+def cliff(x: FloatArray, y: FloatArray) -> FloatArray:
+    """The same with a step of twelve columns, and a shadow beside it (NaN)."""
+    stepped = slope(x, y) + np.where(x > 110, 12.0, 0.0)
+    return np.asarray(np.where((x > 98) & (x <= 110), np.nan, stepped))
+
+
+def rendered(scene: Scene, patterns: tuple[Pattern, ...], *, noise: float = 0.8) -> Capture:
+    """Every column pattern as a blurred, noisy 8-bit camera sees it."""
+    x, y = grid((CAMERA.height_px, CAMERA.width_px * SUBPIXELS))
+    x = (x + 0.5) / SUBPIXELS - 0.5
+    lit = np.isfinite(scene(x, y))
+    # The light of a sub-pixel is the mean of the profile over the stretch of the projector that it sees.
+    ends = [np.nan_to_num(scene(x + side * 0.5 / SUBPIXELS, y), nan=-9.0) for side in (-1, 1)]
+    borders = np.arange(PROJECTOR.width_px + 1) - 0.5
+    albedo = 120 + 70 * np.cos(grid(CAMERA.shape)[1] / 20)
+    rng = np.random.default_rng(7)
+    sequence = encode(patterns, PROJECTOR)
+    shots = []
+    for index in range(len(sequence)):
+        summed = np.concatenate([[0.0], np.cumsum(sequence.image(index)[0] / 255.0)])
+        first, last = (np.interp(each, borders, summed) for each in ends)
+        light = np.where(lit & (ends[1] > ends[0]), (last - first) / np.maximum(ends[1] - ends[0], 1e-9), 0.0)
+        # The lens blurs before the pixels sample.
+        sharp = cv2.GaussianBlur(light, (0, 0), sigmaX=BLUR_PX * SUBPIXELS, sigmaY=BLUR_PX)
+        seen = 12 + albedo * sharp.reshape(CAMERA.height_px, CAMERA.width_px, SUBPIXELS).mean(axis=2)
+        seen = seen + rng.normal(0, noise, seen.shape)
+        shots.append(Shot(index, "eye", np.clip(np.rint(seen), 0, 255).astype(np.uint8)))
+    return Capture(PROJECTOR, patterns, {"eye": CameraFormat(CAMERA, 8)}, tuple(shots))
+
+
+def patterns(*, line_shift: bool = True, cell_px: int | None = None) -> tuple[Pattern, ...]:
+    return scan_patterns(
+        PROJECTOR, line_shift=line_shift, period_px=8, line_width_px=1, gray_cell_px=cell_px, gray_offset_px=0,
+        rows=False,
+    )  # fmt: skip
+
+
+def walk(capture: Capture, *, limits: Limits | None = None) -> tuple[CameraCurves, list[str]]:
+    frames = axis_frames(capture, "eye", Axis.COLUMN)
+    lines = frames.line_patterns
+    tables = CodeTables(
+        index_of_word(frames.gray),
+        cell_positions(frames.gray, PROJECTOR),
+        line_positions(lines, frames.gray, PROJECTOR) if lines else edge_positions(frames.gray, PROJECTOR),
+    )
+    stages: list[str] = []
+    return camera_curves(frames, tables, limits or Limits(), entered=stages.append), stages
+
+
+def errors_px(curves: CameraCurves, scene: Scene) -> FloatArray:
+    """Projector columns by which points miss the column of their curve."""
+    ensemble = curves.ensemble
+    column = np.repeat(ensemble.position_px, np.diff(ensemble.offsets))
+    return scene(ensemble.points_px[:, 0], ensemble.points_px[:, 1]) - column
+
+
+def test_a_slanted_plate_gives_every_column_once_to_a_fraction_of_a_pixel() -> None:
+    curves, stages = walk(rendered(slope, patterns()))
+    assert stages == ["decode", "locate stripes", "identify stripes", "link stripes"]
+    position = curves.ensemble.position_px
+    # 8 … 121 columns are in view; those whose stripe leaves by a corner are there in part.
+    assert set(range(14, 114)) <= set(position.tolist())
+    assert (np.diff(position) > 0).all()
+    errors = errors_px(curves, slope)
+    assert len(errors) > 12_000
+    assert np.abs(errors).max() < 0.25
+    assert np.sqrt(np.mean(errors**2)) < 0.03
+    assert not curves.ensemble.bridge_after.any()
+    assert curves.stripe_points >= len(errors)
+    assert curves.stripe_count == len(position)
+    assert 1.0 <= curves.scale_px <= 2.5
+
+
+@pytest.mark.parametrize("noise", [2.0, 4.0])
+def test_stated_deviations_are_those_of_the_noise(noise: float) -> None:
+    curves, _ = walk(rendered(slope, patterns(), noise=noise))
+    for level in (15, 60, 120):
+        variance = curves.noise.variance(np.full((1, 1), level, dtype=np.float32))[0, 0]
+        assert variance == pytest.approx(noise**2 + 1 / 12, rel=0.2)
+    # 0.52 columns per pixel; the albedo makes some stripes surer than others.
+    missed = errors_px(curves, slope) / np.hypot(0.52, 0.03) / curves.ensemble.sigma_px
+    assert np.sqrt(np.mean(missed**2)) == pytest.approx(1.0, rel=0.1)
+
+
+def test_without_line_frames_code_edges_stand_in() -> None:
+    curves, _ = walk(rendered(slope, patterns(line_shift=False, cell_px=2)))
+    position = curves.ensemble.position_px
+    assert set(np.arange(15.5, 112, 2).tolist()) <= set(position.tolist())
+    errors = errors_px(curves, slope)
+    assert len(errors) > 5000
+    assert np.sqrt(np.mean(errors**2)) < 0.05
+    assert np.abs(errors).max() < 0.4
+
+
+def test_code_edges_are_found_without_inverses_too() -> None:
+    pairs = rendered(slope, patterns(line_shift=False, cell_px=2))
+    kept = [i for i, pattern in enumerate(pairs.patterns) if not getattr(pattern, "inverted", False)]
+    shots = tuple(
+        Shot(kept.index(shot.pattern), shot.camera, shot.image) for shot in pairs.shots if shot.pattern in kept
+    )
+    curves, _ = walk(Capture(PROJECTOR, tuple(pairs.patterns[i] for i in kept), pairs.cameras, shots))
+    errors = errors_px(curves, slope)
+    assert len(errors) > 4500
+    assert np.sqrt(np.mean(errors**2)) < 0.06
+
+
+def test_shadows_and_steps_are_kept_clear_of() -> None:
+    curves, _ = walk(rendered(cliff, patterns()))
+    x = curves.ensemble.points_px[:, 0]
+    # The shadow runs from 98.5 to 110.5. Blur lights two pixels of it, and from there two more are refused.
+    assert not ((x > 98.5) & (x < 110.5)).any()
+    errors = np.abs(errors_px(curves, cliff))
+    assert errors.max() < 0.5
+    assert np.sqrt(np.mean(errors[(x < 94) | (x > 115)] ** 2)) < 0.03
+    refused = {Refusal(int(value)) for value in np.unique(curves.refusal)}
+    assert {Refusal.NOT_LIT, Refusal.SHADOW_EDGE} <= refused
+    assert (curves.refusal[20:130, 103:107] == Refusal.NOT_LIT).all()
+
+
+def test_pixels_that_see_past_the_projector_are_counted_as_such() -> None:
+    def beyond(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.asarray(slope(x, y) + 45.0)
+
+    curves, _ = walk(rendered(beyond, patterns()))
+    assert curves.ensemble.position_px.max() <= 127
+    assert (curves.refusal == Refusal.NOT_LIT).mean() > 0.2
+    assert curves.decoded_pixels == pytest.approx(int(((beyond(*grid(CAMERA.shape))) < 127.5).sum()), rel=0.05)
+
+
+def test_a_dark_room_gives_no_curves() -> None:
+    def nowhere(x: FloatArray, y: FloatArray) -> FloatArray:
+        return np.full((x + y).shape, np.nan)
+
+    curves, _ = walk(rendered(nowhere, patterns()))
+    assert curves.decoded_pixels == curves.stripe_count == curves.stripe_points == 0
+    assert len(curves.ensemble.position_px) == 0
+    assert (curves.refusal == Refusal.NOT_LIT).all()
+
+
+def test_the_same_frames_give_the_same_curves() -> None:
+    capture = rendered(cliff, patterns())
+    arrays: list[list[NDArray[np.generic]]] = []
+    for _ in range(2):
+        ensemble = walk(capture)[0].ensemble
+        arrays.append([ensemble.points_px, ensemble.sigma_px, ensemble.offsets, ensemble.bridge_after])
+    for one, other in zip(*arrays, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def test_lines_are_looked_for_in_the_frames_that_show_them() -> None:
+    every = rendered(slope, patterns())
+    shown = [p for p in every.patterns if not isinstance(p, LineShift) or p.shift in (1, 6)]
+    shots = tuple(
+        Shot(shown.index(every.patterns[s.pattern]), s.camera, s.image)
+        for s in every.shots
+        if every.patterns[s.pattern] in shown
+    )
+    curves, _ = walk(Capture(PROJECTOR, tuple(shown), every.cameras, shots))
+    assert {int(p) % 8 for p in curves.ensemble.position_px} == {1, 6}
+    assert np.sqrt(np.mean(errors_px(curves, slope) ** 2)) < 0.03

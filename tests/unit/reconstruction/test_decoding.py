@@ -1,0 +1,224 @@
+"""Gray decoding pixel by pixel against a plain reading of its rules."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.model import Axis, Gray, IntArray, Refusal, Size
+from slrig.patterns.positions import index_of_word
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.noise import NoiseModel
+from tests.unit.reconstruction.builders import code_frames
+
+BITS = 6
+WORDS = index_of_word(Gray(Axis.COLUMN, 0, BITS))
+QUIET = NoiseModel(1.0, 0.0)
+# An uneven fraction: no integer sample lies on the margin itself.
+LIMITS = DecodingLimits(bit_fraction=0.0813)
+
+
+def word_of(cell: int) -> list[int]:
+    """The bits of a cell's code word, most significant first, by counting through the reflected code."""
+    if cell == 0:
+        return [0] * BITS
+    words = [[]]  # type: list[list[int]]
+    for _ in range(BITS):
+        words = [[0, *word] for word in words] + [[1, *word] for word in reversed(words)]
+    return words[cell]
+
+
+def one_pixel(
+    swings: list[float], *, white: float = 200.0, black: float = 20.0, paired: bool = True, ambient: float = 0.0
+) -> AxisFrames:
+    """A pixel whose bits are white (1), black (-1) or between."""
+    middle, half = (white + black) / 2 + ambient, (white - black) / 2
+    bits = np.array(swings, dtype=np.float32)[:, None, None] * half + middle
+    return code_frames(
+        bits=bits.astype(np.float32),
+        inverses=(2 * middle - bits).astype(np.float32) if paired else None,
+        white=np.full((1, 1), white, dtype=np.float32),
+        black=np.full((1, 1), black, dtype=np.float32),
+    )
+
+
+def swings_of(cell: int) -> list[float]:
+    return [2.0 * bit - 1.0 for bit in word_of(cell)]
+
+
+def read(frames: AxisFrames, *, cells: int = 64, limits: DecodingLimits = LIMITS) -> tuple[int, int, Refusal]:
+    """(lowest, highest, refusal) of the only pixel."""
+    code = decode(frames, QUIET, WORDS, cells, limits)
+    return int(code.lowest[0, 0]), int(code.highest[0, 0]), Refusal(int(code.refusal[0, 0]))
+
+
+def expected(frames: AxisFrames, noise: NoiseModel, cells: int, limits: DecodingLimits) -> CodeMap:
+    """The docstrings of `decode` and `DecodingLimits`, one pixel at a time."""
+    rows, columns = frames.white.shape
+    lowest: IntArray = np.full((rows, columns), -1, dtype=np.int32)
+    highest: IntArray = np.full((rows, columns), -1, dtype=np.int32)
+    refusal: NDArray[np.uint8] = np.zeros((rows, columns), dtype=np.uint8)
+    cell_of = {tuple(word_of(cell)): cell for cell in range(2**BITS)}
+    for y, x in product(range(rows), range(columns)):
+        white, black = float(frames.white[y, x]), float(frames.black[y, x])
+        spread = (2 * noise.read_variance + noise.slope * (white + black)) ** 0.5
+        if white - black <= max(limits.lit_sigma * spread, limits.lit_fraction * frames.full_scale):
+            refusal[y, x] = Refusal.NOT_LIT
+            continue
+        choices: list[tuple[int, ...]] = []
+        clipped = frames.inverses is None and white >= frames.full_scale
+        for b in range(BITS):
+            seen = float(frames.bits[b, y, x])
+            if frames.inverses is None:
+                difference = 2 * (seen - (white + black) / 2)
+            else:
+                other = float(frames.inverses[b, y, x])
+                difference = seen - other
+                clipped |= min(seen, other) >= frames.full_scale
+            margin = max(limits.bit_sigma * spread, limits.bit_fraction * (white - black))
+            choices.append((0, 1) if abs(difference) < margin else (int(difference > 0),))
+        possible = sorted(cell_of[word] for word in product(*choices))
+        if clipped:
+            refusal[y, x] = Refusal.SATURATED
+        elif possible[-1] - possible[0] > limits.widest_interval:
+            refusal[y, x] = Refusal.AMBIGUOUS_BIT
+        elif possible[0] >= cells:
+            refusal[y, x] = Refusal.BEYOND_PROJECTOR
+        else:
+            lowest[y, x], highest[y, x] = possible[0], min(possible[-1], cells - 1)
+    return CodeMap(lowest, highest, refusal)
+
+
+def random_frames(seed: int, *, paired: bool) -> AxisFrames:
+    """Pixels of every kind: certain, uncertain, clipped, dark, of cells beyond the projector."""
+    rng = np.random.default_rng(seed)
+    shape = (24, 32)
+    black = rng.integers(0, 60, shape).astype(np.float32)
+    white = np.minimum(black + rng.choice([2, 8, 40, 120, 230], shape), 255).astype(np.float32)
+    cells = rng.integers(0, 2**BITS, shape)
+    bits = np.array([[word_of(int(cell)) for cell in row] for row in cells]).transpose(2, 0, 1)
+    swing = np.where(bits == 1, 1.0, -1.0) * rng.choice([1.0, 0.9, 0.05, 0.0], (BITS, *shape), p=[0.6, 0.25, 0.1, 0.05])
+    middle, half = (white + black) / 2, (white - black) / 2
+    direct = np.rint(middle + half * swing)
+    inverse = np.rint(middle - half * swing)
+    both = rng.random(shape) < 0.03
+    direct[2, both] = inverse[2, both] = 255
+    return code_frames(
+        bits=direct.astype(np.float32),
+        inverses=inverse.astype(np.float32) if paired else None,
+        white=white,
+        black=black,
+    )
+
+
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
+@pytest.mark.parametrize("noise", [NoiseModel(0.3, 0.0), NoiseModel(2.0, 0.037)], ids=["quiet", "loud"])
+def test_every_pixel_is_read_as_the_rules_say(*, paired: bool, noise: NoiseModel) -> None:
+    for seed in range(3):
+        frames = random_frames(seed, paired=paired)
+        got = decode(frames, noise, WORDS, 50, LIMITS)
+        want = expected(frames, noise, 50, LIMITS)
+        np.testing.assert_array_equal(got.refusal, want.refusal)
+        np.testing.assert_array_equal(got.lowest, want.lowest)
+        np.testing.assert_array_equal(got.highest, want.highest)
+        met = {Refusal(int(value)) for value in np.unique(got.refusal)}
+        assert met == {
+            Refusal.NONE, Refusal.NOT_LIT, Refusal.SATURATED, Refusal.AMBIGUOUS_BIT, Refusal.BEYOND_PROJECTOR,
+        }  # fmt: skip
+
+
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
+def test_every_cell_is_read_exactly(*, paired: bool) -> None:
+    for cell in range(64):
+        assert read(one_pixel(swings_of(cell), paired=paired)) == (cell, cell, Refusal.NONE)
+
+
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "threshold"])
+def test_a_bit_at_its_own_edge_leaves_two_neighbours(*, paired: bool) -> None:
+    for cell in range(63):
+        swings = swings_of(cell)
+        turning = next(b for b in range(BITS) if swings[b] != swings_of(cell + 1)[b])
+        swings[turning] = 0.0
+        assert read(one_pixel(swings, paired=paired)) == (cell, cell + 1, Refusal.NONE)
+
+
+def test_a_coarse_bit_in_doubt_away_from_its_edge_is_refused() -> None:
+    # Bit 0 changes between cells 31 and 32 only; in doubt at cell 5 it could mean 5 or 58.
+    swings = swings_of(5)
+    swings[0] = 0.0
+    assert read(one_pixel(swings)) == (-1, -1, Refusal.AMBIGUOUS_BIT)
+
+
+def test_finest_bits_lost_in_blur_cost_resolution_only() -> None:
+    swings = swings_of(21)
+    swings[-1] = swings[-2] = 0.0
+    assert read(one_pixel(swings)) == (20, 23, Refusal.NONE)
+
+
+def test_a_bit_just_outside_the_margin_is_certain_and_one_inside_is_not() -> None:
+    swings = swings_of(20)
+    swings[-1] = -0.09
+    assert read(one_pixel(swings)) == (20, 20, Refusal.NONE)
+    swings[-1] = -0.07
+    assert read(one_pixel(swings)) == (20, 21, Refusal.NONE)
+
+
+def test_more_doubts_than_are_followed_are_refused() -> None:
+    assert read(one_pixel([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])) == (-1, -1, Refusal.AMBIGUOUS_BIT)
+
+
+def test_an_interval_reaching_beyond_the_projector_ends_at_its_last_cell() -> None:
+    swings = swings_of(39)
+    turning = next(b for b in range(BITS) if swings[b] != swings_of(40)[b])
+    swings[turning] = 0.0
+    assert read(one_pixel(swings), cells=40) == (39, 39, Refusal.NONE)
+    assert read(one_pixel(swings_of(40)), cells=40) == (-1, -1, Refusal.BEYOND_PROJECTOR)
+
+
+@pytest.mark.parametrize("white", [21.0, 23.0])
+def test_what_the_projector_does_not_light_is_refused_first(white: float) -> None:
+    dark = one_pixel([0.0] * BITS, white=white, black=20.0)
+    assert read(dark) == (-1, -1, Refusal.NOT_LIT)
+
+
+def test_clipping_is_told_from_doubt() -> None:
+    # Ambient light lifts bit and inverse over full scale: they are equal, and no noise is to blame.
+    frames = one_pixel(swings_of(9), ambient=400.0)
+    clipped = code_frames(
+        bits=np.minimum(frames.bits, np.float32(255)),
+        inverses=np.minimum(frames.inverses, np.float32(255)) if frames.inverses is not None else None,
+        white=frames.white,
+        black=frames.black,
+    )
+    assert read(clipped) == (-1, -1, Refusal.SATURATED)
+
+
+def test_without_inverses_a_clipped_white_has_no_middle() -> None:
+    assert read(one_pixel(swings_of(9), white=255.0, paired=False))[2] is Refusal.SATURATED
+    assert read(one_pixel(swings_of(9), white=255.0))[2] is Refusal.NONE
+
+
+def test_the_centre_of_an_interval_is_nan_where_refused() -> None:
+    code = CodeMap(
+        np.array([[4, -1]], dtype=np.int32), np.array([[5, -1]], dtype=np.int32), np.array([[0, 3]], dtype=np.uint8)
+    )
+    np.testing.assert_array_equal(code.centre(), [[4.5, np.nan]])
+
+
+def test_words_are_numbered_along_the_projector() -> None:
+    light = [word_of(cell) for cell in range(64)]
+    numbers = [int("".join(map(str, word)), 2) for word in light]
+    assert [int(WORDS[number]) for number in numbers] == list(range(64))
+    assert Size(256, 1).along(Axis.COLUMN) // 4 == 64
+
+
+def test_frames_are_left_alone() -> None:
+    frames = random_frames(1, paired=True)
+    before = [frames.bits.copy(), frames.white.copy(), frames.black.copy(), WORDS.copy()]
+    decode(frames, QUIET, WORDS, 50, LIMITS)
+    for array, earlier in zip([frames.bits, frames.white, frames.black, WORDS], before, strict=True):
+        np.testing.assert_array_equal(array, earlier)

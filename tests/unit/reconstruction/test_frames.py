@@ -1,0 +1,197 @@
+"""Frames sorted by what they show: averages, brackets, stand-ins, and the words of the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from slrig.errors import PatternError
+from slrig.model import (
+    Axis,
+    Black,
+    CameraFormat,
+    Capture,
+    Gray,
+    LineShift,
+    Pattern,
+    Refusal,
+    Shot,
+    Size,
+    White,
+)
+from slrig.patterns.positions import index_of_word
+from slrig.reconstruction.decoding import DecodingLimits, decode
+from slrig.reconstruction.frames import axis_frames
+from slrig.reconstruction.noise import NoiseModel
+
+CAMERA = CameraFormat(Size(3, 2), 8)
+BITS = [Gray(Axis.COLUMN, bit, 2) for bit in range(2)]
+INVERSES = [Gray(Axis.COLUMN, bit, 2, inverted=True) for bit in range(2)]
+LINES = [LineShift(Axis.COLUMN, shift, 4) for shift in range(4)]
+
+Seen = tuple[Pattern, int | Sequence[int], float | None]
+
+
+def capture_of(*seen: Seen, camera: CameraFormat = CAMERA, name: str = "eye") -> Capture:
+    """Frames of one value each (or one per column), in the order given."""
+    patterns = tuple(dict.fromkeys(pattern for pattern, _, _ in seen))
+    shots = tuple(
+        Shot(
+            patterns.index(pattern),
+            name,
+            np.broadcast_to(np.array(value, dtype=np.uint8), camera.size.shape).copy(),
+            exposure_s=exposure,
+        )
+        for pattern, value, exposure in seen
+    )
+    return Capture(Size(4, 4), patterns, {name: camera}, shots)
+
+
+def plain(*patterns: Pattern, value: int = 50) -> list[Seen]:
+    return [(pattern, value, None) for pattern in patterns]
+
+
+def exposed(exposure_s: float | None, *patterns: Pattern) -> list[Seen]:
+    return [(pattern, 50, exposure_s) for pattern in patterns]
+
+
+ENDS: list[Seen] = [(White(), 200, None), (Black(), 10, None)]
+
+
+def test_frames_are_sorted_by_what_they_show() -> None:
+    seen: list[Seen] = [(LINES[2], 72, None), (BITS[1], 21, None), (LINES[0], 70, None), (INVERSES[0], 30, None)]
+    seen += [*ENDS, (INVERSES[1], 31, None), (BITS[0], 20, None)]
+    frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
+    assert frames.bits[:, 0, 0].tolist() == [20, 21]
+    assert frames.inverses is not None
+    assert frames.inverses[:, 0, 0].tolist() == [30, 31]
+    assert frames.lines[:, 0, 0].tolist() == [70, 72]
+    assert frames.line_patterns == (LINES[0], LINES[2])
+    assert (frames.contrast == 190).all()
+    assert frames.full_scale == 255
+    assert (frames.gray.bits, frames.gray.cell_px, frames.gray.offset_px) == (2, 1, 0)
+    for image in (frames.white, frames.black, frames.bits, frames.inverses, frames.lines):
+        assert image.dtype == np.float32
+
+
+def test_only_the_axis_and_the_camera_asked_for_are_taken() -> None:
+    row = Gray(Axis.ROW, 0, 1)
+    both = capture_of(*ENDS, *plain(*BITS), *plain(row, LineShift(Axis.ROW, 0, 4), value=77))
+    assert axis_frames(both, "eye", Axis.ROW).bits[:, 0, 0].tolist() == [77]
+    assert len(axis_frames(both, "eye", Axis.COLUMN).lines) == 0
+    other = capture_of(*ENDS, *plain(*BITS, value=99), name="other")
+    together = Capture(both.projector, both.patterns, {**both.cameras, **other.cameras}, both.shots + other.shots)
+    assert axis_frames(together, "eye", Axis.COLUMN).bits.max() == 50
+
+
+def test_repeats_at_one_exposure_are_averaged() -> None:
+    frames = axis_frames(
+        capture_of(*ENDS, *plain(*BITS), (White(), 205, None), (White(), 207, None)), "eye", Axis.COLUMN
+    )
+    assert (frames.white == np.float32(204)).all()
+
+
+def test_a_bracket_takes_the_longest_exposure_that_nothing_clipped() -> None:
+    # Columns: clipped in the longest; clipped in the two longest; never clipped.
+    values: dict[Pattern, dict[float, list[int]]] = {
+        White(): {0.04: [255, 255, 160], 0.02: [180, 255, 81], 0.01: [91, 140, 40]},
+        Black(): {0.04: [8, 8, 8], 0.02: [5, 5, 5], 0.01: [2, 3, 2]},
+        BITS[0]: {0.04: [255, 255, 159], 0.02: [179, 250, 80], 0.01: [90, 139, 39]},
+        BITS[1]: {0.04: [9, 9, 9], 0.02: [6, 6, 6], 0.01: [3, 4, 3]},
+    }
+    seen: list[Seen] = [(p, value, e) for p, by_time in values.items() for e, value in by_time.items()]
+    frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
+    np.testing.assert_allclose(frames.white[0], [2 * 180, 4 * 140, 160])
+    np.testing.assert_allclose(frames.black[0], [2 * 5, 4 * 3, 8])
+    np.testing.assert_allclose(frames.bits[:, 0], [[2 * 179, 4 * 139, 159], [2 * 6, 4 * 4, 9]])
+
+
+def bracket(bright: Sequence[int]) -> list[Seen]:
+    """White, black and both bits lit at 10 and 20 ms; `bright` is what 10 ms show, per column."""
+    seen: list[Seen] = []
+    for pattern, share in ((White(), 1.0), (Black(), 0.05), (BITS[0], 0.05), (BITS[1], 1.0)):
+        short = [round(share * value) for value in bright]
+        seen += [(pattern, short, 0.01), (pattern, [min(2 * value, 255) for value in short], 0.02)]
+    return seen
+
+
+def test_a_pixel_rescued_by_the_short_exposure_is_decoded() -> None:
+    # 200 at 10 ms clips at 20 ms. Scaled to the longest it is 400, and no sample of it was clipped.
+    frames = axis_frames(capture_of(*bracket([60, 200, 255])), "eye", Axis.COLUMN)
+    assert frames.inverses is None
+    code = decode(frames, NoiseModel(1.0, 0.0), index_of_word(frames.gray), 4, DecodingLimits())
+    assert code.refusal[0].tolist() == [Refusal.NONE, Refusal.NONE, Refusal.SATURATED]
+    assert code.lowest[0].tolist() == [1, 1, -1]
+
+
+def test_missing_inverses_are_said_to_be_missing() -> None:
+    frames = axis_frames(capture_of(*ENDS, *plain(*BITS), *plain(INVERSES[0])), "eye", Axis.COLUMN)
+    assert frames.inverses is None
+
+
+def test_a_bit_shown_only_inverted_is_turned_back() -> None:
+    frames = axis_frames(capture_of(*ENDS, *plain(BITS[0]), (INVERSES[1], 60, None)), "eye", Axis.COLUMN)
+    assert frames.bits[:, 0, 0].tolist() == [50, 200 + 10 - 60]
+
+
+def test_without_white_and_black_the_pairs_stand_in() -> None:
+    seen: list[Seen] = [
+        (BITS[0], [90, 11, 12], None), (INVERSES[0], [10, 91, 92], None),
+        (BITS[1], [9, 10, 95], None), (INVERSES[1], [93, 94, 8], None),
+    ]  # fmt: skip
+    frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
+    assert frames.white[0].tolist() == [93, 94, 95]
+    assert frames.black[0].tolist() == [9, 10, 8]
+    with_white = axis_frames(capture_of(*seen, (White(), 99, None)), "eye", Axis.COLUMN)
+    assert with_white.white[0].tolist() == [99, 99, 99]
+    assert with_white.black[0].tolist() == [9, 10, 8]
+
+
+REFUSED = {
+    "no code": ([*ENDS, *plain(*LINES)], ["camera 'eye'", "no Gray-code frames", "column axis"]),
+    "another axis": ([*ENDS, *plain(Gray(Axis.ROW, 0, 1))], ["no Gray-code frames", "column axis"]),
+    "a missing bit": ([*ENDS, *plain(BITS[1])], ["camera 'eye'", "bits [0] of 2", "shoot them again"]),
+    "two codes": (
+        [*ENDS, *plain(*BITS, Gray(Axis.COLUMN, 0, 2, cell_px=3))],
+        ["camera 'eye'", "2 different codes", "(2, 1, 0)", "(2, 3, 0)", "keep one"],
+    ),
+    "two periods": (
+        [*ENDS, *plain(*BITS, *LINES, LineShift(Axis.COLUMN, 0, 8))],
+        ["camera 'eye'", "two periods or widths", "keep one"],
+    ),
+    "nothing to compare with": (
+        [(White(), 200, None), *plain(*BITS)],
+        ["camera 'eye'", "no white and black frames", "no bit with its inverse", "add a white and a black frame"],
+    ),
+    "a bracket with a hole": (
+        [(White(), 200, 0.01), (White(), 255, 0.02), (Black(), 5, 0.01), *((bit, 50, 0.01) for bit in BITS)],
+        ["camera 'eye'", "bracket", "for every pattern", "0.02"],
+    ),
+    "a bracket without its exposures": (
+        [seen for e in (0.01, None) for seen in exposed(e, White(), Black(), *BITS)],
+        ["bracket", "stated", "None"],
+    ),
+    "patterns at different exposures": (
+        [(White(), 200, 0.01), (Black(), 5, 0.01), *((bit, 50, 0.02) for bit in BITS)],
+        ["camera 'eye'", "0.01", "0.02"],
+    ),
+}  # type: dict[str, tuple[list[Seen], list[str]]]
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_frames_that_cannot_be_decoded_are_refused_in_words_that_help(case: str) -> None:
+    seen, words = REFUSED[case]
+    with pytest.raises(PatternError) as caught:
+        axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_recorded_frames_are_left_alone() -> None:
+    capture = capture_of(*bracket([60, 200, 255]))
+    before = [shot.image.copy() for shot in capture.shots]
+    axis_frames(capture, "eye", Axis.COLUMN)
+    for shot, image in zip(capture.shots, before, strict=True):
+        np.testing.assert_array_equal(shot.image, image)

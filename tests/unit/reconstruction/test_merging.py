@@ -1,0 +1,235 @@
+"""Curves of two cameras merged along the light sheet: fused, filled, never doubled."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.model import Axis, FloatArray, Pinhole, Source
+from slrig.reconstruction.merging import MergedCurves, merged
+from slrig.reconstruction.triangulation import SheetCurves, camera_projector
+from tests.unit.reconstruction.builders import (
+    CAMERA,
+    OTHER_CAMERA,
+    PROJECTOR,
+    Sphere,
+    ensemble_of,
+    lit_rows,
+    opencv_pixels,
+)
+
+BALL = Sphere()
+COLUMNS = [120.0, 140.0, 160.0, 180.0]
+ROWS = np.arange(60.0, 180.0, 0.9)
+GAP_PX = 4.0
+
+
+def seen(
+    camera: Pinhole,
+    rows: FloatArray,
+    *,
+    columns: list[float] | None = None,
+    noise_px: float = 0.0,
+    seed: int = 0,
+    sigma_px: float = 0.02,
+) -> SheetCurves:
+    """What one camera triangulates of the ball; a step of more than 4 rows is a bridge."""
+    columns = COLUMNS if columns is None else columns
+    pixels = [opencv_pixels(camera, lit_rows(column, rows, BALL)) for column in columns]
+    cuts = tuple(int(cut) for cut in np.flatnonzero(np.diff(rows) > GAP_PX))
+    ensemble = ensemble_of(pixels, columns, sigma_px=sigma_px, breaks=dict.fromkeys(range(len(columns)), cuts))
+    noise = np.random.default_rng(seed).normal(0, noise_px, len(ensemble.points_px)) if noise_px else 0.0
+    moved = ensemble.points_px + np.multiply.outer(noise, [1.0, 0.0]) if noise_px else ensemble.points_px
+    return camera_projector(replace(ensemble, points_px=moved), camera, PROJECTOR, Axis.COLUMN)
+
+
+def both(first: SheetCurves, second: SheetCurves) -> MergedCurves:
+    return merged([first, second], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+
+
+def require_one_sheet(result: SheetCurves) -> None:
+    """Along each curve rows rise; no second point stands where one is already."""
+    within = np.diff(result.curve_of_point()) == 0
+    assert (np.diff(result.along_px)[within] > 0).all()
+    assert len(result.along_px) == result.offsets[-1]
+
+
+def along_ray_mm(points: FloatArray) -> FloatArray:
+    """Depth error of points along the projector's rays."""
+    rays = points - PROJECTOR.centre_mm
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    truth = BALL.seen_along(PROJECTOR.centre_mm, rays)
+    return np.asarray(((points - truth) * rays).sum(axis=1))
+
+
+def test_one_camera_is_passed_through() -> None:
+    only = seen(CAMERA, ROWS)
+    result = merged([only], PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+    assert result.curves is only
+    assert (result.camera == 0).all()
+    assert len(result.residual_sigma) == len(result.residual_mm) == 0
+
+
+def test_two_views_of_one_ball_make_one_sheet_of_it() -> None:
+    first, second = seen(CAMERA, ROWS), seen(OTHER_CAMERA, ROWS + 0.37)
+    result = both(first, second)
+    require_one_sheet(result.curves)
+    assert result.curves.position_px.tolist() == COLUMNS
+    assert np.abs(BALL.distance_mm(result.curves.points_mm)).max() < 2e-4
+    # Every point of the first is fused, but for those at the ends that the second does not bracket.
+    assert (result.curves.source == Source.ALL).sum() >= len(first.points_mm) - len(COLUMNS)
+    assert len(result.curves.points_mm) <= len(first.points_mm) + len(COLUMNS)
+    assert (result.camera == 0).sum() == len(first.points_mm)
+    assert not result.curves.bridge_after.any()
+
+
+def test_the_fused_point_has_the_weighted_mean_depth_and_its_deviation() -> None:
+    # The second camera is four times as sure, so it decides.
+    first = seen(CAMERA, ROWS, noise_px=0.08, sigma_px=0.08, seed=1)
+    second = seen(OTHER_CAMERA, ROWS, noise_px=0.02, sigma_px=0.02, seed=2)
+    result = both(first, second)
+    fused = result.curves.source == Source.ALL
+    assert fused.mean() > 0.9
+    errors = [along_ray_mm(each) for each in (first.points_mm, second.points_mm, result.curves.points_mm[fused])]
+    single, other, together = (float(np.sqrt(np.mean(each**2))) for each in errors)
+    # Points between two of the second camera's average their noise: at most half of its variance less.
+    predicted = 1 / np.sqrt(1 / single**2 + 1 / other**2)
+    assert 0.65 * predicted < together < 1.1 * predicted
+    stated = np.sqrt(np.mean((result.curves.deviation_mm[fused] ** 2).sum(axis=1)))
+    assert stated == pytest.approx(predicted, rel=0.15)
+    # What displaces a fused point displaces it along the projector's ray.
+    rays = result.curves.points_mm[fused] - PROJECTOR.centre_mm
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    spread = result.curves.deviation_mm[fused]
+    np.testing.assert_allclose(np.abs((spread * rays).sum(axis=1)), np.linalg.norm(spread, axis=1), rtol=1e-9)
+
+
+def test_equal_cameras_share_evenly() -> None:
+    first, second = seen(CAMERA, ROWS), seen(OTHER_CAMERA, ROWS)
+    shift = 0.1
+    rays = second.points_mm - PROJECTOR.centre_mm
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    nearer = replace(second, points_mm=second.points_mm - shift * rays)
+    # Each camera's deviation in depth is as large as the other's.
+    ratio = np.linalg.norm(first.deviation_mm, axis=1) / np.linalg.norm(second.deviation_mm, axis=1)
+    even = replace(nearer, deviation_mm=second.deviation_mm * np.median(ratio))
+    result = both(first, even)
+    fused = result.curves.source == Source.ALL
+    depth = along_ray_mm(result.curves.points_mm[fused])
+    assert np.median(depth) == pytest.approx(-shift / 2, rel=0.15)
+    np.testing.assert_allclose(result.residual_mm, -shift, rtol=0.02)
+
+
+def test_the_residual_of_a_good_calibration_is_its_noise() -> None:
+    first = seen(CAMERA, ROWS, noise_px=0.03, sigma_px=0.03, seed=3)
+    second = seen(OTHER_CAMERA, ROWS + 0.45, noise_px=0.03, sigma_px=0.03, seed=4)
+    result = both(first, second)
+    assert len(result.residual_sigma) > 400
+    assert abs(result.residual_sigma.mean()) < 0.1
+    # Between two points of the second camera its noise is averaged, by half at most.
+    assert 0.75 < result.residual_sigma.std() < 1.1
+    np.testing.assert_array_equal(np.sign(result.residual_mm), np.sign(result.residual_sigma))
+
+
+def test_a_wrong_calibration_shows_in_the_residual() -> None:
+    moved = replace(OTHER_CAMERA, translation_mm=OTHER_CAMERA.translation_mm + np.array([0.3, 0.0, 0.0]))
+    pixels = [opencv_pixels(OTHER_CAMERA, lit_rows(column, ROWS, BALL)) for column in COLUMNS]
+    second = camera_projector(ensemble_of(pixels, COLUMNS, sigma_px=0.02), moved, PROJECTOR, Axis.COLUMN)
+    result = both(seen(CAMERA, ROWS), second)
+    assert abs(result.residual_sigma.mean()) > 10
+    assert result.residual_sigma.std() < 0.2 * abs(result.residual_sigma.mean())
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_hole_of_one_camera_is_filled_by_the_other_and_is_no_bridge_any_more(*, swapped: bool) -> None:
+    holed, whole = ROWS[(ROWS < 100) | (ROWS > 130)], ROWS + 0.3
+    first, second = (whole, holed) if swapped else (holed, whole)
+    parts = seen(CAMERA, first), seen(OTHER_CAMERA, second)
+    assert sum(part.bridge_after.sum() for part in parts) == len(COLUMNS)
+    result = both(*parts)
+    require_one_sheet(result.curves)
+    assert not result.curves.bridge_after.any()
+    within = np.diff(result.curves.curve_of_point()) == 0
+    assert np.diff(result.curves.along_px)[within].max() < 2
+    filled = (result.curves.along_px > 102) & (result.curves.along_px < 128)
+    assert (result.curves.source[filled] == Source.CAMERA_PROJECTOR).all()
+    assert (result.camera[filled] == (0 if swapped else 1)).all()
+    assert np.abs(BALL.distance_mm(result.curves.points_mm)).max() < 2e-4
+
+
+def test_a_hole_that_both_have_stays_a_bridge() -> None:
+    holed = ROWS[(ROWS < 100) | (ROWS > 130)]
+    result = both(seen(CAMERA, holed), seen(OTHER_CAMERA, holed + 0.3))
+    at = np.flatnonzero(result.curves.bridge_after)
+    assert len(at) == len(COLUMNS)
+    assert (result.curves.along_px[at] < 101).all()
+    assert (result.curves.along_px[at + 1] > 130).all()
+
+
+def test_a_hole_that_is_half_filled_keeps_a_bridge_over_the_rest() -> None:
+    first = seen(CAMERA, ROWS[(ROWS < 100) | (ROWS > 130)])
+    result = both(first, seen(OTHER_CAMERA, ROWS[ROWS < 115] + 0.3))
+    require_one_sheet(result.curves)
+    at = np.flatnonzero(result.curves.bridge_after)
+    assert len(at) == len(COLUMNS)
+    assert (result.curves.along_px[at] > 113).all()
+    assert (result.curves.along_px[at + 1] > 130).all()
+
+
+def test_what_each_camera_sees_alone_is_joined_by_a_bridge() -> None:
+    result = both(seen(CAMERA, ROWS[ROWS < 100]), seen(OTHER_CAMERA, ROWS[ROWS > 130]))
+    require_one_sheet(result.curves)
+    assert not (result.curves.source == Source.ALL).any()
+    at = np.flatnonzero(result.curves.bridge_after)
+    assert len(at) == len(COLUMNS)
+    assert (np.diff(result.curves.along_px)[at] > 29).all()
+
+
+def test_codes_of_either_camera_are_kept() -> None:
+    result = both(seen(CAMERA, ROWS, columns=[120.0, 160.0]), seen(OTHER_CAMERA, ROWS, columns=[140.0, 160.0]))
+    assert result.curves.position_px.tolist() == [120.0, 140.0, 160.0]
+    camera = [
+        set(result.camera[a:b].tolist())
+        for a, b in zip(result.curves.offsets[:-1], result.curves.offsets[1:], strict=True)
+    ]
+    assert camera[0] == {0}
+    assert camera[1] == {1}
+    assert 0 in camera[2]
+    require_one_sheet(result.curves)
+
+
+def test_three_cameras_are_merged_one_after_the_other() -> None:
+    third = replace(CAMERA, translation_mm=CAMERA.translation_mm + np.array([15.0, 0.0, 0.0]))
+    parts = [seen(CAMERA, ROWS[ROWS < 90]), seen(OTHER_CAMERA, ROWS[ROWS < 140] + 0.2), seen(third, ROWS + 0.5)]
+    result = merged(parts, PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+    require_one_sheet(result.curves)
+    assert set(result.camera.tolist()) == {0, 1, 2}
+    assert np.abs(BALL.distance_mm(result.curves.points_mm)).max() < 2e-4
+    assert result.curves.along_px.min() < 61
+    assert result.curves.along_px.max() > 179
+    # Stripes of different cameras stay different stripes.
+    stripes = {int(stripe): set() for stripe in result.curves.stripe}  # type: dict[int, set[int]]
+    for stripe, camera in zip(result.curves.stripe.tolist(), result.camera.tolist(), strict=True):
+        stripes[stripe].add(camera)
+    assert all(len(cameras) == 1 for cameras in stripes.values())
+
+
+def test_a_camera_that_saw_nothing_changes_nothing() -> None:
+    first = seen(CAMERA, ROWS)
+    nothing = seen(OTHER_CAMERA, ROWS[:0], columns=[])
+    for parts in ([first, nothing], [nothing, first]):
+        result = merged(parts, PROJECTOR.centre_mm, widest_gap_px=GAP_PX)
+        np.testing.assert_array_equal(result.curves.points_mm, first.points_mm)
+        assert result.curves.offsets.tolist() == first.offsets.tolist()
+
+
+def test_inputs_are_left_alone() -> None:
+    first, second = seen(CAMERA, ROWS), seen(OTHER_CAMERA, ROWS + 0.3)
+    before = [first.points_mm.copy(), first.deviation_mm.copy(), second.points_mm.copy(), second.bridge_after.copy()]
+    both(first, second)
+    for array, earlier in zip(
+        [first.points_mm, first.deviation_mm, second.points_mm, second.bridge_after], before, strict=True
+    ):
+        np.testing.assert_array_equal(array, earlier)

@@ -1,0 +1,124 @@
+"""The noise model is recovered from frames that were given a known one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slrig.model import FloatArray
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from tests.unit.reconstruction.builders import code_frames, grid
+
+SHAPE = (240, 320)
+BITS = 9
+CAMERAS = pytest.mark.parametrize(
+    ("read_variance", "slope"), [(1.5, 0.02), (0.5, 0.1), (6.0, 0.05)], ids=["typical", "shot", "read"]
+)
+
+
+def frames_with_noise(
+    read_variance: float, slope: float, *, paired: bool, seed: int = 3, texture: float = 0.0, full_scale: float = 4095.0
+) -> AxisFrames:
+    """A lit plate, bright in the middle, under a code blurred by the optics."""
+    rng = np.random.default_rng(seed)
+    x, y = grid(SHAPE)
+    contrast = 150 * (0.25 + np.exp(-(((x - 160) / 110) ** 2) - ((y - 120) / 90) ** 2))
+    contrast *= 1 + texture * rng.standard_normal(SHAPE)
+    black = 12 + 0.01 * y
+
+    def seen(light: FloatArray | float) -> FloatArray:
+        mean = black + contrast * light
+        return np.asarray(mean + np.sqrt(read_variance + slope * mean) * rng.standard_normal(SHAPE))
+
+    bits, inverses = [], []
+    for bit in range(BITS):
+        # A bit that is soft at its edges: the sum with its inverse is white plus black all the same.
+        light = 0.5 + 0.5 * np.sin(2 * np.pi * x * 2**bit / 640 + 0.3)
+        bits.append(seen(light))
+        inverses.append(seen(1 - light))
+    return code_frames(
+        bits=np.array(bits, dtype=np.float32),
+        inverses=np.array(inverses, dtype=np.float32) if paired else None,
+        white=seen(1.0).astype(np.float32),
+        black=seen(0.0).astype(np.float32),
+        full_scale=full_scale,
+    )
+
+
+@CAMERAS
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "neighbours"])
+def test_the_variance_of_dark_and_bright_pixels_is_recovered(
+    read_variance: float, slope: float, *, paired: bool
+) -> None:
+    found = [estimate_noise(frames_with_noise(read_variance, slope, paired=paired, seed=seed)) for seed in range(4)]
+    assert np.mean([model.slope for model in found]) == pytest.approx(slope, rel=0.1)
+    for level in (12.0, 60.0, 180.0):
+        variance = np.mean([variance_at(model, level) for model in found])
+        assert variance == pytest.approx(read_variance + slope * level, rel=0.1)
+
+
+@pytest.mark.parametrize(("read_variance", "slope"), [(3.0, 0.02), (6.0, 0.05)])
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "neighbours"])
+def test_read_variance_is_recovered_where_shot_noise_does_not_drown_it(
+    read_variance: float, slope: float, *, paired: bool
+) -> None:
+    found = [estimate_noise(frames_with_noise(read_variance, slope, paired=paired, seed=seed)) for seed in range(4)]
+    assert np.mean([model.read_variance for model in found]) == pytest.approx(read_variance, rel=0.1)
+
+
+def test_a_textured_surface_does_not_look_noisy_when_inverses_are_there() -> None:
+    found = estimate_noise(frames_with_noise(1.5, 0.02, paired=True, texture=0.2))
+    assert found.slope == pytest.approx(0.02, rel=0.1)
+    assert variance_at(found, 100.0) == pytest.approx(3.5, rel=0.1)
+
+
+def test_clipped_pixels_do_not_look_quiet() -> None:
+    frames = frames_with_noise(2.0, 0.04, paired=True)
+    assert frames.inverses is not None
+    clipped = code_frames(
+        bits=np.clip(frames.bits, 0, 150),
+        inverses=np.clip(frames.inverses, 0, 150),
+        white=np.clip(frames.white, 0, 150),
+        black=frames.black,
+        full_scale=150.0,
+    )
+    assert (frames.white > 150).mean() > 0.05
+    assert variance_at(estimate_noise(clipped), 60.0) == pytest.approx(2.0 + 0.04 * 60.0, rel=0.12)
+
+
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "neighbours"])
+def test_frames_without_noise_still_have_that_of_quantisation(*, paired: bool) -> None:
+    found = estimate_noise(frames_with_noise(0.0, 0.0, paired=paired))
+    assert found.read_variance == pytest.approx(1 / 12)
+    assert found.slope == pytest.approx(0.0, abs=1e-4)
+
+
+def test_an_image_too_small_to_tell_anything_gets_the_floor() -> None:
+    flat = np.full((4, 4), 9, dtype=np.float32)
+    frames = code_frames(bits=np.stack([flat] * 3), inverses=np.stack([flat] * 3), white=flat, black=flat)
+    assert estimate_noise(frames) == NoiseModel(1 / 12, 0.0)
+
+
+@pytest.mark.parametrize("deviation", [0.8, 2.0, 20.0])
+@pytest.mark.parametrize("paired", [True, False], ids=["inverses", "neighbours"])
+def test_one_brightness_gives_one_variance(deviation: float, *, paired: bool) -> None:
+    # A plate that fills the view evenly: its levels differ by noise alone, and that tells nothing of a slope.
+    rng = np.random.default_rng(0)
+    bits, inverses = rng.normal(500.0, deviation, (2, 9, 120, 160)).astype(np.float32)
+    white, black = rng.normal(500.0, deviation, (2, 120, 160)).astype(np.float32)
+    found = estimate_noise(
+        code_frames(bits=bits, inverses=inverses if paired else None, white=white, black=black, full_scale=4095.0)
+    )
+    for level in (50.0, 500.0, 1000.0):
+        assert variance_at(found, level) == pytest.approx(deviation**2, rel=0.1)
+
+
+def test_the_variance_is_linear_in_the_light_and_not_below_that_of_the_dark() -> None:
+    model = NoiseModel(2.0, 0.5)
+    image = np.array([[-3.0, 0.0, 10.0, np.nan]], dtype=np.float32)
+    np.testing.assert_array_equal(model.variance(image), np.array([[2.0, 2.0, 7.0, np.nan]], dtype=np.float32))
+
+
+def variance_at(model: NoiseModel, level: float) -> float:
+    return float(model.variance(np.array([[level]], dtype=np.float32))[0, 0])

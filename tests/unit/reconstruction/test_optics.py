@@ -1,0 +1,126 @@
+"""Pixels to rays and back, against OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.model import FloatArray, Pinhole, Size
+from slrig.reconstruction.optics import distort, packed, project, rays, to_depths
+from tests.unit.reconstruction.builders import CAMERA, OTHER_CAMERA, PROJECTOR, opencv_pixels, opencv_rays
+
+DEVICES = pytest.mark.parametrize("device", [CAMERA, OTHER_CAMERA, PROJECTOR], ids=["camera", "other", "projector"])
+
+
+def pixels_of(size: Size, *, count: int = 400, margin_px: float = 30.0) -> FloatArray:
+    """Pixels all over the image and a little beyond it."""
+    low, high = -margin_px, np.array([size.width_px, size.height_px]) + margin_px
+    return np.random.default_rng(5).uniform(low, high, (count, 2))
+
+
+def points_before(device: Pinhole, *, count: int = 400) -> FloatArray:
+    """World points in the device's field of view."""
+    rng = np.random.default_rng(6)
+    depth = rng.uniform(200.0, 900.0, count)
+    return np.asarray(device.centre_mm + depth[:, None] * opencv_rays(device, pixels_of(device.size, count=count)))
+
+
+@DEVICES
+def test_rays_are_those_of_opencv(device: Pinhole) -> None:
+    pixels = pixels_of(device.size)
+    np.testing.assert_allclose(rays(device, pixels), opencv_rays(device, pixels), rtol=0, atol=1e-12)
+
+
+@DEVICES
+def test_projections_are_those_of_opencv(device: Pinhole) -> None:
+    points = points_before(device)
+    np.testing.assert_allclose(project(device, points), opencv_pixels(device, points), rtol=0, atol=1e-9)
+
+
+@DEVICES
+def test_a_ray_projects_back_to_its_pixel(device: Pinhole) -> None:
+    pixels = pixels_of(device.size)
+    seen = project(device, device.centre_mm + 640.0 * rays(device, pixels))
+    np.testing.assert_allclose(seen, pixels, rtol=0, atol=1e-9)
+
+
+def test_a_ray_has_unit_depth() -> None:
+    pixels = pixels_of(CAMERA.size)
+    depth = to_depths(CAMERA, CAMERA.centre_mm + 37.5 * rays(CAMERA, pixels))
+    np.testing.assert_allclose(depth, 37.5, rtol=1e-12)
+
+
+def test_skew_shears_columns_by_rows_and_is_undone() -> None:
+    # OpenCV's models have no skew: u = fx x + s y + cx by hand.
+    matrix = CAMERA.matrix.copy()
+    matrix[0, 1] = 12.5
+    skewed = replace(CAMERA, matrix=matrix)
+    points = points_before(CAMERA)
+    straight = opencv_pixels(CAMERA, points)
+    expected = straight.copy()
+    expected[:, 0] += 12.5 * (straight[:, 1] - matrix[1, 2]) / matrix[1, 1]
+    np.testing.assert_allclose(project(skewed, points), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(rays(skewed, expected), opencv_rays(CAMERA, straight), rtol=0, atol=1e-12)
+
+
+def test_the_jacobian_of_distortion_is_its_slope() -> None:
+    strong = replace(CAMERA, distortion=np.array([-0.31, 0.17, 3e-3, -2e-3, 0.05]))
+    p = packed(strong)
+    h = 1e-6
+    for x, y in np.random.default_rng(7).uniform(-0.4, 0.4, (60, 2)):
+        _, _, *jacobian = distort(p, x, y)
+        across = np.subtract(distort(p, x + h, y)[:2], distort(p, x - h, y)[:2]) / (2 * h)
+        along = np.subtract(distort(p, x, y + h)[:2], distort(p, x, y - h)[:2]) / (2 * h)
+        # ∂xd/∂x, ∂xd/∂y, ∂yd/∂x, ∂yd/∂y
+        np.testing.assert_allclose(jacobian, [across[0], along[0], across[1], along[1]], rtol=0, atol=1e-9)
+
+
+def test_distortion_without_coefficients_is_the_identity() -> None:
+    plain = packed(replace(CAMERA, distortion=np.zeros(5)))
+    assert distort(plain, 0.31, -0.22) == (0.31, -0.22, 1.0, 0.0, 0.0, 1.0)
+
+
+def test_depth_is_the_third_device_coordinate() -> None:
+    points = np.random.default_rng(8).uniform(-300, 300, (50, 3))
+    expected = [(CAMERA.rotation @ point + CAMERA.translation_mm)[2] for point in points]
+    np.testing.assert_allclose(to_depths(CAMERA, points), expected, rtol=1e-12)
+
+
+def test_a_point_behind_the_device_has_no_pixel() -> None:
+    ahead = points_before(CAMERA, count=3)
+    behind = 2 * CAMERA.centre_mm - ahead
+    seen = project(CAMERA, np.concatenate([ahead, behind]))
+    assert np.isfinite(seen[:3]).all()
+    assert np.isnan(seen[3:]).all()
+
+
+def test_unmeasured_stays_unmeasured() -> None:
+    assert np.isnan(rays(CAMERA, np.array([[np.nan, 3.0]]))).all()
+    assert np.isnan(project(CAMERA, np.array([[np.nan, 0.0, 0.0]]))).all()
+    assert np.isnan(to_depths(CAMERA, np.array([[np.nan, 0.0, 0.0]]))).all()
+
+
+@pytest.mark.parametrize("beyond_px", [30.0, 80.0, 700.0])
+def test_a_pixel_that_the_lens_cannot_light_has_no_ray(beyond_px: float) -> None:
+    # x (1 - 0.3 x²) never exceeds 0.7027: farther out there is no direction that lands on the pixel.
+    barrel = replace(CAMERA, distortion=np.array([-0.3, 0.0, 0.0, 0.0, 0.0]))
+    edge = barrel.matrix[0, 2] + 0.7027 * barrel.matrix[0, 0]
+    row = barrel.matrix[1, 2]
+    assert np.isfinite(rays(barrel, np.array([[edge - beyond_px, row]]))).all()
+    assert np.isnan(rays(barrel, np.array([[edge + beyond_px, row]]))).all()
+
+
+def test_no_points_give_no_rays_and_no_pixels() -> None:
+    assert rays(CAMERA, np.zeros((0, 2))).shape == (0, 3)
+    assert project(CAMERA, np.zeros((0, 3))).shape == (0, 2)
+
+
+def test_inputs_are_left_alone() -> None:
+    pixels, points = pixels_of(CAMERA.size, count=5), points_before(CAMERA, count=5)
+    pixels_before, points_earlier = pixels.copy(), points.copy()
+    rays(CAMERA, pixels)
+    project(CAMERA, points)
+    assert (pixels == pixels_before).all()
+    assert (points == points_earlier).all()

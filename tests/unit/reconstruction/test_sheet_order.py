@@ -1,0 +1,158 @@
+"""Leaving points out of curves, putting stripes in the order of the sheet, and what errors mean in space."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.reconstruction.triangulation import SheetCurves, ordered_along_sheet, selected
+from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
+from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
+
+
+def curves_of(
+    *curves: list[tuple[int, list[float]]], bridges: bool = True, position_px: list[float] | None = None
+) -> SheetCurves:
+    """Curves as lists of (stripe, rows); points are told apart by x = 100·stripe + index within the stripe."""
+    along: list[float] = []
+    stripe: list[int] = []
+    rank: list[int] = []
+    bridge: list[bool] = []
+    counts = [0]
+    for curve in curves:
+        for place, (number, rows) in enumerate(curve):
+            along += rows
+            stripe += [number] * len(rows)
+            rank += range(len(rows))
+            bridge += [False] * (len(rows) - 1) + [bridges and place < len(curve) - 1]
+        counts.append(len(along))
+    count = len(along)
+    points = np.zeros((count, 3))
+    points[:, 0] = 100.0 * np.array(stripe) + np.array(rank)
+    return SheetCurves(
+        offsets=np.array(counts, dtype=np.int32),
+        position_px=np.array(position_px or [8.0 * index for index in range(len(curves))]),
+        points_mm=points,
+        deviation_mm=points + 1000,
+        along_px=np.array(along, dtype=np.float64),
+        pixels_px=points[:, :2] + 0.5,
+        stripe=np.array(stripe, dtype=np.int32),
+        bridge_after=np.array(bridge, dtype=np.bool_),
+        source=(np.arange(count) % 3).astype(np.uint8),
+    )
+
+
+def told(curves: SheetCurves) -> list[int]:
+    return [int(x) for x in curves.points_mm[:, 0]]
+
+
+def keeping(count: int, *left_out: int) -> NDArray[np.bool_]:
+    keep = np.ones(count, dtype=np.bool_)
+    keep[list(left_out)] = False
+    return keep
+
+
+def test_points_are_left_out_with_all_that_belongs_to_them() -> None:
+    curves = curves_of([(0, [1.0, 2.0, 3.0])], [(1, [1.0, 2.0])])
+    kept = selected(curves, keeping(5, 1, 3))
+    assert told(kept) == [0, 2, 101]
+    assert kept.offsets.tolist() == [0, 2, 3]
+    np.testing.assert_array_equal(kept.deviation_mm[:, 0], [1000, 1002, 1101])
+    np.testing.assert_array_equal(kept.pixels_px[:, 0], [0.5, 2.5, 101.5])
+    assert kept.along_px.tolist() == [1.0, 3.0, 2.0]
+    assert kept.stripe.tolist() == [0, 0, 1]
+    assert kept.source.tolist() == [0, 2, 1]
+    assert kept.position_px.tolist() == [0.0, 8.0]
+
+
+def test_a_bridge_is_carried_to_the_last_point_before_it_that_stays() -> None:
+    curves = curves_of([(0, [1.0, 2.0, 3.0]), (1, [7.0, 8.0, 9.0])])
+    assert np.flatnonzero(curves.bridge_after).tolist() == [2]
+    assert np.flatnonzero(selected(curves, keeping(6, 2)).bridge_after).tolist() == [1]
+    assert np.flatnonzero(selected(curves, keeping(6, 1, 2, 3)).bridge_after).tolist() == [0]
+    assert np.flatnonzero(selected(curves, keeping(6, 3)).bridge_after).tolist() == [2]
+
+
+def test_a_whole_stripe_between_two_others_leaves_one_bridge() -> None:
+    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0]), (2, [9.0, 10.0])])
+    kept = selected(curves, keeping(5, 2))
+    assert np.flatnonzero(kept.bridge_after).tolist() == [1]
+
+
+def test_no_bridge_leads_out_of_a_curve() -> None:
+    # What follows the bridge is left out, so the curve ends before it.
+    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0, 2.0]), (3, [5.0, 6.0])])
+    tail_gone = selected(curves, keeping(8, 2, 3))
+    assert np.flatnonzero(tail_gone.bridge_after).tolist() == [3]
+    head_gone = selected(curves, keeping(8, 4, 5))
+    assert np.flatnonzero(head_gone.bridge_after).tolist() == [1]
+
+
+def test_keeping_everything_or_nothing() -> None:
+    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0])])
+    same = selected(curves, keeping(5))
+    assert told(same) == told(curves)
+    np.testing.assert_array_equal(same.bridge_after, curves.bridge_after)
+    none = selected(curves, np.zeros(5, dtype=np.bool_))
+    assert none.offsets.tolist() == [0, 0, 0]
+    assert len(none.points_mm) == len(none.bridge_after) == 0
+
+
+def test_stripes_of_a_curve_follow_one_another_by_row() -> None:
+    curves = curves_of([(0, [50.0, 51.0, 52.0]), (1, [10.0, 11.0]), (2, [30.0, 31.0])], [(3, [5.0, 6.0])])
+    ordered = ordered_along_sheet(curves)
+    assert told(ordered) == [100, 101, 200, 201, 0, 1, 2, 300, 301]
+    assert ordered.offsets.tolist() == curves.offsets.tolist()
+    assert np.flatnonzero(ordered.bridge_after).tolist() == [1, 3]
+    np.testing.assert_array_equal(ordered.deviation_mm, ordered.points_mm + 1000)
+
+
+def test_a_stripe_that_runs_upwards_is_turned() -> None:
+    ordered = ordered_along_sheet(curves_of([(0, [9.0, 8.0, 7.0, 6.0]), (1, [1.0, 2.0, 3.0])]))
+    assert told(ordered) == [100, 101, 102, 3, 2, 1, 0]
+    assert ordered.along_px.tolist() == [1, 2, 3, 6, 7, 8, 9]
+    assert np.flatnonzero(ordered.bridge_after).tolist() == [2]
+
+
+def test_points_keep_their_order_within_a_stripe() -> None:
+    # Row noise of one point is no reason to fold the curve.
+    ordered = ordered_along_sheet(curves_of([(0, [1.0, 2.2, 2.1, 3.0, 4.0])]))
+    assert told(ordered) == [0, 1, 2, 3, 4]
+
+
+def test_curves_of_one_point_and_of_none_keep_their_places() -> None:
+    ordered = ordered_along_sheet(curves_of([(0, [4.0])], [], [(1, [9.0]), (2, [2.0])]))
+    assert told(ordered) == [0, 200, 100]
+    assert ordered.offsets.tolist() == [0, 1, 1, 3]
+    assert np.flatnonzero(ordered.bridge_after).tolist() == [1]
+    assert len(ordered_along_sheet(curves_of()).points_mm) == 0
+
+
+def test_what_is_in_order_is_left_as_it_is() -> None:
+    curves = curves_of([(0, [1.0, 2.0]), (1, [5.0, 6.0])], [(2, [1.0]), (3, [3.0])])
+    again = ordered_along_sheet(ordered_along_sheet(curves))
+    assert told(again) == told(curves)
+    np.testing.assert_array_equal(again.bridge_after, curves.bridge_after)
+
+
+def test_only_the_part_of_an_error_along_the_normal_counts() -> None:
+    deviation = np.array([[0.3, 0.0, 0.4], [0.3, 0.0, 0.4], [0.3, 0.0, -0.4], [0.3, 0.0, 0.4]])
+    normals = np.array([[0, 0, 1], [1, 0, 0], [0.6, 0, 0.8], [np.nan] * 3], dtype=np.float32)
+    np.testing.assert_allclose(sigma_along_normal(deviation, normals), [0.4, 0.3, 0.14, 0.5], atol=1e-7)
+
+
+def test_an_unmeasured_point_has_no_deviation() -> None:
+    normals = np.array([[0, 0, 1]], dtype=np.float32)
+    assert np.isnan(sigma_along_normal(np.full((1, 3), np.nan), normals)).all()
+
+
+@pytest.mark.parametrize("depth_mm", [300.0, 900.0])
+def test_sampling_is_what_a_pixel_or_a_line_covers(depth_mm: float) -> None:
+    ahead = CAMERA.centre_mm + depth_mm * CAMERA.rotation[2]
+    pixel = depth_mm / 1400.0
+    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, None, 1.0), [pixel])
+    before_projector = float(PROJECTOR.rotation[2] @ ahead + PROJECTOR.translation_mm[2])
+    line = before_projector / 680.0
+    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, PROJECTOR, 4.0), [max(pixel, 4 * line)])
+    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, PROJECTOR, 0.1), [max(pixel, 0.1 * line)])

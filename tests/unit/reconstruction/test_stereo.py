@@ -1,0 +1,130 @@
+"""Camera ray with the same code in another camera; the projector's calibration plays no part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.model import FloatArray, Pinhole, Size, Source
+from slrig.reconstruction.linking import StripeEnsemble
+from slrig.reconstruction.triangulation import camera_camera
+from tests.unit.reconstruction.builders import (
+    CAMERA,
+    OTHER_CAMERA,
+    Sphere,
+    ensemble_of,
+    lit_rows,
+    looking,
+    opencv_pixels,
+)
+
+BALL = Sphere()
+ROWS = np.arange(60.0, 180.0, 1.3)
+COLUMNS = [110.0, 138.5, 166.0, 190.0]
+# The baseline to this one runs obliquely: epipolar lines cross the stripes at about 45°.
+OBLIQUE_CAMERA = looking(
+    (80.0, 190.0, -490.0), (0.0, 0.0, 0.0), size=Size(640, 480), focal_px=(1380.0, 1390.0),
+    distortion=(-0.15, 0.05, -5e-4, 6e-4, 0.0),
+)  # fmt: skip
+
+
+def seen(
+    camera: Pinhole, columns: list[float], rows: FloatArray, *, breaks: dict[int, tuple[int, ...]] | None = None
+) -> StripeEnsemble:
+    """Whole columns on the ball with their true normals."""
+    pixels = [opencv_pixels(camera, lit_rows(column, rows, BALL)) for column in columns]
+    ahead = [opencv_pixels(camera, lit_rows(column, rows + 0.01, BALL)) for column in columns]
+    tangent = np.concatenate(ahead) - np.concatenate(pixels)
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    ensemble = ensemble_of(pixels, columns, sigma_px=0.02, breaks=breaks)
+    return replace(ensemble, normals=np.stack([tangent[:, 1], -tangent[:, 0]], axis=1))
+
+
+@pytest.mark.parametrize("other", [OTHER_CAMERA, OBLIQUE_CAMERA], ids=["beside", "oblique"])
+def test_points_that_both_cameras_see_come_back(other: Pinhole) -> None:
+    curves = camera_camera(seen(CAMERA, COLUMNS, ROWS), seen(other, COLUMNS, ROWS), CAMERA, other)
+    truth = np.concatenate([lit_rows(column, ROWS, BALL) for column in COLUMNS])
+    # The two ends may lie a rounding error beyond the other camera's curve.
+    kept = np.isin(np.round(curves.pixels_px, 9), np.round(opencv_pixels(CAMERA, truth), 9)).all(axis=1)
+    assert kept.all()
+    assert len(curves.points_mm) >= len(truth) - 2 * len(COLUMNS)
+    order = [int(np.argmin(np.linalg.norm(truth - point, axis=1))) for point in curves.points_mm]
+    np.testing.assert_allclose(curves.points_mm, truth[order], rtol=0, atol=1e-6)
+    assert (curves.source == Source.CAMERA_CAMERA).all()
+
+
+def test_the_other_curve_is_crossed_between_its_points() -> None:
+    other = seen(OTHER_CAMERA, COLUMNS, ROWS + 0.55)
+    curves = camera_camera(seen(CAMERA, COLUMNS, ROWS), other, CAMERA, OTHER_CAMERA)
+    assert len(curves.points_mm) == len(COLUMNS) * (len(ROWS) - 1)
+    assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 2e-3
+
+
+def test_curves_run_by_the_rows_of_the_first_camera() -> None:
+    backwards = seen(CAMERA, COLUMNS, ROWS[::-1].copy())
+    curves = camera_camera(backwards, seen(OTHER_CAMERA, COLUMNS, ROWS), CAMERA, OTHER_CAMERA)
+    assert (np.diff(curves.along_px)[np.diff(curves.curve_of_point()) == 0] > 0).all()
+    np.testing.assert_array_equal(curves.along_px, curves.pixels_px[:, 1])
+
+
+def test_codes_that_one_camera_has_alone_give_nothing() -> None:
+    first, second = seen(CAMERA, [110.0, 138.5, 166.0], ROWS), seen(OTHER_CAMERA, [138.5, 150.0, 166.0, 190.0], ROWS)
+    curves = camera_camera(first, second, CAMERA, OTHER_CAMERA)
+    assert curves.position_px.tolist() == [110.0, 138.5, 166.0]
+    assert np.diff(curves.offsets)[0] == 0
+    assert (np.diff(curves.offsets)[1:] > 80).all()
+    assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 1e-4
+
+
+def test_nothing_is_crossed_on_a_bridge() -> None:
+    gap = (ROWS < 100) | (ROWS > 130)
+    upper = int((ROWS < 100).sum())
+    second = seen(OTHER_CAMERA, [138.5], ROWS[gap], breaks={0: (upper - 1,)})
+    curves = camera_camera(seen(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
+    met = opencv_pixels(CAMERA, lit_rows(138.5, ROWS, BALL))[:, 1]
+    hidden = met[~gap]
+    assert len(curves.points_mm) > 50
+    assert not ((curves.pixels_px[:, 1] > hidden.min() - 0.1) & (curves.pixels_px[:, 1] < hidden.max() + 0.1)).any()
+
+
+def test_beyond_the_other_cameras_curve_there_is_no_point() -> None:
+    second = seen(OTHER_CAMERA, [138.5], ROWS[30:60])
+    curves = camera_camera(seen(CAMERA, [138.5], ROWS), second, CAMERA, OTHER_CAMERA)
+    assert 28 <= len(curves.points_mm) <= 30
+
+
+@pytest.mark.parametrize("other", [OTHER_CAMERA, OBLIQUE_CAMERA], ids=["beside", "oblique"])
+def test_the_deviation_adds_the_errors_of_both_cameras(other: Pinhole) -> None:
+    first, second = seen(CAMERA, COLUMNS, ROWS[2:-2]), seen(other, COLUMNS, ROWS + 0.2)
+    curves = camera_camera(first, second, CAMERA, other)
+    assert len(curves.points_mm) == len(first.points_px)
+
+    def moved(mine: float, theirs: float) -> FloatArray:
+        a = replace(first, points_px=first.points_px + mine * first.normals)
+        b = replace(second, points_px=second.points_px + theirs * second.normals)
+        return camera_camera(a, b, CAMERA, other).points_mm
+
+    own = (moved(0.02, 0.0) - moved(-0.02, 0.0)) / 2
+    others = (moved(0.0, 0.02) - moved(0.0, -0.02)) / 2
+    wanted = np.sqrt((own**2).sum(axis=1) + (others**2).sum(axis=1))
+    stated = np.linalg.norm(curves.deviation_mm, axis=1)
+    np.testing.assert_allclose(stated, wanted, rtol=0.1)
+    towards = np.abs((curves.deviation_mm * own).sum(axis=1)) / (stated * np.linalg.norm(own, axis=1))
+    assert towards.min() > 0.9
+
+
+def test_a_camera_without_parallax_gives_nothing() -> None:
+    # Both at one place: every ray meets every other at the centre only.
+    turned = replace(CAMERA, matrix=CAMERA.matrix * [[1.05], [1.05], [1.0]])
+    curves = camera_camera(seen(CAMERA, COLUMNS, ROWS), seen(turned, COLUMNS, ROWS), CAMERA, turned)
+    assert len(curves.points_mm) == 0
+
+
+def test_inputs_are_left_alone() -> None:
+    first, second = seen(CAMERA, COLUMNS, ROWS), seen(OTHER_CAMERA, COLUMNS, ROWS)
+    before = [first.points_px.copy(), second.points_px.copy(), second.bridge_after.copy()]
+    camera_camera(first, second, CAMERA, OTHER_CAMERA)
+    for array, earlier in zip([first.points_px, second.points_px, second.bridge_after], before, strict=True):
+        np.testing.assert_array_equal(array, earlier)

@@ -1,0 +1,241 @@
+"""What counts as a stripe, and the kernels of the detector against plain correlation."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray
+from slrig.reconstruction.stripes import (
+    _EDGE,
+    _NEWTON_BOX,
+    _RIDGE,
+    _SUPPORT,
+    _TAYLOR_BOX,
+    StripeLimits,
+    Stripes,
+    _kernels,
+    _newton_kernel,
+    _points,
+    _taylor_kernel,
+    joined,
+    locate_edges,
+    locate_stripes,
+)
+from tests.unit.reconstruction.builders import gaussian_stripe, grid, stripes_of
+
+SHAPE = (80, 90)
+KINDS = pytest.mark.parametrize("kind", [_RIDGE, _EDGE], ids=["ridge", "edge"])
+
+
+def found(
+    image: NDArray[np.float32],
+    *,
+    noise: float = 0.01,
+    limits: StripeLimits | None = None,
+    lit: NDArray[np.bool_] | None = None,
+) -> Stripes:
+    return locate_stripes(
+        image, np.full(image.shape, noise, dtype=np.float32),
+        np.ones(image.shape, dtype=np.bool_) if lit is None else lit, 0, limits or StripeLimits(), sigma_px=1.2,
+    )  # fmt: skip
+
+
+def taylor_oracle(r: FloatArray, kind: int) -> tuple[float, float, float]:
+    """(offset x, offset y, strength) of one pixel from r, rx, ry, rxx, rxy, ryy: Steger's equations, by eigh."""
+    value, rx, ry, rxx, rxy, ryy = r
+    if kind == _RIDGE:
+        values, vectors = np.linalg.eigh([[rxx, rxy], [rxy, ryy]])
+        largest = int(np.argmax(np.abs(values)))
+        normal, strength = vectors[:, largest], -values[largest]
+        t = -float(normal @ [rx, ry]) / values[largest]
+    else:
+        strength = math.hypot(rx, ry)
+        normal = np.array([rx, ry]) / strength
+        t = -value / strength
+    offset = t * normal
+    if strength <= 0 or np.abs(offset).max() > _TAYLOR_BOX:
+        return 0.0, 0.0, 0.0
+    return float(offset[0]), float(offset[1]), float(strength)
+
+
+@KINDS
+def test_the_first_step_is_stegers_equation(kind: int) -> None:
+    filtered = np.random.default_rng(9).normal(0, 1, (6, 20, 30)).astype(np.float32)
+    filtered[0:3] *= 0.4
+    offset, strength = _taylor_kernel(*filtered, kind)
+    kept = 0
+    for y in range(20):
+        for x in range(30):
+            wanted = taylor_oracle(filtered[:, y, x].astype(np.float64), kind)
+            # Offsets at the very edge of the box may fall on either side in single precision.
+            if abs(max(abs(wanted[0]), abs(wanted[1])) - _TAYLOR_BOX) < 1e-4:
+                continue
+            np.testing.assert_allclose([*offset[y, x], strength[y, x]], wanted, rtol=2e-4, atol=2e-5)
+            kept += wanted[2] > 0
+    assert 60 < kept < 560
+
+
+def newton_oracle(
+    image: FloatArray, start: FloatArray, pixel: tuple[int, int], sigma: float, kind: int
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """(point, normal, strength): derivatives by correlation with kernels centred on the start, then one step."""
+    column, row = pixel
+    radius = math.ceil(_SUPPORT * sigma)
+    if not (radius <= column < image.shape[1] - radius and radius <= row < image.shape[0] - radius):
+        return None
+    xs, ys = np.arange(column - radius, column + radius + 1.0), np.arange(row - radius, row + radius + 1.0)
+    window = image[row - radius : row + radius + 1, column - radius : column + radius + 1]
+
+    def weights(at: FloatArray) -> list[FloatArray]:
+        bell = np.exp(-(at**2) / (2 * sigma**2))
+        bell = bell / bell.sum()
+        return [bell, at / sigma**2 * bell, (at**2 / sigma**4 - 1 / sigma**2) * bell]
+
+    wx, wy = weights(xs - start[0]), weights(ys - start[1])
+    r, rx, rxx = (float(wy[0] @ window @ wx[k]) for k in range(3))
+    ry, rxy, ryy = float(wy[1] @ window @ wx[0]), float(wy[1] @ window @ wx[1]), float(wy[2] @ window @ wx[0])
+    if kind == _RIDGE:
+        values, vectors = np.linalg.eigh([[rxx, rxy], [rxy, ryy]])
+        largest = int(np.argmax(np.abs(values)))
+        if values[largest] >= 0:
+            return None
+        normal, strength = vectors[:, largest], float(-values[largest])
+        t = float(normal @ [rx, ry]) / strength
+    else:
+        strength = math.hypot(rx, ry)
+        normal = np.array([rx, ry]) / strength
+        t = -r / strength
+    point = start + t * normal
+    if np.abs(point - [column, row]).max() > _NEWTON_BOX:
+        return None
+    return point, normal, strength
+
+
+@KINDS
+@pytest.mark.parametrize("sigma", [1.0, 1.7])
+def test_the_second_step_is_a_correlation_with_kernels_centred_on_the_point(kind: int, sigma: float) -> None:
+    rng = np.random.default_rng(12)
+    image = rng.normal(0, 1, (40, 50)).astype(np.float32)
+    columns, rows = rng.integers(0, 50, 400).astype(np.int32), rng.integers(0, 40, 400).astype(np.int32)
+    starts = np.stack([columns, rows], axis=1) + rng.uniform(-0.6, 0.6, (400, 2))
+    x, y, normals, strength, kept = _newton_kernel(image, starts, columns, rows, sigma, kind)
+    for i in range(400):
+        wanted = newton_oracle(image.astype(np.float64), starts[i], (int(columns[i]), int(rows[i])), sigma, kind)
+        assert bool(kept[i]) == (wanted is not None)
+        if wanted is not None:
+            np.testing.assert_allclose([x[i], y[i]], wanted[0], rtol=0, atol=1e-9)
+            assert abs(float(normals[i] @ wanted[1])) == pytest.approx(1, abs=1e-9)
+            assert strength[i] == pytest.approx(wanted[2], rel=1e-9)
+    assert 20 < kept.sum() < 380
+
+
+@pytest.mark.parametrize("sigma", [1.0, 1.4, 2.5])
+def test_sampled_kernels_are_exact_for_constants_ramps_and_parabolas(sigma: float) -> None:
+    zero, one, two = _kernels(sigma)
+    at = np.arange(len(zero)) - len(zero) // 2
+    assert len(zero) % 2 == 1
+    moments = [[float((kernel * at**power).sum()) for power in range(3)] for kernel in (zero, one, two)]
+    np.testing.assert_allclose(
+        [moments[0][0], *moments[1], moments[2][0], moments[2][2] / 2], [1, 0, 1, 0, 0, 1], atol=1e-12
+    )
+    assert moments[0][2] == pytest.approx(sigma**2, rel=0.03)
+
+
+def test_the_frame_is_filtered_by_correlation() -> None:
+    """A point's place before the second step follows from sums over windows, written out."""
+    image = gaussian_stripe(grid((30, 30))[0] - 14.3, 1.3)
+    noise = np.full(image.shape, 0.01, dtype=np.float32)
+    x, y, _, strength, _ = _points(image, noise, np.ones(image.shape, dtype=np.bool_), 1.3, _RIDGE, 4.0, 0.12)
+    # A straight bar smoothed to S² = 2σ² answers with -g'' = σ/S³ on its centre line.
+    np.testing.assert_allclose(strength, 1.3 / (2 * 1.3**2) ** 1.5, rtol=5e-3)
+    np.testing.assert_allclose(x, 14.3, atol=1e-3)
+    assert sorted(np.rint(y).astype(int).tolist()) == list(range(5, 25))
+
+
+def test_a_faint_stretch_belongs_to_a_strong_stripe_but_not_to_itself() -> None:
+    x, y = grid(SHAPE)
+    height = np.where(y < 40, 1.0, 0.3)
+    noise = 0.3 / (5.0 * 1.2 * math.sqrt(3 / math.pi) / 2)  # the faint half answers with 4 to 8 sigmas
+    limits = StripeLimits(weak_fraction=0.0)
+    both = found((height * gaussian_stripe(x - 45.2, 1.2)).astype(np.float32), noise=noise, limits=limits)
+    assert len(both) == 1
+    assert both.points_px[:, 1].max() > 70
+    alone = found((0.3 * gaussian_stripe(x - 45.2, 1.2)).astype(np.float32), noise=noise, limits=limits)
+    assert len(alone) == 0
+
+
+def test_a_stripe_much_fainter_than_the_others_is_a_ghost() -> None:
+    x, _ = grid(SHAPE)
+    image = gaussian_stripe(x - 25.2, 1.2) + np.float32(0.05) * gaussian_stripe(x - 60.2, 1.2)
+    stripes = found(image, noise=1e-4)
+    assert len(stripes) == 1
+    assert abs(stripes.points_px[:, 0] - 25.2).max() < 0.01
+    assert len(found(image, noise=1e-4, limits=StripeLimits(weak_fraction=0.01))) == 2
+
+
+def test_dark_stripes_and_flat_light_are_no_stripes() -> None:
+    x, _ = grid(SHAPE)
+    dark = found(1 - gaussian_stripe(x - 45.2, 1.2))
+    # Beside a dark bar the light rises again, without a ridge at the bar itself.
+    assert not (np.abs(dark.points_px[:, 0] - 45.2) < 1.5).any()
+    assert len(found(np.full(SHAPE, 0.7, dtype=np.float32))) == 0
+
+
+def test_noise_alone_makes_no_stripe() -> None:
+    image = np.random.default_rng(1).normal(0, 0.05, (200, 200)).astype(np.float32)
+    assert len(found(image, noise=0.05)) == 0
+
+
+def test_points_lie_on_lit_pixels_only() -> None:
+    x, y = grid(SHAPE)
+    lit = np.asarray(y < 30)
+    points = found(gaussian_stripe(x - 45.2, 1.2), lit=lit).points_px
+    assert len(points) > 20
+    assert points[:, 1].max() < 30.5
+
+
+def test_nothing_is_found_where_the_kernel_leaves_the_image() -> None:
+    x, y = grid(SHAPE)
+    stripes = found(gaussian_stripe(x - 2.0, 1.2) + gaussian_stripe(y - 40.0, 1.2))
+    assert stripes.points_px[:, 0].min() > 4
+    assert stripes.points_px[:, 0].max() < SHAPE[1] - 5
+
+
+def test_unmeasured_pixels_give_no_points() -> None:
+    x, _ = grid(SHAPE)
+    image = gaussian_stripe(x - 45.2, 1.2)
+    image[35:45] = np.nan
+    rows = found(image).points_px[:, 1]
+    assert np.isfinite(rows).all()
+    assert not ((rows > 32) & (rows < 47)).any()
+    assert (rows < 30).any()
+    assert (rows > 50).any()
+
+
+def test_stripes_of_several_frames_are_joined_in_order() -> None:
+    parts = [
+        stripes_of([np.array([[1.0, 2.0], [1.0, 3.0]])], frame=[4]),
+        stripes_of([]),
+        stripes_of([np.ones((3, 2))], frame=[6]),
+    ]
+    both = joined(parts)
+    assert both.offsets.tolist() == [0, 2, 5]
+    assert both.frame.tolist() == [4, 6]
+    assert both.offsets.dtype == both.frame.dtype == np.int32
+    np.testing.assert_array_equal(both.points_px, [[1, 2], [1, 3], [1, 1], [1, 1], [1, 1]])
+    assert len(joined([])) == 0
+
+
+def test_the_frame_is_left_alone() -> None:
+    x, _ = grid(SHAPE)
+    image = gaussian_stripe(x - 45.2, 1.2)
+    before = image.copy()
+    found(image)
+    locate_edges(
+        image, np.full(SHAPE, 0.01, dtype=np.float32), np.ones(SHAPE, dtype=np.bool_), 0, StripeLimits(), sigma_px=1.0
+    )
+    np.testing.assert_array_equal(image, before)

@@ -1,0 +1,179 @@
+"""Camera ray with light sheet: points projected by OpenCV come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.model import Axis, FloatArray, Source
+from slrig.reconstruction.linking import StripeEnsemble
+from slrig.reconstruction.triangulation import SheetCurves, camera_projector
+from tests.unit.reconstruction.builders import (
+    CAMERA,
+    OTHER_CAMERA,
+    PROJECTOR,
+    Sphere,
+    ensemble_of,
+    lit_rows,
+    opencv_pixels,
+    opencv_rays,
+)
+
+BALL = Sphere()
+
+
+def scattered_points(*, count: int = 300) -> FloatArray:
+    """World points before all devices, near the ball's surface and away from it."""
+    return np.random.default_rng(1).uniform([-55, -40, -60], [55, 40, 120], (count, 3))
+
+
+def one_point_each(points_mm: FloatArray, *, axis: Axis = Axis.COLUMN) -> tuple[StripeEnsemble, FloatArray]:
+    """A curve per point, at its exact projector position; the points in that order."""
+    lit = opencv_pixels(PROJECTOR, points_mm)
+    position = lit[:, 0 if axis is Axis.COLUMN else 1]
+    order = np.argsort(position)
+    pixels = opencv_pixels(CAMERA, points_mm)[order]
+    return ensemble_of(list(pixels[:, None, :]), position[order].tolist()), points_mm[order]
+
+
+@pytest.mark.parametrize("axis", list(Axis))
+def test_points_seen_through_two_distorted_lenses_come_back(axis: Axis) -> None:
+    ensemble, truth = one_point_each(scattered_points(), axis=axis)
+    curves = camera_projector(ensemble, CAMERA, PROJECTOR, axis)
+    assert len(curves.points_mm) == len(truth)
+    np.testing.assert_allclose(curves.points_mm, truth, rtol=0, atol=1e-6)
+    along = opencv_pixels(PROJECTOR, truth)[:, 1 if axis is Axis.COLUMN else 0]
+    np.testing.assert_allclose(curves.along_px, along, rtol=0, atol=1e-6)
+    assert (curves.source == Source.CAMERA_PROJECTOR).all()
+
+
+def test_a_strongly_distorted_projector_is_met_exactly() -> None:
+    # The same sheet as a plane would be wrong by millimetres at the corners.
+    strong = replace(PROJECTOR, distortion=np.array([-0.45, 0.21, 4e-3, -3e-3, 0.0]))
+    points = scattered_points()
+    lit = opencv_pixels(strong, points)
+    order = np.argsort(lit[:, 0])
+    ensemble = ensemble_of(list(opencv_pixels(CAMERA, points)[order][:, None, :]), lit[order, 0].tolist())
+    curves = camera_projector(ensemble, CAMERA, strong, Axis.COLUMN)
+    np.testing.assert_allclose(curves.points_mm, points[order], rtol=0, atol=1e-6)
+    plain = camera_projector(ensemble, CAMERA, replace(strong, distortion=np.zeros(5)), Axis.COLUMN)
+    assert np.abs(plain.points_mm - points[order][: len(plain.points_mm)]).max() > 1.0
+
+
+def on_ball(
+    columns: list[float], rows: FloatArray, *, breaks: dict[int, tuple[int, ...]] | None = None
+) -> StripeEnsemble:
+    """What the camera sees of whole columns on the ball."""
+    pixels = [opencv_pixels(CAMERA, lit_rows(column, rows, BALL)) for column in columns]
+    return ensemble_of(pixels, columns, breaks=breaks)
+
+
+def test_curves_on_a_ball_lie_on_the_ball_in_order_of_rows() -> None:
+    rows = np.arange(60.0, 180.0, 1.7)
+    columns = [100.0, 131.5, 160.0, 190.25]
+    curves = camera_projector(on_ball(columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
+    assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 1e-6
+    assert curves.position_px.tolist() == columns
+    assert np.diff(curves.offsets).tolist() == [len(rows)] * 4
+    np.testing.assert_allclose(curves.along_px, np.tile(rows, 4), atol=1e-6)
+    assert curves.curve_of_point().tolist() == np.repeat(range(4), len(rows)).tolist()
+
+
+def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
+    rows = np.arange(70.0, 170.0, 9.0)
+    ensemble = on_ball([120.0, 170.0], rows)
+    rng = np.random.default_rng(2)
+    angle = rng.uniform(-0.5, 0.5, len(ensemble.points_px))
+    ensemble = replace(
+        ensemble,
+        normals=np.stack([np.cos(angle), np.sin(angle)], axis=1),
+        sigma_px=rng.uniform(0.01, 0.05, len(ensemble.points_px)),
+    )
+    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    moved = []
+    for sign in (1, -1):
+        aside = ensemble.points_px + sign * ensemble.sigma_px[:, None] * ensemble.normals
+        moved.append(camera_projector(replace(ensemble, points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN).points_mm)
+    np.testing.assert_allclose(curves.deviation_mm, (moved[0] - moved[1]) / 2, rtol=1e-3, atol=1e-7)
+    # Depth resolution of the rig: Z²/(f b) per pixel.
+    assert 0.5 < np.linalg.norm(curves.deviation_mm, axis=1).mean() / (0.03 * 520**2 / (1400 * 150)) < 2.0
+
+
+def test_the_scatter_of_points_is_what_the_deviation_says() -> None:
+    rows = np.linspace(60.0, 180.0, 2000)
+    clean = on_ball([150.0], rows)
+    rng = np.random.default_rng(3)
+    noisy = clean.points_px + rng.normal(0, 0.02, len(rows))[:, None] * clean.normals
+    ensemble = replace(clean, points_px=noisy, sigma_px=np.full(len(rows), 0.02))
+    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    truth = camera_projector(clean, CAMERA, PROJECTOR, Axis.COLUMN).points_mm
+    shift = np.linalg.norm(curves.points_mm - truth, axis=1)
+    stated = np.linalg.norm(curves.deviation_mm, axis=1)
+    assert np.sqrt(np.mean((shift / stated) ** 2)) == pytest.approx(1.0, rel=0.05)
+
+
+def test_points_behind_a_device_are_left_out() -> None:
+    ahead = scattered_points(count=20)
+    pixels, lit = opencv_pixels(CAMERA, ahead), opencv_pixels(PROJECTOR, ahead)
+    order = np.argsort(lit[:, 0])
+    # A column far to the wrong side: the ray and the sheet part before the camera and meet behind it.
+    behind = ensemble_of([pixels[order], pixels[order]], [-2500.0, 150.0])
+    curves = camera_projector(behind, CAMERA, PROJECTOR, Axis.COLUMN)
+    assert np.diff(curves.offsets)[0] == 0
+    depth = curves.points_mm @ CAMERA.rotation[2] + CAMERA.translation_mm[2]
+    assert (depth > 0).all()
+    turned = replace(PROJECTOR, rotation=np.diag([-1.0, 1.0, -1.0]) @ PROJECTOR.rotation)
+    away = replace(turned, translation_mm=-turned.rotation @ PROJECTOR.centre_mm)
+    assert len(camera_projector(behind, CAMERA, away, Axis.COLUMN).points_mm) == 0
+
+
+def test_points_lit_by_no_row_of_the_projector_are_left_out() -> None:
+    # A projector half as high would not have lit rows below its last.
+    rows = np.arange(60.0, 180.0, 5.0)
+    cut = replace(PROJECTOR, size=replace(PROJECTOR.size, height_px=121))
+    curves = camera_projector(on_ball([140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
+    kept = rows[rows < 120 + 2]
+    np.testing.assert_allclose(curves.along_px, np.tile(kept, 2), atol=1e-6)
+
+
+def test_unmeasured_pixels_give_no_points() -> None:
+    ensemble = on_ball([140.0], np.arange(60.0, 180.0, 5.0))
+    ensemble.points_px[3] = np.nan
+    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    assert len(curves.points_mm) == 23
+    assert np.isfinite(curves.points_mm).all()
+
+
+def test_bridges_are_kept_and_stripes_follow_by_row() -> None:
+    rows = np.concatenate([np.arange(60.0, 80.0), np.arange(120.0, 150.0), np.arange(95.0, 110.0)])
+    ensemble = on_ball([140.0], rows, breaks={0: (19, 49)})
+    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    np.testing.assert_allclose(curves.along_px, np.sort(rows), atol=1e-6)
+    assert curves.stripe.tolist() == [0] * 20 + [2] * 15 + [1] * 30
+    assert np.flatnonzero(curves.bridge_after).tolist() == [19, 34]
+
+
+def test_no_curves_give_no_points() -> None:
+    empty = ensemble_of([], [])
+    curves = camera_projector(empty, CAMERA, PROJECTOR, Axis.COLUMN)
+    assert isinstance(curves, SheetCurves)
+    assert len(curves.points_mm) == len(curves.bridge_after) == 0
+
+
+def test_inputs_are_left_alone() -> None:
+    ensemble = on_ball([140.0], np.arange(60.0, 180.0, 5.0))
+    before = [ensemble.points_px.copy(), ensemble.normals.copy(), ensemble.stripe.copy()]
+    camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    for array, earlier in zip([ensemble.points_px, ensemble.normals, ensemble.stripe], before, strict=True):
+        np.testing.assert_array_equal(array, earlier)
+
+
+def test_the_builders_agree_with_themselves() -> None:
+    # Guards the oracle: rays and projections of OpenCV undo one another for every device of these tests.
+    for device in (CAMERA, OTHER_CAMERA, PROJECTOR):
+        points = scattered_points(count=50)
+        rays = opencv_rays(device, opencv_pixels(device, points))
+        depth = points @ device.rotation[2] + device.translation_mm[2]
+        np.testing.assert_allclose(device.centre_mm + depth[:, None] * rays, points, atol=1e-9)
