@@ -36,8 +36,8 @@ class StripeLimits:
     """
 
     sigma_px: float | None = None
-    strong_sigma: float = 8.0
-    weak_sigma: float = 4.0
+    strong_sigma: float = 7.0
+    weak_sigma: float = 3.5
     weak_fraction: float = 0.12
     shortest_points: int = 5
 

@@ -100,6 +100,7 @@ def mesh_report(surface: InitialMesh, mesh: Mesh, curves: PointCurves) -> dict[s
             "strip_triangles": surface.strip_triangles,
             "dropped_at_depth_edges": surface.dropped_at_depth_edges,
             "dropped_at_bridges": surface.dropped_at_bridges,
+            "dropped_as_dust": surface.dropped_as_dust,
             "dropped_triangles": surface.dropped_triangles,
             "triangles": len(surface.faces),
         },

@@ -90,6 +90,17 @@ def test_a_cliff_is_not_skinned() -> None:
     assert (side.all(axis=1) | ~side.any(axis=1)).all()
 
 
+def test_a_speck_beyond_a_cliff_is_dust() -> None:
+    depth = np.zeros((COLUMNS, ROWS))
+    depth[-2:, -3:] = 50.0
+    points, offsets, position = relief(depth)
+    mesh = meshed(points, offsets, position)
+    assert mesh.dropped_as_dust == 2 * (3 - 1)
+    assert mesh.dropped_triangles == mesh.dropped_at_depth_edges + mesh.dropped_as_dust
+    assert len(mesh.faces) == mesh.strip_triangles - mesh.dropped_triangles
+    assert (points[mesh.faces][..., 2] == 0).all()
+
+
 def test_bridges_are_dropped_on_request_and_drops_overlap_in_the_count() -> None:
     depth = wave()
     depth[6:] += 40
