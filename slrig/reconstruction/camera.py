@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray, IntArray, Refusal
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
-from slrig.reconstruction.edges import EdgeLimits, dense_position, near_edges
+from slrig.reconstruction.edges import EdgeLimits, dense_position, has_phase, near_edges
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.identification import identify
 from slrig.reconstruction.linking import StripeEnsemble, link
@@ -72,13 +72,13 @@ def camera_curves(
     code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits.decoding)
     entered("locate stripes")
     lit = code.refusal != Refusal.NOT_LIT
-    stripes, scale_px = (
+    stripes, scale_px, blur_px = (
         _line_stripes(frames, noise, lit, limits.stripes)
         if len(frames.lines)
         else _edge_stripes(frames, noise, lit, limits.stripes)
     )
     entered("identify stripes")
-    near_shadow, near_step = _borders(frames, code, tables, limits.edges)
+    near_shadow, near_step = _borders(frames, code, tables, limits.edges, blur_px)
     coded, refusal = identify(
         stripes, code, tables.position_of, near_shadow, near_step, shortest_points=limits.stripes.shortest_points
     )
@@ -95,30 +95,31 @@ def camera_curves(
 
 
 def _borders(
-    frames: AxisFrames, code: CodeMap, tables: CodeTables, limits: EdgeLimits
+    frames: AxisFrames, code: CodeMap, tables: CodeTables, limits: EdgeLimits, blur_px: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     position = dense_position(frames, code, tables.cell_position)
-    continuous = len(frames.lines) > 0
-    resolution_px = 0.0 if continuous else float(frames.gray.cell_px)
-    return near_edges(position, code.refusal == Refusal.NOT_LIT, resolution_px, limits)
+    resolution_px = 0.0 if has_phase(frames) else float(frames.gray.cell_px)
+    return near_edges(position, code.refusal == Refusal.NOT_LIT, resolution_px, limits, blur_px=blur_px)
 
 
 def _line_stripes(
     frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
-) -> tuple[Stripes, float]:
+) -> tuple[Stripes, float, float]:
+    """Stripes, the scale that they were found at, and the blur that their width tells."""
     contrast = frames.contrast
     white_variance, black_variance = (noise.variance(end) / frames.ends_repeats for end in (frames.white, frames.black))
-    scale_px = limits.sigma_px
+    scale_px = blur_px = 0.0
     parts = []
     for index, line in enumerate(frames.lines):
         # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
         light = np.clip((line - frames.black) / np.maximum(contrast, 1), 0, 1)
         variance = noise.variance(line) + (1 - light) ** 2 * black_variance + light**2 * white_variance
         image, deviation = normalised(line, frames.black, contrast, np.sqrt(variance))
-        if scale_px is None:
-            scale_px = _matched_scale_px(measured_sigma_px(image, deviation, lit))
+        if index == 0:
+            blur_px = measured_sigma_px(image, deviation, lit)
+            scale_px = limits.sigma_px or _matched_scale_px(blur_px)
         parts.append(locate_stripes(image, deviation, lit, index, limits, sigma_px=scale_px))
-    return joined(parts), scale_px or _FINEST_SCALE_PX
+    return joined(parts), scale_px, blur_px
 
 
 def _matched_scale_px(stripe_sigma_px: float) -> float:
@@ -133,7 +134,8 @@ def _matched_scale_px(stripe_sigma_px: float) -> float:
 
 def _edge_stripes(
     frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
-) -> tuple[Stripes, float]:
+) -> tuple[Stripes, float, float]:
+    """Code edges, the scale that they were found at, and no more blur than that."""
     scale_px = limits.sigma_px or _FINEST_SCALE_PX
     contrast = frames.contrast
     none = np.zeros_like(contrast)
@@ -149,4 +151,4 @@ def _edge_stripes(
             variance = 4 * noise.variance(bit) + ends_variance
         image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
         parts.append(locate_edges(image, deviation, lit, index, limits, sigma_px=scale_px))
-    return joined(parts), scale_px
+    return joined(parts), scale_px, _FINEST_SCALE_PX

@@ -36,6 +36,12 @@ class EdgeLimits:
     smallest_shadow_px: int = 4
 
 
+def has_phase(frames: AxisFrames, /) -> bool:
+    """Whether every shift of the line pattern was shown, so that its light tells the phase at each pixel."""
+    patterns = frames.line_patterns
+    return len(patterns) > 0 and len(patterns) == patterns[0].period_px
+
+
 def dense_position(frames: AxisFrames, code: CodeMap, cell_position: FloatArray, /) -> NDArray[np.float32]:
     """(H, W) float32: the projector position at every decoded pixel, px; NaN where refused.
 
@@ -45,24 +51,32 @@ def dense_position(frames: AxisFrames, code: CodeMap, cell_position: FloatArray,
     """
     middle = 0.5 * (cell_position[code.lowest] + cell_position[code.highest])
     middle = np.where(code.refusal == 0, middle, np.nan)
-    patterns = frames.line_patterns
-    if not patterns or len(patterns) < patterns[0].period_px:
+    if not has_phase(frames):
         return np.asarray(middle, dtype=np.float32)
+    patterns = frames.line_patterns
     period = patterns[0].period_px
     angle = 2 * np.pi / period * np.array([p.centre_px for p in patterns])
     return np.asarray(_phase_kernel(frames.lines, np.cos(angle), np.sin(angle), float(period), middle))
 
 
 def near_edges(
-    position: NDArray[np.float32], unlit: NDArray[np.bool_], resolution_px: float, limits: EdgeLimits, /
+    position: NDArray[np.float32],
+    unlit: NDArray[np.bool_],
+    resolution_px: float,
+    limits: EdgeLimits,
+    /,
+    *,
+    blur_px: float = 1.0,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Pixels near the lit area's border, and pixels near a depth step: two (H, W) bool maps.
 
     unlit : (H, W) bool; resolution_px : step of the position map (0 where phase makes it continuous).
+    blur_px : standard deviation of a stripe; light mixes the further, the more than 1 px it is.
     """
+    reach = max(1.0, blur_px)
     dark = _without_specks(unlit, limits.smallest_shadow_px)
     bends = _bend_kernel(position, limits.bend_px + 2 * resolution_px, limits.bend_share)
-    return _within(dark, limits.shadow_px), _within(bends, limits.depth_px)
+    return _within(dark, limits.shadow_px * reach), _within(bends, limits.depth_px * reach)
 
 
 def _without_specks(unlit: NDArray[np.bool_], smallest: int) -> NDArray[np.bool_]:

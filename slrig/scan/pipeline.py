@@ -19,7 +19,7 @@ from slrig.errors import CalibrationError, NothingToReconstructError, PatternErr
 from slrig.meshing.initial import initial_mesh
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.topology import compact
-from slrig.model import Axis, Calibration, Gray, LineShift, Mesh, Pinhole, Pixels, PointCurves, Refusal
+from slrig.model import Axis, Calibration, Gray, LineShift, Mesh, Pattern, Pinhole, Pixels, PointCurves, Refusal
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import AxisFrames, axis_frames
@@ -103,8 +103,8 @@ def reconstruct_bundle(
         entered("read bundle", 0.0, str(bundle))
         recorded = read_bundle(bundle, calibration_file=calibration)
         devices = _require_calibration(recorded)
-        sections = _sections(recorded, devices)
-        axis = _axis(recorded)
+        axis = _axis(recorded, devices)
+        sections = _sections(recorded, devices, axis)
         seen = _seen(recorded, devices, axis, entered)
         step_px = _step_px(recorded, axis)
         # The frames have told all they know; what follows needs their memory.
@@ -132,9 +132,9 @@ def reconstruct_bundle(
     return report
 
 
-def _sections(recorded: Bundle, devices: Calibration) -> dict[str, object]:
+def _sections(recorded: Bundle, devices: Calibration, axis: Axis) -> dict[str, object]:
     """The parts of the report that the frames themselves tell."""
-    return capture_report(recorded.capture, _axis(recorded), check_capture(recorded.capture)) | {
+    return capture_report(recorded.capture, axis, check_capture(recorded.capture)) | {
         "calibration": {"id": calibration_id(devices)}
     }
 
@@ -164,9 +164,19 @@ def _require_calibration(recorded: Bundle) -> Calibration:
     return found
 
 
-def _axis(recorded: Bundle) -> Axis:
-    axes = {pattern.axis for pattern in recorded.capture.patterns if isinstance(pattern, Gray)}
-    return Axis.ROW if axes == {Axis.ROW} else Axis.COLUMN
+def _axis(recorded: Bundle, devices: Calibration) -> Axis:
+    """The axis to triangulate by: of those shown, the one that the first camera stands to the side of.
+
+    A light sheet that contains the camera's centre is seen edge on and tells no depth.
+    """
+    shown = {pattern.axis for pattern in _shown(recorded) if isinstance(pattern, Gray)}
+    if len(shown) == 1:
+        return shown.pop()
+    if devices.projector is None:
+        return Axis.COLUMN
+    camera = devices.cameras[next(iter(recorded.capture.cameras))]
+    beside, above, _ = devices.projector.rotation @ camera.centre_mm + devices.projector.translation_mm
+    return Axis.COLUMN if abs(beside) >= abs(above) else Axis.ROW
 
 
 def _tables(recorded: Bundle, frames: AxisFrames) -> CodeTables:
@@ -180,12 +190,18 @@ def _tables(recorded: Bundle, frames: AxisFrames) -> CodeTables:
 
 
 def _step_px(recorded: Bundle, axis: Axis) -> float:
-    """Distance between neighbouring curves: of lines where there are any, of code edges otherwise."""
-    shown = {recorded.capture.patterns[shot.pattern] for shot in recorded.capture.shots}
-    lines = {p for p in shown if isinstance(p, LineShift) and p.axis is axis}
+    """Greatest distance between neighbouring curves: of lines where there are any, of code edges otherwise."""
+    shown = _shown(recorded)
+    lines = sorted((p for p in shown if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift)
     if lines:
-        return next(iter(lines)).period_px / len(lines)
+        shifts = [p.shift for p in lines]
+        return float(np.diff([*shifts, shifts[0] + lines[0].period_px]).max())
     return float(next(p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis))
+
+
+def _shown(recorded: Bundle) -> set[Pattern]:
+    """The patterns of which there are frames; a description may list more."""
+    return {recorded.capture.patterns[shot.pattern] for shot in recorded.capture.shots}
 
 
 def _seen(

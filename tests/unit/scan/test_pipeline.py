@@ -23,10 +23,10 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
-from slrig.model import Capture, Gray, LineShift, Shot, Size, White
+from slrig.model import Axis, Capture, Gray, LineShift, Shot, Size, White
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.pipeline import reconstruct_bundle
-from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
 RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
 
@@ -193,3 +193,57 @@ def test_a_cancelled_capture_leaves_nothing(tmp_path: Path) -> None:
     with open_rig(read_rig(RIG)) as rig, pytest.raises(ScanCancelledError):
         capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: True)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def both_axes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Columns and rows, by a rig whose camera stands above its projector."""
+    folder = tmp_path_factory.mktemp("both")
+    text = RIG.read_text()
+    for old, new in (
+        ("[-150.0, -12.0, -560.0]", "[5.0, -160.0, -560.0]"),
+        ("[105.0, -10.0, -590.0]", "[0.0, 90.0, -590.0]"),
+        ("../scenes", str(RIG.parents[1] / "scenes")),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "rig.toml").write_text(text)
+    with open_rig(read_rig(folder / "rig.toml")) as rig:
+        plan = ScanPlan(PatternPlan(rows=True))
+        capture_bundle(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+    for name in ("truth.ply", "visible_points.npy"):
+        assert (folder / "bundle" / name).exists()
+    return folder / "bundle"
+
+
+def test_the_axis_that_the_camera_stands_beside_is_used(both_axes: Path, tmp_path: Path) -> None:
+    report = run(both_axes, tmp_path / "out")
+    assert report["axis"] == "row"
+    assert report["truth"]["rms_mm"] < 0.05  # type: ignore[index]
+    assert report["truth"]["complete_0.3mm"] > 0.90  # type: ignore[index]
+
+
+def test_rows_alone_are_enough(both_axes: Path, tmp_path: Path) -> None:
+    def rows(shot: Shot, capture: Capture) -> Shot | None:
+        return shot if getattr(capture.patterns[shot.pattern], "axis", Axis.ROW) is Axis.ROW else None
+
+    bundle = changed(both_axes, tmp_path / "rows", rows)
+    for name in ("truth.ply", "visible_points.npy"):
+        shutil.copy(both_axes / name, bundle / name)
+    report = run(bundle, tmp_path / "out")
+    assert report["axis"] == "row"
+    assert report["truth"]["rms_mm"] < 0.05  # type: ignore[index]
+
+
+@pytest.mark.parametrize("shifts", [(0,), (0, 2, 4, 6), (0, 1, 2, 5)])
+def test_some_of_the_line_shifts_make_a_coarser_mesh(recorded: Path, tmp_path: Path, shifts: tuple[int, ...]) -> None:
+    def some(shot: Shot, capture: Capture) -> Shot | None:
+        pattern = capture.patterns[shot.pattern]
+        return None if isinstance(pattern, LineShift) and pattern.shift not in shifts else shot
+
+    bundle = changed(recorded, tmp_path / "some", some)
+    for name in ("truth.ply", "visible_points.npy"):
+        shutil.copy(recorded / name, bundle / name)
+    truth = run(bundle, tmp_path / "out")["truth"]
+    assert truth["rms_mm"] < 0.05  # type: ignore[index]
+    assert truth["complete_0.3mm"] > 0.90  # type: ignore[index]
