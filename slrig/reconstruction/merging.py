@@ -106,17 +106,7 @@ def _merged_pair(
 
 def _by_row(curves: SheetCurves) -> tuple[SheetCurves, NDArray[np.intp]]:
     order = np.lexsort((curves.along_px, curves.curve_of_point()))
-    return SheetCurves(
-        offsets=curves.offsets,
-        position_px=curves.position_px,
-        points_mm=curves.points_mm[order],
-        deviation_mm=curves.deviation_mm[order],
-        along_px=curves.along_px[order],
-        pixels_px=curves.pixels_px[order],
-        stripe=curves.stripe[order],
-        bridge_after=curves.bridge_after[order],
-        source=curves.source[order],
-    ), order
+    return curves.taken(order, offsets=curves.offsets, bridge_after=curves.bridge_after[order]), order
 
 
 def _spread(curves: SheetCurves, positions: FloatArray) -> NDArray[np.int32]:

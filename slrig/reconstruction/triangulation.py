@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,22 @@ class SheetCurves:
     def curve_of_point(self) -> IntArray:
         """(n,) int32: the curve each point belongs to."""
         return np.repeat(np.arange(len(self.position_px), dtype=np.int32), np.diff(self.offsets))
+
+    def taken(
+        self, index: NDArray[np.intp] | NDArray[np.bool_], *, offsets: IntArray, bridge_after: NDArray[np.bool_]
+    ) -> SheetCurves:
+        """The points at `index`, in its order, under these offsets and bridges."""
+        return replace(
+            self,
+            offsets=offsets,
+            points_mm=self.points_mm[index],
+            deviation_mm=self.deviation_mm[index],
+            along_px=self.along_px[index],
+            pixels_px=self.pixels_px[index],
+            stripe=self.stripe[index],
+            bridge_after=bridge_after,
+            source=self.source[index],
+        )
 
 
 def camera_projector(ensemble: StripeEnsemble, camera: Pinhole, projector: Pinhole, axis: Axis, /) -> SheetCurves:
@@ -111,17 +127,7 @@ def selected(curves: SheetCurves, keep: NDArray[np.bool_], /) -> SheetCurves:
     offsets = counts[curves.offsets].astype(np.int32)
     # What follows the bridge is gone to the end of the curve: no step is left that would cross it.
     carried[offsets[1:][np.diff(offsets) > 0] - 1] = False
-    return SheetCurves(
-        offsets=offsets,
-        position_px=curves.position_px,
-        points_mm=curves.points_mm[keep],
-        deviation_mm=curves.deviation_mm[keep],
-        along_px=curves.along_px[keep],
-        pixels_px=curves.pixels_px[keep],
-        stripe=curves.stripe[keep],
-        bridge_after=carried,
-        source=curves.source[keep],
-    )
+    return curves.taken(keep, offsets=offsets, bridge_after=carried)
 
 
 def ordered_along_sheet(curves: SheetCurves, /) -> SheetCurves:
@@ -144,17 +150,7 @@ def ordered_along_sheet(curves: SheetCurves, /) -> SheetCurves:
     changes = np.append(stripe[1:] != stripe[:-1], False)
     last_of_curve = np.zeros(len(order), dtype=bool)
     last_of_curve[curves.offsets[1:][np.diff(curves.offsets) > 0] - 1] = True
-    return SheetCurves(
-        offsets=curves.offsets,
-        position_px=curves.position_px,
-        points_mm=curves.points_mm[order],
-        deviation_mm=curves.deviation_mm[order],
-        along_px=curves.along_px[order],
-        pixels_px=curves.pixels_px[order],
-        stripe=stripe,
-        bridge_after=changes & ~last_of_curve,
-        source=curves.source[order],
-    )
+    return curves.taken(order, offsets=curves.offsets, bridge_after=changes & ~last_of_curve)
 
 
 def _rank_within(member: NDArray[np.intp]) -> NDArray[np.int64]:
