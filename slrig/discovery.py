@@ -21,7 +21,7 @@ from slrig.bundle.calibration_file import check_calibration, read_calibration
 from slrig.bundle.faults import explain
 from slrig.config import DriverTable, RigConfig
 from slrig.devices import Camera, CameraInfo, CameraSettings, FoundDevice, Head, Projector, Rig
-from slrig.errors import ConfigError, DeviceError, DriverBrokenError, DriverNotFoundError, SlrigError
+from slrig.errors import ConfigError, DriverBrokenError, DriverNotFoundError, SlrigError
 from slrig.model import Calibration
 
 GROUPS: Mapping[str, str] = {
@@ -164,8 +164,8 @@ def _close_later(opened: ExitStack, projector: Projector, cameras: Mapping[str, 
 
 
 def _close_quietly(device: Camera | Projector) -> None:
-    # The error that made us close is the one to tell.
-    with suppress(DeviceError):
+    # The error that made us close is the one to tell, whatever a driver raises on the way out.
+    with suppress(Exception):
         device.close()
 
 

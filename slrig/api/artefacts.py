@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Header, Response
+from fastapi import APIRouter, Header, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, StreamingResponse
 
@@ -104,17 +104,20 @@ def _answers(media_type: str) -> dict[int | str, dict[str, Any]]:
 
 
 for _name, _media_type in MEDIA_TYPES.items():
+    _fetch = _serve(_name, _media_type)
     router.add_api_route(
         f"/{_name}",
-        _serve(_name, _media_type),
+        _fetch,
         methods=["GET"],
         response_class=Response,
         responses=_answers(_media_type),
         operation_id=f"fetch_{_name.replace('.', '_')}",
         summary=f"Fetch {_name}",
     )
+    router.add_api_route(f"/{_name}", _fetch, methods=["HEAD"], response_class=Response, include_in_schema=False)
 
 
+@router.head("/rejected-{camera}.png", response_class=Response, include_in_schema=False)
 @router.get("/rejected-{camera}.png", response_class=Response, responses=_answers("image/png"))
 def fetch_rejected(
     service: Serving,
@@ -126,8 +129,9 @@ def fetch_rejected(
     return _file(service, scan_id, f"rejected-{camera}.png", "image/png", known)
 
 
+@router.head(f"/{BUNDLE_ZIP}", response_class=Response, include_in_schema=False)
 @router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses=_answers("application/zip"))
-def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+def fetch_bundle(request: Request, service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return the recorded frames and all that belongs to them; unzipped, `slrig reconstruct` reads them.
 
     A scan whose reconstruction failed has its bundle, too.
@@ -139,6 +143,9 @@ def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Res
     headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+    if request.method == "HEAD":
+        # No length: how long it is shows only once it was made.
+        return StreamingResponse(iter(()), media_type="application/zip", headers=headers)
     return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)
 
 

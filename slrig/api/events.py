@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from typing import Annotated, Any
 from uuid import UUID
 
@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
 from slrig.api.service import Serving
+from slrig.errors import ScanNotFoundError
 from slrig.scan.faults import ScanFault
 from slrig.scan.records import ScanEvent
 from slrig.scan.store import ScanStore
@@ -85,16 +86,38 @@ async def _told(store: ScanStore, scan_id: UUID, after: int, streams: OpenStream
     unwatch = store.watch(scan_id, wake)
     with streams:
         try:
-            while True:
+            # A client that names an event that has not come yet would never be told that it has.
+            after = min(after, await run_in_threadpool(_last_event, store, scan_id))
+            over = False
+            while not over:
                 news.clear()
-                for event in await run_in_threadpool(store.events, scan_id, after=after):
+                events, over = await run_in_threadpool(_look, store, scan_id, after)
+                for event in events:
                     after = event.number
                     yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(event.number), sep="\n")
                     if event.last:
                         return
-                await news.wait()
+                if not over:
+                    await news.wait()
         finally:
             unwatch()
+
+
+def _last_event(store: ScanStore, scan_id: UUID) -> int:
+    try:
+        return store.last_event(scan_id)
+    except ScanNotFoundError:
+        return 0
+
+
+def _look(store: ScanStore, scan_id: UUID, after: int) -> tuple[Sequence[ScanEvent], bool]:
+    """The events after one, and whether no more will come: the scan is over, or deleted."""
+    try:
+        # In this order: what ends between the two looks has its last event among those found.
+        over = store.get(scan_id).state.final
+        return store.events(scan_id, after=after), over
+    except ScanNotFoundError:
+        return (), True
 
 
 def _data(event: ScanEvent) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from slrig import errors
 from slrig.errors import RigBusyError, SlrigError
 from slrig.scan import faults
-from slrig.scan.faults import ScanFault, error_classes, fault_of
+from slrig.scan.faults import ScanFault, error_classes
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -166,10 +166,10 @@ async def _slrig_error(_request: Request, error: Exception) -> JSONResponse:
     return answer(document, headers=None if wait_s is None else {"Retry-After": str(wait_s)})
 
 
-async def _invalid_request(_request: Request, error: Exception) -> JSONResponse:
+async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, RequestValidationError):
         raise error
-    found = field_faults(error.errors())
+    found = field_faults(error.errors(), is_json="json" in request.headers.get("content-type", "").lower())
     names = ", ".join(fault["field"] for fault in found)
     noun = "fault" if len(found) == 1 else "faults"
     detail = f"The request has {len(found)} {noun}: {names}. See errors."
@@ -186,21 +186,50 @@ async def _http_error(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
-    return answer(problem(500, "Unexpected", fault_of(error).message))
+    detail = (
+        f"slrig met an error it did not expect ({type(error).__name__}) while it answered this request. The service's "
+        "log has the details; please report them."
+    )
+    return answer(problem(500, "Unexpected", detail))
 
 
-def field_faults(found: Sequence[Any]) -> list[dict[str, Any]]:
-    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short."""
+def field_faults(found: Sequence[Any], *, is_json: bool = True) -> list[dict[str, Any]]:
+    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short.
+
+    `is_json` says whether the request called its body JSON.
+    """
     faults_found = []
     for entry in found:
-        place = [str(part) for part in entry["loc"] if part != "body"]
+        if entry["type"] == "json_invalid":
+            message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
+            faults_found.append({"field": "body", "message": message})
+            continue
+        if entry["loc"] == ("body",) and not is_json:
+            message = "expected a JSON object; send it with Content-Type: application/json"
+            faults_found.append({"field": "body", "message": message})
+            continue
+        place = [printable(str(part)) for part in entry["loc"] if part != "body"]
         sent = entry.get("input")
-        short = isinstance(sent, (bool, int, float)) or (isinstance(sent, str) and len(sent) <= 80)
-        fault = {"field": ".".join(place) or "body", "message": _MESSAGES.get(entry["type"], entry["msg"])}
-        # NaN and infinities, which Python's JSON reader lets through, are no JSON on the way out.
-        printable = sent if not isinstance(sent, float) or abs(sent) <= 1e300 else str(sent)
-        faults_found.append({**fault, "found": printable} if short else fault)
+        message = printable(_MESSAGES.get(entry["type"], entry["msg"]))
+        fault: dict[str, Any] = {"field": ".".join(place) or "body", "message": message}
+        if isinstance(sent, str) and len(sent) <= 80:
+            fault["found"] = printable(sent)
+        elif isinstance(sent, float) and not abs(sent) <= 1e300:
+            # NaN and infinities, which Python's JSON reader lets through, are no JSON on the way out.
+            fault["found"] = str(sent)
+        elif isinstance(sent, (bool, int, float)):
+            fault["found"] = sent
+        faults_found.append(fault)
     return faults_found
+
+
+def printable(text: str) -> str:
+    r"""The text with an escape for what UTF-8 cannot hold: half a surrogate pair, which JSON can.
+
+    >>> printable("\ud800")
+    '\\ud800'
+    """
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _http_problem(status: HTTPStatus, detail: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ USUAL_PAGE = 50
 router = APIRouter(prefix="/scan", tags=["scan"])
 
 
-@router.post("", status_code=202, responses=problems(409, 422, 429, 503, 507))
+@router.post("", status_code=202, responses=problems(404, 409, 422, 429, 503, 507))
 def start_scan(
     service: Serving,
     response: Response,

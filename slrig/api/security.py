@@ -12,12 +12,16 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from slrig.api.problems import answer, problem
 from slrig.bundle.storage import write_file
+from slrig.errors import ConfigError
 
 KEY_VARIABLE = "SLRIG_API_KEY"
 """Where a client keeps its key, and where a service may be given one instead of making its own."""
 
 OPEN_PATHS = frozenset({"/livez", "/readyz"})
 """What answers without a key: probes, which tell nothing about scans."""
+
+LEAST_KEY_LENGTH = 16
+"""A key that people made up and that is shorter than this can be guessed."""
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
@@ -35,10 +39,13 @@ def claim_key(path: Path, *, given: str | None, fresh: bool) -> tuple[str, str |
 
     Raises
     ------
+    ConfigError
+        The given key is too short or cannot travel in a header, or a fresh one is asked for beside it.
     StorageError
         The digest cannot be written.
     """
     if given:
+        _refuse_bad_key(given, fresh=fresh)
         return digest(given), None
     if not fresh and path.is_file():
         return path.read_text(encoding="ascii").strip(), None
@@ -46,6 +53,20 @@ def claim_key(path: Path, *, given: str | None, fresh: bool) -> tuple[str, str |
     write_file(path, f"{digest(key)}\n".encode("ascii"))
     path.chmod(0o600)
     return digest(key), key
+
+
+def _refuse_bad_key(given: str, *, fresh: bool) -> None:
+    if fresh:
+        message = f"--new-key asks for a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
+        raise ConfigError(message)
+    sendable = given.isascii() and given.isprintable()
+    if len(given) < LEAST_KEY_LENGTH or not sendable:
+        others = "" if sendable else ", and others among them"
+        message = (
+            f"{KEY_VARIABLE}: expected a key of {LEAST_KEY_LENGTH} or more printable ASCII characters, found "
+            f"{len(given)}{others}. Unset it, and the service makes a key of its own."
+        )
+        raise ConfigError(message)
 
 
 class KeyCheck:

@@ -21,7 +21,7 @@ from slrig.api.service import Service
 from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
-from slrig.errors import ServiceError
+from slrig.errors import InvalidInputError, ServiceError
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.folder import DataFolder
 from slrig.scan.holding import HeldRig
@@ -36,8 +36,12 @@ ADDRESS_FILE = "service.json"
 _log = structlog.get_logger(__name__)
 
 
-def open_service(settings: ServiceSettings, rig: RigConfig) -> Service:
+def open_service(
+    settings: ServiceSettings, rig: RigConfig, *, give_up: Callable[[InvalidInputError], None] = lambda _: None
+) -> Service:
     """Claim the data folder, bring it in order, and return a service that is ready to be started.
+
+    `give_up` is told, on another thread, when the rig file turns out to be wrong as the rig is first opened.
 
     Raises
     ------
@@ -68,6 +72,7 @@ def open_service(settings: ServiceSettings, rig: RigConfig) -> Service:
         capture=capture_bundle,
         queue_length=settings.queue_length,
         spare_bytes=settings.min_free_bytes,
+        give_up=give_up,
     )
     return Service(settings, rig.scan, folder, store, runner)
 
@@ -80,13 +85,15 @@ def serve(
     until_eof: bool = False,
     say: Callable[[str], None],
 ) -> None:
-    """Serve until SIGTERM or Ctrl-C. `say` tells a person where the service is and, once, its key.
+    """Serve until SIGTERM, SIGHUP or Ctrl-C. `say` tells a person where the service is and, once, its key.
 
     `until_eof` stops it as well when standard input ends: a service that another program started does not outlive it,
     however that program came to its end.
 
     Raises
     ------
+    ConfigError, CalibrationError, BundleError
+        The rig can never be opened as its file describes it, or the key of the environment cannot be used.
     StorageError
         The data folder is in use, or the disk refused.
     ServiceError
@@ -96,13 +103,24 @@ def serve(
     # uvicorn catches SIGTERM while it serves, ends in good order, and then raises it again: here it must not kill the
     # process before the rest of this function has run.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    # A terminal that is closed, or a connection that breaks, ends the service in good order, too; not under nohup.
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     if until_eof:
         threading.Thread(target=_stop_at_eof, name="slrig-stdin", daemon=True).start()
     listener = _listener(settings)
     host, port = listener.getsockname()[:2]
     url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    wrong: list[InvalidInputError] = []
+    server: uvicorn.Server | None = None
+
+    def give_up(error: InvalidInputError) -> None:
+        wrong.append(error)
+        if server is not None:
+            server.should_exit = True
+
     try:
-        service = open_service(settings, rig)
+        service = open_service(settings, rig, give_up=give_up)
     except BaseException:
         listener.close()
         raise
@@ -125,8 +143,11 @@ def serve(
             # sse-starlette ends event streams by itself; this is for every other request under way.
             timeout_graceful_shutdown=1,
         )
+        server = uvicorn.Server(config)
         with suppress(KeyboardInterrupt):
-            uvicorn.Server(config).run(sockets=[listener])
+            server.run(sockets=[listener])
+        if wrong:
+            raise wrong[0]
     finally:
         service.close()
         with suppress(OSError):

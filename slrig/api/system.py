@@ -12,6 +12,10 @@ from slrig.api.problems import answer, explanations, problem
 from slrig.api.schemas import Explanation, Probe
 from slrig.api.service import Service, Serving
 from slrig.errors import StorageError
+from slrig.scan.runner import RunnerStatus
+
+BEING_OPENED = "the rig is being opened"
+"""What the probe says of the rig until it was first open, or could not be opened."""
 
 router = APIRouter(tags=["system"])
 
@@ -24,8 +28,17 @@ async def livez() -> Probe:
 
 @router.get("/readyz", response_model=Probe, responses=problems(503), openapi_extra={"security": []})
 def readyz(service: Serving) -> Response | Probe:
-    """Tell whether a scan could start: records, disk and rig. Touches no device; a rig that is held is well."""
-    checks = {"records": _records(service), "disk": _disk(service), "rig": _rig(service)}
+    """Tell whether a scan could start and end well: records, disk, rig, reconstruction. Touches no device.
+
+    A rig that is held is well. The reconstruction is "loading" until its process has loaded its kernels.
+    """
+    status = service.runner.status()
+    checks = {
+        "records": _records(service),
+        "disk": _disk(service),
+        "rig": _rig(status),
+        "reconstruction": status.reconstruction,
+    }
     if all(found == "ok" for found in checks.values()):
         return Probe(checks=checks)
     wrong = "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
@@ -58,10 +71,9 @@ def _disk(service: Service) -> str:
     return "ok"
 
 
-def _rig(service: Service) -> str:
-    status = service.runner.status()
+def _rig(status: RunnerStatus) -> str:
     if status.ending:
         return "the service is ending"
     if status.fault is not None:
         return status.fault
-    return "ok" if status.facts is not None else "the rig is being opened"
+    return "ok" if status.facts is not None else BEING_OPENED

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 
 from slrig.capture.evidence import Evidence, named
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Shown, Trigger
 from slrig.errors import (
-    DeviceError,
     FrameTimeoutError,
     ScanCancelledError,
     ScanEvidenceError,
@@ -301,7 +300,6 @@ def _under(name: str, frame: Frame) -> Frame:
 
 def _whatever_happens(action: Callable[[], None]) -> None:
     """Do it as far as the device lets; the error that led here matters more than a device that is gone."""
-    try:
+    # Drivers raise what the operating system gives them, too, and no device may keep the next one from its turn.
+    with suppress(Exception):
         action()
-    except DeviceError:
-        return

@@ -50,10 +50,20 @@ class ServiceClient:
         pause: Callable[[float], None] = time.sleep,
         transport: httpx2.BaseTransport | None = None,
     ) -> None:
+        if key is not None and not (key.isascii() and key.isprintable()):
+            message = (
+                f"The API key holds a character that no key has. Copy it again as the service printed it, into "
+                f"{KEY_VARIABLE} or the file that --key-file names."
+            )
+            raise ConfigError(message)
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         try:
+            parts = urlsplit(url)
+            if parts.scheme not in {"http", "https"} or not parts.hostname:
+                fault = "it has no http:// or no host"
+                raise ValueError(fault)  # noqa: TRY301 - told together with what httpx refuses
             # A proxy of the environment is for other machines.
-            elsewhere = urlsplit(url).hostname not in _LOCAL
+            elsewhere = parts.hostname not in _LOCAL
             self._http = httpx2.Client(
                 base_url=url,
                 headers=headers,
@@ -75,12 +85,13 @@ class ServiceClient:
     ) -> None:
         self._http.close()
 
-    def is_ready(self) -> bool:
-        """Whether the service answers that it could scan now."""
+    def checks(self) -> dict[str, str] | None:
+        """Return what the service says of its parts, each "ok" or what is wrong; None while it does not answer."""
         try:
-            return self._http.get("/readyz").status_code == 200
-        except httpx2.TransportError:
-            return False
+            checks: dict[str, str] = self._http.get("/readyz").json()["checks"]
+        except (httpx2.TransportError, ValueError, KeyError, TypeError):
+            return None
+        return checks
 
     def start(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Start a scan and return it. Raises ServiceError."""
@@ -186,4 +197,6 @@ def _refuse_problem(response: httpx2.Response) -> None:
             f"{response.request.url} answered {response.status_code} {response.reason_phrase}, and not as slrig does. "
             "Is another program listening there? Name the service with --url."
         ]
+    if response.status_code == 401:
+        lines.append(f"Set {KEY_VARIABLE}, or name its file with --key-file.")
     raise ServiceError("\n".join(lines))

@@ -46,13 +46,9 @@ KeyFile = Annotated[
 KeepHoles = Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")]
 DepthEdgeRatio = Annotated[
     float | None,
-    typer.Option(
-        min=1.0, max=1000.0, help="Longest triangle edge, in sampling distances. Default 6; longer skins cliffs."
-    ),
+    typer.Option(help="Longest triangle edge, in sampling distances, above 1. Default 6; longer skins cliffs."),
 ]
-MaxCodeGap = Annotated[
-    int | None, typer.Option(min=1, max=64, help="Mesh stripes up to this many columns apart. Default 1.")
-]
+MaxCodeGap = Annotated[int | None, typer.Option(help="Mesh stripes up to this many columns apart. Default 1.")]
 USUAL_URL = "http://127.0.0.1:8731"
 
 

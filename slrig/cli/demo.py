@@ -9,9 +9,10 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -26,6 +27,10 @@ START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
 _POLL_S = 0.05
 _SERVICE_SHARE = 0.05
+BEING_OPENED = "the rig is being opened"
+"""What /readyz says of a rig that is worth waiting for."""
+
+LABEL = "demo"
 
 
 def run_demo(rig: Path | None, output: Path) -> None:
@@ -47,15 +52,16 @@ def run_demo(rig: Path | None, output: Path) -> None:
         display("starting the service", 0.0, str(rig))
         with _service(rig, data, key) as process, ServiceClient(_url(process, data), key) as client:
             _await_ready(process, client, data)
-            earlier = client.get("/scan?limit=200")["scans"]
 
             def shown(stage: str, fraction: float, detail: str) -> None:
                 display(stage, _SERVICE_SHARE + (1 - _SERVICE_SHARE) * fraction, detail)
 
-            scan = scan_with(client, {"label": "demo"}, output, display=shown)
-            for old in earlier:
-                client.delete(old)
+            scan = scan_with(client, {"label": LABEL}, output, display=shown)
+            removed = remove_earlier(client, scan)
     tell_result(scan, output)
+    if removed:
+        noun = "demo scan" if removed == 1 else "demo scans"
+        typer.echo(f"{'removed':<10}{removed} earlier {noun} of rig '{scan['rig']}' from {data}")
     bundle = data / "scans" / scan["id"] / "bundle"
     _tell_next(rig, bundle, output)
 
@@ -115,9 +121,37 @@ def _url(process: subprocess.Popen[bytes], data: Path) -> str:
 
 def _await_ready(process: subprocess.Popen[bytes], client: ServiceClient, data: Path) -> None:
     deadline = time.monotonic() + START_LIMIT_S
-    while not client.is_ready():
+    while not rig_is_open(client):
         _require_alive(process, data, deadline)
         time.sleep(_POLL_S)
+
+
+def rig_is_open(client: ServiceClient) -> bool:
+    """Whether the service's rig is open; False while there is hope. Raises ServiceError with what is wrong.
+
+    The reconstruction is not waited for: its kernels load while the frames are taken.
+    """
+    found = (client.checks() or {}).get("rig", BEING_OPENED)
+    if found not in {"ok", BEING_OPENED}:
+        message = f"The rig cannot be opened: {found}"
+        raise ServiceError(message)
+    return found == "ok"
+
+
+def remove_earlier(client: ServiceClient, scan: Mapping[str, Any]) -> int:
+    """Delete the scans that earlier demos made with the same rig, and no others; return how many."""
+    page: dict[str, Any] = {"next": "/scan?limit=200"}
+    earlier: list[dict[str, Any]] = []
+    while page["next"] is not None:
+        page = client.get(page["next"])
+        earlier += [
+            each
+            for each in page["scans"]
+            if (each["label"], each["rig"]) == (LABEL, scan["rig"]) and each["id"] != scan["id"]
+        ]
+    for old in earlier:
+        client.delete(old)
+    return len(earlier)
 
 
 def _require_alive(process: subprocess.Popen[bytes], data: Path, deadline: float) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
 from slrig.devices.camera import Camera, CameraSettings
 from slrig.devices.projector import Projector
-from slrig.errors import DeviceError
 from slrig.model import Calibration, Truth
 
 
@@ -62,15 +60,16 @@ class Rig:
         """What a rendered rig knows of its scene; None on metal."""
         return self.head.truth() if self.head is not None else None
 
-    def close(self) -> None:
-        """Darken the projector, then close every device, whatever state each is in."""
-        with suppress(DeviceError):
-            self.projector.blank()
-        with suppress(DeviceError):
-            self.projector.close()
-        for camera in self.cameras.values():
-            with suppress(DeviceError):
-                camera.close()
+    def close(self) -> tuple[Exception, ...]:
+        """Darken the projector, then close every device, whatever state each is in. Return what they raised."""
+        faults: list[Exception] = []
+        steps: list[Callable[[], None]] = [self.projector.blank, self.projector.close]
+        for step in (*steps, *(camera.close for camera in self.cameras.values())):
+            try:
+                step()
+            except Exception as error:  # noqa: BLE001 - a driver may raise anything; the other devices are still closed
+                faults.append(error)
+        return tuple(faults)
 
     def __enter__(self) -> Self:
         return self

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import structlog
 
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
-from slrig.errors import DeviceError, SlrigError, UnsupportedByDeviceError
+from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.scan.faults import ScanFault, fault_of
@@ -27,8 +27,21 @@ class RigFacts:
     calibrated: bool
 
 
+@contextmanager
+def driver_errors(rig: str) -> Iterator[None]:
+    """Turn what the operating system tells a driver within the block into a DeviceError.
+
+    Whatever writes to a disk there has to tell its refusals as StorageError itself.
+    """
+    try:
+        yield
+    except OSError as error:
+        message = f"a driver of rig '{rig}' failed: {error}; check cable, power and permissions"
+        raise DeviceError(message) from error
+
+
 class HeldRig:
-    """A rig and the one thread that may touch it: all methods but `facts` and `fault` belong to that thread."""
+    """A rig and the one thread that may touch it: all but `facts`, `fault` and `darken_from_outside` belong to it."""
 
     def __init__(self, name: str, open_rig: Callable[[], Rig]) -> None:
         self.name = name
@@ -36,35 +49,59 @@ class HeldRig:
         self._rig: Rig | None = None
         self.facts: RigFacts | None = None
         self.fault: ScanFault | None = None
+        self._dropped = False
 
     def open(self) -> Rig:
-        """Return the rig, opened if it is not open yet. Raises what the driver raises."""
+        """Return the rig, opened if it is not open yet. Raises what the driver raises, an OSError as DeviceError."""
         if self._rig is None:
+            self._dropped = False
+            rig: Rig | None = None
             try:
-                self._rig = self._open_rig()
+                with driver_errors(self.name):
+                    rig = self._open_rig()
+                    cameras = {name: camera.info for name, camera in rig.cameras.items()}
+                    self.facts = RigFacts(cameras, rig.projector.info, rig.calibration is not None)
             except Exception as error:
                 self.fault = fault_of(error)
+                if rig is not None:
+                    self._close(rig)
                 raise
-            rig = self._rig
-            cameras = {name: camera.info for name, camera in rig.cameras.items()}
-            self.facts = RigFacts(cameras, rig.projector.info, rig.calibration is not None)
+            self._rig = rig
             self.fault = None
         return self._rig
 
-    def try_open(self) -> None:
-        """Open the rig; a failure is kept in `fault` and logged, and the next scan tries again."""
+    def try_open(self) -> Exception | None:
+        """Open the rig, or return why it cannot be opened, which `fault` keeps. The next scan tries again."""
         try:
             self.open()
-        except SlrigError as error:
-            _log.warning("the rig cannot be opened; the next scan tries again", rig=self.name, cause=str(error))
-        except Exception:  # noqa: BLE001 - a driver may raise anything, and must not end the owner thread
-            _log.exception("the rig's driver failed with an error of its own; the next scan tries again", rig=self.name)
+        except Exception as error:  # noqa: BLE001 - a driver may raise anything, and must not end the owner thread
+            return error
+        return None
+
+    def recover(self) -> Exception | None:
+        """Open the rig again, once, if it was let go because of a failure; return why that cannot be done."""
+        return self.try_open() if self._dropped else None
 
     def darken(self) -> None:
-        """Make the projector dark, whatever state the rig is in."""
-        if self._rig is not None:
-            with suppress(DeviceError):
+        """Make the projector dark. One that will not is let go with all other devices."""
+        if self._rig is None:
+            return
+        try:
+            with driver_errors(self.name):
                 self._rig.projector.blank()
+        except Exception as error:  # noqa: BLE001 - a driver may raise anything, and must not end the owner thread
+            _log.error("the projector does not go dark; the rig is closed", rig=self.name, cause=repr(error))
+            self.let_go(error)
+
+    def darken_from_outside(self) -> None:
+        """Try to make the projector dark on a thread that does not own it: for when the owner never comes back."""
+        rig = self._rig
+        if rig is None:
+            return
+        try:
+            rig.projector.blank()
+        except Exception as error:  # noqa: BLE001 - nothing is left to be tried
+            _log.error("the projector may still be lit", rig=self.name, cause=repr(error))
 
     def let_go(self, error: BaseException | None = None) -> None:
         """Close every device. `error` says why, where that is a failure."""
@@ -72,7 +109,12 @@ class HeldRig:
         if error is not None:
             self.fault = fault_of(error)
         if rig is not None:
-            rig.close()
+            self._dropped = error is not None
+            self._close(rig)
+
+    def _close(self, rig: Rig) -> None:
+        for fault in rig.close():
+            _log.error("a device could not be closed in good order", rig=self.name, cause=repr(fault))
 
 
 def pattern_sequence(plan: PatternPlan, size: Size) -> PatternSequence:

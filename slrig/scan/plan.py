@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol
+
+from slrig.errors import ConfigError
 
 
 class Progress(Protocol):
@@ -37,17 +40,46 @@ class ReconstructionPlan:
     keep_holes : drop triangles that use a bridge between two stripes of one code.
     depth_edge_ratio : a triangle edge longer than this many times the local sampling distance crosses a depth edge.
     max_code_gap : neighbouring curves whose columns differ by at most this many column steps are meshed together.
+
+    Raises
+    ------
+    ConfigError
+        depth_edge_ratio is not above 1 and finite, or max_code_gap is below 1.
     """
 
     keep_holes: bool = False
     depth_edge_ratio: float = 6.0
     max_code_gap: int = 1
 
+    def __post_init__(self) -> None:
+        if not 1 < self.depth_edge_ratio < math.inf:
+            message = (
+                f"depth_edge_ratio: expected a finite number above 1, found {self.depth_edge_ratio:g}; at 1 or below "
+                "every triangle would cross a depth edge; 6 is usual"
+            )
+            raise ConfigError(message)
+        if self.max_code_gap < 1:
+            message = (
+                f"max_code_gap: expected 1 or more, found {self.max_code_gap}; 1 meshes each curve with the next one"
+            )
+            raise ConfigError(message)
+
 
 @dataclass(frozen=True, slots=True)
 class ScanPlan:
-    """One scan: patterns, exposure, reconstruction. `exposure_s` None keeps what the rig file says per camera."""
+    """One scan: patterns, exposure, reconstruction. `exposure_s` None keeps what the rig file says per camera.
+
+    Raises
+    ------
+    ConfigError
+        exposure_s is not above 0 and finite.
+    """
 
     patterns: PatternPlan = field(default_factory=PatternPlan)
     reconstruction: ReconstructionPlan = field(default_factory=ReconstructionPlan)
     exposure_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
+            message = f"exposure_s: expected a finite time above 0 s, found {self.exposure_s:g} s; 0.0167 is usual"
+            raise ConfigError(message)

@@ -14,19 +14,28 @@ from uuid import UUID
 import structlog
 
 from slrig.devices import Rig
-from slrig.errors import DeviceError, QueueFullError, RigBusyError, ScanCancelledError, ScanStateError
-from slrig.scan.faults import UNEXPECTED, ScanFault, disk_errors, fault_of, interruption
+from slrig.errors import (
+    DeviceError,
+    InvalidInputError,
+    QueueFullError,
+    RigBusyError,
+    ScanCancelledError,
+    ScanStateError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
 from slrig.scan.folder import DataFolder, sync_tree
-from slrig.scan.holding import HeldRig, RigFacts, check_plan
+from slrig.scan.holding import HeldRig, RigFacts, check_plan, driver_errors
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import ScanProgress, ScanRecord, ScanState, report_summary
-from slrig.scan.store import ScanStore
+from slrig.scan.records import ScanRecord, ScanState, report_summary
+from slrig.scan.store import ProgressRecorder, ScanStore
 from slrig.scan.worker import Job, ReconstructionWorker
 
 CAPTURE_SHARE = 0.5
 """The part of a scan's progress that is capture."""
 
-_LEAST_STEP = 0.01
+_LAST_RESORT_S = 1.0
 
 _log = structlog.get_logger(__name__)
 
@@ -50,7 +59,10 @@ class CaptureBundle(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RunnerStatus:
-    """What the runner is at: the rig as far as it is known, who holds it and since when, and how many wait."""
+    """What the runner is at: the rig as far as it is known, who holds it and since when, and how many wait.
+
+    `reconstruction` is `ReconstructionWorker.condition`.
+    """
 
     rig: str
     facts: RigFacts | None
@@ -59,7 +71,7 @@ class RunnerStatus:
     since: datetime | None
     waiting: int
     queue_length: int
-    worker_warm: bool
+    reconstruction: str
     ending: bool
 
 
@@ -69,6 +81,14 @@ class _Task:
     plan: ScanPlan
     since: datetime
     stop: threading.Event = field(default_factory=threading.Event)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ending:
+    id: UUID
+    state: ScanState
+    fault: ScanFault | None
+    summary: Mapping[str, Any] | None = None
 
 
 class Runner:
@@ -87,7 +107,9 @@ class Runner:
         capture: CaptureBundle,
         queue_length: int = 8,
         spare_bytes: int = 0,
+        give_up: Callable[[InvalidInputError], None] = lambda _: None,
     ) -> None:
+        """`give_up` is told, on the owner thread, when the first opening shows that the rig file is wrong."""
         self._store = store
         self._folder = folder
         self._rig = rig
@@ -95,9 +117,13 @@ class Runner:
         self._capture = capture
         self._queue_length = queue_length
         self._spare_bytes = spare_bytes
+        self._give_up = give_up
+        self._closing = threading.Lock()
+        self._closed = False
         self._changed = threading.Condition()
         self._waiting: deque[_Task] = deque()
         self._active: _Task | None = None
+        self._unrecorded: list[_Ending] = []
         self._ending = False
         self._owner = threading.Thread(target=self._own_rig, name="slrig-rig", daemon=True)
 
@@ -152,12 +178,19 @@ class Runner:
             queued = next((task for task in self._waiting if task.id == scan_id), None)
             if queued is not None:
                 self._waiting.remove(queued)
+                message = "The scan was cancelled while it waited for the rig."
+                self._unrecorded.append(_Ending(scan_id, ScanState.CANCELLED, fault_of(ScanCancelledError(message))))
             elif self._active is not None and self._active.id == scan_id:
                 self._active.stop.set()
-        if queued is not None:
-            message = "The scan was cancelled while it waited for the rig."
-            self._store.finish(scan_id, ScanState.CANCELLED, fault=fault_of(ScanCancelledError(message)))
-        return self._store.get(scan_id) if queued is not None else record
+                return record
+        self._settle()
+        with self._changed:
+            ended = any(ending.id == scan_id for ending in self._unrecorded)
+        if not ended:
+            # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
+            message = "Nothing works on this scan any more. Scan again."
+            self._store.finish(scan_id, ScanState.INTERRUPTED, fault=fault_of(ScanInterruptedError(message)))
+        return self._store.get(scan_id)
 
     def delete(self, scan_id: UUID) -> None:
         """Remove a finished scan: its record, its events, its files.
@@ -169,6 +202,7 @@ class Runner:
         ScanStateError
             It is not finished.
         """
+        self._settle()
         record = self._store.get(scan_id)
         if not record.state.final:
             message = (
@@ -193,15 +227,22 @@ class Runner:
                 since=None if holder is None else holder.since,
                 waiting=len(self._waiting),
                 queue_length=self._queue_length,
-                worker_warm=self._worker.warm,
+                reconstruction=self._worker.condition,
                 ending=self._ending,
             )
 
     def close(self, *, timeout_s: float = 3.0) -> None:
         """Stop scanning, darken and close the rig, and record what was cut off as interrupted. Idempotent.
 
-        A driver that does not return in `timeout_s` is left behind: its scan is recorded all the same.
+        A driver that does not return in `timeout_s` is left behind: the projector is darkened past it, as far as it
+        lets, and its scan is recorded all the same.
         """
+        with self._closing:
+            if not self._closed:
+                self._closed = True
+                self._close(timeout_s)
+
+    def _close(self, timeout_s: float) -> None:
         with self._changed:
             self._ending = True
             cut_off = list(self._waiting)
@@ -214,18 +255,27 @@ class Runner:
             self._owner.join(timeout_s)
         if self._owner.is_alive():
             _log.error("the rig's driver does not return; the service ends without it", rig=self._rig.name)
+            # On a thread of its own: a driver that is stuck may hold back this call as well.
+            last_resort = threading.Thread(target=self._rig.darken_from_outside, name="slrig-dark", daemon=True)
+            last_resort.start()
+            last_resort.join(_LAST_RESORT_S)
         with self._changed:
             cut_off.extend([] if self._active is None else [self._active])
-        for task in cut_off:
-            self._store.finish(task.id, ScanState.INTERRUPTED, fault=fault_of(interruption()))
+            fault = fault_of(interruption())
+            self._unrecorded.extend(_Ending(task.id, ScanState.INTERRUPTED, fault) for task in cut_off)
+        self._settle()
 
     def _own_rig(self) -> None:
-        self._rig.try_open()
+        error = self._rig.try_open()
+        if isinstance(error, InvalidInputError):
+            self._give_up(error)
+        else:
+            self._log_unopened(error)
         while (task := self._next()) is not None:
             try:
                 self._scan(task)
             except Exception:  # noqa: BLE001 - the owner thread outlives whatever happens to one scan
-                _log.exception("the end of a scan could not be recorded", scan=str(task.id))
+                _log.exception("the end of a scan went wrong", scan=str(task.id))
         self._rig.darken()
         self._rig.let_go()
 
@@ -238,6 +288,24 @@ class Runner:
             return self._active
 
     def _scan(self, task: _Task) -> None:
+        self._settle()
+        ending = _Ending(task.id, ScanState.FAILED, fault_of(RuntimeError()))
+        try:
+            ending = self._ended(task)
+            self._rig.darken()
+            if ending.state is not ScanState.SUCCEEDED:
+                self._keep_evidence(task, ending.state)
+            self._worker.start()
+        finally:
+            # The rig is free before anyone can read that the scan is over: a client may start its next one at once.
+            with self._changed:
+                self._active = None
+                self._unrecorded.append(ending)
+            self._settle()
+        if not self._ending:
+            self._log_unopened(self._rig.recover())
+
+    def _ended(self, task: _Task) -> _Ending:
         log = _log.bind(scan=str(task.id))
         state, summary, fault = ScanState.FAILED, None, None
         try:
@@ -253,15 +321,28 @@ class Runner:
                 log.exception("scan failed", kind=fault.kind)
             else:
                 log.warning("scan failed", kind=fault.kind, cause=fault.message)
-        self._rig.darken()
-        if state is not ScanState.SUCCEEDED:
-            self._keep_evidence(task, state)
-        self._worker.start()
-        # The rig is free before anyone can read that the scan is over: a client may start its next one at once.
+        return _Ending(task.id, state, fault, summary)
+
+    def _settle(self) -> None:
+        """Record how scans ended. What the disk refuses is kept and tried again: before the next scan, and at close."""
         with self._changed:
-            self._active = None
-        self._store.finish(task.id, state, fault=fault, summary=summary)
-        log.info("scan finished", state=str(state))
+            endings = list(self._unrecorded)
+        for ending in endings:
+            try:
+                made = self._store.finish(ending.id, ending.state, fault=ending.fault, summary=ending.summary)
+            except Exception:  # noqa: BLE001 - whatever refuses the record, the ending is not lost
+                _log.exception("the end of a scan could not be recorded", scan=str(ending.id), state=str(ending.state))
+                continue
+            with self._changed:
+                self._unrecorded = [each for each in self._unrecorded if each is not ending]
+            if made:
+                _log.info("scan finished", scan=str(ending.id), state=str(ending.state))
+
+    def _log_unopened(self, error: Exception | None) -> None:
+        if isinstance(error, SlrigError):
+            _log.warning("the rig cannot be opened; the next scan tries again", rig=self._rig.name, cause=str(error))
+        elif error is not None:
+            _log.error("the rig's driver failed with an error of its own", rig=self._rig.name, exc_info=error)
 
     def _told(self, task: _Task, error: Exception) -> ScanFault:
         # The staging folder is gone when the message is read: what it names is then the scan's own bundle.
@@ -269,7 +350,7 @@ class Runner:
         return ScanFault(fault.kind, fault.message.replace(f"{self._folder.staging(task.id)}/", ""))
 
     def _walk(self, task: _Task) -> Mapping[str, Any]:
-        progress = _Reporter(self._store, task.id, hidden=f"{self._folder.staging(task.id)}/")
+        progress = ProgressRecorder(self._store, task.id, hidden=f"{self._folder.staging(task.id)}/")
         task.since = self._store.advance(task.id, ScanState.CAPTURING)
         rig = self._rig.open()
         if self._rig.facts is not None:
@@ -278,10 +359,12 @@ class Runner:
         bundle = staged / "bundle"
         progress.span(0.0, CAPTURE_SHARE)
         try:
-            self._capture(rig, task.plan, bundle, progress=progress, cancelled=task.stop.is_set)
+            with driver_errors(self._rig.name):
+                self._capture(rig, task.plan, bundle, progress=progress, cancelled=task.stop.is_set)
         except Exception as error:
             kind = fault_of(error).kind
-            if isinstance(error, DeviceError) or kind == UNEXPECTED:
+            failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
+            if failed or kind == UNEXPECTED:
                 # Nobody knows what state the devices are in; the next scan opens them afresh.
                 self._rig.let_go(error)
             raise
@@ -308,24 +391,3 @@ class Runner:
             # The scan's own fault is the one to tell; without its bundle it is told all the same.
             _log.exception("the bundle of a failed scan could not be kept", scan=str(task.id))
         self._folder.discard(task.id)
-
-
-class _Reporter:
-    """Takes progress from the work and records the steps worth telling: a new stage, or a hundredth of the way."""
-
-    def __init__(self, store: ScanStore, scan_id: UUID, *, hidden: str) -> None:
-        self._hidden = hidden
-        self._store = store
-        self._scan_id = scan_id
-        self._start, self._end = 0.0, 1.0
-        self._told = ScanProgress("", -1.0, "")
-
-    def span(self, start: float, end: float) -> None:
-        """Map the fractions that follow into start..end of the whole scan."""
-        self._start, self._end = start, end
-
-    def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
-        if stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
-            self._told = ScanProgress(stage, overall, detail.replace(self._hidden, ""))
-            self._store.progress(self._scan_id, self._told)

@@ -35,6 +35,8 @@ from slrig.scan.tables import EventRow, KeyRow, ScanRow
 KEY_LIFE_S = 24 * 3600.0
 """How long an idempotency key is remembered unless told otherwise."""
 
+_LEAST_STEP = 0.01
+
 
 class ScanStore:
     """Scans, their events and idempotency keys. Safe to call from any thread of the one process that owns it."""
@@ -154,6 +156,8 @@ class ScanStore:
         """Forget a scan and its events. Raises ScanNotFoundError."""
         with self._changing() as session:
             session.delete(_find(session, scan_id))
+        # Whoever waits for its next event would wait for ever.
+        self._wake(scan_id)
 
     def events(self, scan_id: UUID, *, after: int) -> Sequence[ScanEvent]:
         """Return a scan's events whose number is above `after`, in order."""
@@ -163,8 +167,15 @@ class ScanStore:
         with self._reading() as session:
             return [ScanEvent(row.number, row.kind, row.data) for row in session.scalars(query)]
 
+    def last_event(self, scan_id: UUID) -> int:
+        """Return the number of a scan's newest event. Raises ScanNotFoundError."""
+        with self._reading() as session:
+            return _find(session, scan_id).last_event
+
     def watch(self, scan_id: UUID, wake: Callable[[], None]) -> Callable[[], None]:
-        """Have `wake` called, from any thread, after each new event of a scan. Returns the call that ends it."""
+        """Have `wake` called, from any thread, after each new event of a scan and after its deletion. Returns the
+        call that ends it.
+        """
         with self._watching:
             self._watchers[scan_id].append(wake)
 
@@ -265,6 +276,29 @@ class ScanStore:
                 "Check that its disk has free space and can be written."
             )
             raise StorageError(message) from error
+
+
+class ProgressRecorder:
+    """Takes progress from the work and records the steps worth telling: a new stage, or a hundredth of the way."""
+
+    def __init__(self, store: ScanStore, scan_id: UUID, *, hidden: str) -> None:
+        """`hidden` is left out of what is recorded."""
+        self._hidden = hidden
+        self._store = store
+        self._scan_id = scan_id
+        self._start, self._end = 0.0, 1.0
+        self._told = ScanProgress("", -1.0, "")
+
+    def span(self, start: float, end: float) -> None:
+        """Map the fractions that follow into start..end of the whole scan."""
+        self._start, self._end = start, end
+
+    def __call__(self, stage: str, fraction: float, detail: str) -> None:
+        """Take note, as `slrig.scan.plan.Progress` asks."""
+        overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
+        if stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
+            self._told = ScanProgress(stage, overall, detail.replace(self._hidden, ""))
+            self._store.progress(self._scan_id, self._told)
 
 
 def _set_pragmas(connection: DBAPIConnection, _record: object) -> None:

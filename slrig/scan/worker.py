@@ -33,6 +33,9 @@ RECONSTRUCT = "slrig.scan.pipeline:reconstruct_bundle"
 CANCEL_LIMIT_S = 10.0
 """A job that has not stopped this long after it was asked to is stopped by ending its process."""
 
+LOADING = "loading"
+READY = "ok"
+
 _POLL_S = 0.1
 
 _log = structlog.get_logger(__name__)
@@ -55,6 +58,13 @@ class _Stop:
 @dataclass(frozen=True, slots=True)
 class _Ready:
     """Child to parent: the task is loaded."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Unloadable:
+    """Child to parent: the task cannot be loaded, and the process ends."""
+
+    cause: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,16 +99,26 @@ class ReconstructionWorker:
         self._pipe: Connection | None = None
         self._guard = threading.Lock()
         self._closed = False
-        self._warm = False
+        self._running = False
+        self._condition = LOADING
 
     @property
-    def warm(self) -> bool:
-        """True once the process has loaded its task; looks, and never waits."""
+    def condition(self) -> str:
+        """`LOADING`, `READY` once the process has loaded its task, or why it cannot; looks, and never waits."""
         with self._guard:
-            if not self._warm and self._pipe is not None and self._pipe.poll():
-                # Before a job the only message is _Ready; `run` reads all others itself.
-                self._warm = isinstance(_received(self._pipe), _Ready)
-            return self._warm
+            # While a job is under way `run` reads the pipe, and an answer read here would be lost.
+            if self._condition == LOADING and not self._running and self._pipe is not None and self._pipe.poll():
+                self._note(_received(self._pipe))
+            return self._condition
+
+    def _note(self, told: object | None) -> None:
+        """Take what a process says before its first answer; None stands for its death."""
+        if isinstance(told, _Ready):
+            self._condition = READY
+        elif self._condition == LOADING and not self._closed:
+            cause = told.cause if isinstance(told, _Unloadable) else "its process ended"
+            self._condition = f"the reconstruction cannot be loaded: {cause}; the service's log has the details"
+            _log.error("the reconstruction cannot be loaded", cause=cause)
 
     @property
     def process_id(self) -> int | None:
@@ -112,7 +132,7 @@ class ReconstructionWorker:
                 return
             if self._pipe is not None:
                 self._pipe.close()
-            self._warm = False
+            self._condition = LOADING
             self._pipe, far_end = self._spawning.Pipe()
             self._process = self._spawning.Process(
                 target=_serve, args=(far_end, self._task), name="slrig-reconstruction", daemon=True
@@ -138,22 +158,43 @@ class ReconstructionWorker:
             The reconstruction has a defect.
         """
         self.start()
-        # `warm` must not read this pipe while a job is under way, or it would swallow an answer.
         with self._guard:
             process, pipe = self._process, self._pipe
-            self._warm = True
+            self._running = True
         if process is None or pipe is None:
             message = "The service is ending and reconstructs no more."
             raise ScanCancelledError(message)
+        try:
+            return self._answered(process, pipe, job, progress, cancelled)
+        finally:
+            with self._guard:
+                self._running = False
+
+    def _answered(
+        self,
+        process: BaseProcess,
+        pipe: Connection,
+        job: Job,
+        progress: Callable[[str, float, str], None],
+        cancelled: Callable[[], bool],
+    ) -> Mapping[str, Any]:
         if not _sent(pipe, job):
+            # What it last said may lie in the pipe still: why it could not be loaded.
+            with self._guard:
+                self._note(_received(pipe))
             raise self._lost(process)
         stop_after: float | None = None
         while True:
             if process.sentinel in wait([pipe, process.sentinel], timeout=_POLL_S) and not pipe.poll():
+                with self._guard:
+                    self._note(None)
                 raise self._lost(process)
             while pipe.poll():
                 message_in = _received(pipe)
-                if message_in is None:
+                if message_in is None or isinstance(message_in, (_Ready, _Unloadable)):
+                    with self._guard:
+                        self._note(message_in)
+                if message_in is None or isinstance(message_in, _Unloadable):
                     raise self._lost(process)
                 if isinstance(message_in, _Progressed):
                     progress(message_in.stage, message_in.fraction, message_in.detail)
@@ -183,6 +224,9 @@ class ReconstructionWorker:
 
     def _lost(self, process: BaseProcess) -> WorkerLostError:
         process.join()
+        if self._condition not in {LOADING, READY}:
+            message = f"No mesh was made: {self._condition}. The bundle is kept: scan again once that is put right."
+            return WorkerLostError(message)
         code = process.exitcode
         how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
         message = (
@@ -214,7 +258,7 @@ def _error(failed: _Failed) -> Exception:
 def _sent(pipe: Connection, message: object) -> bool:
     try:
         pipe.send(message)
-    except (BrokenPipeError, OSError):
+    except OSError:
         return False
     return True
 
@@ -231,22 +275,25 @@ def _serve(pipe: Connection, task: str) -> None:
     """The child's life: load the task, then do jobs until the parent's end of the pipe is gone."""
     # Ctrl-C reaches the whole foreground group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     module, _, name = task.partition(":")
-    warm = getattr(importlib.import_module(module), "warm_kernels", None)
-    if warm is not None:
-        warm()
-    reconstruct = pkgutil.resolve_name(f"{module}:{name}")
-    pipe.send(_Ready())
-    while True:
-        try:
-            job = pipe.recv()
-        except EOFError:
-            return
+    try:
+        warm = getattr(importlib.import_module(module), "warm_kernels", None)
+        if warm is not None:
+            warm()
+        reconstruct = pkgutil.resolve_name(f"{module}:{name}")
+    except Exception as error:
+        _sent(pipe, _Unloadable(f"{type(error).__name__}: {error}"))
+        # The traceback goes to the service's log.
+        raise
+    _sent(pipe, _Ready())
+    while (job := _received(pipe)) is not None:
         if isinstance(job, Job):
             try:
-                pipe.send(_answer(pipe, reconstruct, job))
-            except (BrokenPipeError, EOFError):
+                answer = _answer(pipe, reconstruct, job)
+            except (ConnectionError, EOFError):
                 return
+            _sent(pipe, answer)
 
 
 def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job: Job) -> _Done | _Failed:
@@ -263,7 +310,7 @@ def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job
 
     try:
         return _Done(reconstruct(job.bundle, job.output, plan=job.plan, progress=progress, cancelled=cancelled))
-    except (BrokenPipeError, EOFError):
+    except (ConnectionError, EOFError):
         # The parent is gone: nobody waits for an answer.
         raise
     except (SlrigError, OSError) as error:

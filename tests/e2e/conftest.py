@@ -93,9 +93,9 @@ class ServiceProcess:
         message = "the service has no reconstruction process"
         raise AssertionError(message)
 
-    def stop(self) -> int:
-        """End it as a service manager would, and return its exit code."""
-        self.process.send_signal(signal.SIGTERM)
+    def stop(self, how: signal.Signals = signal.SIGTERM) -> int:
+        """End it as a service manager would, or a terminal that is closed, and return its exit code."""
+        self.process.send_signal(how)
         return self._gone(STOP_LIMIT_S)
 
     def kill(self) -> None:

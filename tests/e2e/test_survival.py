@@ -55,7 +55,8 @@ def test_killed_service_remembers_its_scans(start: Start, tmp_path: Path) -> Non
     assert second.stop() == 0
 
 
-def test_stop_in_the_middle_is_quick_and_on_record(start: Start, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP])
+def test_stop_in_the_middle_is_quick_and_on_record(start: Start, tmp_path: Path, how: signal.Signals) -> None:
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
     with first.client() as client:
@@ -75,7 +76,7 @@ def test_stop_in_the_middle_is_quick_and_on_record(start: Start, tmp_path: Path)
         thread = threading.Thread(target=follow, daemon=True)
         thread.start()
         assert begun.wait(60)
-        assert first.stop() == 0
+        assert first.stop(how) == 0
     assert not (first.data / "service.json").exists()
     second = start(rig)
     with second.client() as client:
@@ -116,7 +117,38 @@ def test_unplugged_camera_is_opened_again(start: Start, tmp_path: Path) -> None:
             record = ended(client, client.start({}))
             assert record["state"] == "failed"
             assert record["error"]["type"] == "/problems/device-gone"
-        assert client.get("/rig")["open"] is False
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [("colour = 1", "colour: unknown key"), ('driver_name = "x"', "driver_name: unknown key")],
+)
+def test_rig_that_can_never_be_opened_ends_the_service_with_the_reason(tmp_path: Path, head: str, words: str) -> None:
+    ended_by_rig(write_rig(tmp_path / "rig", head=head), words)
+
+
+def test_rig_without_its_driver_scene_or_calibration_ends_the_service(tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig")
+    text = rig.read_text()
+    for old, new, words in (
+        ('"simulated"', '"simulate"', "no installed package provides the head driver 'simulate'"),
+        ('"scene.toml"', '"scenes.toml"', "scenes.toml"),
+        ('name = "small"', 'name = "small"\ncalibration = "none.json"', "none.json: expected a readable file"),
+    ):
+        rig.write_text(text.replace(old, new, 1))
+        ended_by_rig(rig, words)
+
+
+def ended_by_rig(rig: Path, words: str) -> None:
+    """Serve a rig whose file is wrong: exit code 2 and one message."""
+    data = rig.parent / "data"
+    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(data)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
+    assert found.returncode == 2, found.stderr
+    assert found.stderr.count("error: ") == 1, found.stderr
+    assert words in found.stderr
+    assert "Traceback" not in found.stderr
+    assert not (data / "service.json").exists()
 
 
 def test_service_does_not_outlive_the_program_that_started_it(tmp_path: Path) -> None:

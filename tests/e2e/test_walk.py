@@ -55,6 +55,7 @@ def test_demo_ends_with_a_mesh_its_error_and_what_to_do_next(tmp_path: Path) -> 
         assert str(output / name) in result.stdout
         assert (output / name).stat().st_size > 0
     assert "rms" in result.stdout
+    assert f"removed   1 earlier demo scan of rig 'small' from {output / 'service'}" in result.stdout
     # What it tells to try next is there to be tried, and only the last run's scan is kept.
     (bundle,) = (output / "service" / "scans").glob("*/bundle")
     assert f"slrig reconstruct {bundle}" in result.stdout

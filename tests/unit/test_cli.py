@@ -14,9 +14,11 @@ import httpx2
 import pytest
 from typer.testing import CliRunner
 
+from slrig.api import system
 from slrig.cli import client as client_module
 from slrig.cli.client import ServiceClient, read_key
 from slrig.cli.commands import INTERRUPTED, app
+from slrig.cli.demo import BEING_OPENED, remove_earlier, rig_is_open
 from slrig.cli.display import ProgressDisplay
 from slrig.cli.scan import quality_lines, scan_with
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
@@ -199,9 +201,88 @@ def test_another_program_on_the_port_is_recognised() -> None:
         client.get("/scan")
 
 
-def test_address_that_is_no_url_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"http://127\.0\.0\.1:8731"):
-        ServiceClient("http://[", None)
+@pytest.mark.parametrize("url", ["http://[", "foo", "127.0.0.1:8731", "ftp://127.0.0.1", "http://"])
+def test_address_that_is_no_url_is_refused(url: str) -> None:
+    with pytest.raises(ConfigError, match=r"is no URL of a service: .*http://127\.0\.0\.1:8731"):
+        ServiceClient(url, None)
+
+
+@pytest.mark.parametrize("key", ["schlüssel", "two\nlines"])
+def test_key_that_cannot_be_sent_is_refused_by_its_name(key: str) -> None:
+    with pytest.raises(ConfigError, match="The API key holds a character that no key has") as refused:
+        ServiceClient("http://127.0.0.1:1", key)
+    assert "URL" not in str(refused.value)
+
+
+def test_refused_key_is_told_with_where_to_put_it() -> None:
+    with (
+        client_of(lambda _request: httpx2.Response(401, json={"detail": "another key"})) as client,
+        pytest.raises(ServiceError, match="another key\nSet SLRIG_API_KEY, or name its file with --key-file"),
+    ):
+        client.get("/scan")
+
+
+def ready_answer(status: int, rig: str) -> httpx2.Response:
+    return httpx2.Response(status, json={"checks": {"rig": rig, "reconstruction": "loading"}})
+
+
+def test_demo_waits_for_the_rig_and_for_nothing_else() -> None:
+    assert BEING_OPENED == system.BEING_OPENED
+    with client_of(lambda _request: ready_answer(503, BEING_OPENED)) as client:
+        assert not rig_is_open(client)
+    with client_of(lambda _request: ready_answer(503, "ok")) as client:
+        assert rig_is_open(client)
+
+    def absent(_request: httpx2.Request) -> httpx2.Response:
+        message = "refused"
+        raise httpx2.ConnectError(message)
+
+    with client_of(absent) as client:
+        assert not rig_is_open(client)
+
+
+def test_demo_tells_at_once_why_the_rig_cannot_be_opened() -> None:
+    with (
+        client_of(lambda _request: ready_answer(503, "scene 'tabel.toml': expected a readable file")) as client,
+        pytest.raises(ServiceError, match=r"The rig cannot be opened: scene 'tabel\.toml': expected a readable file"),
+    ):
+        rig_is_open(client)
+
+
+def test_demo_removes_its_own_earlier_scans_and_no_others() -> None:
+    pages = {
+        "/scan?limit=200": {"scans": [scan_of("new"), scan_of("old")], "next": "/scan?cursor=7&limit=2"},
+        "/scan?cursor=7&limit=2": {
+            "scans": [scan_of("other-rig", rig="bench"), scan_of("kept", label="cup"), scan_of("older")],
+            "next": None,
+        },
+    }
+    deleted: list[str] = []
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        if request.method == "DELETE":
+            deleted.append(request.url.path)
+            return httpx2.Response(204)
+        return httpx2.Response(200, json=pages[request.url.raw_path.decode()])
+
+    with client_of(handler) as client:
+        assert remove_earlier(client, scan_of("new")) == 2
+    assert deleted == ["/scan/old", "/scan/older"]
+
+
+def scan_of(name: str, *, rig: str = "sphere", label: str = "demo") -> dict[str, Any]:
+    return {"id": name, "rig": rig, "label": label, "links": {"self": f"/scan/{name}"}}
+
+
+def test_reconstruction_option_out_of_range_is_told_by_the_plan(tmp_path: Path) -> None:
+    for option, value, words in (
+        ("--depth-edge-ratio", "1", "depth_edge_ratio: expected a finite number above 1, found 1;"),
+        ("--max-code-gap", "0", "max_code_gap: expected 1 or more, found 0;"),
+    ):
+        result = CliRunner().invoke(
+            app, ["reconstruct", str(tmp_path), "--output", str(tmp_path / "out"), option, value]
+        )
+        assert (result.exit_code, words in result.stderr) == (2, True), result.stderr
 
 
 def test_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -51,6 +51,9 @@ class FakeDevice:
         if self.options.get("close") == "fails":
             message = "unplugged"
             raise DeviceGoneError(message)
+        if self.options.get("close") == "breaks":
+            message = "Input/output error"
+            raise OSError(message)
 
 
 class FakeCamera(FakeDevice):
@@ -265,10 +268,18 @@ def test_devices_already_open_are_closed_when_one_fails(
     assert [(device.name, device.closed) for device in OPENED] == [("projector", 1), ("left", 1)]
 
 
-def test_a_device_that_cannot_be_closed_does_not_hide_the_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["fails", "breaks"])
+def test_a_device_that_cannot_be_closed_does_not_hide_the_error(tmp_path: Path, how: str) -> None:
     with pytest.raises(DeviceGoneError, match="right is not there"):
-        _open(tmp_path, _camera("left", more='close = "fails"'), _camera("right", "lost"))
+        _open(tmp_path, _camera("left", more=f'close = "{how}"'), _camera("right", "lost"))
     assert [device.closed for device in OPENED] == [1, 1]
+
+
+@pytest.mark.parametrize("how", ["fails", "breaks"])
+def test_a_device_that_cannot_be_closed_keeps_no_other_open(tmp_path: Path, how: str) -> None:
+    rig = _open(tmp_path, _camera("left", more=f'close = "{how}"'), _camera("right"))
+    assert [str(fault) for fault in rig.close()] == ["unplugged" if how == "fails" else "Input/output error"]
+    assert [device.closed for device in OPENED] == [1, 1, 1]
 
 
 def test_options_a_driver_does_not_take_are_all_told(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from slrig.api.app import bare_app
 from slrig.api.openapi import text
 from slrig.api.problems import STATUS, explanations, slug
 from slrig.api.security import claim_key, digest
+from slrig.errors import ConfigError
 from slrig.scan.faults import error_classes
 from tests.unit.api.conftest import KEY, ServedBench
 
@@ -22,6 +23,19 @@ OPENAPI = Path(__file__).resolve().parents[3] / "config" / "openapi.json"
 def test_table_of_statuses_is_the_whole_error_tree() -> None:
     tree = {error for name, error in error_classes().items() if error.__module__.startswith("slrig.")}
     assert set(STATUS) == tree
+
+
+def test_given_key_that_protects_nothing_is_refused(tmp_path: Path) -> None:
+    for given, words in (
+        ("x" * 15, "found 15"),
+        ("schlüssel" * 4, "found 36, and others"),
+        ("x" * 20 + "\n", "found 21, and others"),
+    ):
+        with pytest.raises(ConfigError, match=f"SLRIG_API_KEY: expected a key of 16 or more .* {words}"):
+            claim_key(tmp_path / "key.sha256", given=given, fresh=False)
+    with pytest.raises(ConfigError, match="--new-key asks for a new key, and SLRIG_API_KEY holds the one to use"):
+        claim_key(tmp_path / "key.sha256", given="x" * 16, fresh=True)
+    assert not (tmp_path / "key.sha256").exists()
 
 
 def test_every_error_class_says_when_to_raise_it() -> None:
@@ -89,6 +103,32 @@ def test_numbers_beyond_json_are_refused(client: TestClient) -> None:
 def test_body_that_is_no_json_is_refused(client: TestClient, content: str, kind: str) -> None:
     response = client.post("/scan", content=content, headers={"Content-Type": kind})
     assert (response.status_code, response.headers["content-type"]) == (422, "application/problem+json")
+
+
+def test_body_without_its_type_is_told_to_send_one(client: TestClient) -> None:
+    for headers in ({}, {"Content-Type": "text/plain"}):
+        (fault,) = client.post("/scan", content='{"label": "a"}', headers=headers).json()["errors"]
+        assert fault == {
+            "field": "body",
+            "message": "expected a JSON object; send it with Content-Type: application/json",
+        }
+
+
+def test_broken_json_is_told_where_it_breaks(client: TestClient) -> None:
+    response = client.post("/scan", content='{"label": }', headers={"Content-Type": "application/json"})
+    assert response.json()["errors"] == [{"field": "body", "message": "is no JSON: Expecting value at character 10"}]
+    assert "1 fault: body" in response.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("content", "field", "found"),
+    [(r'{"label": "\ud800"}', "label", r"\ud800"), (r'{"\udfff": "a"}', "body", r"\udfff")],
+)
+def test_half_a_surrogate_pair_is_refused_in_print(client: TestClient, content: str, field: str, found: str) -> None:
+    response = client.post("/scan", content=content, headers={"Content-Type": "application/json"})
+    assert (response.status_code, response.headers["content-type"]) == (422, "application/problem+json")
+    (fault,) = response.json()["errors"]
+    assert (fault["field"], fault["found"]) == (field, found)
 
 
 def test_pattern_that_the_projector_cannot_show_is_refused(client: TestClient) -> None:
@@ -171,7 +211,7 @@ def test_every_kind_of_problem_is_explained(client: TestClient) -> None:
 def test_unexpected_error_tells_no_secrets(
     client: TestClient, served: ServedBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(**_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         message = "secret"
         raise RuntimeError(message)
 
@@ -181,6 +221,9 @@ def test_unexpected_error_tells_no_secrets(
     assert (response.status_code, response.headers["content-type"]) == (500, "application/problem+json")
     assert response.json()["type"] == "/problems/unexpected"
     assert "secret" not in response.text
+    # This request is about no scan, so there is no scan's id to look for.
+    assert "scan" not in response.json()["detail"]
+    assert "RuntimeError" in response.json()["detail"]
 
 
 def test_key_is_made_once_shown_once_and_kept_as_a_digest(tmp_path: Path) -> None:
@@ -194,5 +237,5 @@ def test_key_is_made_once_shown_once_and_kept_as_a_digest(tmp_path: Path) -> Non
     other, shown_again = claim_key(path, given=None, fresh=True)
     assert shown_again is not None
     assert other != kept
-    assert claim_key(path, given="mine", fresh=False) == (digest("mine"), None)
+    assert claim_key(path, given="mine" * 4, fresh=False) == (digest("mine" * 4), None)
     assert path.read_text().strip() == other

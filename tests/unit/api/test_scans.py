@@ -13,6 +13,7 @@ from fastapi.testclient import TestClient
 
 from slrig.api.scans import fingerprint
 from slrig.api.schemas import ScanRequest
+from slrig.scan.worker import ReconstructionWorker
 from tests.unit.api.conftest import ServedBench, ended
 
 
@@ -78,6 +79,26 @@ def test_stream_resumes_after_the_event_that_was_seen(client: TestClient) -> Non
     assert rest == everything[3:]
     over = client.get(path, headers={"Last-Event-ID": str(everything[-1]["id"])})
     assert (over.status_code, over.content) == (204, b"")
+
+
+@pytest.mark.parametrize("name", ["mesh.ply", "bundle.zip", "preview.png"])
+def test_head_tells_what_a_file_is_without_the_file(client: TestClient, name: str) -> None:
+    scan = ended(client, client.post("/scan").json()["id"])
+    path = scan["links"]["files"][name]
+    whole, head = client.get(path), client.head(path)
+    assert (head.status_code, head.content) == (200, b"")
+    for header in ("etag", "content-type", "cache-control", "content-length"):
+        assert head.headers.get(header) == whole.headers.get(header), header
+    assert client.head(f"/scan/{uuid4()}/{name}").status_code == 404
+
+
+def test_key_of_a_deleted_scan_is_told_as_such(client: TestClient) -> None:
+    headers = {"Idempotency-Key": "gone"}
+    scan = ended(client, client.post("/scan", headers=headers).json()["id"])
+    client.delete(scan["links"]["self"])
+    again = client.post("/scan", headers=headers)
+    assert (again.status_code, again.json()["type"]) == (404, "/problems/scan-not-found")
+    assert "404" in client.get("/openapi.json").json()["paths"]["/scan"]["post"]["responses"]
 
 
 def test_busy_rig_names_its_holder(client: TestClient, served: ServedBench) -> None:
@@ -270,4 +291,17 @@ def test_drivers_and_devices_are_listed(client: TestClient) -> None:
 def test_probes_are_well(client: TestClient) -> None:
     ended(client, client.post("/scan").json()["id"])
     assert client.get("/livez").json() == {"checks": {"process": "ok"}}
-    assert client.get("/readyz").json() == {"checks": {"records": "ok", "disk": "ok", "rig": "ok"}}
+    assert client.get("/readyz").json() == {
+        "checks": {"records": "ok", "disk": "ok", "rig": "ok", "reconstruction": "ok"}
+    }
+
+
+@pytest.mark.parametrize("condition", ["loading", "the reconstruction cannot be loaded: its process ended"])
+def test_service_is_not_ready_before_its_reconstruction_is(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch, condition: str
+) -> None:
+    ended(client, client.post("/scan").json()["id"])
+    monkeypatch.setattr(ReconstructionWorker, "condition", condition)
+    ready = client.get("/readyz")
+    assert (ready.status_code, ready.json()["checks"]["reconstruction"]) == (503, condition)
+    assert f"reconstruction: {condition}" in ready.json()["detail"]

@@ -250,6 +250,22 @@ def test_a_projector_that_is_gone_when_it_should_go_dark_is_no_success() -> None
     assert all(camera.armed is None for camera in fake.cameras.values())
 
 
+@pytest.mark.parametrize("error", [OSError(5, "Input/output error"), ZeroDivisionError()])
+def test_a_driver_that_raises_anything_keeps_no_other_device_from_its_turn(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    fake = faulty(unplug_at=9)
+
+    def broken() -> None:
+        raise error
+
+    monkeypatch.setattr(fake.projector, "blank", broken)
+    monkeypatch.setattr(fake.cameras["right"], "disarm", broken)
+    with pytest.raises(DeviceGoneError, match="camera 'right' is gone"):
+        run(fake)
+    assert fake.cameras["left"].armed is None
+
+
 # ---- other ways out
 
 

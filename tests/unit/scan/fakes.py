@@ -36,6 +36,7 @@ class TameCamera:
 
     def __init__(self) -> None:
         self.closed = False
+        self.close_error: Exception | None = None
         self.info = CameraInfo(
             name="cam0",
             model="tame",
@@ -63,6 +64,8 @@ class TameCamera:
 
     def close(self) -> None:
         self.closed = True
+        if self.close_error is not None:
+            raise self.close_error
 
 
 class TameProjector:
@@ -71,6 +74,7 @@ class TameProjector:
     def __init__(self) -> None:
         self.dark = True
         self.closed = False
+        self.blank_error: Exception | None = None
         self.info = ProjectorInfo("projector", "tame", "2", Size(64, 40), plays=False, latency_s=0.0)
 
     def load(self, sequence: PatternSequence) -> None:
@@ -87,6 +91,8 @@ class TameProjector:
         self.dark = True
 
     def blank(self) -> None:
+        if self.blank_error is not None:
+            raise self.blank_error
         self.dark = True
 
     def close(self) -> None:
@@ -97,13 +103,16 @@ class TameBench:
     """Opens rigs, and captures with them as told.
 
     `order` is what the fake reconstruction will read; `error` is raised in place of the next capture. While `gate`
-    is clear a capture holds the rig, with its light on; `began` is set when one does.
+    is clear a capture holds the rig, with its light on; `began` is set when one does. A `deaf` capture hears no cancel.
+    `opened_again` is set when the rig was opened for the second time.
     """
 
     def __init__(self) -> None:
         self.order = "finish"
         self.error: Exception | None = None
         self.open_error: Exception | None = None
+        self.deaf = False
+        self.opened_again = threading.Event()
         self.began = threading.Event()
         self.gate = threading.Event()
         self.gate.set()
@@ -114,6 +123,8 @@ class TameBench:
             raise self.open_error
         camera, projector = TameCamera(), TameProjector()
         self.opened.append((camera, projector))
+        if len(self.opened) > 1:
+            self.opened_again.set()
         return Rig("bench", {"cam0": camera}, projector, {"cam0": CameraSettings(0.01)})
 
     def capture(
@@ -130,7 +141,7 @@ class TameBench:
         progress("capture", 0.0, "frame 1 of 2")
         self.began.set()
         while not self.gate.wait(0.01):
-            if cancelled():
+            if cancelled() and not self.deaf:
                 message = "The scan was cancelled."
                 raise ScanCancelledError(message)
         if self.error is not None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +16,15 @@ from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.scan import worker as worker_module
 from slrig.scan.faults import WorkerLostError
 from slrig.scan.plan import ReconstructionPlan
-from slrig.scan.worker import Job, ReconstructionWorker, UnexpectedWorkerError, prepare_kernel_cache
+from slrig.scan.worker import (
+    LOADING,
+    READY,
+    Job,
+    ReconstructionWorker,
+    UnexpectedWorkerError,
+    prepare_kernel_cache,
+)
+from tests.unit.scan.fakes import WAIT_S
 
 TASK = "tests.unit.scan.fake_pipeline:reconstruct_bundle"
 
@@ -102,6 +112,67 @@ def test_deaf_job_loses_its_process(
         worker.run(job(tmp_path, "hang-deaf"), progress=told, cancelled=lambda: ("mesh", 0.5) in told.stages)
     worker.start()
     assert worker.process_id != before
+
+
+def gone(worker: ReconstructionWorker) -> None:
+    """Wait for the end of the worker's process, and leave its remains to the worker."""
+    assert worker.process_id is not None
+    os.waitid(os.P_PID, worker.process_id, os.WEXITED | os.WNOWAIT)
+
+
+def test_condition_is_loading_and_then_ok(tmp_path: Path) -> None:
+    fresh = ReconstructionWorker(TASK)
+    assert fresh.condition == LOADING
+    fresh.start()
+    fresh.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
+    assert fresh.condition == READY
+    fresh.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "cause"),
+    [
+        ("tests.unit.scan.no_such_module:reconstruct_bundle", "ModuleNotFoundError: No module named"),
+        ("tests.unit.scan.fake_pipeline:no_such_function", "AttributeError: "),
+        ("tests.unit.scan.dying_pipeline:reconstruct_bundle", "its process ended"),
+    ],
+)
+def test_task_that_cannot_be_loaded_is_told(tmp_path: Path, task: str, cause: str) -> None:
+    broken = ReconstructionWorker(task)
+    broken.start()
+    gone(broken)
+    assert f"the reconstruction cannot be loaded: {cause}" in broken.condition
+    with pytest.raises(WorkerLostError, match=cause):
+        broken.run(job(tmp_path, "finish"), progress=Told(), cancelled=never)
+    assert f"the reconstruction cannot be loaded: {cause}" in broken.condition
+    broken.close()
+
+
+@pytest.mark.parametrize("read", [True, False])
+def test_process_whose_parent_is_gone_ends_without_a_word(monkeypatch: pytest.MonkeyPatch, read: bool) -> None:
+    # Signals belong to the tests here. An error in the thread would fail the test as an unhandled one.
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    near, far = multiprocessing.Pipe()
+    orphan = threading.Thread(target=worker_module._serve, args=(far, TASK))
+    orphan.start()
+    assert near.poll(WAIT_S)
+    if read:
+        near.recv()
+    # With something unread in it, the pipe is not ended but reset.
+    near.close()
+    orphan.join(WAIT_S)
+    assert not orphan.is_alive()
+    far.close()
+
+
+def test_process_whose_parent_was_gone_before_it_was_ready_ends_without_a_word(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    near, far = multiprocessing.Pipe()
+    near.close()
+    worker_module._serve(far, TASK)
+    far.close()
 
 
 def test_closed_worker_starts_no_process(tmp_path: Path) -> None:

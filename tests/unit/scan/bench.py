@@ -1,0 +1,76 @@
+"""A runner over a tame bench."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from uuid import UUID
+
+from slrig.errors import InvalidInputError
+from slrig.scan.folder import DataFolder
+from slrig.scan.holding import HeldRig
+from slrig.scan.plan import ScanPlan
+from slrig.scan.records import ScanRecord, ScanState
+from slrig.scan.runner import Runner
+from slrig.scan.store import ScanStore
+from slrig.scan.worker import ReconstructionWorker
+from tests.unit.scan.fakes import WAIT_S, TameBench
+
+TASK = "tests.unit.scan.fake_pipeline:reconstruct_bundle"
+
+
+class Bench(TameBench):
+    """A runner over a tame bench."""
+
+    def __init__(self, tmp_path: Path) -> None:
+        super().__init__()
+        self.free_bytes = 10**9
+        self.given_up: list[InvalidInputError] = []
+        self.folder = DataFolder(tmp_path / "data", free=lambda _: self.free_bytes)
+        self.store = ScanStore(self.folder.database)
+        self.worker = ReconstructionWorker(TASK)
+        self.runner = Runner(
+            self.store,
+            self.folder,
+            HeldRig("bench", self.open_rig),
+            self.worker,
+            capture=self.capture,
+            queue_length=1,
+            give_up=self.given_up.append,
+        )
+
+    def scan(self, *, wait: bool = False) -> ScanRecord:
+        return self.runner.submit(ScanPlan(), label=None, wait=wait)
+
+    def held(self) -> ScanRecord:
+        """A scan that has begun to capture and goes on until `gate` is set."""
+        self.began.clear()
+        self.gate.clear()
+        scan = self.scan()
+        assert self.began.wait(WAIT_S)
+        return scan
+
+    def until(self, scan_id: UUID, state: ScanState | None = None) -> ScanRecord:
+        """The scan once it has reached `state`, or any final state."""
+        reached = threading.Event()
+        states = {state} if state is not None else {state for state in ScanState if state.final}
+
+        def look() -> None:
+            if self.store.get(scan_id).state in states:
+                reached.set()
+
+        unwatch = self.store.watch(scan_id, look)
+        look()
+        assert reached.wait(WAIT_S)
+        unwatch()
+        return self.store.get(scan_id)
+
+    def close(self) -> None:
+        self.gate.set()
+        self.runner.close()
+        self.store.close()
+        self.folder.release()
+
+
+def fault_kind(record: ScanRecord) -> str | None:
+    return None if record.fault is None else record.fault.kind

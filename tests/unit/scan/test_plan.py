@@ -1,0 +1,32 @@
+"""What a plan refuses, whoever makes it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from slrig.errors import ConfigError
+from slrig.scan.plan import ReconstructionPlan, ScanPlan
+
+
+@pytest.mark.parametrize("ratio", [1.0, 0.0, -3.0, math.nan, math.inf])
+def test_depth_edge_ratio_is_above_one_and_finite(ratio: float) -> None:
+    with pytest.raises(ConfigError, match=f"depth_edge_ratio: expected a finite number above 1, found {ratio:g};"):
+        ReconstructionPlan(depth_edge_ratio=ratio)
+
+
+def test_code_gap_is_at_least_one() -> None:
+    with pytest.raises(ConfigError, match="max_code_gap: expected 1 or more, found 0;"):
+        ReconstructionPlan(max_code_gap=0)
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, -0.1, math.nan, math.inf])
+def test_exposure_is_positive_and_finite(exposure_s: float) -> None:
+    with pytest.raises(ConfigError, match=f"exposure_s: expected a finite time above 0 s, found {exposure_s:g} s"):
+        ScanPlan(exposure_s=exposure_s)
+
+
+def test_least_plan_is_accepted() -> None:
+    assert ReconstructionPlan(depth_edge_ratio=1.001, max_code_gap=1).max_code_gap == 1
+    assert ScanPlan(exposure_s=1e-6).exposure_s == 1e-6
