@@ -19,6 +19,7 @@ from slrig.meshing.topology import (
 from slrig.model import FloatArray, IntArray, Mesh, Surface
 
 _VISIBLE_SAMPLES = 60_000
+_FACES_AT_ONCE = 200_000
 _GROSS_MM = 1.0
 _FALSE_MM = 0.5
 _WELD_MM = 1e-3
@@ -78,10 +79,11 @@ def mesh_figures(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> dic
     share of triangles, by number. `harmonic_index_mean` is the mean of hrm = 4 (cot α + cot β + cot η) over triangles
     with an area (paper, section 3.3), 4√3 if all are equilateral. Figures of no triangle are NaN.
     """
-    corners = np.asarray(vertices_mm, dtype=np.float64)[faces]
-    area_mm2 = _areas_mm2(corners)
-    angle_deg = smallest_angles_deg(corners)
-    index = harmonic_indices(corners)
+    points = np.asarray(vertices_mm, dtype=np.float64)
+    parts = [points[faces[i : i + _FACES_AT_ONCE]] for i in range(0, len(faces), _FACES_AT_ONCE)]
+    area_mm2 = np.concatenate([np.zeros(0), *map(_areas_mm2, parts)])
+    angle_deg = np.concatenate([np.zeros(0), *map(smallest_angles_deg, parts)])
+    index = np.concatenate([np.zeros(0), *map(harmonic_indices, parts)])
     counts = topology_counts(faces)
     p1, p5, p50 = _weighted_percentiles(angle_deg, area_mm2, (1.0, 5.0, 50.0))
     return {
@@ -149,20 +151,19 @@ def score(
     vertices, faces = _welded(np.asarray(mesh.vertices_mm, dtype=np.float64), mesh.faces)
     collapsed = degenerate_faces(faces)
     faces = np.ascontiguousarray(faces[~collapsed])
-    corners = vertices[faces]
-    area_mm2 = _areas_mm2(corners)
+    area_mm2, facing = _areas_and_facing(vertices, faces, eye_mm)
+    nonmanifold, misoriented = nonmanifold_edge_count(faces), misoriented_edge_count(faces)
+    duplicates = duplicate_face_count(faces)
     random = np.random.default_rng(seed)
 
     truth = SearchTree.over(surface.vertices_mm, surface.faces)
+    error_mm = truth.distances_mm(_points_on(vertices, faces, area_mm2, sample_count, random))
     found = SearchTree.over(vertices, faces)
-    error_mm = truth.distances_mm(_points_on(corners, area_mm2, sample_count, random))
     near = error_mm < _GROSS_MM
     p50, p95, p99 = np.percentile(error_mm, (50, 95, 99)) if len(error_mm) else (np.nan, np.nan, np.nan)
     # Every so many of the visible points: a share of 60 000 is known to 0.2 %, and rays are what takes the time.
     visible = np.asarray(visible_points_mm[:: max(1, len(visible_points_mm) // _VISIBLE_SAMPLES)], dtype=np.float64)
     first_mm, gap_mm, layers = _seen_through(found, truth, visible, eye_mm, random)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing = np.einsum("ij,ij->i", eye_mm - corners.mean(axis=1), normals) > 0
     return TruthScore(
         rms_mm=float(np.sqrt((error_mm[near] ** 2).mean())) if near.any() else np.nan,
         p50_mm=float(p50),
@@ -173,9 +174,9 @@ def score(
         complete_01mm=_share((first_mm < 0.1) & (gap_mm < 0.1)),
         complete_03mm=_share((first_mm < 0.3) & (gap_mm < 0.3)),
         extra_layer_fraction=_share(layers > 1),
-        nonmanifold_edges=nonmanifold_edge_count(faces),
-        misoriented_edges=misoriented_edge_count(faces),
-        duplicate_faces=duplicate_face_count(faces),
+        nonmanifold_edges=nonmanifold,
+        misoriented_edges=misoriented,
+        duplicate_faces=duplicates,
         degenerate_faces=int((area_mm2 < _FLAT_MM2).sum() + collapsed.sum()),
         facing_camera_fraction=float(area_mm2[facing].sum() / area_mm2.sum()) if area_mm2.any() else np.nan,
         error_over_sigma_p68=_error_over_sigma(mesh, truth),
@@ -196,7 +197,23 @@ def _seen_through(
     return first_mm, found.distances_mm(points_mm), layers
 
 
-def _points_on(corners_mm: FloatArray, area_mm2: FloatArray, count: int, random: np.random.Generator) -> FloatArray:
+def _areas_and_facing(
+    vertices_mm: FloatArray, faces: IntArray, eye_mm: FloatArray
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(F,) float64 area and (F,) bool front towards the eye of each triangle, in bounded memory."""
+    area_mm2, facing = np.zeros(len(faces)), np.zeros(len(faces), dtype=bool)
+    for start in range(0, len(faces), _FACES_AT_ONCE):
+        part = slice(start, start + _FACES_AT_ONCE)
+        corners = vertices_mm[faces[part]]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area_mm2[part] = np.linalg.norm(normals, axis=1) / 2
+        facing[part] = np.einsum("ij,ij->i", eye_mm - corners.mean(axis=1), normals) > 0
+    return area_mm2, facing
+
+
+def _points_on(
+    vertices_mm: FloatArray, faces: IntArray, area_mm2: FloatArray, count: int, random: np.random.Generator
+) -> FloatArray:
     """(count, 3) float64: random points, evenly spread over the area of the triangles; none if there is no area.
 
     One point per equal share of the cumulated area, which spreads better than independent draws; inside its triangle
@@ -206,7 +223,7 @@ def _points_on(corners_mm: FloatArray, area_mm2: FloatArray, count: int, random:
     if not len(cumulated) or cumulated[-1] <= 0:
         return np.zeros((0, 3))
     at = (np.arange(count) + random.random(count)) / count * cumulated[-1]
-    picked = corners_mm[np.minimum(np.searchsorted(cumulated, at, side="right"), len(cumulated) - 1)]
+    picked = vertices_mm[faces[np.minimum(np.searchsorted(cumulated, at, side="right"), len(cumulated) - 1)]]
     root, along = np.sqrt(random.random(count)), random.random(count)
     weights = np.stack((1 - root, root * (1 - along), root * along), axis=1)
     return np.asarray(np.einsum("ij,ijk->ik", weights, picked))

@@ -38,12 +38,12 @@ class SearchTree:
         ValueError
             A vertex that a face uses is not finite.
         """
-        corners = np.asarray(vertices_mm, dtype=np.float64)[faces]
-        if not np.isfinite(corners).all():
+        points = np.asarray(vertices_mm, dtype=np.float64)
+        centroids = (points[faces[:, 0]] + points[faces[:, 1]] + points[faces[:, 2]]) / 3
+        if not np.isfinite(centroids).all():
             message = "a search tree needs finite vertices; drop the faces that use an unmeasured one"
             raise ValueError(message)
-        centroids = corners.mean(axis=1)
-        corners = np.ascontiguousarray(corners[np.argsort(_morton_codes(centroids), kind="stable")])
+        corners = points[faces[np.argsort(_morton_codes(centroids), kind="stable")]]
         leaf_count = 1
         while leaf_count * _TRIANGLES_PER_LEAF < len(corners):
             leaf_count *= 2
