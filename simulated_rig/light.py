@@ -1,4 +1,4 @@
-"""From a pattern to the light on a camera's pixels: projector response, projector blur, table look-up, camera blur.
+"""From a pattern to the light on a camera's pixels: projector response, projector blur, table look-up, camera optics.
 
 A pattern that varies along one axis, blurred by a round Gaussian, is a product of one profile along the columns and
 one along the rows. So the light of a pattern at any projector position is two table look-ups.
@@ -6,6 +6,7 @@ one along the rows. So the light of a pattern at any projector position is two t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from scipy.signal import upfirdn
 from scipy.special import ndtr
 
@@ -24,20 +26,30 @@ Float32Array = NDArray[np.float32]
 NODES_PER_PX = 32
 """Table nodes per projector pixel; between them the look-up is linear (error under 0.0003 of white at blur 0.5 px)."""
 
+_WIDEST_SIGMAS = 4.5  # of a Gaussian; 7 parts in a million of its light lie beyond
+
 
 @dataclass(frozen=True, slots=True)
 class Response:
     """How a projector turns grey values into light: leak + (1 - leak) * (value / 255) ^ gamma, and its blur.
 
     `blur_px` is the standard deviation of the lens's Gaussian spread; each pixel is a square before it.
+    `signal_blur_px` is that of the values on their way to the pixels, before gamma: a scaler, or an analogue cable.
+    Without it a pattern of black and white alone has no value that gamma could bend.
     """
 
     gamma: float
     leak: float
     blur_px: float
+    signal_blur_px: float = 0.0
 
-    def light(self, values: Pixels) -> FloatArray:
-        """Light of grey values 0..255, same shape, as a fraction of full white."""
+    def signal(self, values: Pixels) -> FloatArray:
+        """(H, W) float64, 0..255: the values that reach the pixels, of a pattern (H, W) whose border goes on."""
+        spread = [self.signal_blur_px if length > 1 else 0.0 for length in values.shape]
+        return np.asarray(gaussian_filter(values.astype(np.float64), spread, mode="nearest"), np.float64)
+
+    def light(self, values: Pixels | FloatArray) -> FloatArray:
+        """Light of grey values 0..255 at the pixels, same shape, as a fraction of full white."""
         return np.asarray(self.leak + (1 - self.leak) * (values / 255.0) ** self.gamma, dtype=np.float64)
 
 
@@ -60,7 +72,7 @@ class LightTable:
 
 def light_table(profile: Pixels, projector: Size, response: Response) -> LightTable:
     """Return the light of one pattern; `profile` is (1, Wp), (Hp, 1) or (1, 1) uint8."""
-    light = response.light(profile)
+    light = response.light(response.signal(profile))
     if light.shape[0] > 1 and light.shape[1] > 1:
         message = f"a pattern may vary along one axis only, found an image of shape {profile.shape}"
         raise ValueError(message)
@@ -79,23 +91,39 @@ def no_light(projector: Size) -> LightTable:
     )
 
 
-def radiance(paths: Paths, table: LightTable) -> Float32Array:
-    """(H, W) float32: light that reaches each camera pixel from the projector, a white diffuser giving 1."""
-    light: Float32Array = _gather(
-        paths.column_px, paths.row_px, paths.weight, table.columns, table.rows, np.float32(table.margin_px)
+def radiance(paths: Paths, table: LightTable, *, blur_px: float) -> Float32Array:
+    """(H, W) float32: light that reaches each camera pixel from the projector, a white diffuser giving 1.
+
+    The lens spreads the samples' light first, by a Gaussian of standard deviation blur_px; the pixel's square collects
+    it then. What the lens does not pass cannot alias. Both together are one separable filter, and only its values at
+    the pixels are computed. Beyond the image's border the light goes on as its mirror image. Jittered samples count as
+    in the middle of their cells.
+    """
+    height, width, count = paths.weight.shape
+    shares = _pixel_shares(blur_px, math.isqrt(count))
+    across: Float32Array = _gather(
+        paths.column_px,
+        paths.row_px,
+        paths.weight,
+        table.columns,
+        table.rows,
+        np.float32(table.margin_px),
+        shares,
+        _mirrored(width, shares.shape),
     )
+    light: Float32Array = _collected(across, shares, _mirrored(height, shares.shape))
     return light
 
 
 def blurred(image: Float32Array, blur_px: float) -> Float32Array:
-    """The image as the camera's lens spreads it: a Gaussian of standard deviation blur_px."""
+    """An image of pixels as the lens spreads it, a Gaussian of standard deviation blur_px: for light without detail."""
     if blur_px == 0:
         return image
     return np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px, borderType=cv2.BORDER_REFLECT_101), np.float32)
 
 
 def _margin_px(blur_px: float) -> int:
-    return int(np.ceil(4.5 * blur_px)) + 1
+    return int(np.ceil(_WIDEST_SIGMAS * blur_px)) + 1
 
 
 @lru_cache(maxsize=8)
@@ -122,6 +150,27 @@ def _looked_up(table: Float32Array, position: np.float32, margin: np.float32) ->
     return np.float32(table[node] + part * (table[node + 1] - table[node]))
 
 
+def _pixel_shares(blur_px: float, per_axis: int) -> Float32Array:
+    """(2 m + 1, S): what a pixel takes from sample s of the pixel i - m beside it, along one axis; the sum is 1.
+
+    A Gaussian convolved with a square of 1 px, at the samples' distances d: Φ((d + ½)/σ) - Φ((d - ½)/σ).
+    """
+    reach = math.ceil(_WIDEST_SIGMAS * blur_px)
+    beside, sample = np.arange(-reach, reach + 1)[:, None], np.arange(per_axis)
+    distance = beside + (sample + 0.5) / per_axis - 0.5
+    if blur_px == 0:
+        return np.full(distance.shape, 1 / per_axis, np.float32)
+    share = ndtr((distance + 0.5) / blur_px) - ndtr((distance - 0.5) / blur_px)
+    return np.asarray(share / share.sum(), np.float32)
+
+
+def _mirrored(length_px: int, shape: tuple[int, ...]) -> NDArray[np.intp]:
+    """(m + length + m, S) indices of samples along an axis, mirrored beyond both ends. shape : of the shares."""
+    taps, per_axis = shape
+    around = np.pad(np.arange(length_px * per_axis), taps // 2 * per_axis, mode="symmetric")
+    return around.reshape(-1, per_axis)
+
+
 @njit(cache=True, nogil=True)
 def _gather(
     column: Float32Array,
@@ -130,17 +179,52 @@ def _gather(
     columns: Float32Array,
     rows: Float32Array,
     margin: np.float32,
+    shares: Float32Array,
+    source: NDArray[np.intp],
 ) -> Float32Array:
-    height, width, count = weight.shape
-    out = np.zeros((height, width), np.float32)
-    for r in range(height):
+    """(H S, W): light of each row of samples, filtered along the row at the pixels."""
+    height, width, _ = weight.shape
+    taps, per_axis = shares.shape
+    out = np.zeros((height * per_axis, width), np.float32)
+    reach = taps // 2
+    # One line per sample of a pixel, so that the sums below run over neighbours in memory.
+    lines = np.zeros((per_axis, len(source)), np.float32)
+    for fine in range(height * per_axis):
+        r, first = fine // per_axis, fine % per_axis * per_axis
         for c in range(width):
-            total = np.float32(0)
-            for s in range(count):
-                share = weight[r, c, s]
+            for s in range(per_axis):
+                light = np.float32(0)
+                share = weight[r, c, first + s]
                 if share > 0:
-                    light = _looked_up(columns, column[r, c, s], margin)
+                    light = _looked_up(columns, column[r, c, first + s], margin)
                     if light > 0:
-                        total += share * light * _looked_up(rows, row[r, c, s], margin)
-            out[r, c] = total / np.float32(count)
+                        light *= share * _looked_up(rows, row[r, c, first + s], margin)
+                lines[s, reach + c] = light
+        for i in range(reach):
+            for beyond in (i, reach + width + i):
+                for s in range(per_axis):
+                    lines[s, beyond] = lines[source[beyond, s] % per_axis, reach + source[beyond, s] // per_axis]
+        total = out[fine]
+        for i in range(taps):
+            for s in range(per_axis):
+                line = lines[s, i : i + width]
+                share = shares[i, s]
+                for c in range(width):
+                    total[c] += share * line[c]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _collected(across: Float32Array, shares: Float32Array, source: NDArray[np.intp]) -> Float32Array:
+    """(H, W): rows of samples, filtered down the columns at the pixels."""
+    taps, per_axis = shares.shape
+    width = across.shape[1]
+    out = np.zeros((len(across) // per_axis, width), np.float32)
+    for r in range(len(out)):
+        total = out[r]
+        for i in range(taps):
+            for s in range(per_axis):
+                share, line = shares[i, s], across[source[r + i, s]]
+                for c in range(width):
+                    total[c] += share * line[c]
     return out

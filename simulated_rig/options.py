@@ -74,13 +74,14 @@ class Device(Table):
 class ProjectorOptions(Device):
     """The projector: `[head.projector]`.
 
-    gamma, leak : response (see `light.Response`). working_distance_mm : where a white diffuser has unit brightness;
-    absent, the distance from the projector to the world's origin. latency_s : from `show` to light, each time off by
-    at most visible_error_s.
+    gamma, leak, signal_blur_px : response (see `light.Response`). working_distance_mm : where a white diffuser has
+    unit brightness; absent, the distance from the projector to the world's origin. latency_s : from `show` to light,
+    each time off by at most visible_error_s.
     """
 
     gamma: Annotated[float, Field(gt=0, le=5)] = 1.0
     leak: Fraction = 0.001
+    signal_blur_px: Annotated[float, Field(ge=0, le=20)] = 0.0
     working_distance_mm: Positive | None = None
     latency_s: NotNegative = 0.02
     visible_error_s: NotNegative = 0.0005
@@ -88,7 +89,7 @@ class ProjectorOptions(Device):
 
     def response(self) -> Response:
         """Return how grey values become light."""
-        return Response(gamma=self.gamma, leak=self.leak, blur_px=self.blur_px)
+        return Response(gamma=self.gamma, leak=self.leak, blur_px=self.blur_px, signal_blur_px=self.signal_blur_px)
 
 
 class CameraOptions(Device):

@@ -84,15 +84,15 @@ class View:
         1 is a white diffuser, at the working distance and facing the projector, under full white.
         """
         paths = self.prepare()
-        total = paths.albedo * np.float32(self._ambient)
+        total = blurred(paths.albedo * np.float32(self._ambient), self._blur_px)
         for fraction, light in lights:
             total += np.float32(fraction) * self._under(paths, light)
-        return blurred(total, self._blur_px)
+        return total
 
     def _under(self, paths: Paths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
         if self._last is None or self._last[0] is not light:
-            self._last = (light, radiance(paths, light))
+            self._last = (light, radiance(paths, light, blur_px=self._blur_px))
         return self._last[1]
 
     def truth(self) -> CameraTruth:

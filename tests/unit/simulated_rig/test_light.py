@@ -64,6 +64,41 @@ def test_the_response_is_a_power_law_above_the_leak() -> None:
     np.testing.assert_allclose(response.light(values), expected)
 
 
+def test_native_patterns_of_black_and_white_do_not_know_gamma() -> None:
+    tables = [
+        light_table(line_profile(SIZE, 3), SIZE, Response(gamma=gamma, leak=0.001, blur_px=0.6)) for gamma in (1.0, 2.6)
+    ]
+    np.testing.assert_array_equal(tables[0].columns, tables[1].columns)
+
+
+def test_gamma_acts_on_values_that_the_signal_has_spread() -> None:
+    response = Response(gamma=2.2, leak=0.01, blur_px=0.6, signal_blur_px=0.5)
+    table = light_table(line_profile(SIZE, 3), SIZE, response)
+    # A line spread by a sampled Gaussian: weights exp(-i²/2σ²) that sum to 1, over four σ.
+    weight = np.exp(-(np.arange(-2, 3) ** 2) / (2 * 0.5**2))
+    value = np.convolve((np.arange(24) % 8 == 3).astype(np.float64), weight / weight.sum(), mode="same")
+    expected = spread_by_hand(0.01 + 0.99 * value**2.2, nodes(table), 0.6)
+    np.testing.assert_allclose(table.columns, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("blur_px", [0.4, 0.6])
+def test_gamma_moves_an_edge_into_the_light_and_no_line(blur_px: float) -> None:
+    step = np.where(np.arange(24) < 12, 255, 0).astype(np.uint8)[None]
+    crossings, means = [], []
+    for gamma in (1.0, 1.8, 2.6):
+        response = Response(gamma=gamma, leak=0.0, blur_px=blur_px, signal_blur_px=0.5)
+        table = light_table(step, SIZE, response)
+        half = np.interp(-0.5, -table.columns[8 * NODES_PER_PX :], nodes(table)[8 * NODES_PER_PX :])
+        crossings.append(float(half))
+        line = np.zeros((1, 24), np.uint8)
+        line[0, 11] = 255
+        table = light_table(line, SIZE, response)
+        means.append(float((nodes(table) * table.columns).sum() / table.columns.sum()))
+    assert crossings[0] == pytest.approx(11.5, abs=1e-3)
+    assert crossings[2] < crossings[1] - 0.05 < crossings[0] - 0.1
+    assert means == pytest.approx([11.0] * 3, abs=1e-5)
+
+
 def test_a_row_pattern_varies_down_and_fades_at_the_sides() -> None:
     profile = np.zeros((16, 1), np.uint8)
     profile[5] = 255
@@ -85,9 +120,10 @@ def test_a_pattern_that_varies_both_ways_is_refused() -> None:
         light_table(np.zeros((16, 24), np.uint8), SIZE, Response(gamma=1.0, leak=0.0, blur_px=0.0))
 
 
-def test_gather_kernel_equals_numpy_interpolation() -> None:
+@pytest.mark.parametrize(("per_axis", "blur_px"), [(1, 0.0), (1, 0.7), (2, 0.0), (2, 0.6), (3, 0.25), (3, 2.1)])
+def test_kernels_equal_interpolation_and_a_filter_of_all_samples_in_numpy(per_axis: int, blur_px: float) -> None:
     rng = np.random.default_rng(2)
-    shape = (6, 7, 4)
+    shape = (6, 7, per_axis**2)
     paths = Paths(
         rng.uniform(-4, 28, shape).astype(np.float32),
         rng.uniform(-4, 20, shape).astype(np.float32),
@@ -98,10 +134,53 @@ def test_gather_kernel_equals_numpy_interpolation() -> None:
     across = np.interp(paths.column_px, nodes(table), table.columns, left=0, right=0)
     down_at = np.arange(len(table.rows)) / NODES_PER_PX - table.margin_px
     down = np.interp(paths.row_px, down_at, table.rows, left=0, right=0)
-    expected = (paths.weight * across * down).mean(axis=2)
-    np.testing.assert_allclose(radiance(paths, table), expected, atol=1e-5)
-    arguments = (paths.column_px, paths.row_px, paths.weight, table.columns, table.rows, np.float32(table.margin_px))
-    np.testing.assert_allclose(light._gather.py_func(*arguments), expected, atol=1e-5)
+    fine = (paths.weight * across * down).reshape(6, 7, per_axis, per_axis).transpose(0, 2, 1, 3)
+    expected = through_optics(fine.reshape(6 * per_axis, 7 * per_axis), per_axis, blur_px)
+    np.testing.assert_allclose(radiance(paths, table, blur_px=blur_px), expected, atol=1e-5)
+    tables = (table.columns, table.rows, np.float32(table.margin_px))
+    shares = light._pixel_shares(blur_px, per_axis)
+    sides = [light._mirrored(length, shares.shape) for length in (7, 6)]
+    rows = light._gather.py_func(paths.column_px, paths.row_px, paths.weight, *tables, shares, sides[0])
+    np.testing.assert_allclose(light._collected.py_func(rows, shares, sides[1]), expected, atol=1e-5)
+
+
+def through_optics(fine: FloatArray, per_axis: int, blur_px: float) -> FloatArray:
+    """The pixels of a fine image, mirrored at its border: Gaussian and square laid over every sample, no separation."""
+    around = np.ceil(5 * blur_px + 1).astype(int) * per_axis
+    rows, columns = (np.arange(-around, length + around) for length in fine.shape)
+    image = np.pad(fine, around, mode="symmetric")
+    out = np.zeros((fine.shape[0] // per_axis, fine.shape[1] // per_axis))
+    for r, c in np.ndindex(*out.shape):
+        off = [(at + 0.5) / per_axis - 0.5 - centre for at, centre in ((rows, r), (columns, c))]
+        if blur_px:
+            scale = np.sqrt(2) * blur_px
+            down, across = (erf((d + 0.5) / scale) - erf((d - 0.5) / scale) for d in off)
+        else:
+            down, across = ((np.abs(d) < 0.5).astype(np.float64) for d in off)
+        weight = down[:, None] * across
+        out[r, c] = (weight * image).sum() / weight.sum()
+    return out
+
+
+@pytest.mark.parametrize("per_axis", [1, 2, 3, 4])
+@pytest.mark.parametrize("blur_px", [0.6, 1.3])
+def test_the_lens_and_the_pixel_have_the_stated_width_together(per_axis: int, blur_px: float) -> None:
+    """A spot that one sample sees: what the pixels get of it has the Gaussian's variance and the square's, 1/12."""
+    weight = np.zeros((1, 41, per_axis**2), np.float32)
+    weight[0, 20, 0] = 1
+    paths = Paths(np.full_like(weight, 12), np.full_like(weight, 8), weight, np.zeros((1, 41), np.float32))
+    table = light_table(WHITE, SIZE, Response(gamma=1.0, leak=0.0, blur_px=0.0))
+    # A single spot aliases; the mean over its places within the pixel does not.
+    total, second = 0.0, 0.0
+    for s in range(per_axis):
+        weight[:] = 0
+        weight[0, 20, s] = 1
+        spot = radiance(paths, table, blur_px=blur_px)[0].astype(np.float64)
+        off = np.arange(41) - 20 - (s + 0.5) / per_axis + 0.5
+        total += spot.sum()
+        second += (spot * off**2).sum()
+    assert second / total == pytest.approx(blur_px**2 + 1 / 12, rel=4e-3)
+    assert total * per_axis == pytest.approx(1, rel=1e-4)
 
 
 @pytest.mark.parametrize("axis", ["column", "row"])
@@ -142,7 +221,7 @@ def view_response(*, gamma: float, leak: float) -> Response:
     return Response(gamma=gamma, leak=leak, blur_px=0.6)
 
 
-def test_camera_blur_has_the_stated_width_and_keeps_the_light() -> None:
+def test_the_blur_of_an_image_has_the_stated_width_and_keeps_the_light() -> None:
     image = np.zeros((41, 41), np.float32)
     image[20, 20] = 1
     out = blurred(image, 1.3).astype(np.float64)

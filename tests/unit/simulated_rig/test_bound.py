@@ -1,0 +1,225 @@
+"""The Cramér-Rao bound of rendered stripes: closed forms, an estimator that attains it, and what must not matter.
+
+Camera and projector look the same way from the same distance at a facing plate, with the same focal length, so one
+projector column is one camera pixel and the projector column is the camera's plus a constant.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simulated_rig.bound import ExposedView, StripeBound, pixel_bound, stripe_bound
+from simulated_rig.light import Response
+from simulated_rig.options import CameraOptions, ProjectorOptions
+from simulated_rig.rendering import Stage, View
+from simulated_rig.scene import Scene, surface_of
+from simulated_rig.sensor import Sensor
+from slrig.model import FloatArray, Pixels
+from tests.unit.simulated_rig.building import line_profile
+
+PERIOD = 24
+SAMPLES = 4
+BLUR_PX = 2.0
+# A square pixel of the projector, its blur, and the camera's square pixel as its samples stand for it.
+SIGMA_PX = math.sqrt(1 / 12 + BLUR_PX**2 + (1 - 1 / SAMPLES**2) / 12)
+QUIET = {"full_well_e": 1e6, "bit_depth": 16, "saturation_s": 1.0, "pedestal_dn": 500.0}
+WHITE_NOISE = {**QUIET, "read_noise_e": 3000.0}
+SHOT_NOISE = {**QUIET, "full_well_e": 1e5, "read_noise_e": 0.0}
+
+
+def exposed_view(
+    sensor: dict[str, float],
+    *,
+    exposure_s: float = 0.02,
+    gain: float = 1.0,
+    leak: float = 0.0,
+    phase_px: float = 0.0,
+    turned_rad: float = 0.0,
+    **thing: Any,
+) -> ExposedView:
+    """A plate before the rig; `phase_px` moves the camera's image, `turned_rad` turns it."""
+    lamp = ProjectorOptions.model_validate({
+        "size_px": [256, 192], "focal_px": [400.0, 400.0], "principal_px": [128.0, 96.0], "blur_px": BLUR_PX,
+        "position_mm": [20.0, 0.0, -500.0], "target_mm": [20.0, 0.0, 0.0], "leak": leak,
+    })  # fmt: skip
+    eye = CameraOptions.model_validate({
+        "name": "eye", "size_px": [120, 60], "focal_px": [400.0, 400.0], "principal_px": [60.0 + phase_px, 30.0],
+        "position_mm": [-20.0, 0.0, -500.0], "target_mm": [-20.0, 0.0, 0.0],
+        "down": [math.sin(turned_rad), math.cos(turned_rad), 0.0],
+    })  # fmt: skip
+    plate: dict[str, Any] = {"shape": "plane", "size_mm": [800.0, 800.0], "albedo": 0.8} | thing
+    stage = Stage(
+        surface_of(Scene.model_validate({"object": [plate]}), Path()), lamp.pinhole(), working_distance_mm=500
+    )
+    view = View(
+        eye.pinhole(), stage, blur_px=0.0, ambient=0.0, samples_per_axis=SAMPLES, jitter=False, seed=1, workers=1
+    )
+    numbers = dict(sensor)
+    camera = Sensor(bit_depth=int(numbers.pop("bit_depth")), **numbers)
+    return ExposedView(view, lamp.size, Response(1.0, leak, BLUR_PX), camera, exposure_s, gain)
+
+
+def lines(shift: int = 0) -> tuple[Pixels, FloatArray]:
+    centres = np.arange(shift, 256, PERIOD, dtype=np.float64)
+    return line_profile(exposed_view(WHITE_NOISE).projector, shift, period=PERIOD), centres
+
+
+def bound_of(exposed: ExposedView, *, ends_repeats: float | None = None) -> StripeBound:
+    return stripe_bound(exposed, *lines(), ends_repeats=ends_repeats)
+
+
+def height_e(exposed: ExposedView) -> float:
+    """Mean over the stripes of their middle's height; with no phase it lies on a pixel centre."""
+    image = exposed.electrons(lines()[0])
+    peaks = np.sort(image, axis=1)[:, -3:]
+    return float(peaks.mean())
+
+
+def test_white_noise_gives_the_closed_form_of_a_gaussian_stripe() -> None:
+    exposed = exposed_view(WHITE_NOISE)
+    bound = bound_of(exposed)
+    expected = 1.062 * (3000.0 / height_e(exposed)) * math.sqrt(SIGMA_PX)
+    assert len(bound.row) > 200
+    assert np.median(bound.row_px) == pytest.approx(expected, rel=0.02)
+    assert np.ptp(bound.row_px) < 0.1 * expected
+    np.testing.assert_allclose(bound.width_px, SIGMA_PX, rtol=0.01)
+    np.testing.assert_allclose(bound.tilt_cosine, 1.0, rtol=1e-6)
+
+
+def test_shot_noise_alone_gives_the_width_over_the_root_of_the_photons() -> None:
+    exposed = exposed_view(SHOT_NOISE, exposure_s=0.2)
+    bound = bound_of(exposed)
+    image = exposed.electrons(lines()[0]).astype(np.float64)
+    # A stripe that the image's side cuts has fewer photons than it shows here.
+    middle = np.abs(bound.column_px - 60) < 30
+    crossings = zip(bound.row[middle], bound.column_px[middle], strict=True)
+    photons = np.array([image[r, round(c) - 11 : round(c) + 12].sum() for r, c in crossings])
+    assert len(photons) > 150
+    np.testing.assert_allclose(bound.row_known_px[middle], SIGMA_PX / np.sqrt(photons), rtol=0.02)
+
+
+@pytest.mark.parametrize("sensor", [WHITE_NOISE, SHOT_NOISE], ids=["white", "shot"])
+@pytest.mark.parametrize("phase_px", [0.0, 0.25, 0.5])
+def test_unknown_height_background_and_width_cost_nothing_by_symmetry(
+    sensor: dict[str, float], phase_px: float
+) -> None:
+    bound = bound_of(exposed_view(sensor, phase_px=phase_px))
+    assert (bound.row_px >= bound.row_known_px * (1 - 1e-9)).all()
+    middle = np.abs(bound.column_px - 60) < 30
+    np.testing.assert_allclose(bound.row_px[middle], bound.row_known_px[middle], rtol=2e-3)
+
+
+def test_they_cost_something_where_the_albedo_breaks_the_symmetry() -> None:
+    bound = bound_of(
+        exposed_view(WHITE_NOISE, texture={"kind": "checker", "contrast": 0.9, "scale_mm": 13.0}),
+    )
+    cost = bound.row_px / bound.row_known_px
+    assert cost.max() > 1.1
+
+
+def test_an_estimator_on_the_sensor_s_own_frames_attains_the_bound_and_none_beats_it() -> None:
+    sensor = {"full_well_e": 20000.0, "bit_depth": 10, "saturation_s": 1.0, "read_noise_e": 12.0, "pedestal_dn": 30.0}
+    exposed, ahead, behind = (
+        exposed_view(sensor, exposure_s=0.2, phase_px=phase, leak=0.01) for phase in (0.2, 0.25, 0.15)
+    )
+    profile, _ = lines()
+    bound = bound_of(exposed)
+    mean, after, before = (each.electrons(profile).astype(np.float64) for each in (exposed, ahead, behind))
+    # A displacement through the camera's principal point: another way than the bound's own.
+    change = (after - before) / 0.1
+    per_dn = 1 / exposed.sensor.dn_per_electron(1.0)
+    variance = mean + 12.0**2 + per_dn**2 / 12
+    rng = np.random.default_rng(4)
+    frames = [(exposed.frame(profile, rng) - 30.0) * per_dn - mean for _ in range(60)]
+    kept = np.abs(bound.column_px - 60) < 40
+    efficient, plain = [], []
+    for r, c in zip(bound.row[kept], bound.column_px[kept], strict=True):
+        own = slice(round(c) - 11, round(c) + 12)
+        weights = change[r, own] / variance[r, own]
+        efficient.append([weights @ f[r, own] / (weights @ change[r, own]) for f in frames])
+        even = change[r, own]
+        plain.append([even @ f[r, own] / (even @ even) for f in frames])
+    attained = np.std(efficient, axis=1) / bound.row_known_px[kept]
+    assert len(attained) > 150
+    assert np.sqrt(np.mean(attained**2)) == pytest.approx(1.0, abs=0.02)
+    assert np.sqrt(np.mean((np.std(plain, axis=1) / bound.row_known_px[kept]) ** 2)) > 1.03
+
+
+def test_the_bound_along_a_turned_stripe_is_that_of_an_upright_one() -> None:
+    upright, turned = (bound_of(exposed_view(WHITE_NOISE, turned_rad=turn)) for turn in (0.0, 0.5))
+    assert np.median(turned.tilt_cosine) == pytest.approx(math.cos(0.5), rel=1e-3)
+    assert np.median(turned.width_px) == pytest.approx(np.median(upright.width_px), rel=0.01)
+    # One row holds more pixels of a slanting stripe, but fewer rows make up its length.
+    assert np.median(turned.row_px) == pytest.approx(np.median(upright.row_px) * math.sqrt(math.cos(0.5)), rel=0.02)
+    assert np.median(turned.averaged_px(2.0)) == pytest.approx(np.median(upright.averaged_px(2.0)), rel=0.02)
+    rows = 2 * math.sqrt(math.pi) * 2.0
+    np.testing.assert_allclose(upright.averaged_px(2.0), upright.row_px / math.sqrt(rows), rtol=1e-6)
+
+
+def test_noise_of_white_and_black_counts_until_they_are_repeated_without_end() -> None:
+    exposed = exposed_view(SHOT_NOISE)
+    alone = bound_of(exposed).row_px
+    once, twice, endless = (bound_of(exposed, ends_repeats=n).row_px for n in (1.0, 2.0, 1e9))
+    assert (once > twice).all()
+    assert (twice > alone * 1.01).all()
+    np.testing.assert_allclose(endless, alone, rtol=1e-6)
+
+
+def test_signal_to_noise_is_the_height_over_the_noise_at_the_stripe() -> None:
+    exposed = exposed_view(WHITE_NOISE)
+    assert np.median(bound_of(exposed).snr) == pytest.approx(height_e(exposed) / 3000.0, rel=0.01)
+
+
+def test_clipped_samples_tell_nothing() -> None:
+    # Full scale is reached by 1e6 / gain electrons; white gives 16 000 of them, the lines' middles a fifth.
+    plain, clipped = (bound_of(exposed_view(WHITE_NOISE, gain=gain)) for gain in (1.0, 400.0))
+    assert np.median(clipped.row_px) > 1.05 * np.median(plain.row_px)
+    bright = bound_of(exposed_view(WHITE_NOISE, gain=1e4, leak=0.3))
+    assert len(bright.row) == 0
+
+
+def test_crossings_are_where_the_true_map_says_and_stripes_at_the_border_are_left_out() -> None:
+    exposed = exposed_view(WHITE_NOISE, phase_px=0.3)
+    bound = bound_of(exposed)
+    # The projector stands 40 mm to the right: 32 pixels at 500 mm. Its principal column is 128, the camera's 60.3.
+    np.testing.assert_allclose(bound.column_px, bound.line_px - 128.0 + 32.0 + 60.3, atol=1e-6)
+    assert set(bound.line_px) == {48.0, 72.0, 96.0, 120.0, 144.0}
+    assert bound.column_px.min() > 1.5
+    assert bound.column_px.max() < 117.5
+
+
+@pytest.mark.parametrize(("past_px", "found"), [(1, False), (4, True)])
+def test_a_stripe_beside_the_edge_of_the_surface_is_left_out(past_px: int, *, found: bool) -> None:
+    # The line of column 96 is at camera column 60, the middle of the image, x = -20 mm; the plate ends farther right.
+    right_mm = -20.0 + past_px * 500.0 / 400.0
+    bound = bound_of(exposed_view(WHITE_NOISE, size_mm=[200.0, 800.0], position_mm=[right_mm - 100.0, 0.0, 0.0]))
+    assert (96.0 in bound.line_px) is found
+    assert 72.0 in bound.line_px
+    assert 120.0 not in bound.line_px
+
+
+def test_all_shifts_at_one_pixel_tell_what_all_pixels_of_one_stripe_tell() -> None:
+    # One pixel is one column here: what shift k shows at a pixel is what shift 0 shows k pixels farther.
+    exposed = exposed_view(SHOT_NOISE, phase_px=0.2)
+    unknown, known = pixel_bound(exposed, [lines(shift)[0] for shift in range(PERIOD)])
+    bound = bound_of(exposed)
+    middle = np.abs(bound.column_px - 60) < 30
+    at = bound.row[middle], np.rint(bound.column_px[middle]).astype(int)
+    np.testing.assert_allclose(known[at], bound.row_known_px[middle], rtol=0.02)
+    np.testing.assert_allclose(unknown[at], known[at], rtol=0.01)
+    assert (unknown >= known * (1 - 1e-9)).all()
+
+
+def test_a_pixel_in_the_dark_has_no_bound_and_fewer_frames_tell_less() -> None:
+    exposed = exposed_view(WHITE_NOISE, size_mm=[60.0, 800.0], position_mm=[-20.0, 0.0, 0.0])
+    every = [lines(shift)[0] for shift in range(PERIOD)]
+    all_frames, half = pixel_bound(exposed, every)[1], pixel_bound(exposed, every[::2])[1]
+    dark = np.isnan(exposed.view.truth().depth_mm)
+    assert 0.3 < dark.mean() < 0.8
+    assert (np.isnan(all_frames) == dark).all()
+    np.testing.assert_allclose(half[~dark] / all_frames[~dark], math.sqrt(2), rtol=0.02)
