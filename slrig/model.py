@@ -345,6 +345,13 @@ class Refusal(IntEnum):
     OFF_PROJECTOR = 10
 
 
+class FlipRule(StrEnum):
+    """When an edge of the mesh is exchanged for the other diagonal of its two triangles (paper, section 3.1)."""
+
+    CONSTRAINED = "constrained"
+    DELAUNAY = "delaunay"
+
+
 class Source(IntEnum):
     """Which devices a point was triangulated from."""
 

@@ -1,7 +1,8 @@
-"""The constrained edge-flip rule (Yang & Chen 2010, section 3.1).
+"""The constrained edge-flip rule (Yang & Chen 2010, section 3.1), and Dyer's, which it extends.
 
 For an edge pq with opposite vertices f and w: θ_pq = max(∠fpw, ∠fqw), θ_fw = max(∠pfq, ∠pwq).
 θ_fw - θ_pq > γ: flip; θ_pq - θ_fw > γ: keep; otherwise Delaunay: flip if ∠pfq + ∠pwq > ∠fpw + ∠fqw.
+The last alone is the rule of Dyer et al. (2007); differences of angles never exceed π, so γ = π leaves only that.
 
 No angle is computed: each is kept as the pair (cosine, sine) up to a positive factor, so that sums and differences of
 angles are products of complex numbers.
@@ -10,13 +11,38 @@ angles are products of complex numbers.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import njit
 
+from slrig.model import FlipRule
+
 GAMMA = math.pi / 6
-_TAN_GAMMA = math.tan(GAMMA)
+_COS_GAMMA, _SIN_GAMMA = math.cos(GAMMA), math.sin(GAMMA)
 _TIE = 1e-12
+
+
+class Constraint(NamedTuple):
+    """γ as a unit complex number: the last arguments of `prefers_flip`."""
+
+    cosine: float
+    sine: float
+
+
+def constraint(rule: FlipRule, gamma: float = GAMMA) -> Constraint:
+    """γ of the constrained rule, radians; the Delaunay rule has none, whatever `gamma` says.
+
+    Raises
+    ------
+    ValueError
+        gamma is not in [0, π].
+    """
+    if not 0 <= gamma <= math.pi:
+        message = f"gamma: expected an angle from 0 to π radians, found {gamma:g}; π/6 is the paper's"
+        raise ValueError(message)
+    if rule is FlipRule.DELAUNAY:
+        return Constraint(-1.0, 0.0)
+    return Constraint(math.cos(gamma), math.sin(gamma))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -37,7 +63,9 @@ def _larger(c1: float, s1: float, c2: float, s2: float) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def prefers_flip(points: Any, p: int, q: int, f: int, w: int) -> bool:
+def prefers_flip(
+    points: Any, p: int, q: int, f: int, w: int, cos_gamma: float = _COS_GAMMA, sin_gamma: float = _SIN_GAMMA
+) -> bool:
     """True when edge fw represents the surface better than edge pq. points : (n, 3) float64, mm."""
     fc, fs = _angle(points, p, f, q)
     wc, ws = _angle(points, p, w, q)
@@ -45,10 +73,10 @@ def prefers_flip(points: Any, p: int, q: int, f: int, w: int) -> bool:
     qc, qs = _angle(points, f, q, w)
     at_fw_c, at_fw_s = _larger(fc, fs, wc, ws)
     at_pq_c, at_pq_s = _larger(pc, ps, qc, qs)
-    # θ_fw - θ_pq as a complex number; |difference| > γ when it leaves the wedge of half-angle γ.
+    # θ_fw - θ_pq as a complex number; |difference| > γ when the sine of |difference| - γ is positive.
     real = at_fw_c * at_pq_c + at_fw_s * at_pq_s
     imaginary = at_fw_s * at_pq_c - at_fw_c * at_pq_s
-    if real <= 0 or abs(imaginary) > _TAN_GAMMA * real:
+    if abs(imaginary) * cos_gamma - real * sin_gamma > 0:
         return bool(imaginary > 0)
     # Both sums lie in [0, 2π): compare half-planes first, then the sine of their difference.
     fw_real, fw_imaginary = fc * wc - fs * ws, fc * ws + fs * wc

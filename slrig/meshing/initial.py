@@ -1,32 +1,43 @@
-"""Curves to a mesh: strips, the recorded step that drops what is no surface, orientation, normals."""
+"""Curves to a mesh: strips, the recorded step that drops what is no surface, orientation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
-from slrig.meshing.strips import neighbouring_curves, strips, to_drop
-from slrig.meshing.topology import component_labels, vertex_normals
+from slrig.meshing.strips import neighbouring_curves, strip_neighbours, strips, to_drop
+from slrig.meshing.topology import component_sizes, vertex_normals
 from slrig.model import FloatArray, IntArray
+
+_BLOCK = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class InitialMesh:
-    """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye; normals : (n, 3) float32,
-    NaN for points in no triangle. strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges
-    overlap, dust is what they leave in specks of a few triangles.
+    """faces : (F, 3) int32 into points_mm, the curves' points, counter-clockwise seen from the eye.
+    adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary.
+    strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, dust is what they leave in
+    specks of a few triangles.
     """
 
+    points_mm: FloatArray
     faces: IntArray
-    normals: NDArray[np.float32]
+    adjacency: IntArray
     strip_pairs: int
     strip_triangles: int
     dropped_at_depth_edges: int
     dropped_at_bridges: int
     dropped_as_dust: int
     dropped_triangles: int
+
+    @property
+    def normals(self) -> NDArray[np.float32]:
+        """(n, 3) float32, NaN for points in no triangle; worked out each time it is asked for."""
+        return vertex_normals(self.points_mm, self.faces)
 
 
 def initial_mesh(
@@ -51,36 +62,61 @@ def initial_mesh(
     """
     pairs = neighbouring_curves(position_px, offsets, widest_step_px=widest_step_px)
     everything = strips(points_mm, offsets, pairs)
+    adjacency = strip_neighbours(everything, offsets, pairs)
     drop = to_drop(
         points_mm, everything, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
     )
-    connected = everything[~drop.any]
-    faces = connected[~_dust(connected, smallest_component)]
-    if _facing_area_mm2(points_mm, faces, eye_mm) < 0:
-        faces = np.ascontiguousarray(faces[:, ::-1])
+    connected = ~drop.any
+    kept = component_sizes(everything, connected) >= max(smallest_component, 1)
+    areas_mm2 = np.zeros(-(-len(everything) // _BLOCK))
+    _facing_areas(np.ascontiguousarray(points_mm), everything, kept, eye_mm, areas_mm2)
+    count = int(np.count_nonzero(kept))
+    faces, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
+    _gathered(everything, adjacency, kept, bool(areas_mm2.sum() < 0), faces, across)
     return InitialMesh(
+        points_mm=points_mm,
         faces=faces,
-        normals=vertex_normals(points_mm, faces),
+        adjacency=across,
         strip_pairs=len(pairs),
         strip_triangles=len(everything),
-        dropped_at_depth_edges=int(drop.depth_edge.sum()),
-        dropped_at_bridges=int(drop.bridge.sum()),
-        dropped_as_dust=len(connected) - len(faces),
-        dropped_triangles=len(everything) - len(faces),
+        dropped_at_depth_edges=int(np.count_nonzero(drop.depth_edge)),
+        dropped_at_bridges=int(np.count_nonzero(drop.bridge)),
+        dropped_as_dust=int(np.count_nonzero(connected)) - count,
+        dropped_triangles=len(everything) - count,
     )
 
 
-def _dust(faces: IntArray, smallest_component: int) -> NDArray[np.bool_]:
-    """(F,) bool: triangles of pieces that are too small."""
-    if not len(faces):
-        return np.zeros(0, dtype=bool)
-    labels = component_labels(faces)
-    return np.asarray(np.bincount(labels)[labels] < smallest_component)
+@njit(cache=True, nogil=True, parallel=True)
+def _facing_areas(points: Any, faces: Any, kept: Any, eye: Any, areas: Any) -> None:
+    """For each block of faces, twice the area that faces the eye less the area that faces away."""
+    # Blocks of one size, added up in order: the same sum for any number of threads.
+    for block in prange(len(areas)):
+        total = 0.0
+        for face in range(block * _BLOCK, min((block + 1) * _BLOCK, len(faces))):
+            if not kept[face]:
+                continue
+            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+            ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+            vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+            x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            towards = x * (eye[0] - points[a, 0]) + y * (eye[1] - points[a, 1]) + z * (eye[2] - points[a, 2])
+            total += np.sign(towards) * np.sqrt(x * x + y * y + z * z)
+        areas[block] = total
 
 
-def _facing_area_mm2(points_mm: FloatArray, faces: IntArray, eye_mm: FloatArray) -> float:
-    """Area that faces the eye less area that faces away."""
-    corners = points_mm[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    towards = np.sum((eye_mm - corners.mean(axis=1)) * normal, axis=1)
-    return float(np.sum(np.sign(towards) * np.linalg.norm(normal, axis=1)) / 2)
+@njit(cache=True, nogil=True, parallel=True)
+def _gathered(faces: Any, across: Any, kept: Any, turn_over: bool, to_faces: Any, to_across: Any) -> None:
+    """Copy the kept faces and who lies across their edges, under new numbers."""
+    numbers = np.full(len(faces) + 1, -1, dtype=np.int32)
+    count = 0
+    for face in range(len(faces)):
+        if kept[face]:
+            numbers[face] = count
+            count += 1
+    # Across a boundary lies face -1: the last number is its own.
+    for face in prange(len(faces)):
+        if kept[face]:
+            for corner in range(3):
+                to = 2 - corner if turn_over else corner
+                to_faces[numbers[face], to] = faces[face, corner]
+                to_across[numbers[face], to] = numbers[across[face, corner]]

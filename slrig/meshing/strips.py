@@ -6,6 +6,7 @@ away by a second, recorded step: triangles across a depth edge and, on request, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,12 +45,22 @@ def strips(points_mm: FloatArray, offsets: IntArray, pairs: IntArray, /) -> IntA
     Returns (Σ(I + J - 2), 3) int32. Seen with curves running down and following one another to the right, triangles
     run counter-clockwise.
     """
-    lengths = np.diff(offsets)
-    counts = lengths[pairs[:, 0]] + lengths[pairs[:, 1]] - 2
-    firsts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    firsts = _firsts(offsets, pairs)
     faces = np.zeros((int(firsts[-1]), 3), dtype=np.int32)
     _strips_kernel(np.ascontiguousarray(points_mm), offsets, pairs, firsts, faces)
     return faces
+
+
+def strip_neighbours(faces: IntArray, offsets: IntArray, pairs: IntArray, /) -> IntArray:
+    """What `neighbours` finds for the faces that `strips` made of these pairs, in a fraction of its time.
+
+    Triangles of a strip follow one another; two strips meet in the steps of the curve that they share.
+    Returns (F, 3) int32: entry k is the face across the edge opposite corner k, -1 at a boundary.
+    """
+    after_first, after_second = np.full((2, int(offsets[-1])), -1, dtype=np.int32)
+    across = np.zeros(faces.shape, dtype=np.int32)
+    _strip_neighbours(faces, offsets, pairs, _firsts(offsets, pairs), after_first, after_second, across)
+    return across
 
 
 def to_drop(
@@ -68,17 +79,20 @@ def to_drop(
     A triangle with an edge longer than depth_edge_ratio times that crosses a depth edge. With keep_holes, a triangle
     that uses the step over a bridge goes too.
     """
-    corners = points_mm[faces]
-    longest = np.sqrt(np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2), axis=1))
-    allowed = depth_edge_ratio * sampling_mm[faces].mean(axis=1)
-    rolled = np.roll(faces, -1, axis=1)
-    step = np.abs(faces - rolled) == 1
-    over_bridge = (step & bridge_after[np.minimum(faces, rolled)]).any(axis=1)
-    return DroppedTriangles(
-        # Not "longest > allowed": a triangle with an unmeasured corner goes too.
-        depth_edge=~(longest <= allowed),
-        bridge=over_bridge if keep_holes else np.zeros(len(faces), dtype=bool),
-    )
+    depth_edge = np.zeros(len(faces), dtype=np.bool_)
+    bridge = np.zeros(len(faces), dtype=np.bool_)
+    _to_drop(
+        np.ascontiguousarray(points_mm), np.ascontiguousarray(faces), bridge_after, sampling_mm,
+        depth_edge_ratio, keep_holes, depth_edge, bridge,
+    )  # fmt: skip
+    return DroppedTriangles(depth_edge=depth_edge, bridge=bridge)
+
+
+def _firsts(offsets: IntArray, pairs: IntArray) -> NDArray[np.int64]:
+    """(s + 1,) int64: where each strip's triangles begin."""
+    lengths = np.diff(offsets)
+    counts = lengths[pairs[:, 0]] + lengths[pairs[:, 1]] - 2
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -104,3 +118,48 @@ def _strips_kernel(points: Any, offsets: Any, pairs: Any, firsts: Any, faces: An
                 faces[at, 2] = j
                 j += 1
             at += 1
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _strip_neighbours(
+    faces: Any, offsets: Any, pairs: Any, firsts: Any, after_first: Any, after_second: Any, across: Any
+) -> None:
+    # Who stands on each step, as a strip's first curve and as its second: a curve is either at most once.
+    for s in prange(len(pairs)):
+        last_of_first = offsets[pairs[s, 0] + 1]
+        for face in range(firsts[s], firsts[s + 1]):
+            if faces[face, 1] < last_of_first:
+                after_first[faces[face, 0]] = face
+            else:
+                after_second[faces[face, 2]] = face
+    for s in prange(len(pairs)):
+        last_of_first = offsets[pairs[s, 0] + 1]
+        for face in range(firsts[s], firsts[s + 1]):
+            before = face - 1 if face > firsts[s] else -1
+            after = face + 1 if face + 1 < firsts[s + 1] else -1
+            if faces[face, 1] < last_of_first:
+                # (i, i + 1, j): the step lies opposite j, the next triangle opposite i, the one before opposite i + 1.
+                across[face, 0], across[face, 1], across[face, 2] = after, before, after_second[faces[face, 0]]
+            else:
+                # (i, j + 1, j): the step lies opposite i.
+                across[face, 0], across[face, 1], across[face, 2] = after_first[faces[face, 2]], before, after
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _to_drop(
+    points: Any, faces: Any, bridge_after: Any, sampling: Any, ratio: float, keep_holes: bool, depth_edge: Any,
+    bridge: Any,
+) -> None:  # fmt: skip
+    for face in prange(len(faces)):
+        longest, allowed, over = 0.0, 0.0, False
+        for corner in range(3):
+            a, b = faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]
+            x, y, z = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
+            square = x * x + y * y + z * z
+            # Not "square > longest": an unmeasured corner is longer than anything.
+            if not square <= longest:
+                longest = square if square > longest else np.inf
+            allowed += sampling[a]
+            over |= abs(a - b) == 1 and bridge_after[min(a, b)]
+        depth_edge[face] = not math.sqrt(longest) <= ratio * (allowed / 3.0)
+        bridge[face] = keep_holes and over

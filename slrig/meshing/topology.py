@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
 from slrig.model import IntArray
@@ -118,35 +118,47 @@ def component_labels(faces: IntArray) -> IntArray:
 
     Faces that share a vertex belong together.
     """
-    return np.asarray(_component_labels(np.ascontiguousarray(faces), _vertex_bound(faces)))
+    faces = np.ascontiguousarray(faces)
+    everyone = np.ones(len(faces), dtype=np.bool_)
+    return np.asarray(_component_labels(faces, _joined(faces, everyone, _vertex_bound(faces))))
+
+
+def component_sizes(faces: IntArray, among: NDArray[np.bool_]) -> IntArray:
+    """(F,) int32: number of faces in the connected piece that each face belongs to, in a mesh of those `among` alone.
+
+    among : (F,) bool. 0 for the others. Faces that share a vertex belong together.
+    """
+    faces = np.ascontiguousarray(faces)
+    return np.asarray(_component_sizes(faces, among, _joined(faces, among, _vertex_bound(faces))))
 
 
 def topology_counts(faces: IntArray) -> TopologyCounts:
     """All the counts of this module at once."""
-    table = edge_table(faces)
+    faces = np.ascontiguousarray(faces)
+    bound = _vertex_bound(faces)
+    border = np.zeros(bound, dtype=np.bool_)
+    edges, boundary, nonmanifold, misoriented = _edge_counts(faces, *_halves_by_lower_vertex(faces, bound), border)
     labels = component_labels(faces)
     vertices = _marked_count(faces)
-    border = table.edges[table.triangle_counts == 1]
     return TopologyCounts(
         vertices=vertices,
-        edges=len(table.edges),
-        boundary_edges=len(border),
-        boundary_vertices=_marked_count(border),
-        nonmanifold_edges=int((table.triangle_counts > 2).sum()),
-        misoriented_edges=misoriented_edge_count(faces),
+        edges=edges,
+        boundary_edges=boundary,
+        boundary_vertices=int(np.count_nonzero(border)),
+        nonmanifold_edges=nonmanifold,
+        misoriented_edges=misoriented,
         duplicate_faces=duplicate_face_count(faces),
         degenerate_faces=int(degenerate_faces(faces).sum()),
         components=int(labels.max()) + 1 if len(labels) else 0,
-        euler_characteristic=vertices - len(table.edges) + len(faces),
+        euler_characteristic=vertices - edges + len(faces),
     )
 
 
 def compact(faces: IntArray, *, vertex_count: int) -> CompactIndex:
     """How to leave out the vertices that no face uses, keeping the order of the others."""
-    used = np.zeros(vertex_count, dtype=np.bool_)
-    used[faces.ravel()] = True
-    renumbered = (np.cumsum(used) - 1).astype(np.int32)
-    return CompactIndex(np.flatnonzero(used).astype(np.int32), np.ascontiguousarray(renumbered[faces]))
+    faces = np.ascontiguousarray(faces)
+    renumbered, kept = _renumbered(faces, vertex_count)
+    return CompactIndex(kept, np.asarray(_gathered(faces, renumbered)))
 
 
 def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> NDArray[np.float32]:
@@ -157,7 +169,7 @@ def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> N
     NaN where no triangle with an area meets the vertex.
     """
     points = np.ascontiguousarray(vertices_mm, dtype=np.float64)
-    return np.asarray(_vertex_normals(points, np.ascontiguousarray(faces)))
+    return np.asarray(_vertex_normals(points, np.ascontiguousarray(faces), get_num_threads()))
 
 
 def _directed_edges(faces: IntArray) -> IntArray:
@@ -198,6 +210,82 @@ def _marked_count(indices: IntArray) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _halves_by_lower_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArray, IntArray]:
+    """Where each vertex's half-edges begin; half-edges, 4 * face + first corner, sorted by the lower of their ends."""
+    starts = np.zeros(vertex_bound + 2, dtype=np.int32)
+    for face in range(len(faces)):
+        for corner in range(3):
+            starts[min(faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]) + 2] += 1
+    for vertex in range(vertex_bound):
+        starts[vertex + 2] += starts[vertex + 1]
+    halves = np.zeros(faces.size, dtype=np.int32)
+    for face in range(len(faces)):
+        for corner in range(3):
+            # A vertex's start stands one place to the right until its half-edges have moved it on to its end.
+            place = min(faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]) + 1
+            halves[starts[place]] = 4 * face + corner
+            starts[place] += 1
+    return starts, halves
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _far_end(faces: IntArray, half: int, vertex: int) -> int:
+    face, corner = half >> 2, half & 3
+    return int(faces[face, corner] + faces[face, corner + 1 if corner < 2 else 0] - vertex)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _edge_counts(faces: IntArray, starts: IntArray, halves: IntArray, border: Any) -> tuple[int, int, int, int]:
+    """Edges; those of one triangle, marking their ends; those of more than two; directions run along more than once."""
+    edges, boundary, nonmanifold, misoriented = 0, 0, 0, 0
+    for vertex in prange(len(border)):
+        for at in range(starts[vertex], starts[vertex + 1]):
+            other, known, uses, outward = _far_end(faces, halves[at], vertex), False, 0, 0
+            for each in range(starts[vertex], starts[vertex + 1]):
+                if _far_end(faces, halves[each], vertex) == other:
+                    known |= each < at
+                    uses += 1
+                    outward += faces[halves[each] >> 2, halves[each] & 3] == vertex
+            if known:
+                continue
+            edges += 1
+            if uses == 1:
+                boundary += 1
+                border[vertex], border[other] = True, True
+            nonmanifold += uses > 2
+            misoriented += (outward > 1) + (uses - outward > 1)
+    return edges, boundary, nonmanifold, misoriented
+
+
+@njit(cache=True, nogil=True)
+def _renumbered(faces: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
+    """The new number of each vertex, and the old number of each that stays."""
+    used = np.zeros(vertex_count, dtype=np.bool_)
+    for face in range(len(faces)):
+        for corner in range(3):
+            used[faces[face, corner]] = True
+    renumbered = np.zeros(vertex_count, dtype=np.int32)
+    count = 0
+    for vertex in range(vertex_count):
+        renumbered[vertex] = count
+        count += used[vertex]
+    kept = np.zeros(count, dtype=np.int32)
+    for vertex in range(vertex_count):
+        if used[vertex]:
+            kept[renumbered[vertex]] = vertex
+    return renumbered, kept
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _gathered(faces: IntArray, renumbered: IntArray) -> IntArray:
+    found = np.zeros_like(faces)
+    for face in prange(len(faces)):
+        for corner in range(3):
+            found[face, corner] = renumbered[faces[face, corner]]
+    return found
+
+
+@njit(cache=True, nogil=True)
 def _root(parents: IntArray, vertex: int) -> int:
     while parents[vertex] != vertex:
         parents[vertex] = parents[parents[vertex]]
@@ -206,10 +294,12 @@ def _root(parents: IntArray, vertex: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _component_labels(faces: IntArray, vertex_bound: int) -> IntArray:
-    """Union-find over vertices with path halving, the lower index always the root."""
+def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
+    """The lowest vertex of each vertex's piece, by union-find with path halving, the lower index always the root."""
     parents = np.arange(vertex_bound).astype(np.int32)
     for face in range(len(faces)):
+        if not among[face]:
+            continue
         first = _root(parents, faces[face, 0])
         for corner in (1, 2):
             second = _root(parents, faces[face, corner])
@@ -218,11 +308,19 @@ def _component_labels(faces: IntArray, vertex_bound: int) -> IntArray:
             else:
                 parents[first] = second
                 first = second
-    numbers = np.full(vertex_bound, -1, dtype=np.int32)
+    # A parent comes before its child, so one pass leaves everyone below their root.
+    for vertex in range(vertex_bound):
+        parents[vertex] = parents[parents[vertex]]
+    return parents
+
+
+@njit(cache=True, nogil=True)
+def _component_labels(faces: IntArray, roots: IntArray) -> IntArray:
+    numbers = np.full(len(roots), -1, dtype=np.int32)
     labels = np.zeros(len(faces), dtype=np.int32)
     count = 0
     for face in range(len(faces)):
-        root = _root(parents, faces[face, 0])
+        root = roots[faces[face, 0]]
         if numbers[root] < 0:
             numbers[root] = count
             count += 1
@@ -231,28 +329,48 @@ def _component_labels(faces: IntArray, vertex_bound: int) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def _vertex_normals(points: NDArray[np.float64], faces: IntArray) -> NDArray[np.float32]:
-    sums = np.zeros((len(points), 3))
+def _component_sizes(faces: IntArray, among: Any, roots: IntArray) -> IntArray:
+    counts = np.zeros(len(roots), dtype=np.int32)
     for face in range(len(faces)):
-        a, b, c = faces[face]
-        ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-        vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        twice_area = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if not twice_area > 0.0:
-            continue
-        nx, ny, nz = nx / twice_area, ny / twice_area, nz / twice_area
-        # The cross product of any two edges is twice the area, so each angle is atan2(2 A, dot of the edges there).
-        at_a = np.arctan2(twice_area, ux * vx + uy * vy + uz * vz)
-        at_b = np.arctan2(twice_area, ux * (ux - vx) + uy * (uy - vy) + uz * (uz - vz))
-        at_c = np.pi - at_a - at_b
-        for corner, angle in ((a, at_a), (b, at_b), (c, at_c)):
-            sums[corner, 0] += angle * nx
-            sums[corner, 1] += angle * ny
-            sums[corner, 2] += angle * nz
+        if among[face]:
+            counts[roots[faces[face, 0]]] += 1
+    sizes = np.zeros(len(faces), dtype=np.int32)
+    for face in range(len(faces)):
+        if among[face]:
+            sizes[face] = counts[roots[faces[face, 0]]]
+    return sizes
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _vertex_normals(points: NDArray[np.float64], faces: IntArray, parts: int) -> NDArray[np.float32]:
+    # Each part owns a range of vertices, goes over all faces and adds to its own vertices only: every vertex has its
+    # sum taken in the order of the faces, so the result is the same for any number of threads.
+    sums = np.zeros((len(points), 3))
+    for part in prange(parts):
+        low, high = len(points) * part // parts, len(points) * (part + 1) // parts
+        for face in range(len(faces)):
+            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+            if not (low <= a < high or low <= b < high or low <= c < high):
+                continue
+            ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+            vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            twice_area = np.sqrt(nx * nx + ny * ny + nz * nz)
+            if not twice_area > 0.0:
+                continue
+            nx, ny, nz = nx / twice_area, ny / twice_area, nz / twice_area
+            # The cross product of any two edges is twice the area: each angle is atan2(2 A, dot of the edges there).
+            at_a = np.arctan2(twice_area, ux * vx + uy * vy + uz * vz)
+            at_b = np.arctan2(twice_area, ux * (ux - vx) + uy * (uy - vy) + uz * (uz - vz))
+            at_c = np.pi - at_a - at_b
+            for corner, angle in ((a, at_a), (b, at_b), (c, at_c)):
+                if low <= corner < high:
+                    sums[corner, 0] += angle * nx
+                    sums[corner, 1] += angle * ny
+                    sums[corner, 2] += angle * nz
     normals = np.full((len(points), 3), np.nan, dtype=np.float32)
-    for vertex in range(len(points)):
-        x, y, z = sums[vertex]
+    for vertex in prange(len(points)):
+        x, y, z = sums[vertex, 0], sums[vertex, 1], sums[vertex, 2]
         length = np.sqrt(x * x + y * y + z * z)
         if length > 0.0:
             normals[vertex, 0], normals[vertex, 1], normals[vertex, 2] = x / length, y / length, z / length

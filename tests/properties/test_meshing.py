@@ -10,11 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from slrig.meshing.adjacency import neighbours
 from slrig.meshing.flips import prefers_flip
 from slrig.meshing.initial import initial_mesh
+from slrig.meshing.optimisation import NO_FLIPS, optimised
 from slrig.meshing.strips import neighbouring_curves, strips, to_drop
-from slrig.meshing.topology import topology_counts
-from slrig.model import FloatArray, IntArray
+from slrig.meshing.topology import boundary_edges, topology_counts
+from slrig.model import FlipRule, FloatArray, IntArray
 
 # The first call of a kernel compiles it.
 unhurried = settings(deadline=None)
@@ -130,3 +132,27 @@ def test_unmeasured_points_leave_the_mesh(ours: int, theirs: int, seed: int) -> 
     with_it = (faces == missing).any(axis=1)
     assert drop.any[with_it].all()
     assert not drop.any[~with_it].any()
+
+
+@unhurried
+@given(counts, seeds, st.sampled_from(FlipRule), st.floats(0.5, 1))
+def test_optimisation_keeps_what_makes_a_surface(lengths: list[int], seed: int, rule: FlipRule, share: float) -> None:
+    points, offsets = surface(lengths, seed)
+    pairs = neighbouring_curves(np.arange(len(lengths), dtype=np.float64), offsets, widest_step_px=1.0)
+    everything = strips(points, offsets, pairs)
+    # What is left has holes and pinched vertices.
+    faces = everything[np.random.default_rng(seed).random(len(everything)) < share]
+    found = optimised(points, faces, rule=rule)
+    before, after = topology_counts(faces), topology_counts(found.faces)
+    assert after.nonmanifold_edges == after.misoriented_edges == after.duplicate_faces == after.degenerate_faces == 0
+    assert (after.vertices, after.edges, after.euler_characteristic) == (
+        before.vertices, before.edges, before.euler_characteristic,
+    )  # fmt: skip
+    assert sorted(boundary_edges(found.faces).tolist()) == sorted(boundary_edges(faces).tolist())
+    np.testing.assert_array_equal(found.adjacency, neighbours(found.faces, vertex_count=len(points)))
+    course = [found.harmonic_index_before, *(turn.harmonic_index for turn in found.turns if turn.flipped_edges)]
+    assert all(later < earlier for earlier, later in pairwise(course))
+    assert found.turns[0].tested_triangles == len(faces)
+    # What it ends with is the end.
+    if found.ended_by == NO_FLIPS:
+        assert optimised(points, found.faces, rule=rule).faces.tolist() == found.faces.tolist()

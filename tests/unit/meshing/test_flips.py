@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from slrig.meshing.flips import GAMMA, prefers_flip
-from slrig.model import FloatArray
+from slrig.meshing.flips import GAMMA, Constraint, constraint, prefers_flip
+from slrig.model import FlipRule, FloatArray
 
 
 def angle(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
@@ -136,6 +136,7 @@ def test_gamma_overrules_delaunay_both_ways(bend: float) -> None:
         assert not wanted
         assert not flips(points)
         assert prefers_flip(points, 2, 3, 0, 1)
+        assert prefers_flip(points, 0, 1, 2, 3, *constraint(FlipRule.DELAUNAY))
         overruled += 1
     assert overruled > 100
 
@@ -175,3 +176,45 @@ def test_squares_on_a_cylinder_keep_the_edge_they_have() -> None:
             quad = np.stack([one[k], other[k + 1], one[k + 1], other[k]])
             assert not flips(quad)
             assert not prefers_flip(quad, 2, 3, 0, 1)
+
+
+@pytest.mark.parametrize("kind", TETRAHEDRA)
+def test_dyers_rule_compares_the_sums_alone(kind: str) -> None:
+    rng = np.random.default_rng(22)
+    verdicts = []
+    dyer = constraint(FlipRule.DELAUNAY, 0.1)
+    for _ in range(2000):
+        points = rng.normal(0, 1, (4, 3)) * TETRAHEDRA[kind]
+        p, q, f, w = points
+        margin = abs(angle(p, f, q) + angle(p, w, q) - angle(f, p, w) - angle(f, q, w))
+        if margin < 1e-7:
+            continue
+        found = bool(prefers_flip(points, 0, 1, 2, 3, *dyer))
+        assert found == delaunay(points)
+        verdicts.append(found)
+    assert 200 < sum(verdicts) < len(verdicts) - 200
+
+
+@pytest.mark.parametrize("gamma", [0.0, 0.2, math.pi / 2, 2.5, math.pi])
+def test_gamma_may_be_any_angle(gamma: float) -> None:
+    rng = np.random.default_rng(23)
+    constrained = constraint(FlipRule.CONSTRAINED, gamma)
+    forced = 0
+    for _ in range(2000):
+        points = rng.normal(0, 1, (4, 3)) * [4, 1, 0.3]
+        p, q, f, w = points
+        excess = max(angle(p, f, q), angle(p, w, q)) - max(angle(f, p, w), angle(f, q, w))
+        if abs(abs(excess) - gamma) < 1e-7:
+            continue
+        wanted = excess > 0 if abs(excess) > gamma else delaunay(points)
+        assert bool(prefers_flip(points, 0, 1, 2, 3, *constrained)) == wanted
+        forced += abs(excess) > gamma
+    assert (forced > 0) == (gamma < 3)
+
+
+def test_the_constraint_is_that_of_the_paper_unless_told_otherwise() -> None:
+    assert constraint(FlipRule.CONSTRAINED) == Constraint(math.cos(GAMMA), math.sin(GAMMA))
+    assert constraint(FlipRule.DELAUNAY) == Constraint(-1.0, 0.0)
+    for gamma in (-0.1, 3.2, math.nan):
+        with pytest.raises(ValueError, match="angle from 0 to π radians"):
+            constraint(FlipRule.CONSTRAINED, gamma)

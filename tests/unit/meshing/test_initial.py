@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slrig.meshing.adjacency import neighbours
 from slrig.meshing.initial import InitialMesh, initial_mesh
 from slrig.model import FloatArray, IntArray
 
@@ -151,3 +152,29 @@ def test_the_same_curves_give_the_same_mesh() -> None:
     assert one.faces.tobytes() == other.faces.tobytes()
     assert one.normals.tobytes() == other.normals.tobytes()
     np.testing.assert_array_equal(points, before)
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_the_mesh_knows_its_neighbours_after_the_drop(*, behind: bool) -> None:
+    depth = wave()
+    depth[6:, 4:] += 40
+    points, offsets, position = relief(depth)
+    bridge = np.zeros(len(points), dtype=np.bool_)
+    bridge[3 * ROWS + 7] = True
+    eye = EYE_MM * [1, 1, -1] if behind else EYE_MM
+    mesh = meshed(points, offsets, position, eye_mm=eye, bridge_after=bridge, keep_holes=True)
+    assert mesh.dropped_triangles > 10
+    np.testing.assert_array_equal(mesh.adjacency, neighbours(mesh.faces, vertex_count=len(points)))
+
+
+def test_the_side_with_more_area_towards_the_eye_is_the_front() -> None:
+    # A ridge of which the eye sees both sides, one of them from behind; areas in plain numpy.
+    x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS), indexing="ij")
+    points, offsets, position = relief(np.where(x < 5, 4.0 * x, 40.0 - 4 * x) + 0.1 * y)
+    for eye in (np.array([-300.0, 5, 0]), np.array([300.0, 5, 0])):
+        mesh = meshed(points, offsets, position, eye_mm=eye)
+        corners = points[mesh.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        towards = np.sign(((eye - corners.mean(axis=1)) * normal).sum(axis=1))
+        assert (towards * np.linalg.norm(normal, axis=1)).sum() > 0
+        assert not (towards > 0).all()

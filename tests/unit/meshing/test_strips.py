@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.meshing.strips import neighbouring_curves, strips, to_drop
+from slrig.meshing.adjacency import neighbours
+from slrig.meshing.strips import neighbouring_curves, strip_neighbours, strips, to_drop
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.test_flips import verdict
 
@@ -223,3 +224,33 @@ def test_inputs_are_left_alone() -> None:
     np.testing.assert_array_equal(points, before[0])
     np.testing.assert_array_equal(offsets, before[1])
     np.testing.assert_array_equal(faces, kept)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_strips_know_their_neighbours(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    curves = [wandering(seed + k, float(k), int(rng.integers(1, 30))) for k in range(9)]
+    points, offsets = np.concatenate(curves), offsets_of(*curves)
+    position = np.cumsum(rng.integers(1, 3, 9)).astype(np.float64)
+    for widest in (1.0, 2.0):
+        pairs = neighbouring_curves(position, offsets, widest_step_px=widest)
+        faces = strips(points, offsets, pairs)
+        found = strip_neighbours(faces, offsets, pairs)
+        assert found.dtype == np.int32
+        np.testing.assert_array_equal(found, neighbours(faces, vertex_count=len(points)))
+
+
+@pytest.mark.parametrize("keep_holes", [False, True])
+def test_drops_agree_with_plain_numpy(*, keep_holes: bool) -> None:
+    rng = np.random.default_rng(4)
+    curves = [wandering(k, float(k), 40) for k in range(12)]
+    points, faces = np.concatenate(curves), between(*curves)
+    points[rng.random(len(points)) < 0.02] = np.nan
+    sampling, bridge = rng.uniform(0.5, 2, len(points)), np.asarray(rng.random(len(points)) < 0.2)
+    corners, after = points[faces], np.roll(faces, -1, axis=1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    far = ~(longest <= 1.2 * sampling[faces].mean(axis=1))
+    over = ((abs(faces - after) == 1) & bridge[np.minimum(faces, after)]).any(axis=1) & keep_holes
+    found = dropped(points, faces, bridge_after=bridge, keep_holes=keep_holes, sampling=sampling, ratio=1.2)
+    assert found == (far.tolist(), over.tolist(), (far | over).tolist())
+    assert 0.05 < far.mean() < 0.95

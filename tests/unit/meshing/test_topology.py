@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+import numba
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from slrig.meshing.topology import (
     boundary_vertex_count,
     compact,
     component_labels,
+    component_sizes,
     degenerate_faces,
     duplicate_face_count,
     edge_table,
@@ -70,6 +72,21 @@ def test_random_faces_agree_with_counting_one_by_one() -> None:
     assert duplicate_face_count(faces) == len(faces) - len({tuple(sorted(f)) for f in faces.tolist()}) > 0
 
 
+def test_all_counts_at_once_are_the_counts_one_by_one() -> None:
+    random = np.random.default_rng(9)
+    for most in (4, 12, 300):
+        faces = random.integers(0, most, (150, 3)).astype(np.int32)
+        counts, table = topology_counts(faces), edge_table(faces)
+        assert counts.edges == len(table.edges)
+        assert counts.boundary_edges == (table.triangle_counts == 1).sum()
+        assert counts.boundary_vertices == boundary_vertex_count(faces)
+        assert counts.nonmanifold_edges == nonmanifold_edge_count(faces)
+        assert counts.misoriented_edges == misoriented_edge_count(faces)
+        assert counts.duplicate_faces == duplicate_face_count(faces)
+        assert counts.degenerate_faces == degenerate_faces(faces).sum()
+        assert counts.vertices == len(np.unique(faces))
+
+
 def test_boundary_edges_keep_the_direction_of_their_triangle() -> None:
     faces = faces_of((5, 1, 2), (2, 1, 3))
     assert sorted(map(tuple, boundary_edges(faces).tolist())) == [(1, 3), (2, 5), (3, 2), (5, 1)]
@@ -98,6 +115,41 @@ def test_components_are_numbered_by_first_appearance_and_joined_by_a_vertex() ->
     faces = faces_of((8, 9, 7), (0, 1, 2), (9, 10, 11), (3, 4, 5), (5, 1, 6))
     assert component_labels(faces).tolist() == [0, 1, 0, 1, 1]
     assert topology_counts(faces).components == 2
+
+
+def test_sizes_of_components_agree_with_counting_labels() -> None:
+    random = np.random.default_rng(6)
+    faces = grid(30, 40)
+    among = np.asarray(random.random(len(faces)) < 0.45)
+    labels = component_labels(faces[among])
+    wanted = np.zeros(len(faces), dtype=np.int64)
+    wanted[among] = np.bincount(labels)[labels]
+    assert component_sizes(faces, among).tolist() == wanted.tolist()
+    assert len(np.unique(wanted)) > 3
+    assert component_sizes(faces[:0], among[:0]).shape == (0,)
+
+
+def test_labels_agree_with_flooding() -> None:
+    random = np.random.default_rng(7)
+    faces = random.permutation(grid(30, 40))[:500]
+    labels = np.arange(len(faces))
+    while True:
+        lowest = np.full(1200, len(faces))
+        np.minimum.at(lowest, faces.ravel(), np.repeat(labels, 3))
+        spread = np.minimum(labels, lowest[faces].min(axis=1))
+        if (spread == labels).all():
+            break
+        labels = spread
+    assert component_labels(faces).tolist() == np.unique(labels, return_inverse=True)[1].tolist()
+    assert labels.max() > 20
+
+
+def test_compact_agrees_with_plain_numpy() -> None:
+    faces = np.random.default_rng(8).integers(0, 500, (100, 3)).astype(np.int32)
+    found = compact(faces, vertex_count=600)
+    kept, renumbered = np.unique(faces, return_inverse=True)
+    assert found.kept.tolist() == kept.tolist()
+    assert found.faces.tolist() == renumbered.reshape(-1, 3).tolist()
 
 
 def test_compact_drops_what_no_face_uses_and_keeps_order() -> None:
@@ -152,3 +204,18 @@ def test_a_vertex_without_area_has_no_normal() -> None:
     normals = vertex_normals(vertices, faces_of((0, 1, 2), (0, 1, 3)))
     assert normals[:3].tolist() == [[0, 0, 1]] * 3
     assert np.isnan(normals[3:]).all()
+
+
+def test_vertex_normals_are_the_same_for_any_number_of_threads() -> None:
+    random = np.random.default_rng(2)
+    # Names in no order, so that every triangle concerns several threads.
+    faces = random.permutation(54).astype(np.int32)[grid(6, 9)]
+    vertices = random.normal(0, 1, (54, 3))
+    most = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        one = vertex_normals(vertices, faces)
+    finally:
+        numba.set_num_threads(most)
+    assert vertex_normals(vertices, faces).tobytes() == one.tobytes()
+    assert one == pytest.approx(plain_vertex_normals(vertices, faces), abs=1e-5)

@@ -1,0 +1,326 @@
+"""The boundary of a mesh: shrink and smooth (Yang & Chen 2010, section 3.4).
+
+A boundary edge belongs to one triangle only; outer borders and the borders of holes are treated alike. Both steps
+change triangles where they are, on the adjacency of `slrig.meshing.adjacency`, and build nothing anew. No vertex
+moves and none is added. What may change at a corner, and why, is in `slrig.meshing.boundary_rules`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slrig.meshing.adjacency import neighbours
+from slrig.meshing.boundary_rules import (
+    add,
+    boundary_half_edges,
+    cosine_at,
+    following,
+    is_notch,
+    length_mm,
+    may_add,
+    may_remove,
+    preceding,
+    remove,
+    side_towards,
+)
+from slrig.model import FloatArray, IntArray
+
+PSI = math.pi / 2
+LONGEST_MM = 5.0
+_SPACINGS = 4.0
+_MOST_TRIANGLES_OF_A_SPIKE = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Shrunk:
+    """faces, adjacency : (F', 3) int32, what is left of the faces, in their order, and their neighbours."""
+
+    faces: IntArray
+    adjacency: IntArray
+    removed_triangles: int
+
+
+@dataclass(frozen=True, slots=True)
+class Smoothed:
+    """faces, adjacency : (F', 3) int32, what is left of the faces, in their order, then what was added; neighbours.
+
+    added : (F',) bool. removed_triangles : of the faces given, so that F' = F - removed_triangles + added.sum().
+    rounds : how often there were sharp corners to go through; the last time may have changed nothing.
+    """
+
+    faces: IntArray
+    adjacency: IntArray
+    added: NDArray[np.bool_]
+    removed_triangles: int
+    rounds: int
+
+
+def longest_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> FloatArray:
+    """(n,) float64: λ at each vertex, max(5 mm, 4 x local spacing); the local spacing is the median of its edges.
+
+    The paper's λ = 5 alone takes good triangles where the points are sparse. The median (the upper one) keeps to the
+    wider of the spacings along the curves and across, so that sparse curves of dense points are left alone too, and
+    does not see the one long triangle beside a curve's end. A vertex of one triangle only, that has no such
+    median, has the smaller spacing of the other two.
+    """
+    points, faces = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(faces)
+    longest = np.full(len(points), LONGEST_MM)
+    near = np.zeros(len(points), dtype=np.bool_)
+    if not _mark_long_edges(points, faces, LONGEST_MM, near):
+        return longest
+    # The spacing of all that an edge too long touches, and of their neighbours, from all edges of both.
+    ring = np.zeros(len(points), dtype=np.bool_)
+    ring[faces[near[faces].any(axis=1)]] = True
+    around = faces[ring[faces].any(axis=1)]
+    start, end = around.ravel().astype(np.int64), np.roll(around, -1, axis=1).ravel()
+    low, high = np.divmod(np.unique(np.minimum(start, end) << 32 | np.maximum(start, end)), 1 << 32)
+    length = np.linalg.norm(points[high] - points[low], axis=1)
+    vertex, length = np.concatenate((low, high)), np.concatenate((length, length))
+    order = np.lexsort((length, vertex))
+    named, first, count = np.unique(vertex[order], return_index=True, return_counts=True)
+    spacing, ear = np.zeros(len(points)), np.zeros(len(points), dtype=np.bool_)
+    spacing[named] = length[order][first + count // 2]
+    ear[named] = count == 2
+    smaller = spacing.copy()
+    for corner in range(3):
+        tip, left, right = (around[:, (corner + k) % 3] for k in range(3))
+        smaller[tip[ear[tip]]] = np.minimum(spacing[left], spacing[right])[ear[tip]]
+    longest[near] = np.maximum(LONGEST_MM, _SPACINGS * smaller[near])
+    return longest
+
+
+def boundary_point_count(faces: IntArray, adjacency: IntArray, /) -> int:
+    """Number of vertices on the boundary; adjacency as `neighbours` gives it."""
+    return int(_boundary_point_count(np.ascontiguousarray(faces), np.ascontiguousarray(adjacency)))
+
+
+def shrunk(
+    points_mm: FloatArray, faces: IntArray, longest_mm: FloatArray, /, *, adjacency: IntArray | None = None
+) -> Shrunk:
+    """Take away triangles from the boundary inwards until no boundary edge is longer than λ.
+
+    A boundary edge longer than λ goes with its triangle, and the triangle's third vertex joins the boundary.
+
+    points_mm : (n, 3) float64; faces : (F, 3) int32, edge-manifold, consistently wound; longest_mm : (n,) float64, λ
+    at each vertex. An edge's λ is the smaller of its ends': a fan of long triangles widens the spacing at its apex,
+    not at its rim. adjacency : (F, 3) int32, as `neighbours` gives it, if it is known.
+
+    Raises
+    ------
+    ValueError
+        The faces are no such mesh (see `neighbours`).
+    """
+    points, longest = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(longest_mm, np.float64)
+    faces = np.ascontiguousarray(faces)
+    across = neighbours(faces, vertex_count=len(points)) if adjacency is None else adjacency.copy()
+    alive = np.ones(len(faces), dtype=np.bool_)
+    removed = _shrink(points, faces, across, longest, alive)
+    if not removed:
+        return Shrunk(faces, across, 0)
+    kept, across = _kept(faces, across, alive)
+    return Shrunk(kept, across, removed)
+
+
+def smoothed(
+    points_mm: FloatArray,
+    faces: IntArray,
+    allowed_mm: FloatArray,
+    /,
+    *,
+    psi_rad: float = PSI,
+    most_rounds: int = 8,
+    adjacency: IntArray | None = None,
+) -> Smoothed:
+    """Fill the notches of the boundary and take off its spikes.
+
+    Walked with the surface on its left, the boundary comes from b_(i-1) to b_i and goes on to b_(i+1). The corner is
+    handled when ∠b_(i-1) b_i b_(i+1) < ψ: the angle between the two edges, at most π, which is the surface's own
+    angle at a spike and the gap's at a notch. n' = (b_(i+1) - b_i) x (b_(i-1) - b_i), n the mean normal of the
+    corner's triangles. ∠(n', n) > π/2, a notch (Fig. 8(a)): triangle b_(i+1) b_i b_(i-1) is added, b_i is inside.
+    Otherwise a spike (Fig. 8(b)): b_i goes with its triangles and the vertices behind join the boundary.
+
+    Corners are handled in rounds, notches first, each kind sharpest first; a round looks at what the one before has
+    changed. A zigzag can be smoothed either way, and filling it keeps what was measured.
+
+    The paper's rule alone eats through posts of a few triangles' width, peels a slanted border row after row, and
+    skins depth edges. So `may_add` and `may_remove` may refuse; the two neighbours of a spike that went stay; and
+    a notch or a spike is followed over at most `most_rounds` points. It ends without that limit, too: filling a
+    notch leaves fewer boundary edges, taking a spike fewer fans of triangles about a vertex.
+
+    points_mm : (n, 3) float64; faces : (F, 3) int32, edge-manifold, consistently wound; allowed_mm : (n,) float64,
+    length beyond which an edge at each vertex crosses a depth edge. adjacency : (F, 3) int32, as `neighbours` gives
+    it, if it is known.
+
+    Raises
+    ------
+    ValueError
+        The faces are no such mesh (see `neighbours`), or psi_rad is not between 0 and π.
+    """
+    if not 0.0 < psi_rad < math.pi:
+        message = f"psi_rad: expected an angle between 0 and π, found {psi_rad:g}; π/2 is usual"
+        raise ValueError(message)
+    points, allowed = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(allowed_mm, np.float64)
+    faces = np.ascontiguousarray(faces)
+    across = neighbours(faces, vertex_count=len(points)) if adjacency is None else np.ascontiguousarray(adjacency)
+    new_faces, new_across, alive, rounds = _smooth(
+        points, faces, across, allowed, math.cos(psi_rad), most_rounds, _MOST_TRIANGLES_OF_A_SPIKE
+    )
+    removed = len(faces) - int(np.count_nonzero(alive[: len(faces)]))
+    if not removed and len(new_faces) == len(faces):
+        return Smoothed(faces, across, np.zeros(len(faces), dtype=np.bool_), 0, rounds)
+    kept, across = _kept(new_faces, new_across, alive)
+    added = np.zeros(len(kept), dtype=np.bool_)
+    added[len(faces) - removed :] = True
+    return Smoothed(kept, across, added, removed, rounds)
+
+
+@njit(cache=True, nogil=True)
+def _boundary_point_count(faces: Any, adjacency: Any) -> int:
+    # Every boundary vertex has a half-edge that runs into it.
+    heads = np.array([faces[into // 3, (into + 2) % 3] for into in boundary_half_edges(adjacency)])
+    return len(np.unique(heads))
+
+
+@njit(cache=True, nogil=True)
+def _mark_long_edges(points: Any, faces: Any, longest_mm: float, near: Any) -> bool:
+    """Mark both ends of every edge longer than longest_mm; whether there is one."""
+    found = False
+    for face in range(len(faces)):
+        for corner in range(3):
+            a, b = faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]
+            if length_mm(points, a, b) > longest_mm:
+                near[a] = near[b] = found = True
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _shrink(points: Any, faces: Any, adjacency: Any, longest_mm: Any, alive: Any) -> int:
+    stack = boundary_half_edges(adjacency)
+    removed = 0
+    while len(stack):
+        half_edge = stack.pop()
+        face = half_edge // 3
+        a, b = faces[face, (half_edge + 1) % 3], faces[face, (half_edge + 2) % 3]
+        if not alive[face] or length_mm(points, a, b) <= min(longest_mm[a], longest_mm[b]):
+            continue
+        alive[face] = False
+        removed += 1
+        for corner in range(3):
+            behind = adjacency[face, corner]
+            if behind >= 0:
+                side = side_towards(adjacency, behind, face)
+                adjacency[behind, side] = -1
+                stack.append(np.int64(3 * behind + side))
+    return removed
+
+
+@njit(cache=True, nogil=True)
+def _kept(faces: Any, adjacency: Any, alive: Any) -> Any:
+    """The faces that are alive, in their order, and their neighbours in the new numbering."""
+    number = np.full(len(faces) + 1, -1, dtype=np.int32)
+    count = 0
+    for face in range(len(faces)):
+        if alive[face]:
+            number[face] = count
+            count += 1
+    kept, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
+    for face in range(len(faces)):
+        if alive[face]:
+            for corner in range(3):
+                kept[number[face], corner] = faces[face, corner]
+                # -1 reads the last entry, which is -1.
+                across[number[face], corner] = number[adjacency[face, corner]]
+    return kept, across
+
+
+@njit(cache=True, nogil=True)
+def _lengthened(rows: Any, length: int) -> Any:
+    longer = np.zeros((length, 3), dtype=rows.dtype)
+    for row in range(len(rows)):
+        for k in range(3):
+            longer[row, k] = rows[row, k]
+    return longer
+
+
+@njit(cache=True, nogil=True)
+def _smooth(
+    points: Any,
+    given: Any,
+    given_adjacency: Any,
+    allowed_mm: Any,
+    cos_psi: float,
+    most_rounds: int,
+    most_triangles: int,
+) -> Any:
+    """Faces given and added, their adjacency, which of them are alive, and the number of rounds."""
+    degree, corners = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
+    stays = np.zeros(len(points), dtype=np.bool_)
+    queue = boundary_half_edges(given_adjacency)
+    for into in queue:
+        corners[given[into // 3, (into + 2) % 3]] += 1
+    for face in range(len(given)):
+        for corner in range(3):
+            degree[given[face, corner]] += 1
+    count = len(given)
+    room = count + len(queue) // 8 + 16
+    faces, adjacency = _lengthened(given, room), _lengthened(given_adjacency, room)
+    # waiting: half-edges that are in the queue; alive: faces, three times over.
+    waiting = np.zeros((room, 3), dtype=np.bool_)
+    alive = np.zeros((room, 3), dtype=np.bool_)
+    alive[:count] = True
+    rounds = 0
+    while len(queue) and rounds < most_rounds:
+        sharp = [np.int64(0) for _ in range(0)]
+        rank = [0.0 for _ in range(0)]
+        for into in queue:
+            waiting[into // 3, into % 3] = False
+            if alive[into // 3, 0] and adjacency[into // 3, into % 3] < 0:
+                out = following(faces, adjacency, into)
+                a, b = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3]
+                cosine = cosine_at(points, a, b, faces[out // 3, (out + 2) % 3])
+                if cosine > cos_psi:
+                    # Notches before spikes, each sharpest first.
+                    notch = is_notch(points, faces, adjacency, into, out)
+                    sharp.append(into)
+                    rank.append(-cosine - (2.0 if notch else 0.0))
+        queue = [np.int64(0) for _ in range(0)]
+        if not len(sharp):
+            break
+        rounds += 1
+        for place in np.argsort(np.array(rank), kind="mergesort"):
+            into = sharp[place]
+            if not alive[into // 3, 0] or adjacency[into // 3, into % 3] >= 0:
+                continue
+            out = following(faces, adjacency, into)
+            a, b = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3]
+            c = faces[out // 3, (out + 2) % 3]
+            if not cosine_at(points, a, b, c) > cos_psi:
+                continue
+            changed = [np.int64(0) for _ in range(0)]
+            if is_notch(points, faces, adjacency, into, out):
+                if may_add(points, faces, adjacency, degree, allowed_mm, into, out):
+                    if count == room:
+                        room *= 2
+                        faces, adjacency = _lengthened(faces, room), _lengthened(adjacency, room)
+                        waiting, alive = _lengthened(waiting, room), _lengthened(alive, room)
+                    add(faces, adjacency, degree, corners, count, into, out)
+                    alive[count] = True
+                    if adjacency[count, 1] < 0:
+                        changed.append(np.int64(3 * count + 1))
+                        changed.append(preceding(faces, adjacency, np.int64(3 * count + 1)))
+                    count += 1
+            elif not stays[b] and may_remove(faces, adjacency, corners, into, out, most_triangles):
+                stays[a] = stays[c] = True
+                changed.append(preceding(faces, adjacency, into))
+                remove(faces, adjacency, degree, corners, alive, into, out, changed)
+            for half_edge in changed:
+                if not waiting[half_edge // 3, half_edge % 3]:
+                    waiting[half_edge // 3, half_edge % 3] = True
+                    queue.append(half_edge)
+    return faces[:count], adjacency[:count], alive[:count, 0].copy(), rounds

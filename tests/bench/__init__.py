@@ -1,0 +1,1 @@
+"""Benchmarks, each run by name: they print a table and hold what it has to show."""

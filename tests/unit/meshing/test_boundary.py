@@ -1,0 +1,368 @@
+"""The boundary on meshes small enough to say what must come out, and on random ones against plain Python."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from slrig.meshing.adjacency import neighbours
+from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
+from slrig.meshing.boundary_rules import following, may_add
+from slrig.meshing.topology import boundary_edges, boundary_vertex_count
+from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.boundary_oracle import as_set, smoothed_by_hand
+
+ANYTHING_MM = 1e6
+
+
+def flat(*places: tuple[float, float]) -> FloatArray:
+    return np.array([(x, y, 0.0) for x, y in places], dtype=np.float64)
+
+
+def faces_of(*rows: tuple[int, int, int]) -> IntArray:
+    return np.array(rows, dtype=np.int32).reshape(-1, 3)
+
+
+def grid(rows: int, columns: int, *, slant: float = 0.0) -> tuple[FloatArray, IntArray]:
+    """A flat grid of unit cells, counter-clockwise seen from above; each row `slant` further to the right."""
+    row, column = np.mgrid[:rows, :columns]
+    points = np.stack([column + slant * row, row, np.zeros_like(row)], axis=-1).reshape(-1, 3).astype(np.float64)
+    index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
+    a, b, c, d = (index[s, t].ravel() for s in (np.s_[:-1], np.s_[1:]) for t in (np.s_[:-1], np.s_[1:]))
+    return points, np.concatenate((np.stack((a, b, c), 1), np.stack((b, d, c), 1)))
+
+
+def with_border_point(points: FloatArray, y: float, *, columns: int) -> FloatArray:
+    """The middle point of the grid's first row moved to this y."""
+    moved = points.copy()
+    moved[columns // 2, 1] = y
+    return moved
+
+
+def everywhere(points: FloatArray, mm: float = ANYTHING_MM) -> FloatArray:
+    return np.full(len(points), mm)
+
+
+def test_a_right_angle_is_no_spike_and_a_straight_border_no_notch() -> None:
+    points, faces = grid(4, 5)
+    result = smoothed(points, faces, everywhere(points))
+    np.testing.assert_array_equal(result.faces, faces)
+    assert (result.removed_triangles, int(result.added.sum()), result.rounds) == (0, 0, 0)
+
+
+def test_a_notch_is_filled_with_one_triangle_of_the_same_winding() -> None:
+    points, faces = grid(5, 7)
+    points = with_border_point(points, 0.0, columns=7)
+    points[3, 1] = 1.2
+    points[10, 1] = 1.6
+    result = smoothed(points, faces, everywhere(points))
+    assert as_set(result.faces[result.added]) == {(2, 4, 3)}
+    assert result.removed_triangles == 0
+    np.testing.assert_array_equal(result.faces[:-1], faces)
+    assert boundary_vertex_count(result.faces) == boundary_vertex_count(faces) - 1
+
+
+def test_a_spike_goes_with_its_triangles() -> None:
+    points, faces = grid(5, 7)
+    points = with_border_point(points, -1.5, columns=7)
+    result = smoothed(points, faces, everywhere(points))
+    assert not result.added.any()
+    assert as_set(faces) - as_set(result.faces) == as_set(faces[(faces == 3).any(axis=1)])
+    assert result.removed_triangles == (faces == 3).any(axis=1).sum()
+    # What lay behind it is on the border now, and the mesh says so.
+    assert {10} < set(boundary_edges(result.faces).ravel().tolist())
+    np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
+
+
+def test_the_side_that_the_mesh_is_seen_from_makes_no_difference() -> None:
+    points, faces = grid(5, 7)
+    for y in (-1.5, 0.9):
+        moved = with_border_point(points, y, columns=7)
+        mirrored = smoothed(moved * (1, 1, -1), faces[:, ::-1], everywhere(points))
+        direct = smoothed(moved, faces, everywhere(points))
+        assert as_set(mirrored.faces[:, ::-1]) == as_set(direct.faces)
+
+
+def test_psi_says_what_is_sharp() -> None:
+    points, faces = grid(5, 7)
+    points = with_border_point(points, -1.2, columns=7)
+    angle = 2 * math.atan(1 / 1.2)
+    assert smoothed(points, faces, everywhere(points), psi_rad=angle - 0.01).removed_triangles == 0
+    assert smoothed(points, faces, everywhere(points), psi_rad=angle + 0.01).removed_triangles > 0
+
+
+@pytest.mark.parametrize("psi_rad", [0.0, math.pi, math.nan])
+def test_an_angle_that_means_nothing_is_refused(psi_rad: float) -> None:
+    points, faces = grid(2, 2)
+    with pytest.raises(ValueError, match="psi_rad: expected an angle between 0 and π"):
+        smoothed(points, faces, everywhere(points), psi_rad=psi_rad)
+
+
+def deep_notch() -> tuple[FloatArray, IntArray]:
+    points, faces = grid(5, 7)
+    points[3, 1], points[10, 1] = 1.2, 1.6
+    return points, faces
+
+
+def test_a_notch_as_wide_as_a_depth_edge_stays_open() -> None:
+    points, faces = deep_notch()
+    # Its mouth is 2 mm wide.
+    assert smoothed(points, faces, everywhere(points, 2.01)).added.sum() == 1
+    assert smoothed(points, faces, everywhere(points, 1.99)).added.sum() == 0
+
+
+def test_a_notch_between_surfaces_that_face_apart_stays_open() -> None:
+    points, faces = deep_notch()
+
+    # A roof with its ridge along the notch: each side falls away at the angle, and the fill would be level.
+    def roof(angle_deg: float) -> FloatArray:
+        aside = points[:, 0] - 3
+        bent = points.copy()
+        bent[:, 0] = 3 + aside * math.cos(math.radians(angle_deg))
+        bent[:, 2] = -np.abs(aside) * math.sin(math.radians(angle_deg))
+        return bent
+
+    assert smoothed(roof(30), faces, everywhere(points)).added.sum() == 1
+    assert smoothed(roof(75), faces, everywhere(points)).added.sum() == 0
+
+
+def test_no_sliver_is_added() -> None:
+    # A square corner of surface bent in at vertex 0, the gap 80° wide, one side long and the other short.
+    side = 0.1
+    gap = math.radians(80)
+    points = flat((0, 0), (1, 0), (side * math.cos(gap), side * math.sin(gap)), (0.7, -1), (-1, -1), (-1, 1))
+    faces = faces_of((1, 0, 3), (3, 0, 4), (4, 0, 5), (5, 0, 2))
+    assert smoothed(points, faces, everywhere(points)).added.sum() == 0
+    points[2] = (0.5 * math.cos(gap), 0.5 * math.sin(gap), 0)
+    result = smoothed(points, faces, everywhere(points), most_rounds=1)
+    assert (0, 1, 2) in as_set(result.faces[result.added])
+
+
+def test_a_hole_of_three_edges_is_closed() -> None:
+    points, faces = grid(5, 5)
+    hole = faces[9]
+    result = smoothed(points, np.delete(faces, 9, axis=0), everywhere(points))
+    assert as_set(result.faces) == as_set(faces)
+    assert as_set(result.faces[result.added]) == as_set(hole[None])
+    np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
+
+
+def test_a_hole_of_three_edges_with_a_long_one_stays() -> None:
+    points, faces = grid(5, 5)
+    assert smoothed(points, np.delete(faces, 9, axis=0), everywhere(points, 1.4)).added.sum() == 0
+
+
+def test_an_edge_that_exists_is_not_made_again() -> None:
+    # A double pyramid over triangle 012, two of its upper faces missing: at 1 the gap's far edge 02 has two faces.
+    points = np.array([(0, 0, 0), (1, 0, 0), (0.5, 0.9, 0), (0.5, 0.3, 0.4), (0.5, 0.3, -0.4)], dtype=np.float64)
+    faces = faces_of((2, 0, 3), (1, 0, 4), (2, 1, 4), (0, 2, 4))
+    result = smoothed(points, faces, everywhere(points))
+    np.testing.assert_array_equal(result.faces, faces)
+
+
+def test_a_notch_that_another_stretch_of_boundary_runs_into_is_not_covered() -> None:
+    def fits(tip: tuple[float, float]) -> bool:
+        points = flat((0.8, 1), (0, 0), (-0.8, 1), tip, (-0.2, 1.6), (1, 0), (0, -1), (-1, 0.2), (-1.2, 1.2))
+        faces = faces_of((0, 1, 5), (5, 1, 6), (6, 1, 7), (1, 2, 7), (7, 2, 8), (8, 2, 4), (2, 3, 4))
+        across = neighbours(faces, vertex_count=len(points))
+        degree = np.bincount(faces.ravel()).astype(np.int32)
+        into = 2  # from 0 to 1, opposite corner 2 of face 0
+        out = following(faces, across, into)
+        return bool(may_add(points, faces, across, degree, everywhere(points), into, out))
+
+    assert fits((0.2, 1.3))
+    assert not fits((0.0, 0.6))
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_a_thin_post_keeps_both_sides(width: int) -> None:
+    # Rows half a step apart make the post's ends sharp.
+    points, faces = grid(20, width + 1, slant=0.5)
+    rng = np.random.default_rng(width)
+    points[:, :2] += rng.uniform(-0.15, 0.15, (len(points), 2))
+    result = smoothed(points, faces, everywhere(points))
+    used = np.unique(result.faces)
+    sides = set(range(0, len(points), width + 1)) | set(range(width, len(points), width + 1))
+    # At most the sharp corner of each end goes.
+    assert len(sides - set(used.tolist())) <= 2
+    assert result.removed_triangles <= 4
+
+
+def test_a_slanted_border_is_not_peeled() -> None:
+    points, faces = grid(40, 40, slant=0.7)
+    result = smoothed(points, faces, everywhere(points))
+    # Two corners of the slanted square are sharp.
+    assert result.removed_triangles <= 4
+    assert not result.added[: len(faces) - result.removed_triangles].any()
+
+
+def test_a_long_spike_goes_down_to_its_foot() -> None:
+    # One curve reaches three points further than its neighbours do.
+    points, faces = grid(5, 7)
+    extra = np.array([(3, -1, 0), (3, -2, 0), (3, -3, 0)], dtype=np.float64)
+    at = len(points)
+    tooth = faces_of((at, 3, 2), (3, at, 4), (at + 1, at, 2), (at, at + 1, 4), (at + 2, at + 1, 2), (at + 1, at + 2, 4))
+    points, faces = np.concatenate((points, extra)), np.concatenate((faces, tooth))
+    result = smoothed(points, faces, everywhere(points))
+    assert not np.isin([at + 1, at + 2], result.faces).any()
+    assert result.removed_triangles == 4
+    assert as_set(result.faces) > as_set(grid(5, 7)[1])
+
+
+def test_a_zigzag_is_filled_tooth_by_tooth_and_loses_nothing() -> None:
+    columns = 601
+    points, faces = grid(4, columns)
+    # Tips at odd columns; each of the notches between two of them is 67° wide.
+    points[1:columns:2, 1] = -1.5
+    result = smoothed(points, faces, everywhere(points))
+    assert result.removed_triangles == 0
+    wanted = {(k - 1, k + 1, k) for k in range(2, columns - 1, 2)}
+    assert as_set(result.faces[result.added]) == wanted
+    np.testing.assert_array_equal(result.adjacency, neighbours(result.faces, vertex_count=len(points)))
+
+
+def test_rounds_limit_how_far_a_slot_is_filled() -> None:
+    points, faces = grid(4, 40)
+    # The middle row of cells is missing from the left on, but for the last ones.
+    points[40 * 2 :, 1] -= 0.3
+    middle = faces[:, 0] // 40 == 1
+    kept = faces[~(middle & (faces.min(axis=1) % 40 < 30))]
+    points += np.random.default_rng(1).uniform(-0.02, 0.02, points.shape)
+    few = smoothed(points, kept, everywhere(points, 3.0), most_rounds=4)
+    more = smoothed(points, kept, everywhere(points, 3.0), most_rounds=12)
+    assert few.rounds == 4
+    assert more.rounds > few.rounds
+    assert 0 < few.added.sum() < more.added.sum() < 30
+
+
+def test_shrinking_takes_long_boundary_edges_from_outside_inwards() -> None:
+    # A fan of long triangles beside a dense grid, as at the end of a curve that its neighbour does not reach.
+    points, faces = grid(4, 4)
+    far = flat((1, -9), (2, -9), (3, -9))
+    at = len(points)
+    fan = faces_of((at, 1, 0), (at, at + 1, 1), (at + 1, 2, 1), (at + 1, at + 2, 2), (at + 2, 3, 2))
+    points, joined = np.concatenate((points, far)), np.concatenate((faces, fan))
+    result = shrunk(points, joined, everywhere(points, 5.0))
+    np.testing.assert_array_equal(result.faces, faces)
+    assert result.removed_triangles == len(fan)
+    np.testing.assert_array_equal(result.adjacency, neighbours(faces, vertex_count=len(points)))
+
+
+def test_shrinking_leaves_long_edges_inside() -> None:
+    points, faces = grid(4, 4)
+    points *= 6
+    narrow = everywhere(points, 6.1)
+    # Diagonals are 8.5 mm long, and none of them is on the boundary.
+    assert shrunk(points, faces, narrow).removed_triangles == 0
+    narrow[5] = 1.0
+    assert shrunk(points, faces, narrow).removed_triangles == 0
+    narrow[1] = 1.0
+    assert shrunk(points, faces, narrow).removed_triangles > 0
+
+
+def test_shrinking_agrees_with_dropping_until_nothing_changes() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        points, faces = grid(9, 9)
+        points += rng.normal(0, 0.4, points.shape)
+        faces = faces[rng.random(len(faces)) > 0.1]
+        longest = rng.uniform(0.8, 3.0, len(points))
+        left = faces
+        while True:
+            edges = boundary_edges(left)
+            length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+            bad = set(map(tuple, edges[length > longest[edges].min(axis=1)].tolist()))
+            has = [any((f[k], f[(k + 1) % 3]) in bad for k in range(3)) for f in left.tolist()]
+            if not any(has):
+                break
+            left = left[~np.array(has)]
+        result = shrunk(points, faces, longest)
+        np.testing.assert_array_equal(result.faces, left)
+        assert result.removed_triangles == len(faces) - len(left)
+
+
+def test_lambda_is_five_millimetres_on_dense_points() -> None:
+    points, faces = grid(5, 5)
+    np.testing.assert_array_equal(longest_boundary_edge_mm(points, faces), everywhere(points, 5.0))
+
+
+def test_lambda_follows_the_wider_spacing_of_sparse_curves() -> None:
+    points, faces = grid(30, 6)
+    points *= (6.0, 0.5, 1.0)
+    longest = longest_boundary_edge_mm(points, faces)
+    # Edges at a vertex inside: two of 0.5 mm along, four of 6 mm or a little more across.
+    assert longest[6 * 10 + 2] == pytest.approx(4 * 6.0, rel=0.01)
+    assert (longest >= 5.0).all()
+    # The paper's fixed 5 mm takes the whole mesh away; this takes nothing.
+    assert len(shrunk(points, faces, everywhere(points, 5.0)).faces) == 0
+    assert shrunk(points, faces, longest).removed_triangles == 0
+
+
+def test_lambda_does_not_follow_the_long_triangles_beside_the_end_of_a_curve() -> None:
+    # The last curve of a dense grid reaches 12 mm further than its neighbour: one fan from the neighbour's end.
+    points, faces = grid(30, 6)
+    points *= (0.6, 0.5, 1.0)
+    end, last, at = 28 * 6 + 4, 29 * 6 + 5, len(points)
+    faces = faces[~(faces == 29 * 6 + 4).any(axis=1)]
+    tail = points[last] + np.outer(np.arange(1, 25), (0, 0.5, 0))
+    steps = np.concatenate(([last], np.arange(at, at + 24)))
+    fan = np.stack((np.full(24, end), steps[:-1], steps[1:]), axis=1).astype(np.int32)
+    points, joined = np.concatenate((points, tail)), np.concatenate((faces, fan))
+    left = shrunk(points, joined, longest_boundary_edge_mm(points, joined))
+    # The fan goes back to where it is 5 mm long.
+    corners = points[left.faces]
+    assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= 5.0
+    assert 14 <= left.removed_triangles <= 16
+    assert as_set(left.faces) > as_set(faces)
+
+
+def test_lambda_is_the_median_of_the_edges_at_a_vertex() -> None:
+    rng = np.random.default_rng(4)
+    points, faces = grid(8, 8)
+    points = points * 3 + rng.normal(0, 0.8, points.shape)
+    longest = longest_boundary_edge_mm(points, faces)
+    inside = set(range(len(points))) - set(boundary_edges(faces).ravel().tolist())
+    for v in inside:
+        around = {int(w) for f in faces[(faces == v).any(axis=1)] for w in f} - {v}
+        lengths = sorted(float(np.linalg.norm(points[w] - points[v])) for w in around)
+        wanted = max(5.0, 4 * lengths[len(lengths) // 2]) if lengths[-1] > 5 else 5.0
+        assert longest[v] == pytest.approx(wanted)
+
+
+def test_the_boundary_points_are_counted() -> None:
+    _, faces = grid(5, 7)
+    for left in (faces, np.delete(faces, [10, 30], axis=0), faces[:0]):
+        assert boundary_point_count(left, neighbours(left, vertex_count=35)) == boundary_vertex_count(left)
+
+
+def test_nothing_to_do_on_no_faces() -> None:
+    points, none = np.zeros((3, 3)), faces_of()
+    assert len(smoothed(points, none, everywhere(points)).faces) == 0
+    assert len(shrunk(points, none, everywhere(points)).faces) == 0
+    assert longest_boundary_edge_mm(points, none).tolist() == [5.0] * 3
+
+
+def test_smoothing_agrees_with_plain_python() -> None:
+    seen: Counter[str] = Counter()
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        points, faces = grid(10, 10)
+        points += rng.normal(0, 0.18, points.shape)
+        faces = faces[rng.random(len(faces)) > rng.uniform(0.02, 0.35)]
+        allowed = rng.uniform(1.2, 4.0, len(points))
+        psi = rng.uniform(1.0, 2.2)
+        rounds = int(rng.integers(1, 9))
+        result = smoothed(points, faces, allowed, psi_rad=psi, most_rounds=rounds)
+        wanted = smoothed_by_hand(points, faces, allowed, psi, rounds)
+        assert as_set(result.faces) == wanted.faces
+        assert as_set(result.faces[result.added]) == wanted.added
+        assert result.rounds == wanted.rounds
+        seen += Counter(added=int(result.added.sum()), removed=result.removed_triangles)
+        seen += Counter(wanted.refusals)
+    # The comparison means something only if every rule had its say.
+    assert min(seen[what] for what in ("added", "removed", "long", "sliver", "fold", "edge", "inside", "post")) > 0, (
+        seen
+    )

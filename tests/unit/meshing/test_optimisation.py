@@ -1,0 +1,421 @@
+"""Global optimisation: against a plain one, against Delaunay, on a face sampled well, sparsely and unevenly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numba
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay
+
+from slrig.meshing.adjacency import neighbours
+from slrig.meshing.optimisation import INDEX, NO_FLIPS, TURN_LIMIT, Optimised, optimised
+from slrig.meshing.quality import harmonic_indices, smallest_angles_deg
+from slrig.meshing.strips import strips
+from slrig.meshing.topology import boundary_edges, topology_counts
+from slrig.model import FlipRule, FloatArray, IntArray
+from tests.unit.meshing.test_flips import delaunay, verdict
+
+
+def all_strips(points: FloatArray, offsets: IntArray) -> IntArray:
+    """Strips between each curve and the next."""
+    count = len(offsets) - 1
+    return strips(points, offsets, np.stack([np.arange(count - 1), np.arange(1, count)], axis=1).astype(np.int32))
+
+
+def face_depth_mm(x: FloatArray, y: FloatArray) -> FloatArray:
+    """An analytic head with nose, eyes, brow and lips, away from the viewer; x, y in mm."""
+    head = np.sqrt(130**2 - 1.5 * x**2 - 0.7 * y**2)
+    nose = 32 * np.exp(-((x / 9) ** 2) - ((y + 2) / 16) ** 2) / (1 + np.exp((y - 14) / 2.5))
+    eyes = 9 * np.exp(-(((abs(x) - 28) / 11) ** 2) - ((y + 22) / 9) ** 2)
+    brow = 5 * np.exp(-(((abs(x) - 26) / 16) ** 2) - ((y + 36) / 5) ** 2)
+    lips = 6 * np.exp(-((x / 22) ** 2)) * (np.exp(-(((y - 34) / 4) ** 2)) + np.exp(-(((y - 45) / 5) ** 2)))
+    return np.asarray(600 - head - nose + eyes - brow - lips)
+
+
+def face_curves(stripes: int = 136, *, step_mm: float = 0.5, noise_mm: float = 0.02, seed: int = 1) -> list[FloatArray]:
+    """Stripes down the head, a point near each multiple of the step, noise along the line of sight."""
+    random = np.random.default_rng(seed)
+    curves = []
+    for x in np.linspace(-76, 76, stripes):
+        half = 95 * math.sqrt(1 - (x / 85) ** 2)
+        rows = np.arange(math.ceil(-half / step_mm), math.floor(half / step_mm) + 1)
+        y: FloatArray = (step_mm * (rows + np.clip(random.normal(0, 0.1, len(rows)), -0.4, 0.4))).astype(np.float64)
+        points = np.stack([np.full(len(y), x), y, face_depth_mm(np.full(len(y), x), y)], axis=1)
+        range_mm = np.linalg.norm(points, axis=1, keepdims=True)
+        curves.append(points * (1 + random.normal(0, noise_mm, (len(y), 1)) / range_mm))
+    return curves
+
+
+def joined(curves: list[FloatArray]) -> tuple[FloatArray, IntArray]:
+    """Points and offsets of curves."""
+    return np.concatenate(curves), np.concatenate([[0], np.cumsum([len(c) for c in curves])]).astype(np.int32)
+
+
+def uneven(curves: list[FloatArray], seed: int = 3) -> list[FloatArray]:
+    """35 % of the points of each third curve, 80 % of the others."""
+    random = np.random.default_rng(seed)
+    return [c[random.random(len(c)) < (0.35 if k % 3 == 0 else 0.8)] for k, c in enumerate(curves)]
+
+
+def bends_deg(points: FloatArray, faces: IntArray) -> FloatArray:
+    """Angle between the normals on both sides of each interior edge."""
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    across = neighbours(faces, vertex_count=len(points))
+    face, corner = np.nonzero(across > np.arange(len(faces))[:, None])
+    cosine = (normals[face] * normals[across[face, corner]]).sum(axis=1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def wandering(
+    rows: int, columns: int, seed: int, *, across: float = 0.3, depth: float = 0.2
+) -> tuple[FloatArray, IntArray]:
+    """Curves that stray into one another, more so for larger `across`, and their strips."""
+    random = np.random.default_rng(seed)
+    curves = [
+        np.stack(
+            [
+                x + random.normal(0, across, rows),
+                np.cumsum(random.uniform(0.1, 2, rows)),
+                random.normal(0, depth, rows),
+            ],
+            axis=1,
+        )
+        for x in range(columns)
+    ]
+    points, offsets = joined(curves)
+    return points, all_strips(points, offsets)
+
+
+def as_set(faces: IntArray) -> set[tuple[int, ...]]:
+    """The faces whatever their order, each beginning with its lowest vertex."""
+    return {tuple(np.roll(face, -int(np.argmin(face))).tolist()) for face in faces}
+
+
+def mean_index(points: FloatArray, faces: IntArray) -> float:
+    return float(harmonic_indices(points[faces]).mean())
+
+
+def plain_wishes(
+    points: FloatArray, faces: list[list[int]], face: int, *, constrained: bool
+) -> Iterator[tuple[int, int, int, int, int, bool]]:
+    """Edges pq of this face that the rule would make fw: the other face, p, q, f, w, and whether fw exists."""
+    runs = {(f[k], f[(k + 1) % 3]): i for i, f in enumerate(faces) for k in range(3)}
+    for k in range(3):
+        f, p, q = (faces[face][(k + s) % 3] for s in range(3))
+        other = runs.get((q, p))
+        if other is None:
+            continue
+        w = next(v for v in faces[other] if v not in (p, q))
+        quad = points[[p, q, f, w]]
+        if verdict(*quad)[0] if constrained else delaunay(quad):
+            yield other, p, q, f, w, (f, w) in runs or (w, f) in runs
+
+
+def plain_turn(
+    points: FloatArray, faces: list[list[int]], queue: set[int], *, constrained: bool, must_fall: bool
+) -> tuple[int, int, set[int]]:
+    """Section 3.3, one turn, changing `faces`: tested, flipped, and what to test in the next turn."""
+    indices = harmonic_indices(points[np.array(faces)])
+    replaced: set[int] = set()
+    again: set[int] = set()
+    tested = flipped = 0
+    for face in sorted(queue, key=lambda i: (-indices[i], i)):
+        if face in replaced:
+            continue
+        tested += 1
+        for other, p, q, f, w, exists in plain_wishes(points, faces, face, constrained=constrained):
+            if exists:
+                again.add(face)
+                continue
+            old, new = (mean_index(points, np.array(two)) for two in ([[f, p, q], [w, q, p]], [[f, p, w], [w, q, f]]))
+            if must_fall and not new < old:
+                continue
+            faces[face][faces[face].index(q)] = w
+            faces[other][faces[other].index(p)] = f
+            flipped += 1
+            pair = {face, other}
+            across = neighbours(np.array(faces, dtype=np.int32), vertex_count=len(points))
+            replaced |= pair
+            again |= pair | {int(n) for i in pair for n in across[i] if n >= 0}
+            break
+    return tested, flipped, again
+
+
+def plain_optimised(
+    points: FloatArray, start: IntArray, *, constrained: bool
+) -> tuple[IntArray, list[tuple[int, int]], str]:
+    """The method with lists, dictionaries and arc cosines."""
+    faces: list[list[int]] = start.tolist()
+    queue = {i for i in range(len(faces)) if any(plain_wishes(points, faces, i, constrained=constrained))}
+    turns: list[tuple[int, int]] = []
+    must_fall = False
+    while not turns or turns[-1][1]:
+        before = [list(f) for f in faces]
+        tested, flipped, again = plain_turn(points, faces, queue, constrained=constrained, must_fall=must_fall)
+        if flipped and not must_fall and not mean_index(points, np.array(faces)) < mean_index(points, np.array(before)):
+            faces, must_fall = before, True
+            tested, flipped, again = plain_turn(points, faces, queue, constrained=constrained, must_fall=True)
+        turns.append((tested if turns else len(faces), flipped))
+        queue = again
+    return np.array(faces, dtype=np.int32), turns, INDEX if must_fall else NO_FLIPS
+
+
+@pytest.mark.parametrize("rule", FlipRule)
+@pytest.mark.parametrize("seed", range(6))
+def test_the_course_is_that_of_a_plain_one(seed: int, rule: FlipRule) -> None:
+    points, faces = wandering(9, 7, seed)
+    wanted, turns, ended_by = plain_optimised(points, faces, constrained=rule is FlipRule.CONSTRAINED)
+    found = optimised(points, faces, rule=rule)
+    assert found.faces.tolist() == wanted.tolist()
+    assert [(turn.tested_triangles, turn.flipped_edges) for turn in found.turns] == turns
+    assert found.ended_by == ended_by
+    assert sum(turn.flipped_edges for turn in found.turns) > 4
+    assert found.harmonic_index_before == pytest.approx(mean_index(points, faces), rel=1e-6)
+    assert found.turns[-1].harmonic_index == pytest.approx(mean_index(points, wanted), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_a_constraint_a_plane_becomes_its_delaunay_triangulation(seed: int) -> None:
+    flat = np.random.default_rng(seed).random((300, 2))
+    # Stretched points have the same hull and another triangulation.
+    start = Delaunay(flat * [5, 1]).simplices.astype(np.int32)
+    wanted = Delaunay(flat).simplices.astype(np.int32)
+    points = np.column_stack([flat, np.zeros(300)])
+    found = optimised(points, start, rule=FlipRule.DELAUNAY)
+    assert as_set(start) != as_set(wanted)
+    assert as_set(found.faces) == as_set(wanted)
+    assert found.ended_by == NO_FLIPS
+    # In a plane γ changes the verdict on some edges: it is another triangulation.
+    assert as_set(optimised(points, start).faces) != as_set(wanted)
+    assert as_set(optimised(points, start, gamma=math.pi).faces) == as_set(wanted)
+
+
+def test_figure_5_six_points_of_a_cylinder() -> None:
+    around, heights = np.radians([-62, -62, -14, -14, 50, 50]), [0.1, 2.9, 0.0, 2.7, 0.2, 2.6]
+    points = np.stack([np.sin(around), heights, -np.cos(around)], axis=1)
+    start = all_strips(points, np.array([0, 2, 4, 6], dtype=np.int32))
+
+    def off_radial_deg(faces: IntArray) -> float:
+        corners = points[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        radial = corners.mean(axis=1) * [1, 0, 1]
+        cosine = abs((normals * radial).sum(axis=1)) / np.linalg.norm(normals, axis=1) / np.linalg.norm(radial, axis=1)
+        return float(np.degrees(np.arccos(cosine)).max())
+
+    ours, theirs = optimised(points, start).faces, optimised(points, start, rule=FlipRule.DELAUNAY).faces
+    assert as_set(ours) != as_set(theirs)
+    # "This mesh not only contains some sharp triangles, but exits a sharp edge": not so with the constraint.
+    assert off_radial_deg(ours) < 12 < 70 < off_radial_deg(theirs)
+    assert bends_deg(points, ours).max() < 57 < 80 < bends_deg(points, theirs).max()
+
+
+def test_on_a_sparse_scan_the_constraint_keeps_the_surface_from_folding() -> None:
+    points, offsets = joined(face_curves()[::8])
+    start = all_strips(points, offsets)
+    folds = {rule: int((bends_deg(points, optimised(points, start, rule=rule).faces) > 60).sum()) for rule in FlipRule}
+    assert folds[FlipRule.DELAUNAY] > 100
+    assert folds[FlipRule.CONSTRAINED] < folds[FlipRule.DELAUNAY] / 5
+
+
+def test_uneven_sampling_gains() -> None:
+    points, offsets = joined(uneven(face_curves(271)))
+    start = all_strips(points, offsets)
+    found = optimised(points, start)
+    before, after = (float(np.percentile(smallest_angles_deg(points[f]), 5)) for f in (start, found.faces))
+    assert after > 1.5 * before
+    assert (bends_deg(points, found.faces) > 60).sum() < (bends_deg(points, start) > 60).sum() / 4
+    assert found.turns[-1].harmonic_index < 0.95 * found.harmonic_index_before
+    assert found.ended_by == NO_FLIPS
+
+
+def test_a_well_sampled_face_hardly_changes() -> None:
+    # Local optimisation in the strips leaves little to do: the paper's Fig. 10.
+    points, offsets = joined(face_curves(271))
+    start = all_strips(points, offsets)
+    found = optimised(points, start)
+    assert found.turns[0].tested_triangles == len(start)
+    assert 0 < sum(turn.flipped_edges for turn in found.turns) < 1e-3 * len(start)
+    assert found.turns[1].tested_triangles <= 6 * found.turns[0].flipped_edges
+
+
+@pytest.mark.parametrize("rule", FlipRule)
+@pytest.mark.parametrize(("across", "depth"), [(0.1, 0.1), (0.3, 0.0), (0.5, 0.5), (0.3, 2.0)])
+def test_what_must_not_change_does_not(across: float, depth: float, rule: FlipRule) -> None:
+    points, faces = wandering(40, 30, 5, across=across, depth=depth)
+    found = optimised(points, faces, rule=rule)
+    assert topology_counts(found.faces) == topology_counts(faces)
+    assert topology_counts(faces).nonmanifold_edges == topology_counts(faces).misoriented_edges == 0
+    assert {*map(tuple, boundary_edges(found.faces).tolist())} == {*map(tuple, boundary_edges(faces).tolist())}
+    np.testing.assert_array_equal(found.adjacency, neighbours(found.faces, vertex_count=len(points)))
+    # The index falls from turn to turn.
+    course = [found.harmonic_index_before, *(t.harmonic_index for t in found.turns if t.flipped_edges)]
+    assert (np.diff(course) < 0).all()
+    assert len(course) > 2
+
+
+@pytest.mark.parametrize(("stripes", "ended_by"), [(40, INDEX), (60, NO_FLIPS)])
+def test_at_the_end_no_edge_is_left_to_flip(stripes: int, ended_by: str) -> None:
+    points, offsets = joined(uneven(face_curves(stripes, step_mm=2.0)))
+    found = optimised(points, all_strips(points, offsets))
+    assert found.ended_by == ended_by
+    faces, across = found.faces, found.adjacency
+    edges = {(int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3)}
+    kept = 0
+    for face, corner in zip(*np.nonzero(across > np.arange(len(faces))[:, None]), strict=True):
+        f, p, q = np.roll(faces[face], -corner)
+        w = next(v for v in faces[across[face, corner]] if v not in (p, q))
+        wanted, margin, _ = verdict(*points[[p, q, f, w]])
+        kept += not wanted
+        if wanted and margin > 1e-9 and (f, w) not in edges and (w, f) not in edges:
+            # Only flips that raise the index may be left, and only if that was what ended it.
+            assert ended_by == INDEX
+            now, then = ([[f, p, q], [w, q, p]], [[f, p, w], [w, q, f]])
+            assert mean_index(points, np.array(then)) >= mean_index(points, np.array(now)) - 1e-5
+    assert kept > 3000
+
+
+def test_where_the_index_would_rise_the_turn_is_done_again() -> None:
+    # Curves that cross in a plane: unfolding them makes slivers.
+    ends = []
+    for seed in range(12):
+        points, faces = wandering(40, 30, seed, across=0.3, depth=0.0)
+        found = optimised(points, faces)
+        ends.append(found.ended_by)
+        course = [found.harmonic_index_before, *(t.harmonic_index for t in found.turns if t.flipped_edges)]
+        assert (np.diff(course) < 0).all()
+        assert mean_index(points, found.faces) < mean_index(points, faces)
+    assert INDEX in ends
+
+
+def test_turns_are_limited() -> None:
+    points, faces = wandering(20, 20, 1)
+    everything = optimised(points, faces)
+    assert len(everything.turns) > 3
+    for most in range(3):
+        found = optimised(points, faces, most_turns=most)
+        assert found.turns == everything.turns[:most]
+        assert found.ended_by == TURN_LIMIT
+    assert optimised(points, faces, most_turns=0).faces.tolist() == faces.tolist()
+
+
+def test_an_optimal_mesh_has_one_turn_without_flips() -> None:
+    points, faces = wandering(20, 20, 1, across=0.05, depth=0.05)
+    once = optimised(points, faces)
+    assert once.ended_by == NO_FLIPS
+    again = optimised(points, once.faces)
+    assert again.faces.tolist() == once.faces.tolist()
+    assert [(t.tested_triangles, t.flipped_edges) for t in again.turns] == [(len(faces), 0)]
+    assert again.turns[0].harmonic_index == again.harmonic_index_before == once.turns[-1].harmonic_index
+    assert again.ended_by == NO_FLIPS
+
+
+def spoilt(best: Optimised, face: int) -> tuple[IntArray, NDArray[np.bool_]]:
+    """The mesh with one edge of this face flipped for the worse, and which two triangles those are."""
+    faces = best.faces.copy()
+    other = int(best.adjacency[face].max())
+    corner = best.adjacency[face].tolist().index(other)
+    f, p, q = np.roll(faces[face], -corner)
+    w = next(v for v in faces[other] if v not in (p, q))
+    faces[face], faces[other] = (f, p, w), (w, q, f)
+    return faces, np.isin(np.arange(len(faces)), (face, other))
+
+
+def test_among_limits_where_flips_begin() -> None:
+    points, faces = wandering(20, 20, 1, across=0.05, depth=0.05)
+    best = optimised(points, faces)
+    worse, here = spoilt(best, 150)
+    assert topology_counts(worse).nonmanifold_edges == 0
+    repaired = optimised(points, worse, among=here)
+    assert as_set(repaired.faces) == as_set(best.faces)
+    assert repaired.turns[0].tested_triangles == 2
+    elsewhere = ~here
+    elsewhere[best.adjacency[here].ravel()] = False
+    elsewhere[here] = False
+    assert optimised(points, worse, among=elsewhere).faces.tolist() == worse.tolist()
+
+
+def test_an_edge_that_exists_is_not_made() -> None:
+    # Each edge of a tetrahedron has its opposite edge in the mesh already.
+    corners = np.array([[0, 0, 0], [9, 0, 0], [0, 1, 0], [3, 1, 5]], dtype=np.float64)
+    tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
+    assert optimised(corners, tetrahedron).faces.tolist() == tetrahedron.tolist()
+    # Two triangles back to back.
+    pillow = np.array([[0, 1, 2], [0, 2, 1]], dtype=np.int32)
+    assert optimised(corners, pillow).faces.tolist() == pillow.tolist()
+
+
+def test_an_edge_that_exists_beyond_a_pinched_vertex_is_not_made() -> None:
+    # Edge 0-1 wants to become 2-3; far from it in the mesh, triangle 4 joins 2 and 3.
+    points = np.array([[-3, 0, 0], [3, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 9]], dtype=np.float64)
+    quad, beyond = [[2, 0, 1], [3, 1, 0]], [2, 3, 4]
+    alone = optimised(points, np.array(quad, dtype=np.int32))
+    assert alone.turns[0].flipped_edges == 1
+    assert topology_counts(optimised(points, np.array([*quad, beyond], dtype=np.int32)).faces).nonmanifold_edges == 0
+    assert optimised(points, np.array([*quad, beyond], dtype=np.int32)).turns[0].flipped_edges == 0
+    # Pinched at 2 alone, nothing is in the way.
+    elsewhere = np.array([*quad, [2, 5, 4]], dtype=np.int32)
+    assert optimised(np.concatenate([points, [[5, 5, 5]]]), elsewhere).turns[0].flipped_edges == 1
+
+
+def test_flat_triangles_are_flipped_away_and_leave_the_mean_alone() -> None:
+    points = np.array([[0, 0, 0], [2, 0, 0], [1, 0, 0], [1, -1, 0]], dtype=np.float64)
+    # Corner 2 lies on edge 0-1.
+    faces = np.array([[0, 1, 2], [1, 0, 3]], dtype=np.int32)
+    found = optimised(points, faces)
+    assert found.harmonic_index_before == pytest.approx(8)
+    assert as_set(found.faces) == {(0, 3, 2), (1, 2, 3)}
+    assert found.turns[-1].harmonic_index == pytest.approx(8)
+    only_flat = optimised(np.zeros((3, 3)), np.array([[0, 1, 2]], dtype=np.int32))
+    assert math.isnan(only_flat.harmonic_index_before)
+
+
+def test_the_mesh_is_the_same_for_any_number_of_threads() -> None:
+    points, offsets = joined(uneven(face_curves(60)))
+    faces = all_strips(points, offsets)
+    most = numba.get_num_threads()
+    try:
+        found = []
+        for threads in {1, most}:
+            numba.set_num_threads(threads)
+            found.append(optimised(points, faces))
+    finally:
+        numba.set_num_threads(most)
+    again = optimised(points, faces)
+    for each in found:
+        assert each.faces.tobytes() == again.faces.tobytes()
+        assert each.turns == again.turns
+
+
+def test_inputs_are_left_alone_and_adjacency_may_be_given() -> None:
+    points, faces = wandering(20, 20, 3)
+    across = neighbours(faces, vertex_count=len(points))
+    kept = points.copy(), faces.copy(), across.copy()
+    given, found = optimised(points, faces, adjacency=across), optimised(points, faces)
+    assert given.faces.tobytes() == found.faces.tobytes() != faces.tobytes()
+    for now, before in zip((points, faces, across), kept, strict=True):
+        np.testing.assert_array_equal(now, before)
+
+
+def test_no_face_is_no_fault() -> None:
+    found = optimised(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
+    assert found.faces.shape == (0, 3)
+    assert found.ended_by == NO_FLIPS
+    assert math.isnan(found.harmonic_index_before)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    points, faces = wandering(5, 5, 3)
+    with pytest.raises(ValueError, match="among: expected shape"):
+        optimised(points, faces, among=np.ones(3, dtype=np.bool_))
+    with pytest.raises(ValueError, match="adjacency: expected shape"):
+        optimised(points, faces, adjacency=np.zeros((3, 3), dtype=np.int32))
+    with pytest.raises(ValueError, match="angle from 0 to π"):
+        optimised(points, faces, gamma=4.0)
+    with pytest.raises(ValueError, match="same direction"):
+        optimised(points, np.concatenate([faces, faces[:1]]))

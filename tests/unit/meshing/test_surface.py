@@ -1,0 +1,121 @@
+"""The stages of meshing, one after the other, on a surface with a cliff."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from slrig.meshing.surface import FinishedMesh, MeshingLimits, finished_mesh
+from slrig.meshing.topology import topology_counts
+from slrig.model import FlipRule, FloatArray, IntArray
+
+EYE_MM = np.array([0.0, 0.0, -500.0])
+LIMITS = MeshingLimits(
+    widest_step_px=1.0,
+    depth_edge_ratio=6.0,
+    keep_holes=False,
+    flip_rule=FlipRule.CONSTRAINED,
+    smooth_boundary=True,
+)
+
+
+def jagged_curves(*, cliff_mm: float = 0.0, curves: int = 60, points: int = 80) -> tuple[FloatArray, IntArray]:
+    """Curves running down at unit distance, their ends uneven; right of the middle the surface lies deeper."""
+    random = np.random.default_rng(3)
+    parts = []
+    for c in range(curves):
+        first, last = random.integers(0, 4), points - random.integers(0, 4)
+        y = np.arange(first, last) + random.uniform(-0.3, 0.3, last - first)
+        z = 0.02 * (c - 30) ** 2 + 0.4 * np.sin(y / 6) + (cliff_mm if c >= curves // 2 else 0.0)
+        parts.append(np.stack([np.full(len(y), float(c)), y, z], axis=1))
+    offsets = np.cumsum([0, *map(len, parts)]).astype(np.int32)
+    return np.concatenate(parts), offsets
+
+
+def meshed(points: FloatArray, offsets: IntArray, limits: MeshingLimits = LIMITS) -> tuple[FinishedMesh, list[str]]:
+    told: list[str] = []
+    made = finished_mesh(
+        points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=bool), np.ones(len(points)), EYE_MM,
+        limits, entered=told.append,
+    )  # fmt: skip
+    return made, told
+
+
+def test_every_stage_is_told_and_counted_in_the_order_of_the_paper() -> None:
+    made, told = meshed(*jagged_curves())
+    names = [
+        "initial meshing",
+        "global optimisation",
+        "shrinking boundary",
+        "smoothing boundary",
+        "optimising boundary",
+    ]
+    assert [stage.name for stage in made.stages] == names
+    assert told == [*names, "vertex normals"]
+    assert made.stages[0].triangles == made.initial.strip_triangles - made.initial.dropped_triangles
+    # Flips keep the number of triangles and the boundary; the last stage is what is returned.
+    assert made.stages[0].triangles == made.stages[1].triangles
+    assert made.stages[0].boundary_points == made.stages[1].boundary_points
+    assert made.stages[-1].triangles == len(made.faces)
+    assert made.stages[-1].boundary_points == topology_counts(made.faces).boundary_vertices
+
+
+def test_smoothing_leaves_a_shorter_boundary_and_a_sound_mesh() -> None:
+    made, _ = meshed(*jagged_curves())
+    counts = topology_counts(made.faces)
+    assert (counts.nonmanifold_edges, counts.misoriented_edges, counts.duplicate_faces) == (0, 0, 0)
+    assert made.stages[-1].boundary_points < made.stages[0].boundary_points
+    assert made.smoothed is not None
+    assert made.smoothed.added.any()
+
+
+def test_a_cliff_stays_open() -> None:
+    points, offsets = jagged_curves(cliff_mm=40.0)
+    made, _ = meshed(points, offsets)
+    side = points[made.faces, 0] >= 30
+    assert (side.all(axis=1) | ~side.any(axis=1)).all()
+    assert topology_counts(made.faces).components == 2
+
+
+def test_the_boundary_is_left_alone_when_asked() -> None:
+    made, told = meshed(*jagged_curves(), replace(LIMITS, smooth_boundary=False))
+    assert [stage.name for stage in made.stages] == ["initial meshing", "global optimisation"]
+    assert made.shrunk is None
+    assert made.smoothed is None
+    assert made.boundary_optimised is None
+    assert "shrinking boundary" not in told
+    np.testing.assert_array_equal(made.faces, made.optimised.faces)
+
+
+def test_a_hole_at_a_bridge_stays_open_when_holes_are_kept() -> None:
+    points, offsets = jagged_curves()
+    bridge = np.zeros(len(points), dtype=bool)
+    # One point is missing from four neighbouring curves, and each knows that it was bridged there.
+    gaps = [int(offsets[c]) + 40 for c in range(20, 24)]
+    bridge[[gap - 1 for gap in gaps]] = True
+    keep = np.ones(len(points), dtype=bool)
+    keep[gaps] = False
+    shorter = (offsets - np.searchsorted(np.array(gaps), offsets)).astype(np.int32)
+    holes = {}
+    for keep_holes in (True, False):
+        made = finished_mesh(
+            points[keep], shorter, np.arange(len(offsets) - 1.0), bridge[keep], np.ones(int(keep.sum())), EYE_MM,
+            replace(LIMITS, keep_holes=keep_holes), entered=lambda _: None,
+        )  # fmt: skip
+        holes[keep_holes] = 1 - topology_counts(made.faces).euler_characteristic
+    assert holes == {True: 1, False: 0}
+
+
+def test_the_unconstrained_rule_can_be_chosen() -> None:
+    random = np.random.default_rng(5)
+    points, offsets = jagged_curves()
+    rough = points + random.normal(0, 0.4, points.shape)
+    constrained, _ = meshed(rough, offsets)
+    delaunay, _ = meshed(rough, offsets, replace(LIMITS, flip_rule=FlipRule.DELAUNAY))
+    assert not np.array_equal(constrained.optimised.faces, delaunay.optimised.faces)
+
+
+def test_nothing_makes_an_empty_mesh() -> None:
+    made, _ = meshed(np.zeros((0, 3)), np.zeros(1, dtype=np.int32))
+    assert len(made.faces) == 0
