@@ -4,25 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
-from slrig.model import FloatArray, IntArray, Refusal
+from slrig.errors import PatternError
+from slrig.model import FloatArray, IntArray, Pattern, Refusal
+from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
-from slrig.reconstruction.edges import EdgeLimits, dense_position, has_phase, near_edges
-from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.identification import identify
+from slrig.reconstruction.edges import EdgeLimits, near_edges
+from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from slrig.reconstruction.identification import identify, with_refused_points
 from slrig.reconstruction.linking import StripeEnsemble, link
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from slrig.reconstruction.phase import has_phase, position_map, refined
 from slrig.reconstruction.stripes import (
+    LinePoints,
     StripeLimits,
-    Stripes,
-    joined,
-    locate_edges,
-    locate_stripes,
+    chained,
+    edge_points,
     measured_sigma_px,
     normalised,
+    stripe_points,
 )
 
 _FINEST_SCALE_PX = 1.0
@@ -43,16 +48,27 @@ class CodeTables:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """All thresholds of a camera's reconstruction."""
+    """All thresholds of a camera's reconstruction.
+
+    largest_disagreement_px : where the stripes of one frame lie further than this from where all frames together put
+    them, the light changed from frame to frame, and each stripe stands as its own frame shows it.
+    camera_blur_px : standard deviation of the camera's own blur: a lens in focus, half a pixel, and the pixel's own
+    square, 1/12 px² of variance.
+    """
 
     decoding: DecodingLimits = field(default_factory=DecodingLimits)
     stripes: StripeLimits = field(default_factory=StripeLimits)
     edges: EdgeLimits = field(default_factory=EdgeLimits)
+    largest_disagreement_px: float = 0.03
+    camera_blur_px: float = 0.58
 
 
 @dataclass(frozen=True, slots=True)
 class CameraCurves:
-    """What one camera gives. refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking."""
+    """What one camera gives. refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking.
+
+    refined : the points are those of `phase.refined`; disagreement_px : see there, empty where there was no phase.
+    """
 
     ensemble: StripeEnsemble
     refusal: NDArray[np.uint8]
@@ -61,65 +77,187 @@ class CameraCurves:
     decoded_pixels: int
     stripe_points: int
     stripe_count: int
+    refined: bool
+    disagreement_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Coded:
+    """What white, black and code frames tell of every pixel."""
+
+    frames: AxisFrames
+    noise: NoiseModel
+    code: CodeMap
+
+    @property
+    def unlit(self) -> NDArray[np.bool_]:
+        return np.asarray(self.code.refusal == Refusal.NOT_LIT)
+
+
+class CameraStream:
+    """The reconstruction of one camera and axis, fed frame by frame.
+
+    What a frame allows is done when it comes: the code is read once its last frame is in, stripes are located in each
+    line frame once the code is known, and the rest waits for `finish`. Frames may come in any order, with the same
+    result to the bit.
+
+    entered : told the name of each stage as it begins.
+    """
+
+    def __init__(
+        self, stacks: FrameStacks, tables: CodeTables, limits: Limits, /, *, entered: Callable[[str], None]
+    ) -> None:
+        self._stacks = stacks
+        self._tables = tables
+        self._limits = limits
+        self._entered = entered
+        self._coded: _Coded | None = None
+        self._scales: _Scales | None = None
+        self._points: list[LinePoints] = []
+
+    def take(self, pattern: Pattern, image: NDArray[Any]) -> None:
+        """Take the (H, W) image of a pattern. Repeats of one pattern come as their mean."""
+        self._stacks.put(pattern, image)
+        self._go_on()
+
+    def finish(self) -> tuple[CameraCurves, AxisFrames]:
+        """The curves, and the frames that they were found in.
+
+        Raises
+        ------
+        PatternError
+            Frames are missing.
+        """
+        coded = self._go_on()
+        if coded is None or self._scales is None or self._stacks.missing:
+            missing = sorted(map(repr, self._stacks.missing))
+            message = f"{len(missing)} of the frames announced did not come: {'; '.join(missing)}; capture them again"
+            raise PatternError(message)
+        return _curves(coded, self._points, self._scales, self._tables, self._limits, self._entered), coded.frames
+
+    def _go_on(self) -> _Coded | None:
+        """Do what the frames so far allow."""
+        if self._coded is None and self._stacks.coded:
+            self._coded = self._decoded(self._stacks.frames())
+        if self._coded is not None:
+            self._locate(self._coded)
+        return self._coded
+
+    def _decoded(self, frames: AxisFrames) -> _Coded:
+        self._entered("decode")
+        noise = estimate_noise(frames)
+        tables = self._tables
+        code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding)
+        return _Coded(frames, noise, code)
+
+    def _locate(self, coded: _Coded) -> None:
+        if self._scales is None and not self._stacks.patterns.lines:
+            self._entered("locate stripes")
+            scale_px = self._limits.stripes.sigma_px or _FINEST_SCALE_PX
+            self._scales = _Scales(scale_px, _FINEST_SCALE_PX)
+            self._points = _edge_points(coded, self._limits.stripes, scale_px)
+        # By shift, whatever came first: the first one's stripes tell the scale for all.
+        for pattern in self._stacks.patterns.lines[len(self._points) :]:
+            if not self._stacks.has(pattern):
+                return
+            self._entered("locate stripes")
+            image, deviation = _normalised_line(coded, len(self._points))
+            lit = ~coded.unlit
+            if self._scales is None:
+                blur_px = measured_sigma_px(image, deviation, lit)
+                self._scales = _Scales(self._limits.stripes.sigma_px or _matched_scale_px(blur_px), blur_px)
+            scale_px = self._scales.filter_px
+            self._points.append(stripe_points(image, deviation, lit, self._limits.stripes, sigma_px=scale_px))
 
 
 def camera_curves(
     frames: AxisFrames, tables: CodeTables, limits: Limits, /, *, entered: Callable[[str], None]
 ) -> CameraCurves:
     """Reconstruct the curves of one camera. `entered` is told the name of each stage as it begins."""
-    entered("decode")
-    noise = estimate_noise(frames)
-    code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits.decoding)
-    entered("locate stripes")
-    lit = code.refusal != Refusal.NOT_LIT
-    stripes, scale_px, blur_px = (
-        _line_stripes(frames, noise, lit, limits.stripes)
-        if len(frames.lines)
-        else _edge_stripes(frames, noise, lit, limits.stripes)
-    )
+    stream = CameraStream(FrameStacks.of(frames), tables, limits, entered=entered)
+    return stream.finish()[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _Scales:
+    """Scale of the filter that points were found with, and the blur that the stripes' width tells, px."""
+
+    filter_px: float
+    blur_px: float
+
+
+def _curves(
+    coded: _Coded,
+    found: list[LinePoints],
+    scales: _Scales,
+    tables: CodeTables,
+    limits: Limits,
+    entered: Callable[[str], None],
+) -> CameraCurves:
+    """What is left when all points are found: refine, number and link them."""
+    frames, noise, code = coded.frames, coded.noise, coded.code
+    points = found
+    entered("refine stripes")
+    seen = position_map(frames, noise, code, tables.cell_position)
+    disagreement_px = np.zeros(0)
+    phase = has_phase(frames)
+    if phase:
+        seen = at_pixel_centres(seen, frames.contrast, limits.camera_blur_px)
+    resolution_px = 0.0 if phase else float(frames.gray.cell_px)
+    near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges)
+    if phase:
+        usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
+        refinement = refined(points, seen, usable, code, tables.position_of)
+        disagreement_px = refinement.disagreement_px
+        phase = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)
+    if phase:
+        points = refinement.points
+        code = with_refused_points(code, found, frames, tables.position_of, near_shadow, near_step)
+    else:
+        # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
+        near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))
     entered("identify stripes")
-    near_shadow, near_step = _borders(frames, code, tables, limits.edges, blur_px)
-    coded, refusal = identify(
+    stripes = chained(points, code.refusal.shape)
+    numbered, refusal = identify(
         stripes, code, tables.position_of, near_shadow, near_step, shortest_points=limits.stripes.shortest_points
     )
     entered("link stripes")
     return CameraCurves(
-        ensemble=link(coded),
+        ensemble=link(numbered),
         refusal=refusal,
         noise=noise,
-        scale_px=scale_px,
-        decoded_pixels=int((code.refusal == Refusal.NONE).sum()),
+        scale_px=scales.filter_px,
+        decoded_pixels=int((coded.code.refusal == Refusal.NONE).sum()),
         stripe_points=len(stripes.points_px),
-        stripe_count=len(coded.stripes),
+        stripe_count=len(numbered.stripes),
+        refined=phase,
+        disagreement_px=disagreement_px,
     )
 
 
-def _borders(
-    frames: AxisFrames, code: CodeMap, tables: CodeTables, limits: EdgeLimits, blur_px: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    position = dense_position(frames, code, tables.cell_position)
-    resolution_px = 0.0 if has_phase(frames) else float(frames.gray.cell_px)
-    return near_edges(position, code.refusal == Refusal.NOT_LIT, resolution_px, limits, blur_px=blur_px)
+def _normalised_line(coded: _Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Line frame `index` relative to white, and its noise."""
+    frames, noise = coded.frames, coded.noise
+    deviation = _line_noise_kernel(
+        frames.lines[index], frames.white, frames.black, noise.read_variance, noise.slope, frames.ends_repeats
+    )
+    return normalised(frames.lines[index], frames.black, frames.contrast, deviation)
 
 
-def _line_stripes(
-    frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
-) -> tuple[Stripes, float, float]:
-    """Stripes, the scale that they were found at, and the blur that their width tells."""
-    contrast = frames.contrast
-    white_variance, black_variance = (noise.variance(end) / frames.ends_repeats for end in (frames.white, frames.black))
-    scale_px = blur_px = 0.0
-    parts = []
-    for index, line in enumerate(frames.lines):
-        # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
-        light = np.clip((line - frames.black) / np.maximum(contrast, 1), 0, 1)
-        variance = noise.variance(line) + (1 - light) ** 2 * black_variance + light**2 * white_variance
-        image, deviation = normalised(line, frames.black, contrast, np.sqrt(variance))
-        if index == 0:
-            blur_px = measured_sigma_px(image, deviation, lit)
-            scale_px = limits.sigma_px or _matched_scale_px(blur_px)
-        parts.append(locate_stripes(image, deviation, lit, index, limits, sigma_px=scale_px))
-    return joined(parts), scale_px, blur_px
+@njit(cache=True, nogil=True, parallel=True)
+def _line_noise_kernel(line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float) -> Any:
+    """(H, W) float32: standard deviation of a line frame less black, with the noise of white and black counted."""
+    out = np.zeros(line.shape, dtype=np.float32)
+    for y in prange(line.shape[0]):
+        for x in range(line.shape[1]):
+            # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
+            light = (line[y, x] - black[y, x]) / max(white[y, x] - black[y, x], np.float32(1))
+            light = min(max(light, np.float32(0)), np.float32(1))
+            of_white = (read + slope * max(white[y, x], np.float32(0))) / ends_repeats
+            of_black = (read + slope * max(black[y, x], np.float32(0))) / ends_repeats
+            own = read + slope * max(line[y, x], np.float32(0))
+            out[y, x] = np.sqrt(own + (1 - light) ** 2 * of_black + light**2 * of_white)
+    return out
 
 
 def _matched_scale_px(stripe_sigma_px: float) -> float:
@@ -132,12 +270,10 @@ def _matched_scale_px(stripe_sigma_px: float) -> float:
     return float(np.clip(max(stripe_sigma_px, more), _FINEST_SCALE_PX, _COARSEST_SCALE_PX))
 
 
-def _edge_stripes(
-    frames: AxisFrames, noise: NoiseModel, lit: NDArray[np.bool_], limits: StripeLimits
-) -> tuple[Stripes, float, float]:
-    """Code edges, the scale that they were found at, and no more blur than that."""
-    scale_px = limits.sigma_px or _FINEST_SCALE_PX
-    contrast = frames.contrast
+def _edge_points(coded: _Coded, limits: StripeLimits, scale_px: float) -> list[LinePoints]:
+    """Points of each code bit's edges."""
+    frames, noise = coded.frames, coded.noise
+    contrast, lit = frames.contrast, ~coded.unlit
     none = np.zeros_like(contrast)
     ends_variance = (noise.variance(frames.white) + noise.variance(frames.black)) / frames.ends_repeats
     parts = []
@@ -150,5 +286,5 @@ def _edge_stripes(
             swing = 2 * bit - frames.white - frames.black
             variance = 4 * noise.variance(bit) + ends_variance
         image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
-        parts.append(locate_edges(image, deviation, lit, index, limits, sigma_px=scale_px))
-    return joined(parts), scale_px, _FINEST_SCALE_PX
+        parts.append(edge_points(image, deviation, lit, limits, sigma_px=scale_px))
+    return parts

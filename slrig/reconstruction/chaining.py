@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, IntArray
@@ -19,6 +19,11 @@ _SHARPEST_TURN = np.pi / 3
 _SAME_LINE_ANGLE = np.pi / 6
 _SAME_LINE_PX = 0.8
 _LONGEST_STEP_PX = 2.2
+_STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+_STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+_SHARPEST_ALIGNED = np.cos(_SHARPEST_TURN)
+_SAME_LINE_ALIGNED = np.cos(_SAME_LINE_ANGLE)
+_HALF_OCTANT = np.tan(np.pi / 8)
 
 
 def chain(
@@ -34,107 +39,192 @@ def chain(
     strong : (n,) bool, points at which a chain may start; shape : (rows, columns) of the image.
     Returns order, the indices of the points chain by chain, and offsets (chains + 1,). A chain has two points or more.
     """
-    at = np.full(shape, -1, dtype=np.int32)
-    columns = np.clip(np.rint(points_px[:, 0]).astype(np.int32), 0, shape[1] - 1)
-    rows = np.clip(np.rint(points_px[:, 1]).astype(np.int32), 0, shape[0] - 1)
-    by_strength = np.argsort(-strength, kind="stable").astype(np.int32)
-    # Where two points fall into one pixel the stronger is kept.
-    at[rows[by_strength[::-1]], columns[by_strength[::-1]]] = by_strength[::-1]
-    order, offsets = _chain_kernel(at, points_px, normals, columns, rows, strong, by_strength)
+    order, offsets, _ = chain_frames(points_px, normals, strength, strong, np.array([0, len(points_px)]), shape)
     return order, offsets
 
 
-@njit(cache=True, nogil=True)
-def _chain_kernel(at: Any, points: Any, normals: Any, columns: Any, rows: Any, strong: Any, by_strength: Any) -> Any:
-    count = len(points)
-    used = np.zeros(count, dtype=np.bool_)
-    order = np.zeros(count, dtype=np.int32)
-    offsets = np.zeros(count + 1, dtype=np.int32)
-    ahead = np.zeros(count, dtype=np.int32)
-    behind = np.zeros(count, dtype=np.int32)
-    filled = 0
-    chains = 0
-    for start in by_strength:
-        if used[start] or not strong[start] or at[rows[start], columns[start]] != start:
-            continue
-        used[start] = True
-        forward = _trace(start, 1.0, at, points, normals, columns, rows, used, ahead)
-        backward = _trace(start, -1.0, at, points, normals, columns, rows, used, behind)
-        if forward + backward == 0:
-            continue
-        for k in range(backward - 1, -1, -1):
-            order[filled] = behind[k]
-            filled += 1
-        order[filled] = start
-        filled += 1
-        for k in range(forward):
-            order[filled] = ahead[k]
-            filled += 1
-        chains += 1
-        offsets[chains] = filled
-    return order[:filled].copy(), offsets[: chains + 1].copy()
+def chain_frames(
+    points_px: FloatArray,
+    normals: FloatArray,
+    strength: FloatArray,
+    strong: NDArray[np.bool_],
+    borders: NDArray[np.int64],
+    shape: tuple[int, int],
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Link the points of several frames, each by itself: frame k holds the points borders[k]:borders[k + 1].
+
+    The other arguments are as for `chain`. Returns order and offsets as `chain` does, frame by frame, and the frame of
+    each chain (chains,).
+    """
+    # Positive numbers sort as their bits do; complemented, from the largest to the smallest.
+    by_strength = _order_kernel(~strength.astype(np.float32).view(np.uint32), borders)
+    placed = np.concatenate([points_px, normals], axis=1)
+    order, ends, filled, chains = _chain_kernel(placed, strong, by_strength, borders, shape)
+    none = np.zeros(0, dtype=np.int32)
+    parts = list(zip(borders, filled, chains, strict=False))
+    lengths = np.concatenate([none, *(np.diff(ends[a : a + count], prepend=0) for a, _, count in parts)])
+    return (
+        np.concatenate([none, *(order[a : a + count] for a, count, _ in parts)]),
+        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
+        np.repeat(np.arange(len(chains), dtype=np.int32), chains),
+    )
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _order_kernel(keys: Any, borders: Any) -> Any:
+    """(n,) int32: for each frame the order of its rising keys, ties by index (radix sort, eleven bits at a time)."""
+    order = np.zeros(len(keys), dtype=np.int32)
+    for frame in prange(len(borders) - 1):
+        first, last = borders[frame], borders[frame + 1]
+        now = np.arange(last - first).astype(np.int32)
+        following = np.zeros(last - first, dtype=np.int32)
+        for shift in (0, 11, 22):
+            place = np.zeros(2049, dtype=np.int64)
+            for i in range(first, last):
+                place[((keys[i] >> shift) & 2047) + 1] += 1
+            for digit in range(2048):
+                place[digit + 1] += place[digit]
+            for k in now:
+                digit = (keys[first + k] >> shift) & 2047
+                following[place[digit]] = k
+                place[digit] += 1
+            now, following = following, now
+        order[first:last] = now
+    return order
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _chain_kernel(placed: Any, strong: Any, by_strength: Any, borders: Any, shape: Any) -> Any:
+    """Chain each frame into its own part of the results.
+
+    placed : (n, 4) x, y and normal of each point. Returns order, the ends of the chains within each frame's part, and
+    how much of either each frame has filled.
+    """
+    frames = len(borders) - 1
+    order = np.zeros(len(placed), dtype=np.int32)
+    ends = np.zeros(len(placed), dtype=np.int32)
+    filled = np.zeros(frames, dtype=np.int64)
+    chains = np.zeros(frames, dtype=np.int64)
+    for frame in prange(frames):
+        first, last = borders[frame], borders[frame + 1]
+        # at : one more than the point that a pixel holds and no chain has used; 0 for none.
+        at = np.zeros(shape, dtype=np.int32)
+        for k in range(first, last):
+            i = first + by_strength[k]
+            row, column = _pixel(placed, i, shape)
+            # Where two points fall into one pixel the stronger is kept.
+            if at[row, column] == 0:
+                at[row, column] = i + 1
+        ahead = np.zeros(last - first, dtype=np.int32)
+        behind = np.zeros(last - first, dtype=np.int32)
+        place = first
+        for k in range(first, last):
+            start = first + by_strength[k]
+            row, column = _pixel(placed, start, shape)
+            if not strong[start] or at[row, column] != start + 1:
+                continue
+            at[row, column] = 0
+            forward = _trace(start, 1.0, at, placed, ahead)
+            backward = _trace(start, -1.0, at, placed, behind)
+            if forward + backward == 0:
+                continue
+            for j in range(backward - 1, -1, -1):
+                order[place] = behind[j]
+                place += 1
+            order[place] = start
+            place += 1
+            for j in range(forward):
+                order[place] = ahead[j]
+                place += 1
+            ends[first + chains[frame]] = place - first
+            chains[frame] += 1
+        filled[frame] = place - first
+    return order, ends, filled, chains
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _pixel(placed: Any, i: int, shape: Any) -> Any:
+    column = min(max(int(np.rint(placed[i, 0])), 0), shape[1] - 1)
+    row = min(max(int(np.rint(placed[i, 1])), 0), shape[0] - 1)
+    return row, column
 
 
 @njit(cache=True, nogil=True)
-def _trace(
-    start: int, sign: float, at: Any, points: Any, normals: Any, columns: Any, rows: Any, used: Any, out: Any
-) -> int:
+def _trace(start: int, sign: float, at: Any, placed: Any, out: Any) -> int:
     height, width = at.shape
-    step_x = np.array([1, 1, 0, -1, -1, -1, 0, 1])
-    step_y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
     current = start
-    heading_x, heading_y = -sign * normals[start, 1], sign * normals[start, 0]
+    heading_x, heading_y = -sign * placed[start, 3], sign * placed[start, 2]
     count = 0
     while True:
-        octant = int(np.rint(np.arctan2(heading_y, heading_x) / (np.pi / 4)))
-        column, row = columns[current], rows[current]
+        octant = _octant(heading_x, heading_y)
+        row, column = _pixel(placed, current, at.shape)
         for side in (2, -2):
             k = (octant + side) % 8
-            _use_double(current, row + step_y[k], column + step_x[k], at, points, normals, used)
+            _use_double(current, row + _STEP_Y[k], column + _STEP_X[k], at, placed)
         best = -1
-        best_cost = np.inf
+        best_cost = np.nan
+        best_distance = 0.0
         for turn in (0, -1, 1):
             k = (octant + turn) % 8
-            y, x = row + step_y[k], column + step_x[k]
+            y, x = row + _STEP_Y[k], column + _STEP_X[k]
             if y < 0 or x < 0 or y >= height or x >= width:
                 continue
-            other = at[y, x]
-            if other < 0 or used[other]:
+            other = at[y, x] - 1
+            if other < 0:
                 continue
-            dx, dy = points[other, 0] - points[current, 0], points[other, 1] - points[current, 1]
+            dx, dy = placed[other, 0] - placed[current, 0], placed[other, 1] - placed[current, 1]
             distance = np.sqrt(dx * dx + dy * dy)
-            angle = _angle_between(normals, current, other)
-            if distance > _LONGEST_STEP_PX or angle > _SHARPEST_TURN or dx * heading_x + dy * heading_y <= 0:
+            aligned = _alignment(placed, current, other)
+            if distance > _LONGEST_STEP_PX or aligned < _SHARPEST_ALIGNED or dx * heading_x + dy * heading_y <= 0:
                 continue
-            if distance + angle < best_cost:
-                best_cost = distance + angle
-                best = other
+            if best < 0:
+                best, best_distance = other, distance
+                continue
+            # Two ways to go on: now the angles themselves are needed.
+            if np.isnan(best_cost):
+                best_cost = best_distance + np.arccos(_alignment(placed, current, best))
+            cost = distance + np.arccos(aligned)
+            if cost < best_cost:
+                best, best_cost = other, cost
         if best < 0:
             return count
-        used[best] = True
+        row, column = _pixel(placed, best, at.shape)
+        at[row, column] = 0
         out[count] = best
         count += 1
-        tangent_x, tangent_y = -normals[best, 1], normals[best, 0]
+        tangent_x, tangent_y = -placed[best, 3], placed[best, 2]
         if tangent_x * heading_x + tangent_y * heading_y < 0:
             tangent_x, tangent_y = -tangent_x, -tangent_y
         heading_x, heading_y = tangent_x, tangent_y
         current = best
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _octant(x: float, y: float) -> int:
+    """The direction in eighths of a turn, rounded: 0 along x, 2 along y."""
+    if abs(y) <= _HALF_OCTANT * abs(x):
+        return 0 if x > 0 else 4
+    if abs(x) <= _HALF_OCTANT * abs(y):
+        return 2 if y > 0 else 6
+    if x > 0:
+        return 1 if y > 0 else 7
+    return 3 if y > 0 else 5
+
+
 @njit(cache=True, nogil=True)
-def _use_double(current: int, row: int, column: int, at: Any, points: Any, normals: Any, used: Any) -> None:
+def _use_double(current: int, row: int, column: int, at: Any, placed: Any) -> None:
     if row < 0 or column < 0 or row >= at.shape[0] or column >= at.shape[1]:
         return
-    other = at[row, column]
-    if other < 0 or used[other]:
+    other = at[row, column] - 1
+    if other < 0:
         return
-    dx, dy = points[other, 0] - points[current, 0], points[other, 1] - points[current, 1]
-    across = abs(dx * normals[current, 0] + dy * normals[current, 1])
-    if across < _SAME_LINE_PX and _angle_between(normals, current, other) < _SAME_LINE_ANGLE:
-        used[other] = True
+    dx, dy = placed[other, 0] - placed[current, 0], placed[other, 1] - placed[current, 1]
+    across = abs(dx * placed[current, 2] + dy * placed[current, 3])
+    if across < _SAME_LINE_PX and _alignment(placed, current, other) > _SAME_LINE_ALIGNED:
+        at[row, column] = 0
 
 
-@njit(cache=True, nogil=True)
-def _angle_between(normals: Any, a: int, b: int) -> float:
-    dot = abs(normals[a, 0] * normals[b, 0] + normals[a, 1] * normals[b, 1])
-    return float(np.arccos(min(1.0, dot)))
+@njit(cache=True, nogil=True, inline="always")
+def _alignment(placed: Any, a: int, b: int) -> float:
+    """Cosine of the angle between two points' lines."""
+    return float(min(1.0, abs(placed[a, 2] * placed[b, 2] + placed[a, 3] * placed[b, 3])))

@@ -7,8 +7,9 @@ exposure at which nothing it showed was clipped, and values are scaled to the lo
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,16 +54,35 @@ class AxisFrames:
         return self.white - self.black
 
 
-def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
-    """Sort the frames of one camera for decoding along one axis.
+@dataclass(frozen=True, slots=True)
+class AxisPatterns:
+    """What one camera is shown along one axis, in the order in which decoding wants it.
+
+    gray : the code, as its first bit; direct, inverted : the bits shown so; lines : by shift; ends : White and Black as
+    far as they are shown.
+    """
+
+    gray: Gray
+    direct: frozenset[int]
+    inverted: frozenset[int]
+    lines: tuple[LineShift, ...]
+    ends: frozenset[White | Black]
+
+    @property
+    def paired(self) -> bool:
+        """Whether every bit comes with its inverse."""
+        return len(self.direct) == len(self.inverted) == self.gray.bits
+
+
+def axis_patterns(shown: Collection[Pattern], camera: str, axis: Axis) -> AxisPatterns:
+    """Sort the patterns that one camera is shown, as far as one axis needs them.
 
     Raises
     ------
     PatternError
         Bits are missing or of two codes, or there is neither a white-black pair nor inverses to threshold with.
     """
-    images, exposure_ratio = _fused_images(capture, camera)
-    grays = [p for p in images if isinstance(p, Gray) and p.axis is axis]
+    grays = [p for p in shown if isinstance(p, Gray) and p.axis is axis]
     if not grays:
         message = (
             f"camera '{camera}' has no Gray-code frames of the {axis.value} axis; a scan needs them to number lines"
@@ -76,74 +96,186 @@ def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
         )
         raise PatternError(message)
     first = grays[0]
-    direct = {p.bit: images[p] for p in grays if not p.inverted}
-    inverse = {p.bit: images[p] for p in grays if p.inverted}
-    missing = [b for b in range(first.bits) if b not in direct and b not in inverse]
+    direct = frozenset(p.bit for p in grays if not p.inverted)
+    inverted = frozenset(p.bit for p in grays if p.inverted)
+    missing = [b for b in range(first.bits) if b not in direct | inverted]
     if missing:
         message = (
             f"camera '{camera}', {axis.value} axis: bits {missing} of {first.bits} have no frame; "
             "shoot them again or lower the number of bits"
         )
         raise PatternError(message)
-    white, black = _white_and_black(images, direct, inverse, camera)
-    paired = all(b in direct and b in inverse for b in range(first.bits))
-    bits = np.stack([direct[b] if b in direct else white + black - inverse[b] for b in range(first.bits)])
-    line_patterns = tuple(
-        sorted((p for p in images if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift)
-    )
-    if len({(p.period_px, p.line_width_px) for p in line_patterns}) > 1:
-        message = f"camera '{camera}' has line-shift frames of two periods or widths on the {axis.value} axis; keep one"
-        raise PatternError(message)
-    lines = (
-        np.stack([images[p] for p in line_patterns]) if line_patterns else np.zeros((0, *white.shape), dtype=np.float32)
-    )
-    return AxisFrames(
-        axis=axis,
-        white=white,
-        black=black,
-        bits=bits,
-        inverses=np.stack([inverse[b] for b in range(first.bits)]) if paired else None,
-        gray=Gray(axis, 0, first.bits, first.cell_px, first.offset_px),
-        lines=lines,
-        line_patterns=line_patterns,
-        full_scale=float(capture.cameras[camera].full_scale),
-        exposure_ratio=exposure_ratio,
-        ends_repeats=_ends_repeats(capture, camera, axis),
-    )
-
-
-def _ends_repeats(capture: Capture, camera: str, axis: Axis) -> float:
-    counts = Counter(capture.patterns[shot.pattern] for shot in capture.shots if shot.camera == camera)
-    others = [n for p, n in counts.items() if isinstance(p, Gray | LineShift) and p.axis is axis]
-    return max(1.0, min(counts[White()], counts[Black()]) / max(others))
-
-
-def _white_and_black(
-    images: Mapping[Pattern, Image], direct: Mapping[int, Image], inverse: Mapping[int, Image], camera: str
-) -> tuple[Image, Image]:
-    white, black = images.get(White()), images.get(Black())
-    if white is not None and black is not None:
-        return white, black
-    pairs = [b for b in direct if b in inverse]
-    if not pairs:
+    ends = frozenset(p for p in shown if isinstance(p, White | Black))
+    if len(ends) < 2 and not direct & inverted:
         message = (
             f"camera '{camera}' has no white and black frames and no bit with its inverse: "
             "nothing tells lit from dark; add a white and a black frame, or inverses"
         )
         raise PatternError(message)
-    bright = np.max([np.maximum(direct[b], inverse[b]) for b in pairs], axis=0)
-    dark = np.min([np.minimum(direct[b], inverse[b]) for b in pairs], axis=0)
-    return (bright if white is None else white), (dark if black is None else black)
+    lines = tuple(sorted((p for p in shown if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift))
+    if len({(p.period_px, p.line_width_px) for p in lines}) > 1:
+        message = f"camera '{camera}' has line-shift frames of two periods or widths on the {axis.value} axis; keep one"
+        raise PatternError(message)
+    return AxisPatterns(Gray(axis, 0, first.bits, first.cell_px, first.offset_px), direct, inverted, lines, ends)
 
 
-def _fused_images(capture: Capture, camera: str) -> tuple[dict[Pattern, Image], float]:
+def telling(shown: Sequence[Pattern], exposures_s: Sequence[float | None]) -> list[bool]:
+    """Which of a camera's frames are reconstructed from; the others prove only that nothing has changed.
+
+    shown, exposures_s : pattern and exposure of each frame, in the order of the sequence.
+    Where every code and line pattern is shown once, the white and black frames before the first of them tell, so that
+    each frame can be used as it comes; those that close the sequence do not. Where patterns are repeated or bracketed,
+    or nothing opens the sequence, all do.
+    """
+    bodies = [i for i, p in enumerate(shown) if isinstance(p, Gray | LineShift)]
+    once = len({shown[i] for i in bodies}) == len(bodies) and len(set(exposures_s)) <= 1
+    if not (once and bodies and {White(), Black()} <= set(shown[: bodies[0]])):
+        return [True] * len(shown)
+    return [i < bodies[0] or not isinstance(p, White | Black) for i, p in enumerate(shown)]
+
+
+class FrameStacks:
+    """The frames of one camera and axis while they come, each put where decoding wants it.
+
+    shape : (rows, columns) of the images; ends_repeats : as in `AxisFrames`.
+    """
+
+    def __init__(
+        self,
+        patterns: AxisPatterns,
+        shape: tuple[int, int],
+        *,
+        full_scale: float,
+        exposure_ratio: float = 1.0,
+        ends_repeats: float = 1.0,
+    ) -> None:
+        self.patterns = patterns
+        self._scales = {
+            "full_scale": full_scale, "exposure_ratio": exposure_ratio, "ends_repeats": ends_repeats
+        }  # fmt: skip
+        bits = patterns.gray.bits
+        self._bits = np.zeros((bits, *shape), dtype=np.float32)
+        self._inverses = np.zeros((bits if patterns.inverted else 0, *shape), dtype=np.float32)
+        self._lines = np.zeros((len(patterns.lines), *shape), dtype=np.float32)
+        self._ends: dict[Pattern, Image] = {}
+        self._missing: set[Pattern] = {
+            *patterns.ends,
+            *(replace(patterns.gray, bit=bit) for bit in patterns.direct),
+            *(replace(patterns.gray, bit=bit, inverted=True) for bit in patterns.inverted),
+            *patterns.lines,
+        }
+
+    @classmethod
+    def of(cls, frames: AxisFrames) -> FrameStacks:
+        """The stacks of frames that are all in."""
+        bits = frozenset(range(frames.gray.bits))
+        stacks = cls(
+            AxisPatterns(
+                frames.gray, bits, bits if frames.inverses is not None else frozenset(), frames.line_patterns,
+                frozenset((White(), Black())),
+            ),
+            (0, 0), full_scale=frames.full_scale, exposure_ratio=frames.exposure_ratio,
+            ends_repeats=frames.ends_repeats,
+        )  # fmt: skip
+        stacks._bits, stacks._lines = frames.bits, frames.lines
+        stacks._inverses = stacks._inverses if frames.inverses is None else frames.inverses
+        stacks._ends = {White(): frames.white, Black(): frames.black}
+        stacks._missing = set()
+        return stacks
+
+    def put(self, pattern: Pattern, image: NDArray[Any]) -> None:
+        """Take the (H, W) image of a pattern; of one that this axis does not need, nothing is kept."""
+        if pattern not in self._missing:
+            return
+        if isinstance(pattern, Gray):
+            (self._inverses if pattern.inverted else self._bits)[pattern.bit] = image
+        elif isinstance(pattern, LineShift):
+            self._lines[self.patterns.lines.index(pattern)] = image
+        else:
+            self._ends[pattern] = image.astype(np.float32)
+        self._missing.discard(pattern)
+
+    def has(self, pattern: Pattern) -> bool:
+        """Whether the image of a pattern is in."""
+        return pattern not in self._missing
+
+    @property
+    def missing(self) -> frozenset[Pattern]:
+        """The patterns whose images are not in."""
+        return frozenset(self._missing)
+
+    @property
+    def coded(self) -> bool:
+        """Whether all that decoding needs is in: everything but line frames."""
+        return all(isinstance(pattern, LineShift) for pattern in self._missing)
+
+    def frames(self) -> AxisFrames:
+        """The frames, once `coded`; line frames that are not in are black."""
+        patterns = self.patterns
+        pairs = sorted(patterns.direct & patterns.inverted)
+        white, black = self._ends.get(White()), self._ends.get(Black())
+        if white is None:
+            white = np.maximum(self._bits[pairs], self._inverses[pairs]).max(axis=0)
+        if black is None:
+            black = np.minimum(self._bits[pairs], self._inverses[pairs]).min(axis=0)
+        for bit in patterns.inverted - patterns.direct:
+            self._bits[bit] = white + black - self._inverses[bit]
+        return AxisFrames(
+            axis=patterns.gray.axis,
+            white=white,
+            black=black,
+            bits=self._bits,
+            inverses=self._inverses if patterns.paired else None,
+            gray=patterns.gray,
+            lines=self._lines,
+            line_patterns=patterns.lines,
+            **self._scales,
+        )
+
+
+def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
+    """Sort the frames of one camera for decoding along one axis.
+
+    Raises
+    ------
+    PatternError
+        As `axis_patterns` does, or an exposure bracket is incomplete.
+    """
+    shots = telling_shots(capture, camera)
+    images, exposure_ratio = _fused_images(capture, camera, shots)
+    stacks = FrameStacks(
+        axis_patterns(images, camera, axis),
+        capture.cameras[camera].size.shape,
+        full_scale=float(capture.cameras[camera].full_scale),
+        exposure_ratio=exposure_ratio,
+        ends_repeats=ends_repeats([capture.patterns[shot.pattern] for shot in shots], axis),
+    )
+    for pattern, image in images.items():
+        stacks.put(pattern, image)
+    return stacks.frames()
+
+
+def telling_shots(capture: Capture, camera: str) -> list[Shot]:
+    """The frames of a camera that are reconstructed from; see `telling`."""
+    shots = [shot for shot in capture.shots if shot.camera == camera]
+    tells = telling([capture.patterns[shot.pattern] for shot in shots], [shot.exposure_s for shot in shots])
+    return [shot for shot, used in zip(shots, tells, strict=True) if used]
+
+
+def ends_repeats(shown: Sequence[Pattern], axis: Axis) -> float:
+    """How many times more frames white and black are means of than the others; 1 where there are none of one."""
+    counts = Counter(shown)
+    others = [n for p, n in counts.items() if isinstance(p, Gray | LineShift) and p.axis is axis]
+    return max(1.0, min(counts[White()], counts[Black()]) / max(others, default=1))
+
+
+def _fused_images(capture: Capture, camera: str, telling: Sequence[Shot]) -> tuple[dict[Pattern, NDArray[Any]], float]:
     """The image of each pattern, and the longest exposure over the shortest."""
     shots: dict[Pattern, dict[float | None, list[Shot]]] = {}
-    for shot in capture.shots:
-        if shot.camera == camera:
-            shots.setdefault(capture.patterns[shot.pattern], {}).setdefault(shot.exposure_s, []).append(shot)
+    for shot in telling:
+        shots.setdefault(capture.patterns[shot.pattern], {}).setdefault(shot.exposure_s, []).append(shot)
     averaged = {
-        pattern: {exposure: _mean(repeats) for exposure, repeats in by_exposure.items()}
+        pattern: {exposure: mean_image([shot.image for shot in repeats]) for exposure, repeats in by_exposure.items()}
         for pattern, by_exposure in shots.items()
     }
     exposures = {frozenset(by_exposure) for by_exposure in averaged.values()}
@@ -153,8 +285,8 @@ def _fused_images(capture: Capture, camera: str) -> tuple[dict[Pattern, Image], 
 
 
 def _fused_bracket(
-    averaged: Mapping[Pattern, Mapping[float | None, Image]], camera: str, full_scale: float
-) -> tuple[dict[Pattern, Image], float]:
+    averaged: Mapping[Pattern, Mapping[float | None, NDArray[Any]]], camera: str, full_scale: float
+) -> tuple[dict[Pattern, NDArray[Any]], float]:
     sets = {frozenset(by_exposure) for by_exposure in averaged.values()}
     if len(sets) > 1 or None in next(iter(sets)):
         message = (
@@ -175,7 +307,8 @@ def _fused_bracket(
     return fused, float(scale[-1])
 
 
-def _mean(repeats: list[Shot]) -> Image:
+def mean_image(repeats: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """The mean of images of one pattern, float32; a single one as it is."""
     if len(repeats) == 1:
-        return repeats[0].image.astype(np.float32)
-    return np.asarray(np.mean([shot.image for shot in repeats], axis=0, dtype=np.float64), dtype=np.float32)
+        return repeats[0]
+    return np.asarray(np.mean(repeats, axis=0, dtype=np.float64), dtype=np.float32)

@@ -6,16 +6,18 @@ column in the frame that the point was found in. A chain is cut where the column
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Refusal
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.stripes import Stripes
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.stripes import LinePoints, Stripes, gathered
 
 _AMBIGUOUS_LINE = int(Refusal.AMBIGUOUS_LINE)
 _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
@@ -23,6 +25,7 @@ _STRAY_CODE = int(Refusal.STRAY_CODE)
 _SHADOW_EDGE = int(Refusal.SHADOW_EDGE)
 _DEPTH_EDGE = int(Refusal.DEPTH_EDGE)
 _SHORT_STRIPE = int(Refusal.SHORT_STRIPE)
+_SATURATED = int(Refusal.SATURATED)
 _LONGEST_GAP_POINTS = 3
 
 
@@ -52,44 +55,106 @@ def identify(
     Returns the coded stripes, and the (H, W) uint8 map of refusals with those of the stripe points added.
     """
     refusal = code.refusal.copy()
-    order, offsets, chains, position = _identify_kernel(
+    shown, cause = _position_kernel(
         stripes.offsets, stripes.frame, stripes.points_px, code.lowest, code.highest, position_of,
-        near_shadow, near_step, shortest_points, refusal,
+        near_shadow, near_step,
     )  # fmt: skip
+    order, offsets, chains, position = _identify_kernel(
+        stripes.offsets, stripes.points_px, shown, cause, shortest_points, refusal
+    )
+    points, normals, sigma_px = gathered(order, stripes.points_px, stripes.normals, stripes.sigma_px)
     cut = Stripes(
         offsets=offsets,
         frame=stripes.frame[chains],
-        points_px=stripes.points_px[order],
-        normals=stripes.normals[order],
-        sigma_px=stripes.sigma_px[order],
+        points_px=points,
+        normals=normals,
+        sigma_px=sigma_px,
     )
     return CodedStripes(cut, position), refusal
 
 
+def with_refused_points(
+    code: CodeMap,
+    found: Sequence[LinePoints],
+    frames: AxisFrames,
+    position_of: FloatArray,
+    near_shadow: NDArray[np.bool_],
+    near_step: NDArray[np.bool_],
+    /,
+) -> CodeMap:
+    """The code map with the causes of those points marked that a filter found and that `phase.refined` leaves out.
+
+    Arguments as for `identify`; found : the points of each line frame, as the filter found them.
+    """
+    refusal = code.refusal.copy()
+    clipped_at = np.float32(frames.clipped_at)
+    for index, points in enumerate(found):
+        _refused_kernel(
+            points.points_px, position_of[index], code.lowest, code.highest, frames.lines, clipped_at, near_shadow,
+            near_step, refusal,
+        )  # fmt: skip
+    return replace(code, refusal=refusal)
+
+
 @njit(cache=True, nogil=True)
-def _identify_kernel(
-    offsets: Any, frame: Any, points: Any, lowest: Any, highest: Any, position_of: Any,
-    near_shadow: Any, near_step: Any, shortest: int, refusal: Any,
-) -> Any:  # fmt: skip
-    count = len(points)
-    position = np.full(count, np.nan)
-    for s in range(len(offsets) - 1):
+def _refused_kernel(
+    points: Any, position_of: Any, lowest: Any, highest: Any, lines: Any, clipped_at: float, near_shadow: Any,
+    near_step: Any, refusal: Any,
+) -> None:  # fmt: skip
+    for i in range(len(points)):
+        x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
+        if lowest[y, x] < 0:
+            continue
+        cause = _cause(position_of[lowest[y, x]], position_of[highest[y, x]], near_shadow[y, x], near_step[y, x])
+        if not cause:
+            for k in range(len(lines)):
+                if lines[k, y, x] >= clipped_at:
+                    cause = _SATURATED
+        if cause:
+            refusal[y, x] = cause
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _cause(low: float, high: float, near_shadow: bool, near_step: bool) -> int:
+    """Why a point is refused whose pixel may mean these two lines; 0 if it is not."""
+    if np.isnan(low) or np.isnan(high):
+        return _BEYOND_PROJECTOR
+    if low != high:
+        return _AMBIGUOUS_LINE
+    if near_shadow:
+        return _SHADOW_EDGE
+    if near_step:
+        return _DEPTH_EDGE
+    return 0
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _position_kernel(
+    offsets: Any, frame: Any, points: Any, lowest: Any, highest: Any, position_of: Any, near_shadow: Any, near_step: Any
+) -> Any:
+    """The position that each point shows, NaN where it is refused, and the cause of that."""
+    position = np.full(len(points), np.nan)
+    cause = np.zeros(len(points), dtype=np.uint8)
+    for s in prange(len(offsets) - 1):
         for i in range(offsets[s], offsets[s + 1]):
             x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
             if lowest[y, x] < 0:
                 continue
             low = position_of[frame[s], lowest[y, x]]
             high = position_of[frame[s], highest[y, x]]
-            if np.isnan(low) or np.isnan(high):
-                refusal[y, x] = _BEYOND_PROJECTOR
-            elif low != high:
-                refusal[y, x] = _AMBIGUOUS_LINE
-            elif near_shadow[y, x]:
-                refusal[y, x] = _SHADOW_EDGE
-            elif near_step[y, x]:
-                refusal[y, x] = _DEPTH_EDGE
-            else:
+            cause[i] = _cause(low, high, near_shadow[y, x], near_step[y, x])
+            if not cause[i]:
                 position[i] = low
+    return position, cause
+
+
+@njit(cache=True, nogil=True)
+def _identify_kernel(offsets: Any, points: Any, position: Any, cause: Any, shortest: int, refusal: Any) -> Any:
+    count = len(points)
+    # One after another: points of two frames may share a pixel, and the last one's cause stands.
+    for i in range(count):
+        if cause[i]:
+            _mark(refusal, points, i, cause[i])
     order = np.zeros(count, dtype=np.int32)
     out_offsets = np.zeros(count + 1, dtype=np.int32)
     chains = np.zeros(count, dtype=np.int32)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.identification import CodedStripes
+from slrig.reconstruction.stripes import gathered
 
 _END_POINTS = 10
 
@@ -46,12 +47,13 @@ def link(coded: CodedStripes, /) -> StripeEnsemble:
     starts = np.flatnonzero(np.diff(sorted_positions, prepend=-np.inf) > 0)
     groups = np.append(starts, len(sorted_positions)).astype(np.int32)
     order, bridge, offsets = _link_kernel(stripes.points_px, stripes.offsets, by_position, groups)
+    points, normals, sigma_px = gathered(order, stripes.points_px, stripes.normals, stripes.sigma_px)
     return StripeEnsemble(
         offsets=offsets,
         position_px=sorted_positions[starts],
-        points_px=stripes.points_px[order],
-        normals=stripes.normals[order],
-        sigma_px=stripes.sigma_px[order],
+        points_px=points,
+        normals=normals,
+        sigma_px=sigma_px,
         stripe=np.repeat(np.arange(len(stripes), dtype=np.int32), np.diff(stripes.offsets))[order],
         bridge_after=bridge,
     )
@@ -173,11 +175,16 @@ def _end_direction(points: Any, end: int, inwards: int, length: int, out: Any) -
 
 @njit(cache=True, nogil=True)
 def _bend(a: Any, direction_a: Any, b: Any, direction_b: Any) -> float:
-    """ω1 + ω2: how far the join of two ends turns from the directions in which they point."""
+    """ω1 + ω2: how far the join of two ends turns from the directions in which they point.
+
+    Ends that touch have no line between them: what is left is the turn from one direction into the other, the least
+    that any line could have.
+    """
     dx, dy = b[0] - a[0], b[1] - a[1]
     norm = np.sqrt(dx * dx + dy * dy)
     if norm == 0:
-        return 0.0
+        turn = -direction_a[0] * direction_b[0] - direction_a[1] * direction_b[1]
+        return float(np.arccos(min(1.0, max(-1.0, turn))))
     dx, dy = dx / norm, dy / norm
     first = min(1.0, max(-1.0, direction_a[0] * dx + direction_a[1] * dy))
     second = min(1.0, max(-1.0, -direction_b[0] * dx - direction_b[1] * dy))

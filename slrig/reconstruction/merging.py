@@ -65,8 +65,8 @@ def _merged_pair(
     centre_mm: FloatArray,
     widest_gap_px: float,
 ) -> tuple[SheetCurves, NDArray[np.int32], FloatArray, FloatArray]:
-    first, order_first = _by_row(first)
-    second, _ = _by_row(second)
+    first, order_first = by_row(first)
+    second, _ = by_row(second)
     camera = camera[order_first]
     offset = int(first.stripe.max(initial=-1)) + 1
     positions = np.union1d(first.position_px, second.position_px)
@@ -104,7 +104,8 @@ def _merged_pair(
     return result, cameras.astype(np.int32), sigma[seen], distance[seen]
 
 
-def _by_row(curves: SheetCurves) -> tuple[SheetCurves, NDArray[np.intp]]:
+def by_row(curves: SheetCurves, /) -> tuple[SheetCurves, NDArray[np.intp]]:
+    """The same curves, the points of each by rising `along_px`, and the order that makes them so."""
     order = np.lexsort((curves.along_px, curves.curve_of_point()))
     return curves.taken(order, offsets=curves.offsets, bridge_after=curves.bridge_after[order]), order
 

@@ -36,13 +36,27 @@ class NoiseModel:
 def estimate_noise(frames: AxisFrames) -> NoiseModel:
     """Fit the noise model to the frames of one camera.
 
-    A bit and its inverse add up to white plus black whatever the code, the blur and the projector's response, so the
-    scatter of that sum over the bits is noise alone: variance = 2 · read + slope · (white + black). Without inverses
-    the scatter between neighbouring pixels stands in (Immerkær 1996, DOI 10.1006/cviu.1996.0060).
+    A bit and its inverse add up to white plus black whatever the code and the lens, so the scatter of that sum over the
+    bits is noise alone: variance = 2 · read + slope · (white + black). A projector that spreads its signal before its
+    gamma (a scaler, a cable) breaks the sum at code edges, so only the coarser half of the bits counts, which has few.
+    Where the sums have one level only, as on an even wall, the black frame's scatter between neighbouring pixels
+    (Immerkær 1996, DOI 10.1006/cviu.1996.0060) tells the noise of the dark. Without inverses that scatter of white and
+    black stands alone.
     """
-    if frames.inverses is not None and len(frames.bits) >= 3:
-        return _fitted(*_scatter_of_sums(frames.bits, frames.inverses, frames.clipped_at))
-    return _fitted(*_scatter_between_neighbours(frames))
+    if frames.inverses is None or len(frames.bits) < 3:
+        return _fitted(*_scatter_between_neighbours(frames, frames.white, frames.black))
+    coarse = max(3, len(frames.bits) // 2)
+    level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at)
+    if len(level) and not _tells_slope(level, variance):
+        dark, dark_variance = _scatter_between_neighbours(frames, frames.black)
+        level, variance = np.concatenate([level, dark]), np.concatenate([variance, dark_variance])
+    return _fitted(level, variance)
+
+
+def _tells_slope(level: NDArray[np.float32], variance: NDArray[np.float32]) -> bool:
+    """Whether the levels differ by more than noise makes them; the outermost hundredths do not count."""
+    low, high = np.quantile(level, (0.01, 0.99))
+    return bool(high - low >= _LEAST_RANGE * np.sqrt(np.median(variance)))
 
 
 def _scatter_of_sums(
@@ -60,9 +74,11 @@ def _scatter_of_sums(
     return sums.mean(axis=0)[unclipped] / 2, (variance[unclipped] / 2).astype(np.float32)
 
 
-def _scatter_between_neighbours(frames: AxisFrames) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _scatter_between_neighbours(
+    frames: AxisFrames, *images: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     levels, variances = [], []
-    for image in (frames.white, frames.black):
+    for image in images:
         across = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
         both = across[:-2] - 2 * across[1:-1] + across[2:]
         # The mask sums to zero, so the mean of its pixels is independent of its response; the centre alone is not.
@@ -71,7 +87,7 @@ def _scatter_between_neighbours(frames: AxisFrames) -> tuple[NDArray[np.float32]
         unclipped = (lowest > 0) & (highest < frames.clipped_at)
         levels.append(mean[unclipped])
         # median of a squared normal = 0.4549 of its variance; the mask has norm² 36
-        variances.append(both[unclipped] ** 2 / 36 / 0.4549)
+        variances.append(both[unclipped] ** 2 * (frames.ends_repeats / 36 / 0.4549))
     return np.concatenate(levels), np.concatenate(variances)
 
 

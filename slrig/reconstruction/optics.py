@@ -14,7 +14,7 @@ from numba import njit, prange
 from slrig.model import FloatArray, Pinhole
 
 _UNDISTORT_STEPS = 30
-_CONVERGED = 1e-13
+_CONVERGED = 1e-7  # of a step of Newton's method, which leaves about the square of it
 
 
 def packed(device: Pinhole) -> FloatArray:
@@ -72,14 +72,21 @@ def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
     NaN for a pixel that the lens cannot light: beyond the radius where its distortion turns back there is no direction.
     """
     yd = (v - d[4]) / d[3]
+    return normalised_near(d, u, v, (u - d[2] - d[1] * yd) / d[0], yd)
+
+
+@njit(cache=True, nogil=True)
+def normalised_near(d: Any, u: float, v: float, x: float, y: float) -> Any:
+    """As `normalised_from_pixel`, from a start: coordinates that are known to be near."""
+    yd = (v - d[4]) / d[3]
     xd = (u - d[2] - d[1] * yd) / d[0]
-    x, y = xd, yd
     for _ in range(_UNDISTORT_STEPS):
         gx, gy, a, b, c, e = distort(d, x, y)
         det = a * e - b * c
         if not det > 0:
             break
-        dx, dy = (e * (xd - gx) - b * (yd - gy)) / det, (a * (yd - gy) - c * (xd - gx)) / det
+        scale = 1 / det
+        dx, dy = (e * (xd - gx) - b * (yd - gy)) * scale, (a * (yd - gy) - c * (xd - gx)) * scale
         x += dx
         y += dy
         if dx * dx + dy * dy < _CONVERGED * _CONVERGED:

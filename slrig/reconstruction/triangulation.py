@@ -2,64 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-from slrig.model import Axis, FloatArray, IntArray, Pinhole, Source
+from slrig.model import Axis, Pinhole, Source
 from slrig.reconstruction.linking import StripeEnsemble
-from slrig.reconstruction.optics import distort, normalised_from_pixel, packed, project, rays, to_device, world_ray
+from slrig.reconstruction.optics import (
+    distort,
+    normalised_from_pixel,
+    normalised_near,
+    packed,
+    project,
+    rays,
+    to_device,
+    world_ray,
+)
+from slrig.reconstruction.sheet_curves import SheetCurves, ordered_along_sheet, selected
 
 _NEWTON_STEPS = 25
-_CONVERGED_PX = 1e-9
+_CONVERGED_PX = 1e-5  # before the last step of Newton's method, which leaves about the square of it
 _PROBE_PX = 1e-3
 _BORDER_PX = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class SheetCurves:
-    """Triangulated curves, one per light sheet, seen by one reference camera. Curve i: offsets[i]:offsets[i + 1].
-
-    offsets : (c + 1,) int32; position_px : (c,) float64; points_mm : (n, 3) float64, world.
-    deviation_mm : (n, 3) float64, displacement of the point for one standard deviation of the stripe position.
-    along_px : (n,) float64, the coordinate along the sheet that orders the curve: projector row (column for row
-    patterns), or the reference camera's row where the projector is not calibrated.
-    pixels_px : (n, 2) float64, (x, y) in the reference camera; stripe : (n,) int32, the stripe each point came from;
-    bridge_after : (n,) bool, True where the step to the next point joins two stripes; source : (n,) uint8, `Source`.
-    """
-
-    offsets: IntArray
-    position_px: FloatArray
-    points_mm: FloatArray
-    deviation_mm: FloatArray
-    along_px: FloatArray
-    pixels_px: FloatArray
-    stripe: IntArray
-    bridge_after: NDArray[np.bool_]
-    source: NDArray[np.uint8]
-
-    def curve_of_point(self) -> IntArray:
-        """(n,) int32: the curve each point belongs to."""
-        return np.repeat(np.arange(len(self.position_px), dtype=np.int32), np.diff(self.offsets))
-
-    def taken(
-        self, index: NDArray[np.intp] | NDArray[np.bool_], *, offsets: IntArray, bridge_after: NDArray[np.bool_]
-    ) -> SheetCurves:
-        """The points at `index`, in its order, under these offsets and bridges."""
-        return replace(
-            self,
-            offsets=offsets,
-            points_mm=self.points_mm[index],
-            deviation_mm=self.deviation_mm[index],
-            along_px=self.along_px[index],
-            pixels_px=self.pixels_px[index],
-            stripe=self.stripe[index],
-            bridge_after=bridge_after,
-            source=self.source[index],
-        )
+_NEAR_PX = 3.0
 
 
 def camera_projector(ensemble: StripeEnsemble, camera: Pinhole, projector: Pinhole, axis: Axis, /) -> SheetCurves:
@@ -69,10 +35,9 @@ def camera_projector(ensemble: StripeEnsemble, camera: Pinhole, projector: Pinho
     Newton's method on the whole distorted projection. Points behind a device, or met where the projector has no pixel,
     are left out.
     """
-    curve = np.repeat(np.arange(len(ensemble.position_px)), np.diff(ensemble.offsets))
     points, deviation, along, good = _sheet_kernel(
         packed(camera), packed(projector), camera.centre_mm, ensemble.points_px, ensemble.normals, ensemble.sigma_px,
-        ensemble.position_px[curve], axis is Axis.ROW,
+        ensemble.offsets, ensemble.position_px, axis is Axis.ROW,
     )  # fmt: skip
     other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
     good &= (along > -_BORDER_PX) & (along < projector.size.along(other) - 1 + _BORDER_PX)
@@ -119,50 +84,6 @@ def camera_camera(first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole
     return ordered_along_sheet(selected(made, good))
 
 
-def selected(curves: SheetCurves, keep: NDArray[np.bool_], /) -> SheetCurves:
-    """The curves without the points where `keep` is False; a step over such points inherits their bridges."""
-    counts = np.concatenate([[0], np.cumsum(keep)])
-    # A bridge belongs to the last kept point at or before it.
-    carried = np.add.reduceat(curves.bridge_after, np.flatnonzero(keep)) > 0 if keep.any() else np.zeros(0, dtype=bool)
-    offsets = counts[curves.offsets].astype(np.int32)
-    # What follows the bridge is gone to the end of the curve: no step is left that would cross it.
-    carried[offsets[1:][np.diff(offsets) > 0] - 1] = False
-    return curves.taken(keep, offsets=offsets, bridge_after=carried)
-
-
-def ordered_along_sheet(curves: SheetCurves, /) -> SheetCurves:
-    """The same curves, the stripes of each in the order of rising `along_px`, each running that way.
-
-    In the image the order of stripes has to be guessed from angles and distances, and a cliff misleads the guess. On
-    the light sheet it is known: every projector row meets the surface once, so stripes of one code follow one another
-    by row. Points keep their order within a stripe.
-    """
-    curve = curves.curve_of_point()
-    stripes, member = np.unique(curves.stripe, return_inverse=True)
-    count = np.bincount(member, minlength=len(stripes))
-    middle = np.bincount(member, weights=curves.along_px, minlength=len(stripes)) / np.maximum(count, 1)
-    rank = _rank_within(member)
-    # A stripe runs upwards when row and rank fall together.
-    drift = np.bincount(member, weights=(curves.along_px - middle[member]) * (rank - (count[member] - 1) / 2))
-    rank = np.where(drift[member] < 0, count[member] - 1 - rank, rank)
-    order = np.lexsort((rank, member, middle[member], curve))
-    stripe = curves.stripe[order]
-    changes = np.append(stripe[1:] != stripe[:-1], False)
-    last_of_curve = np.zeros(len(order), dtype=bool)
-    last_of_curve[curves.offsets[1:][np.diff(curves.offsets) > 0] - 1] = True
-    return curves.taken(order, offsets=curves.offsets, bridge_after=changes & ~last_of_curve)
-
-
-def _rank_within(member: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Position of each entry among the entries of its own group, in the order given."""
-    order = np.argsort(member, kind="stable")
-    counts = np.bincount(member)
-    firsts = np.cumsum(counts) - counts
-    rank = np.zeros(len(member), dtype=np.int64)
-    rank[order] = np.arange(len(member)) - firsts[member[order]]
-    return rank
-
-
 @njit(cache=True, nogil=True, inline="always")
 def _position(p: Any, x: float, y: float, z: float, row: bool) -> Any:
     """Projector position of a world point along the coded axis, and along the other one; z_p tells behind."""
@@ -193,55 +114,67 @@ def _depth_on_sheet(p: Any, o: Any, d: Any, position: float, row: bool, s: float
     return np.nan
 
 
-@njit(cache=True, nogil=True)
-def _start_depth(p: Any, o: Any, d: Any, position: float, row: bool) -> float:
-    """Depth on the plane that touches the sheet at the projector's principal point: a start for Newton's method."""
-    if row:
-        n = normalised_from_pixel(p, p[2], position)[1]
-        base = 13
-    else:
-        n = normalised_from_pixel(p, position, p[4])[0]
-        base = 10
-    ox, oy, oz = to_device(p, o[0], o[1], o[2])
-    oc = ox if base == 10 else oy
-    dc = p[base] * d[0] + p[base + 1] * d[1] + p[base + 2] * d[2]
-    dz = p[16] * d[0] + p[17] * d[1] + p[18] * d[2]
-    denominator = dc - n * dz
-    if denominator == 0:
-        return np.nan
-    return float((n * oz - oc) / denominator)
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def _sheet_kernel(
-    camera: Any, projector: Any, centre: Any, points: Any, normals: Any, sigma: Any, position: Any, row: bool
-) -> Any:
+    camera: Any, projector: Any, centre: Any, points: Any, normals: Any, sigma: Any, offsets: Any, positions: Any,
+    row: bool,
+) -> Any:  # fmt: skip
     count = len(points)
-    out = np.full((count, 3), np.nan)
-    deviation = np.full((count, 3), np.nan)
+    out = np.zeros((count, 3))
+    deviation = np.zeros((count, 3))
     along = np.full(count, np.nan)
     good = np.zeros(count, dtype=np.bool_)
-    for i in prange(count):
+    p = projector
+    ox, oy, oz = to_device(p, centre[0], centre[1], centre[2])
+    for curve in prange(len(offsets) - 1):
+        position = positions[curve]
         d = np.zeros(3)
-        world_ray(camera, points[i, 0], points[i, 1], d)
-        s = _depth_on_sheet(
-            projector, centre, d, position[i], row, _start_depth(projector, centre, d, position[i], row)
-        )
-        if not s > 0:
-            continue
-        for k in range(3):
-            out[i, k] = centre[k] + s * d[k]
-        _, v, zp, _, _, _, _ = _position(projector, out[i, 0], out[i, 1], out[i, 2], row)
-        if zp <= 0:
-            continue
-        along[i] = v
-        # The point of the same sheet for a stripe found a little aside.
-        aside = np.zeros(3)
-        world_ray(camera, points[i, 0] + _PROBE_PX * normals[i, 0], points[i, 1] + _PROBE_PX * normals[i, 1], aside)
-        moved = _depth_on_sheet(projector, centre, aside, position[i], row, s)
-        for k in range(3):
-            deviation[i, k] = (centre[k] + moved * aside[k] - out[i, k]) / _PROBE_PX * sigma[i]
-        good[i] = np.isfinite(deviation[i, 0])
+        slope_d = np.zeros(3)
+        # Newton's method starts on the plane that touches the sheet at the projector's principal point.
+        n = normalised_from_pixel(p, p[2], position)[1] if row else normalised_from_pixel(p, position, p[4])[0]
+        base = 13 if row else 10
+        from_plane = n * oz - (oy if row else ox)
+        x = y = dxu = dxv = dyu = dyv = np.nan
+        for i in range(offsets[curve], offsets[curve + 1]):
+            du, dv = points[i, 0] - points[max(i - 1, 0), 0], points[i, 1] - points[max(i - 1, 0), 1]
+            if abs(du) < _NEAR_PX and abs(dv) < _NEAR_PX and x == x and dxu == dxu:
+                # One step from the point before is all but there.
+                x, y = normalised_near(
+                    camera, points[i, 0], points[i, 1], x + dxu * du + dxv * dv, y + dyu * du + dyv * dv
+                )
+            else:
+                x, y = normalised_from_pixel(camera, points[i, 0], points[i, 1])
+            for k in range(3):
+                d[k] = camera[10 + k] * x + camera[13 + k] * y + camera[16 + k]
+            towards = p[base] * d[0] + p[base + 1] * d[1] + p[base + 2] * d[2]
+            deep = p[16] * d[0] + p[17] * d[1] + p[18] * d[2]
+            if towards == n * deep:
+                continue
+            s = _depth_on_sheet(p, centre, d, position, row, from_plane / (towards - n * deep))
+            if not s > 0:
+                continue
+            for k in range(3):
+                out[i, k] = centre[k] + s * d[k]
+            _, v, zp, xn, yn, gx, gy = _position(p, out[i, 0], out[i, 1], out[i, 2], row)
+            if zp <= 0:
+                continue
+            along[i] = v
+            # On the same sheet, for a stripe found a little aside: position(o + s d) stays, so along with the ray's
+            # direction its depth changes by ds = -s ∇position · dd / ∇position · d.
+            _, _, a, b, c, e = distort(camera, x, y)
+            fx, fy = 1 / (camera[0] * (a * e - b * c)), 1 / (camera[3] * (a * e - b * c))
+            skew = camera[1] / camera[0]
+            dxu, dxv, dyu, dyv = e * fx, -(b + e * skew) * fy, -c * fx, (a + c * skew) * fy
+            dx, dy = dxu * normals[i, 0] + dxv * normals[i, 1], dyu * normals[i, 0] + dyv * normals[i, 1]
+            along_d = across_d = 0.0
+            for k in range(3):
+                slope_d[k] = camera[10 + k] * dx + camera[13 + k] * dy
+                gradient = gx * (p[10 + k] - xn * p[16 + k]) + gy * (p[13 + k] - yn * p[16 + k])
+                along_d += gradient * d[k]
+                across_d += gradient * slope_d[k]
+            for k in range(3):
+                deviation[i, k] = s * (slope_d[k] - across_d / along_d * d[k]) * sigma[i]
+            good[i] = np.isfinite(deviation[i, 0])
     return out, deviation, along, good
 
 

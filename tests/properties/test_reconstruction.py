@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Pinhole, Refusal, Size
 from slrig.patterns.gray import gray_bits
-from slrig.patterns.positions import cell_count, edge_positions, index_of_word, line_positions
+from slrig.patterns.positions import LEAST_FROM_BORDER_PX, cell_count, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.chaining import _LONGEST_STEP_PX, chain
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.identification import CodedStripes, identify
 from slrig.reconstruction.linking import link
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.optics import project, rays
-from slrig.reconstruction.stripes import StripeLimits, locate_edges, locate_stripes
+from slrig.reconstruction.stripes import StripeLimits, chained, edge_points, stripe_points
 from slrig.reconstruction.triangulation import camera_projector, ordered_along_sheet, selected
 from tests.unit.reconstruction.builders import (
     CAMERA,
@@ -90,9 +90,9 @@ def test_straight_stripes_and_edges_are_found_where_they_are(
     nx, ny = math.cos(angle_rad), math.sin(angle_rad)
     distance = (x - 25) * nx + (y - 25) * ny - offset_px
     light = np.tanh(distance / width_px).astype(np.float32) if edge else gaussian_stripe(distance, width_px)
-    find = locate_edges if edge else locate_stripes
+    find = edge_points if edge else stripe_points
     noise, lit = np.full((50, 50), 1e-3, dtype=np.float32), np.ones((50, 50), dtype=np.bool_)
-    stripes = find(light, noise, lit, 0, StripeLimits(), sigma_px=1.2)
+    stripes = chained([find(light, noise, lit, StripeLimits(), sigma_px=1.2)], light.shape)
     assert len(stripes) == 1
     errors = (stripes.points_px - 25) @ [nx, ny] - offset_px
     assert np.abs(errors).max() < 0.01
@@ -201,13 +201,16 @@ def projectors(draw: st.DrawFn) -> tuple[Gray, list[LineShift], Size]:
 
 @unhurried
 @given(projectors())
-def test_every_whole_line_is_named_by_its_own_cell(drawn: tuple[Gray, list[LineShift], Size]) -> None:
+def test_every_whole_line_away_from_the_border_is_named_by_its_own_cell(
+    drawn: tuple[Gray, list[LineShift], Size],
+) -> None:
     code, lines, size = drawn
     table = line_positions(lines, code, size)
     extent_px = size.along(code.axis)
     for frame, line in enumerate(lines):
         first = np.arange(line.shift, extent_px - line.line_width_px + 1, line.period_px)
         centres = first + (line.line_width_px - 1) / 2
+        centres = centres[np.minimum(centres, extent_px - 1 - centres) >= LEAST_FROM_BORDER_PX]
         cells = (np.floor(centres + 0.5).astype(int) + code.offset_px) // code.cell_px
         np.testing.assert_array_equal(table[frame, cells], centres)
         named = table[frame][np.isfinite(table[frame])]

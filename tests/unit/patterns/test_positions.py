@@ -10,6 +10,7 @@ from slrig.model import Axis, FloatArray, Gray, LineShift, Size
 from slrig.patterns.gray import gray_bits, gray_profile
 from slrig.patterns.line_shift import line_profile
 from slrig.patterns.positions import (
+    LEAST_FROM_BORDER_PX,
     cell_count,
     cell_positions,
     edge_positions,
@@ -44,6 +45,10 @@ def cells_shown(code: Gray, size: Size) -> list[int]:
     """The cell of each position, read from its light."""
     word = index_of_word(code)
     return [int(word[int("".join(str(int(lit)) for lit in bits), 2)]) for bits in light_of_bits(code, size).T]
+
+
+def is_inside(centre_px: float, extent_px: int) -> bool:
+    return LEAST_FROM_BORDER_PX <= centre_px <= extent_px - 1 - LEAST_FROM_BORDER_PX
 
 
 def lit_runs(pattern: LineShift, size: Size) -> list[FloatArray]:
@@ -83,7 +88,8 @@ def test_each_line_is_named_by_the_cells_it_may_be_seen_in(
         for run in lit_runs(line, size):
             centre = float(run.mean())
             whole = len(run) == width_px
-            if not whole:
+            if not (whole and is_inside(centre, extent_px)):
+                assert centre not in table[frame]
                 continue
             # The cells under its centre: one, or the two on whose border it lies.
             own = {shown[int(np.floor(centre))], shown[int(np.ceil(centre))]}
@@ -108,15 +114,26 @@ def test_a_cell_never_names_a_line_half_a_period_away(axis: Axis) -> None:
 
 
 def test_lines_that_the_border_cuts_have_no_position() -> None:
-    # 18 columns, period 8, width 2: the lines of shift 7 lie at 7.5 and 15.5; of shift 1 at 1.5, 9.5
-    # and, cut by the border, 17.5.
+    # 18 columns, period 8, width 7: the lines of shift 1 lie at 4 and 12; of shift 5 at 8 and, cut by the
+    # border on both sides, about 0 and 16.
     size, code = Size(18, 1), code_of(Axis.COLUMN, 18, 4, 0)
-    table = line_positions([LineShift(Axis.COLUMN, k, 8, 2) for k in (1, 7)], code, size)
-    # Cells 1 and 3 lie halfway between two lines of this frame, whose stripes they never show.
-    np.testing.assert_array_equal(table[0, ::2], [1.5, 9.5, np.nan])
-    # Shift 7: its light at column 0 belongs to a line cut on the left.
-    np.testing.assert_array_equal(table[1], [np.nan, 7.5, 7.5, 15.5, 15.5])
-    assert line_profile(LineShift(Axis.COLUMN, 7, 8, 2), size)[0, 0] == 255
+    lines = [LineShift(Axis.COLUMN, k, 8, 7) for k in (1, 5)]
+    table = line_positions(lines, code, size)
+    # Cell 1 lies nearer to 4, cell 3 to 12; cell 4 beside the border can only mean a line that has no place there.
+    np.testing.assert_array_equal(table[0, [0, 1, 2, 3]], [4, 4, 12, 12])
+    assert np.isnan(table[1, [0, 4]]).all()
+    np.testing.assert_array_equal(table[1, [1, 2]], [8, 8])
+    # The light of a cut line is there, in part.
+    assert line_profile(lines[1], size)[0, [0, 3, 4]].tolist() == [255, 255, 0]
+
+
+@AXES
+def test_lines_beside_the_border_have_no_position_and_all_others_do(axis: Axis) -> None:
+    code, size = code_of(axis, 40, 4, 0), size_of(axis, 40)
+    for width_px, left_out in ((1, [0, 1, 2, 37, 38, 39]), (2, [0.5, 1.5, 2.5, 36.5, 37.5, 38.5]), (7, [])):
+        table = line_positions([LineShift(axis, shift, 8, width_px) for shift in range(8)], code, size)
+        every = np.arange(40 - width_px + 1) + (width_px - 1) / 2
+        assert sorted(set(table[np.isfinite(table)].tolist())) == sorted(set(every.tolist()) - set(left_out))
 
 
 def test_only_the_frames_that_were_shown_have_a_row() -> None:

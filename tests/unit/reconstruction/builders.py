@@ -12,8 +12,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.special import ndtr
 
-from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Pinhole, Size
+from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, IntArray, LineShift, Pattern, Pinhole, Shot, Size
+from slrig.patterns.sequence import encode
+from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.stripes import Stripes
@@ -185,3 +189,66 @@ def grid(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """(x, y) of every pixel, (H, W) float64 each."""
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
     return x, y
+
+
+def bars(position_px: FloatArray, pattern: LineShift, blur_px: float) -> FloatArray:
+    """Light of a line pattern at projector positions, 1 in the middle of a wide line; blur_px in projector pixels."""
+    apart = position_px - pattern.centre_px
+    apart = apart - pattern.period_px * np.rint(apart / pattern.period_px)
+    half = pattern.line_width_px / 2
+    near = (apart + turn * pattern.period_px for turn in (-1, 0, 1))
+    return np.asarray(sum(ndtr((each + half) / blur_px) - ndtr((each - half) / blur_px) for each in near))
+
+
+def cells_of(position_px: FloatArray, cell_px: int) -> CodeMap:
+    """The code cell that each pixel shows; NaN is refused."""
+    lit = np.isfinite(position_px)
+    cell = np.where(lit, np.floor((np.nan_to_num(position_px) + 0.5) / cell_px), -1).astype(np.int32)
+    return CodeMap(cell, cell.copy(), np.where(lit, 0, 1).astype(np.uint8))
+
+
+def nearest_lines(lines: tuple[LineShift, ...], cell_px: int, cells: int) -> tuple[FloatArray, FloatArray]:
+    """The middle of each code cell, (cells,), and the line of each frame nearest to it, (frames, cells)."""
+    middle: FloatArray = cell_px * np.arange(cells, dtype=np.float64) + (cell_px - 1) / 2
+    number = [np.rint((middle - line.centre_px) / line.period_px) for line in lines]
+    return middle, np.stack([n * line.period_px + line.centre_px for n, line in zip(number, lines, strict=True)])
+
+
+def seen_by_camera(
+    position_px: FloatArray,
+    patterns: tuple[Pattern, ...],
+    projector: Size,
+    *,
+    axis: Axis = Axis.COLUMN,
+    blur_px: float = 0.6,
+    smear_px: float = 0.0,
+    noise: float = 0.8,
+    seed: int = 7,
+    white: float = 150.0,
+    bit_depth: int = 8,
+) -> Capture:
+    """Every pattern on a surface of known projector positions, whichever way the stripes run; NaN is not lit.
+
+    blur_px : standard deviation of the light's blur, projector pixels; smear_px : of the camera's, over borders of what
+    is lit as well. Albedo swings by a third over the image.
+    """
+    fine = 32
+    lit = np.isfinite(position_px)
+    x, y = grid((position_px.shape[0], position_px.shape[1]))
+    albedo = white * (1 + np.cos(x / 23 + y / 31) / 3)
+    rng = np.random.default_rng(seed)
+    sequence = encode(patterns, projector)
+    shots = []
+    for index in range(len(sequence)):
+        image = sequence.image(index)
+        profile = np.repeat((image[0] if axis is Axis.COLUMN else image[:, 0]) / 255.0, fine)
+        blurred = gaussian_filter1d(np.pad(profile, 4 * fine), blur_px * fine, mode="constant")
+        at = (np.arange(len(blurred)) + 0.5) / fine - 4.5
+        light = np.where(lit, np.interp(np.nan_to_num(position_px, nan=-9.0), at, blurred, left=0.0, right=0.0), 0.0)
+        if smear_px:
+            light = cv2.GaussianBlur(light, (0, 0), smear_px)
+        counts = 12 + albedo * light + rng.normal(0, noise, light.shape)
+        kind = np.uint8 if bit_depth <= 8 else np.uint16
+        shots.append(Shot(index, "eye", np.clip(np.rint(counts), 0, 2**bit_depth - 1).astype(kind)))
+    size = Size(position_px.shape[1], position_px.shape[0])
+    return Capture(projector, patterns, {"eye": CameraFormat(size, bit_depth)}, tuple(shots))

@@ -87,10 +87,31 @@ def test_only_the_axis_and_the_camera_asked_for_are_taken() -> None:
 
 
 def test_repeats_at_one_exposure_are_averaged() -> None:
-    frames = axis_frames(
-        capture_of(*ENDS, *plain(*BITS), (White(), 205, None), (White(), 207, None)), "eye", Axis.COLUMN
-    )
+    opening: list[Seen] = [(White(), 205, None), (White(), 207, None)]
+    frames = axis_frames(capture_of(*ENDS, *opening, *plain(*BITS)), "eye", Axis.COLUMN)
     assert (frames.white == np.float32(204)).all()
+    twice = axis_frames(capture_of(*ENDS, *plain(*BITS), *plain(*BITS, value=60), *ENDS), "eye", Axis.COLUMN)
+    assert (twice.bits == np.float32(55)).all()
+    assert (frames.ends_repeats, twice.ends_repeats) == (1.0, 1.0)
+
+
+def test_white_and_black_that_close_a_sequence_are_evidence_only() -> None:
+    closing: list[Seen] = [(White(), 220, None), (Black(), 30, None)]
+    frames = axis_frames(capture_of(*ENDS, *plain(*BITS), *closing), "eye", Axis.COLUMN)
+    assert (frames.white == 200).all()
+    assert (frames.black == 10).all()
+    alone = axis_frames(capture_of(*plain(*BITS), *closing), "eye", Axis.COLUMN)
+    assert (alone.white == 220).all()
+    # Of a sequence that is played twice everything counts, and twice as much of the ends where it is closed, too.
+    twice = axis_frames(capture_of(*ENDS, *plain(*BITS), *closing, *ENDS, *plain(*BITS), *closing), "eye", Axis.COLUMN)
+    assert (twice.white == 210).all()
+    assert twice.ends_repeats == 2.0
+
+
+@pytest.mark.parametrize("opening", [2, 3])
+def test_ends_that_are_shown_several_times_before_the_code_have_less_noise(opening: int) -> None:
+    frames = axis_frames(capture_of(*(ENDS * opening), *plain(*BITS), *ENDS), "eye", Axis.COLUMN)
+    assert frames.ends_repeats == opening
 
 
 def test_a_bracket_takes_the_longest_exposure_that_nothing_clipped() -> None:

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from slrig.model import FloatArray
+from slrig.model import Axis, FloatArray
 from slrig.reconstruction.identification import CodedStripes
 from slrig.reconstruction.linking import StripeEnsemble, _bend, _end_direction, link
-from tests.unit.reconstruction.builders import stripes_of
+from slrig.reconstruction.triangulation import camera_projector
+from tests.unit.reconstruction.builders import CAMERA, PROJECTOR, opencv_pixels, opencv_rays, stripes_of
 
 
 def linked(*stripes: FloatArray, position_px: list[float] | None = None) -> StripeEnsemble:
@@ -64,6 +65,107 @@ def test_each_of_the_four_joins_is_chosen_when_it_is_the_smoothest(mine: int, th
     assert sorted(joined[0]) == sorted(ends)
     steps = np.linalg.norm(np.diff(ensemble.points_px, axis=0), axis=1)
     assert np.sort(steps)[-2] < 1.0
+
+
+COLUMN = 150.0
+
+
+def lit_plate(depth_mm: float, rows: FloatArray) -> FloatArray:
+    """(n, 2): pixels of one projector column on a plate at a depth, from top to bottom."""
+    pixels = np.column_stack([np.full(len(rows), COLUMN), rows])
+    rays = opencv_rays(PROJECTOR, pixels)
+    reach = (depth_mm - PROJECTOR.centre_mm[2]) / rays[:, 2]
+    return opencv_pixels(CAMERA, PROJECTOR.centre_mm + reach[:, None] * rays)
+
+
+@pytest.mark.parametrize("step_mm", [-15.0, -5.0, 5.0, 15.0, 60.0])
+@pytest.mark.parametrize("turned", [(), (0,), (1,), (0, 1)])
+def test_one_light_on_a_step_makes_two_stripes_and_one_curve_along_its_sheet(
+    step_mm: float, turned: tuple[int, ...]
+) -> None:
+    # Figure 2: the plane of light meets two surfaces; in the image the stripes lie beside one another.
+    above, below = lit_plate(0.0, np.arange(20.0, 110.0, 0.4)), lit_plate(step_mm, np.arange(112.0, 230.0, 0.4))
+    sideways = abs(below[0, 0] - above[-1, 0])
+    assert sideways > 0.07 * abs(step_mm)
+    stripes = [stripe[::-1].copy() if k in turned else stripe for k, stripe in enumerate((above, below))]
+    ensemble = linked(*stripes, position_px=[COLUMN, COLUMN])
+    np.testing.assert_array_equal(ensemble.points_px, np.concatenate([above, below]))
+    assert np.flatnonzero(ensemble.bridge_after).tolist() == [len(above) - 1]
+    # In space the curve runs down the sheet: every point at its own row of the projector, in order.
+    sheet = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    assert len(sheet.points_mm) == len(ensemble.points_px)
+    assert (np.diff(sheet.along_px) > 0).all()
+    assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
+
+
+def test_a_cliff_can_mislead_the_papers_rule_and_the_light_sheet_knows_the_order() -> None:
+    # The lower stripe lies so far aside that a line to its far end turns less than one to its near end.
+    above, below = lit_plate(0.0, np.arange(20.0, 110.0, 0.4)), lit_plate(-60.0, np.arange(112.0, 230.0, 0.4))
+    ensemble = linked(above, below, position_px=[COLUMN, COLUMN])
+    np.testing.assert_array_equal(ensemble.points_px, curve_by_the_paper([above, below]).points)
+    assert points_between(ensemble) == [(above[-1].tolist(), below[-1].tolist())]
+    sheet = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    np.testing.assert_array_equal(sheet.pixels_px, np.concatenate([above, below]))
+    assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
+
+
+def test_adjacent_pixels_of_two_stripes_may_be_far_apart_in_space_and_are_joined_by_a_bridge() -> None:
+    # Figure 2 (b, c): the far plate's stripe ends beside the near one's; neighbours in the image, 60 mm apart in depth.
+    near, far = lit_plate(-60.0, np.arange(20.0, 110.0, 0.4)), lit_plate(0.0, np.arange(110.4, 200.0, 0.4))
+    sheet = camera_projector(linked(near, far, position_px=[COLUMN] * 2), CAMERA, PROJECTOR, Axis.COLUMN)
+    (at,) = np.flatnonzero(sheet.bridge_after)
+    assert np.linalg.norm(sheet.points_mm[at + 1] - sheet.points_mm[at]) > 59
+
+
+def test_figure_3_two_stripes_with_four_candidate_joins() -> None:
+    # a falls to the left and b goes on to the right of its lower end: of the four joins a's last with b's first is
+    # the smoothest, by the sums of the two angles of each.
+    a = np.array([[10.0 - 0.02 * t * t / 10, float(t)] for t in range(30)])
+    b = np.array([[9.0 + 0.3 * t, 38.0 + t] for t in range(20)])
+    sums = {}
+    for mine, point, facing in ((0, a[0], end_direction(a)), (1, a[-1], end_direction(a[::-1]))):
+        for theirs, other, answering in ((0, b[0], end_direction(b)), (1, b[-1], end_direction(b[::-1]))):
+            line = (other - point) / np.linalg.norm(other - point)
+            sums[mine, theirs] = math.acos(facing @ line) + math.acos(-answering @ line)
+    assert min(sums, key=lambda join: sums[join]) == (1, 0)
+    assert sums[1, 0] < 0.5 < min(value for join, value in sums.items() if join != (1, 0))
+    for first, second in ((a, b), (a[::-1].copy(), b), (a, b[::-1].copy()), (b, a)):
+        np.testing.assert_array_equal(linked(first, second).points_px, np.concatenate([a, b]))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-9, 0.5, 1.0])
+@pytest.mark.parametrize("turned", [(), (0,), (1,), (0, 1)])
+def test_stripes_that_touch_are_joined_where_they_touch(gap: float, turned: tuple[int, ...]) -> None:
+    upper, lower = down(10.0, range(0, 20), lean=0.1), down(11.9, range(19, 34), lean=0.1)
+    lower[:, 1] += gap
+    stripes = [stripe[::-1].copy() if k in turned else stripe for k, stripe in enumerate((upper, lower))]
+    ensemble = linked(*stripes)
+    np.testing.assert_array_equal(ensemble.points_px, np.concatenate([upper, lower]))
+    assert points_between(ensemble) == [(upper[-1].tolist(), lower[0].tolist())]
+
+
+def test_stripes_that_touch_in_a_fold_are_joined_elsewhere_if_that_is_smoother() -> None:
+    # b begins where a ends, a turn of nearly 180°, runs back beside it and comes down again ahead of a's upper end.
+    a = down(0.0, range(0, 30))
+    arc = [[4.1 + 4 * math.cos(t), -8 - 4 * math.sin(t)] for t in np.linspace(0, math.pi, 14)]
+    b = np.array([[0.0, 29.0], *([8.1 * t / 14, 29.0 - 37 * t / 14] for t in range(1, 14)), *arc])
+    b = np.concatenate([b, [[0.1, -7.0 + 0.5 * t] for t in range(8)]])
+    np.testing.assert_array_equal(linked(a, b).points_px, curve_by_the_paper([a, b]).points)
+    assert points_between(linked(a, b)) in ([(a[0].tolist(), b[-1].tolist())], [(b[-1].tolist(), a[0].tolist())])
+
+
+def test_pieces_of_one_line_that_interleave_with_another_codes_are_put_in_order() -> None:
+    # Two codes broken into five pieces each, given in any order and any direction: each is one line again.
+    rng = np.random.default_rng(12)
+    bent = {code: np.array([[x + 4 * math.sin(y / 25), y] for y in range(100)]) for code, x in ((3.0, 0.0), (4.0, 3.0))}
+    pieces = [(code, line[20 * k : 20 * k + 17]) for code, line in bent.items() for k in range(5)]
+    for _ in range(20):
+        order = rng.permutation(len(pieces))
+        stripes = [pieces[k][1][:: rng.choice([-1, 1])].copy() for k in order]
+        ensemble = linked(*stripes, position_px=[pieces[k][0] for k in order])
+        wanted = np.concatenate([piece for _, piece in pieces])
+        np.testing.assert_array_equal(ensemble.points_px, wanted)
+        assert ensemble.bridge_after.sum() == 8
 
 
 def test_a_stripe_beside_another_is_joined_where_the_curve_turns_least() -> None:
@@ -130,9 +232,10 @@ def test_codes_are_linked_apart_and_come_in_rising_order() -> None:
 
 
 def test_stripes_side_by_side_still_make_one_curve_of_all_their_points() -> None:
-    # Interleaved in y, as at an overhang: the order is a matter of taste, completeness is not.
+    # Interleaved in y, as at an overhang: the paper's rule has an answer, and every point is in it once.
     a, b, c = down(0.0, range(0, 40)), down(12.0, range(10, 50)), down(24.0, range(-5, 22))
     ensemble = linked(a, b, c)
+    np.testing.assert_array_equal(ensemble.points_px, curve_by_the_paper([a, b, c]).points)
     everything = np.concatenate([a, b, c])
     assert sorted(map(tuple, ensemble.points_px.tolist())) == sorted(map(tuple, everything.tolist()))
     assert ensemble.bridge_after.sum() == 2
@@ -222,7 +325,9 @@ def curve_by_the_paper(stripes: list[FloatArray], *, start: int | None = None) -
         for i in range(2):
             for k in range(2):
                 join = b[-k] - curve[-i]
-                join = join / np.linalg.norm(join)
+                length = float(np.linalg.norm(join))
+                # Ends that touch: the turn from one direction into the other.
+                join = join / length if length else facing[i]
                 bend = math.acos(np.clip(facing[i] @ join, -1, 1)) + math.acos(np.clip(-(theirs[k] @ join), -1, 1))
                 best = min(best, (bend, i, k))
         _, i, k = best

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from slrig.model import FloatArray
 from slrig.reconstruction.frames import AxisFrames
@@ -122,3 +125,29 @@ def test_the_variance_is_linear_in_the_light_and_not_below_that_of_the_dark() ->
 
 def variance_at(model: NoiseModel, level: float) -> float:
     return float(model.variance(np.array([[level]], dtype=np.float32))[0, 0])
+
+
+@CAMERAS
+def test_an_evenly_lit_wall_tells_its_noise_in_the_dark_as_well(read_variance: float, slope: float) -> None:
+    rng = np.random.default_rng(8)
+    repeats = 2
+
+    def seen(mean: FloatArray, frames: int = 1) -> NDArray[np.float32]:
+        scatter = rng.standard_normal((frames, *SHAPE)).mean(axis=0)
+        return np.asarray(mean + np.sqrt(read_variance + slope * mean) * scatter, dtype=np.float32)
+
+    dark, bright = np.full(SHAPE, 15.0), np.full(SHAPE, 190.0)
+    lit = [np.where(grid(SHAPE)[0] % 2 ** (BITS - bit) < 2 ** (BITS - bit - 1), bright, dark) for bit in range(BITS)]
+    frames = replace(
+        code_frames(
+            bits=np.array([seen(each) for each in lit], dtype=np.float32),
+            inverses=np.array([seen(dark + bright - each) for each in lit], dtype=np.float32),
+            white=seen(bright, repeats),
+            black=seen(dark, repeats),
+            full_scale=4095.0,
+        ),
+        ends_repeats=float(repeats),
+    )
+    model = estimate_noise(frames)
+    for level in (15.0, 100.0, 190.0):
+        assert variance_at(model, level) == pytest.approx(read_variance + slope * level, rel=0.12)

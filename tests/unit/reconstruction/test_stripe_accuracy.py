@@ -18,10 +18,11 @@ from slrig.model import FloatArray
 from slrig.reconstruction.stripes import (
     StripeLimits,
     Stripes,
-    locate_edges,
-    locate_stripes,
+    chained,
+    edge_points,
     measured_sigma_px,
     normalised,
+    stripe_points,
 )
 from tests.unit.reconstruction.builders import gaussian_stripe, grid
 
@@ -58,8 +59,8 @@ def located(
 ) -> Stripes:
     deviation = np.full(image.shape, noise, dtype=np.float32)
     lit = np.ones(image.shape, dtype=np.bool_)
-    find = locate_edges if edge else locate_stripes
-    return find(image, deviation, lit, 3, limits or StripeLimits(), sigma_px=sigma_px)
+    find = edge_points if edge else stripe_points
+    return chained([find(image, deviation, lit, limits or StripeLimits(), sigma_px=sigma_px)], image.shape)
 
 
 def errors_px(stripes: Stripes, distance: Distance) -> FloatArray:
@@ -80,7 +81,7 @@ def test_a_straight_stripe_is_found_to_a_two_hundredth_of_a_pixel(angle_rad: flo
         assert rms(errors_px(stripes, distance)) < 0.005
         across = np.abs(stripes.normals @ [math.cos(angle_rad), math.sin(angle_rad)])
         np.testing.assert_allclose(across, 1.0, atol=1e-4)
-        assert stripes.frame.tolist() == [3]
+        assert stripes.frame.tolist() == [0]
 
 
 @pytest.mark.parametrize(("width_px", "scale_px"), [(0.7, 1.0), (1.0, 1.0), (1.0, 1.6), (1.6, 1.2), (2.0, 2.0)])
@@ -191,7 +192,7 @@ def test_a_step_of_albedo_does_not_move_the_stripe_once_normalised(dark: float) 
     noise = np.full(SHAPE, 0.5, dtype=np.float32)
     raw = located(np.asarray((seen - black) / 200, dtype=np.float32), sigma_px=1.3)
     image, deviation = normalised(seen, black, albedo, noise)
-    stripes = locate_stripes(image, deviation, albedo > 0, 0, StripeLimits(), sigma_px=1.3)
+    stripes = chained([stripe_points(image, deviation, albedo > 0, StripeLimits(), sigma_px=1.3)], SHAPE)
     assert rms(errors_px(raw, distance)) > 0.1
     assert rms(errors_px(stripes, distance)) < 0.005
 

@@ -1,0 +1,257 @@
+"""The two steps of Steger's detector as kernels: Taylor at every pixel, and Newton on kernels centred on the point."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+RIDGE = 0
+"""Bright lines: the point where the first derivative across the line is zero."""
+
+EDGE = 1
+"""Steps through zero: the point where the value is zero."""
+
+_SUPPORT = 3.6  # kernel radius in sigmas
+_TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; the chain drops double responses
+_NEWTON_BOX = 1.1
+_ROWS = 32  # rows, and points, that one thread takes at a time
+_POINTS = 1024
+
+
+def kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Sampled Gaussian of this scale and its first two derivatives, each (2 r + 1,) float32."""
+    radius = int(np.ceil(_SUPPORT * sigma_px))
+    at = np.arange(-radius, radius + 1, dtype=np.float64)
+    zero = np.exp(-(at**2) / (2 * sigma_px**2))
+    zero /= zero.sum()
+    one = at / sigma_px**2 * zero
+    one /= (one * at).sum()
+    two = (at**2 / sigma_px**4 - 1 / sigma_px**2) * zero
+    two -= two.mean()
+    two /= (two * at**2).sum() / 2
+    # They correlate: a rising ramp gives +1 with `one`, a parabola x²/2 gives +1 with `two`.
+    return zero.astype(np.float32), one.astype(np.float32), two.astype(np.float32)
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath={"reassoc", "contract"})
+def taylor_kernel(image: Any, noise: Any, lit: Any, weak: Any, zero: Any, one: Any, two: Any, kind: int) -> Any:
+    """One Taylor step at every lit pixel whose response exceeds `weak` times its noise: offset and response.
+
+    The filters are separable, even or odd: rows first, and then along the row, while it is in the cache.
+    """
+    rows, columns = image.shape
+    radius = len(zero) // 2
+    offset = np.zeros((rows, columns, 2), dtype=np.float32)
+    response = np.zeros((rows, columns), dtype=np.float32)
+    g0, g1, g2 = zero[radius:], one[radius:], two[radius:]
+    for block in prange((rows + _ROWS - 1) // _ROWS):
+        down = np.zeros((3, columns + 2 * radius), dtype=np.float32)
+        along = np.zeros((6, columns), dtype=np.float32)
+        for y in range(block * _ROWS, min(rows, (block + 1) * _ROWS)):
+            _filter_down(image, y, radius, g0, g1, g2, down)
+            _filter_along(down, radius, g0, g1, g2, along)
+            for x in range(columns):
+                if not lit[y, x]:
+                    continue
+                r, rx, ry, rxx, rxy, ryy = (
+                    along[0, x], along[1, x], along[2, x], along[3, x], along[4, x], along[5, x]
+                )  # fmt: skip
+                if kind == RIDGE:
+                    if rxx + ryy > 0:
+                        continue
+                    nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
+                    if not -curvature > weak * noise[y, x]:
+                        continue
+                    t = -(rx * nx + ry * ny) / curvature
+                    strength = -curvature
+                else:
+                    strength = np.sqrt(rx * rx + ry * ry)
+                    if not strength > max(weak * noise[y, x], 1e-9):
+                        continue
+                    nx, ny = rx / strength, ry / strength
+                    t = -r / strength
+                if abs(t * nx) <= _TAYLOR_BOX and abs(t * ny) <= _TAYLOR_BOX:
+                    offset[y, x, 0] = t * nx
+                    offset[y, x, 1] = t * ny
+                    response[y, x] = strength
+    return offset, response
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
+    """Fill (3, columns + 2 radius) with the image's rows round y, smoothed and differentiated once and twice.
+
+    Beyond its borders the image is reflected about its outermost pixels.
+    """
+    rows, columns = image.shape
+    smooth, first, second = out[0, radius:], out[1, radius:], out[2, radius:]
+    middle = image[y]
+    for x in range(columns):
+        smooth[x] = g0[0] * middle[x]
+    for x in range(columns):
+        second[x] = g2[0] * middle[x]
+    first[:] = 0
+    for t in range(1, radius + 1):
+        above, below = image[_reflected(y - t, rows)], image[_reflected(y + t, rows)]
+        _add(smooth, columns, g0[t], below, above)
+        _subtract(first, columns, g1[t], below, above)
+        _add(second, columns, g2[t], below, above)
+    for k in range(3):
+        for t in range(1, radius + 1):
+            out[k, radius - t] = out[k, radius + _reflected(-t, columns)]
+            out[k, radius + columns - 1 + t] = out[k, radius + _reflected(columns - 1 + t, columns)]
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
+    """Fill (6, columns) with r, rx, ry, rxx, rxy, ryy of one row."""
+    columns = out.shape[1]
+    smooth, first, second = down[0], down[1], down[2]
+    for x in range(columns):
+        out[0, x] = g0[0] * smooth[x + radius]
+    for x in range(columns):
+        out[2, x] = g0[0] * first[x + radius]
+    for x in range(columns):
+        out[3, x] = g2[0] * smooth[x + radius]
+    for x in range(columns):
+        out[5, x] = g0[0] * second[x + radius]
+    out[1] = 0
+    out[4] = 0
+    for t in range(1, radius + 1):
+        left, right = radius - t, radius + t
+        _add(out[0], columns, g0[t], smooth[right:], smooth[left:])
+        _subtract(out[1], columns, g1[t], smooth[right:], smooth[left:])
+        _add(out[2], columns, g0[t], first[right:], first[left:])
+        _add(out[3], columns, g2[t], smooth[right:], smooth[left:])
+        _subtract(out[4], columns, g1[t], first[right:], first[left:])
+        _add(out[5], columns, g0[t], second[right:], second[left:])
+
+
+# Loops of three arrays each: with more, the compiler gives up proving that they do not overlap, and uses no vectors.
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
+    for x in range(count):
+        out[x] += weight * (right[x] + left[x])
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _subtract(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
+    for x in range(count):
+        out[x] += weight * (right[x] - left[x])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _reflected(index: int, count: int) -> int:
+    while index < 0 or index >= count:
+        index = -index if index < 0 else 2 * (count - 1) - index
+        if count == 1:
+            return 0
+    return index
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ridge_normal(rxx: float, rxy: float, ryy: float) -> Any:
+    # Eigenvector of the symmetric 2 x 2 Hessian for the eigenvalue of largest magnitude.
+    half = 0.5 * (rxx - ryy)
+    root = np.sqrt(half * half + rxy * rxy)
+    mean = 0.5 * (rxx + ryy)
+    value = mean + root if mean > 0 else mean - root
+    ax, ay = rxy, value - rxx
+    bx, by = value - ryy, rxy
+    if ax * ax + ay * ay < bx * bx + by * by:
+        ax, ay = bx, by
+    length = np.sqrt(ax * ax + ay * ay)
+    if length < 1e-20:
+        return 1.0, 0.0, value
+    return ax / length, ay / length, value
+
+
+@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"})
+def newton_kernel(image: Any, offset: Any, columns: Any, rows: Any, sigma: float, kind: int) -> Any:
+    """One Newton step from each pixel's offset on kernels centred there; response and normal are those of the start."""
+    count = len(columns)
+    height, width = image.shape
+    radius = int(np.ceil(_SUPPORT * sigma))
+    size = 2 * radius + 1
+    x_out = np.zeros(count)
+    y_out = np.zeros(count)
+    normals = np.zeros((count, 2))
+    response = np.zeros(count)
+    kept = np.zeros(count, dtype=np.bool_)
+    whole = np.exp(-((np.arange(size) - radius) ** 2) / (2 * sigma * sigma))
+    for block in prange((count + _POINTS - 1) // _POINTS):
+        wx = np.zeros((3, size))
+        wy = np.zeros((3, size))
+        for i in range(block * _POINTS, min(count, (block + 1) * _POINTS)):
+            column, row = columns[i], rows[i]
+            if column < radius or row < radius or column >= width - radius or row >= height - radius:
+                continue
+            fx, fy = float(offset[row, column, 0]), float(offset[row, column, 1])
+            _centred_weights(wx, fx, sigma, whole)
+            _centred_weights(wy, fy, sigma, whole)
+            r = rx = ry = rxx = rxy = ryy = 0.0
+            for j in range(size):
+                line = image[row - radius + j, column - radius :]
+                s0 = s1 = s2 = 0.0
+                for k in range(size):
+                    value = float(line[k])
+                    s0 += value * wx[0, k]
+                    s1 += value * wx[1, k]
+                    s2 += value * wx[2, k]
+                r += s0 * wy[0, j]
+                rx += s1 * wy[0, j]
+                rxx += s2 * wy[0, j]
+                ry += s0 * wy[1, j]
+                rxy += s1 * wy[1, j]
+                ryy += s0 * wy[2, j]
+            if kind == RIDGE:
+                nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
+                if curvature >= 0:
+                    continue
+                t = -(rx * nx + ry * ny) / curvature
+                strength = -curvature
+            else:
+                strength = np.sqrt(rx * rx + ry * ry)
+                if strength <= 1e-9:
+                    continue
+                nx, ny = rx / strength, ry / strength
+                t = -r / strength
+            x, y = fx + t * nx, fy + t * ny
+            if abs(x) > _NEWTON_BOX or abs(y) > _NEWTON_BOX:
+                continue
+            x_out[i], y_out[i] = column + x, row + y
+            normals[i, 0], normals[i, 1] = nx, ny
+            response[i] = strength
+            kept[i] = True
+    return x_out, y_out, normals, response, kept
+
+
+@njit(cache=True, nogil=True)
+def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
+    """Fill (3, size) with Gaussian, first and second derivative weights for samples at -radius … radius.
+
+    whole : (size,) the Gaussian's values when its centre is 0. About another centre f each changes by
+    exp(f k / σ²) and by a factor that all share.
+    """
+    size = out.shape[1]
+    radius = size // 2
+    s2 = sigma * sigma
+    step = np.exp(centre / s2)
+    back = 1 / step
+    total = out[0, radius] = whole[radius]
+    up = down = 1.0
+    for k in range(1, radius + 1):
+        up *= step
+        down *= back
+        out[0, radius + k] = whole[radius + k] * up
+        out[0, radius - k] = whole[radius - k] * down
+        total += out[0, radius + k] + out[0, radius - k]
+    for k in range(size):
+        at = k - radius - centre
+        g = out[0, k] / total
+        out[0, k] = g
+        out[1, k] = at / s2 * g
+        out[2, k] = (at * at / s2 - 1) / s2 * g

@@ -1,0 +1,95 @@
+"""The centroid of a pixel's light, against light that is blurred numerically on a fine grid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from slrig.model import FloatArray
+from slrig.reconstruction.centroid import at_pixel_centres
+from slrig.reconstruction.phase import PositionMap
+
+FINE = 20
+PIXELS = 60
+BLUR_PX = 0.55
+PERIOD_PX = 8.0
+
+
+def seen_through_blur(albedo: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Phase position and brightness at each pixel of a row, from albedo and position on the fine grid.
+
+    The light of eight shifts, each a raised cosine over the projector, is blurred as a whole: no formula of the code
+    under test is used.
+    """
+    shifts = np.arange(8)
+    light = 1 + np.cos(2 * np.pi / PERIOD_PX * (position[:, None] - shifts))
+    lines = gaussian_filter1d(albedo[:, None] * light, BLUR_PX * FINE, axis=0, mode="nearest")[FINE // 2 :: FINE]
+    white = gaussian_filter1d(albedo, BLUR_PX * FINE, mode="nearest")[FINE // 2 :: FINE]
+    phase = np.angle((lines * np.exp(2j * np.pi / PERIOD_PX * shifts)).sum(axis=1)) * PERIOD_PX / (2 * np.pi)
+    true = position[FINE // 2 :: FINE]
+    return phase + PERIOD_PX * np.rint((true - phase) / PERIOD_PX), white
+
+
+def fine_x() -> FloatArray:
+    return (np.arange(PIXELS * FINE) - FINE // 2) / FINE
+
+
+def as_map(row: FloatArray) -> NDArray[np.float32]:
+    return np.tile(row, (5, 1)).astype(np.float32)
+
+
+@pytest.mark.parametrize(("dark", "bright"), [(1.0, 2.0), (1.0, 7.0), (7.0, 1.0)])
+@pytest.mark.parametrize("slope", [1.2, -0.7])
+def test_an_edge_of_the_albedo_bends_the_position_half_as_much(dark: float, bright: float, slope: float) -> None:
+    x = fine_x()
+    position = 40 + slope * x
+    measured, white = seen_through_blur(np.where(x < 30.3, dark, bright), position)
+    true = position[FINE // 2 :: FINE]
+    centred = at_pixel_centres(PositionMap(as_map(measured), as_map(0 * measured)), as_map(white * 20), BLUR_PX)
+    before, after = np.abs(measured - true)[5:-5], np.abs(centred.position[2] - true)[5:-5]
+    assert before.max() > 0.1 * abs(slope)
+    # Differences over two pixels see a step of the albedo smoother than the blur makes it: a part stays.
+    assert after.max() < 0.6 * before.max()
+    assert np.sqrt((after**2).mean()) < 0.6 * np.sqrt((before**2).mean())
+
+
+def test_smooth_texture_of_seven_to_one_bends_it_a_tenth_as_much() -> None:
+    x = fine_x()
+    position = 40 + 1.2 * x
+    measured, white = seen_through_blur(7 ** (0.5 + 0.5 * np.sin(x / 1.5)), position)
+    true = position[FINE // 2 :: FINE]
+    centred = at_pixel_centres(PositionMap(as_map(measured), as_map(0 * measured)), as_map(white * 20), BLUR_PX)
+    before, after = np.abs(measured - true)[5:-5], np.abs(centred.position[2] - true)[5:-5]
+    assert before.max() > 0.1
+    assert np.sqrt((after**2).mean()) < 0.2 * np.sqrt((before**2).mean())
+
+
+def test_rows_are_treated_as_columns_are() -> None:
+    x = fine_x()
+    measured, white = seen_through_blur(np.exp(0.4 * np.sin(x)), 40 + 1.1 * x)
+    across = at_pixel_centres(PositionMap(as_map(measured), as_map(0 * measured)), as_map(white), BLUR_PX)
+    down = at_pixel_centres(
+        PositionMap(as_map(measured).T.copy(), as_map(0 * measured).T.copy()), as_map(white).T.copy(), BLUR_PX
+    )
+    np.testing.assert_array_equal(down.position.T[2], across.position[2])
+
+
+def test_an_even_surface_stays_as_it_is() -> None:
+    position = as_map(40 + 1.3 * np.arange(30.0))
+    sigma = np.full_like(position, 0.02)
+    centred = at_pixel_centres(PositionMap(position, sigma), np.full_like(position, 100), BLUR_PX)
+    np.testing.assert_array_equal(centred.position, position)
+    np.testing.assert_array_equal(centred.sigma, sigma)
+
+
+def test_pixels_without_a_neighbour_or_without_light_stay_as_they_are() -> None:
+    position = as_map(40 + 1.3 * np.arange(30.0))
+    position[2, 10] = np.nan
+    contrast = np.tile(np.linspace(20, 200, 30), (5, 1)).astype(np.float32)
+    contrast[2, 20] = 0
+    centred = at_pixel_centres(PositionMap(position, np.zeros_like(position)), contrast, BLUR_PX).position
+    assert np.isnan(centred[2, 10])
+    np.testing.assert_array_equal(centred[2, [9, 11, 19, 21]], position[2, [9, 11, 19, 21]])
+    assert (centred[2, 12:18] != position[2, 12:18]).all()

@@ -1,0 +1,176 @@
+"""Kernels that were written for speed, each against the plain way to the same numbers."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from slrig.model import FloatArray
+from slrig.reconstruction.chaining import _order_kernel, chain, chain_frames
+from slrig.reconstruction.optics import normalised_from_pixel, normalised_near, packed
+from slrig.reconstruction.sheet_curves import SheetCurves
+from slrig.reconstruction.steger import (
+    _TAYLOR_BOX,
+    EDGE,
+    RIDGE,
+    _centred_weights,
+    kernels,
+    newton_kernel,
+    taylor_kernel,
+)
+from slrig.reconstruction.stripes import gathered
+from tests.unit.reconstruction.builders import CAMERA
+
+KINDS = pytest.mark.parametrize("kind", [RIDGE, EDGE])
+
+
+def filtered(image: FloatArray, sigma_px: float) -> list[FloatArray]:
+    """r, rx, ry, rxx, rxy, ryy by OpenCV, in double precision."""
+    zero, one, two = (kernel.astype(np.float64) for kernel in kernels(sigma_px))
+    pairs = ((zero, zero), (one, zero), (zero, one), (two, zero), (one, one), (zero, two))
+    return [np.asarray(cv2.sepFilter2D(image, cv2.CV_64F, across, along)) for across, along in pairs]
+
+
+@KINDS
+@pytest.mark.parametrize(("sigma_px", "shape"), [(1.03, (41, 70)), (2.5, (40, 33)), (1.4, (70, 6))])
+def test_first_step_is_taken_from_six_separable_filters(kind: int, sigma_px: float, shape: tuple[int, int]) -> None:
+    # Narrower than the kernel's reach, too: beyond the border the image is reflected, more than once if need be.
+    rng = np.random.default_rng(5)
+    image = rng.normal(0, 1, shape).astype(np.float32)
+    noise = rng.uniform(0.0, 0.1, shape).astype(np.float32)
+    lit = rng.uniform(0, 1, shape) > 0.2
+    r, rx, ry, rxx, rxy, ryy = filtered(image.astype(np.float64), sigma_px)
+    offset, response = taylor_kernel(image, noise, lit, np.float32(0.5), *kernels(sigma_px), kind)
+    kept = 0
+    for y, x in np.ndindex(shape):
+        if kind == RIDGE:
+            values, vectors = np.linalg.eigh([[rxx[y, x], rxy[y, x]], [rxy[y, x], ryy[y, x]]])
+            largest = int(np.argmax(np.abs(values)))
+            normal, strength = vectors[:, largest], -values[largest]
+            t = -float(normal @ [rx[y, x], ry[y, x]]) / values[largest]
+        else:
+            strength = np.hypot(rx[y, x], ry[y, x])
+            normal, t = np.array([rx[y, x], ry[y, x]]) / strength, -r[y, x] / strength
+        reach = np.abs(t * normal).max()
+        # What lies at the very edge of a limit may fall on either side of it in single precision.
+        if abs(reach - _TAYLOR_BOX) < 1e-3 or abs(strength - 0.5 * noise[y, x]) < 1e-4 or abs(strength) < 1e-3:
+            continue
+        if lit[y, x] and strength > 0.5 * noise[y, x] and reach < _TAYLOR_BOX:
+            kept += 1
+            assert response[y, x] == pytest.approx(strength, rel=1e-3)
+            np.testing.assert_allclose(offset[y, x], t * normal, atol=2e-3)
+        else:
+            assert response[y, x] == 0
+    assert kept > 10
+
+
+@pytest.mark.parametrize("centre", [-0.6, 0.0, 0.37])
+@pytest.mark.parametrize("sigma_px", [1.0, 2.5])
+def test_weights_about_a_point_between_pixels(centre: float, sigma_px: float) -> None:
+    at = np.arange(-9, 10) - centre
+    bell = np.exp(-(at**2) / (2 * sigma_px**2))
+    bell /= bell.sum()
+    out = np.zeros((3, 19))
+    _centred_weights(out, centre, sigma_px, np.exp(-(np.arange(-9.0, 10) ** 2) / (2 * sigma_px**2)))
+    np.testing.assert_allclose(out[0], bell, atol=1e-14)
+    np.testing.assert_allclose(out[1], at / sigma_px**2 * bell, atol=1e-14)
+    np.testing.assert_allclose(out[2], (at**2 / sigma_px**2 - 1) / sigma_px**2 * bell, atol=1e-14)
+
+
+@KINDS
+def test_second_step_is_taken_from_kernels_centred_on_the_first(kind: int) -> None:
+    sigma_px, radius = 1.3, 5
+    rng = np.random.default_rng(8)
+    image = cv2.GaussianBlur(rng.normal(0, 1, (50, 60)).astype(np.float32), (0, 0), 1.0)
+    offset = rng.uniform(-0.6, 0.6, (50, 60, 2)).astype(np.float32)
+    columns, rows = rng.integers(0, 60, 300).astype(np.int32), rng.integers(0, 50, 300).astype(np.int32)
+    x, y, normals, strength, kept = newton_kernel(image, offset, columns, rows, sigma_px, kind)
+    at = np.arange(-radius, radius + 1.0)
+    for i in np.flatnonzero(kept):
+        start = offset[rows[i], columns[i]].astype(np.float64)
+        weights = []
+        for middle in start:
+            away = at - middle
+            bell = np.exp(-(away**2) / (2 * sigma_px**2))
+            bell /= bell.sum()
+            weights.append([bell, away / sigma_px**2 * bell, (away**2 / sigma_px**2 - 1) / sigma_px**2 * bell])
+        wx, wy = weights
+        rows_of, columns_of = slice(rows[i] - radius, rows[i] + radius + 1), slice(columns[i] - 5, columns[i] + 6)
+        window = image[rows_of, columns_of].astype(np.float64)
+        gradient = np.array([wy[0] @ window @ wx[1], wy[1] @ window @ wx[0]])
+        if kind == RIDGE:
+            rxy = wy[1] @ window @ wx[1]
+            hessian = [[wy[0] @ window @ wx[2], rxy], [rxy, wy[2] @ window @ wx[0]]]
+            values, vectors = np.linalg.eigh(hessian)
+            largest = int(np.argmax(np.abs(values)))
+            normal, wanted = vectors[:, largest], -values[largest]
+            t = float(normal @ gradient) / wanted
+        else:
+            wanted = float(np.hypot(*gradient))
+            normal, t = gradient / wanted, -float(wy[0] @ window @ wx[0]) / wanted
+        assert strength[i] == pytest.approx(wanted, rel=1e-9)
+        np.testing.assert_allclose([x[i] - columns[i], y[i] - rows[i]], start + t * normal, atol=1e-9)
+        assert abs(float(normals[i] @ normal)) == pytest.approx(1, abs=1e-9)
+    assert 20 < kept.sum() < 280
+
+
+@pytest.mark.parametrize("counts", [[0], [1, 0, 700], [2500, 3]])
+def test_keys_are_ordered_frame_by_frame_with_ties_by_index(counts: list[int]) -> None:
+    rng = np.random.default_rng(3)
+    borders = np.cumsum([0, *counts])
+    keys = rng.integers(0, 2**32, borders[-1], dtype=np.uint32)
+    keys[::3] = keys[: len(keys[::3])] & np.uint32(0xFFC00003)
+    order = _order_kernel(keys, borders)
+    for a, b in pairwise(borders):
+        np.testing.assert_array_equal(order[a:b], np.argsort(keys[a:b], kind="stable"))
+
+
+def test_frames_are_chained_each_by_itself() -> None:
+    rng = np.random.default_rng(6)
+    y = np.arange(3.0, 40)
+    lines = [np.stack([20 + shift + 0.2 * y + rng.normal(0, 0.05, len(y)), y], axis=1) for shift in (0.0, 4.0, 0.4)]
+    points = np.concatenate([lines[0], lines[1], lines[0], lines[2]])
+    normals = np.tile([1.0, -0.2] / np.hypot(1.0, 0.2), (len(points), 1))
+    strength, strong = rng.uniform(1, 2, len(points)), rng.uniform(0, 1, len(points)) > 0.3
+    borders = np.array([0, 2 * len(y), 2 * len(y), 4 * len(y)])
+    order, offsets, frame = chain_frames(points, normals, strength, strong, borders, (50, 60))
+    parts = [slice(a, b) for a, b in pairwise(borders)]
+    alone = [chain(points[p], normals[p], strength[p], strong[p], (50, 60)) for p in parts]
+    assert order.tolist() == [int(i + b) for (each, _), b in zip(alone, borders, strict=False) for i in each]
+    lengths = [int(n) for _, each in alone for n in np.diff(each)]
+    assert np.diff(offsets).tolist() == lengths
+    assert frame.tolist() == [k for k, (_, each) in enumerate(alone) for _ in range(len(each) - 1)]
+    assert set(frame.tolist()) == {0, 2}
+
+
+def test_gathering_is_indexing() -> None:
+    rng = np.random.default_rng(2)
+    points, normals, sigma = rng.normal(0, 1, (90, 2)), rng.normal(0, 1, (90, 2)), rng.normal(0, 1, 90)
+    order = rng.permutation(90)[:50].astype(np.int32)
+    for got, wanted in zip(gathered(order, points, normals, sigma), (points, normals, sigma), strict=True):
+        np.testing.assert_array_equal(got, wanted[order])
+    curves = SheetCurves(
+        offsets=np.array([0, 90], dtype=np.int32), position_px=np.zeros(1), points_mm=rng.normal(0, 1, (90, 3)),
+        deviation_mm=rng.normal(0, 1, (90, 3)), along_px=sigma, pixels_px=points,
+        stripe=rng.integers(0, 9, 90).astype(np.int32), bridge_after=np.zeros(90, dtype=bool),
+        source=rng.integers(0, 3, 90).astype(np.uint8),
+    )  # fmt: skip
+    keep = rng.uniform(0, 1, 90) > 0.5
+    for index in (keep, order.astype(np.intp)):
+        taken = curves.taken(index, offsets=curves.offsets, bridge_after=np.zeros(0, dtype=bool))
+        for name in ("points_mm", "deviation_mm", "along_px", "pixels_px", "stripe", "source"):
+            wanted, got = getattr(curves, name)[index], getattr(taken, name)
+            assert got.dtype == wanted.dtype
+            np.testing.assert_array_equal(got, wanted)
+
+
+def test_a_start_nearby_leads_to_the_same_ray() -> None:
+    device = packed(CAMERA)
+    for u, v in ((10.0, 12.5), (120.3, 77.7)):
+        wanted = normalised_from_pixel(device, u, v)
+        for away in ((0.0, 0.0), (2e-3, -1e-3), (1e-8, 1e-8)):
+            got = normalised_near(device, u, v, wanted[0] + away[0], wanted[1] + away[1])
+            np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12)

@@ -1,0 +1,265 @@
+"""The spare equation of two cameras, against projections by OpenCV and a plain walk along the curves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.model import Axis, FloatArray, Pinhole, Size, Source
+from slrig.reconstruction.redundancy import (
+    CELLS,
+    FEWEST_PAIRS,
+    PairRedundancy,
+    SpareEquation,
+    in_figures,
+    redundancy,
+    spare_equation,
+)
+from slrig.reconstruction.triangulation import SheetCurves, camera_projector
+from tests.unit.reconstruction.builders import (
+    CAMERA,
+    OTHER_CAMERA,
+    PROJECTOR,
+    Sphere,
+    ensemble_of,
+    lit_rows,
+    opencv_pixels,
+    opencv_rays,
+)
+
+BALL = Sphere()
+COLUMNS = [100.0, 120.0, 140.0, 160.0, 180.0, 200.0]
+ROWS = np.arange(50.0, 190.0, 0.8)
+GAP_PX = 4.0
+
+
+def turned(device: Pinhole, *, degrees: tuple[float, float, float]) -> Pinhole:
+    """The device turned about its own centre, by angles about its own axes."""
+    x, y, z = np.radians(degrees)
+    about_x = np.array([[1, 0, 0], [0, math.cos(x), -math.sin(x)], [0, math.sin(x), math.cos(x)]])
+    about_y = np.array([[math.cos(y), 0, math.sin(y)], [0, 1, 0], [-math.sin(y), 0, math.cos(y)]])
+    about_z = np.array([[math.cos(z), -math.sin(z), 0], [math.sin(z), math.cos(z), 0], [0, 0, 1]])
+    rotation = about_x @ about_y @ about_z @ device.rotation
+    return replace(device, rotation=rotation, translation_mm=-rotation @ device.centre_mm)
+
+
+def normals_along(pixels: FloatArray) -> FloatArray:
+    """(n, 2): across a curve, to its left as one walks it on a screen (rows go down)."""
+    tangent = np.gradient(pixels, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    return np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+
+
+def seen(
+    camera: Pinhole, *, believed: Pinhole | None = None, rows: FloatArray = ROWS, noise_px: float = 0.0, seed: int = 0
+) -> SheetCurves:
+    """What a camera triangulates of the ball with the pose it is believed to have; gaps of the rows are bridges."""
+    rng = np.random.default_rng(seed)
+    pixels, normals = [], []
+    for column in COLUMNS:
+        curve = opencv_pixels(camera, lit_rows(column, rows, BALL))
+        normals.append(normals_along(curve))
+        pixels.append(curve + rng.normal(0, 1, len(curve))[:, None] * noise_px * normals[-1])
+    cuts = tuple(int(cut) for cut in np.flatnonzero(np.diff(rows) > GAP_PX))
+    ensemble = ensemble_of(pixels, COLUMNS, sigma_px=noise_px or 0.01, breaks=dict.fromkeys(range(len(COLUMNS)), cuts))
+    ensemble = replace(ensemble, normals=np.concatenate(normals))
+    return camera_projector(ensemble, believed or camera, PROJECTOR, Axis.COLUMN)
+
+
+def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAMERA) -> SpareEquation:
+    return spare_equation(first, second, other, Axis.COLUMN, widest_gap_px=GAP_PX)
+
+
+def test_a_perfect_rig_has_nothing_to_spare() -> None:
+    spare = both(seen(CAMERA), seen(OTHER_CAMERA, rows=ROWS + 0.37))
+    assert len(spare.residual_px) > 0.97 * len(COLUMNS) * len(ROWS)
+    # What is left is the sagitta of a curve between two of its points.
+    assert np.abs(spare.residual_px).max() < 1e-3
+
+
+def test_the_residual_of_a_good_calibration_is_its_stated_noise() -> None:
+    rows = ROWS + 0.001
+    spare = both(seen(CAMERA, noise_px=0.03, seed=1), seen(OTHER_CAMERA, rows=rows, noise_px=0.05, seed=2))
+    count = len(spare.residual_px)
+    assert abs(spare.residual_px.mean()) < 4 * spare.residual_px.std() / math.sqrt(count)
+    # Rows all but meet, so that a point of the other camera is one point, not the mean of two.
+    assert np.sqrt(np.mean((spare.residual_px / spare.sigma_px) ** 2)) == pytest.approx(1.0, abs=0.06)
+    assert (spare.sigma_px > 0.05).all()
+
+
+@pytest.mark.parametrize("degrees", [(0.0, 0.05, 0.0), (0.0, -0.05, 0.0), (0.0, 0.0, 0.05), (0.05, 0.0, 0.0)])
+def test_a_turned_second_camera_shows_as_the_shift_of_its_image(degrees: tuple[float, float, float]) -> None:
+    # The oracle: where truth is seen, less where the turned camera is believed to see it, across the stripe.
+    believed = turned(OTHER_CAMERA, degrees=degrees)
+    spare = both(seen(CAMERA), seen(OTHER_CAMERA, believed=believed), other=believed)
+    wanted = []
+    for column in COLUMNS:
+        truth = lit_rows(column, ROWS, BALL)
+        found, expected = opencv_pixels(OTHER_CAMERA, truth), opencv_pixels(believed, truth)
+        wanted.append(((found - expected) * normals_along(found)).sum(axis=1))
+    predicted = np.concatenate(wanted)
+    assert spare.residual_px.mean() == pytest.approx(predicted.mean(), rel=0.02, abs=2e-3)
+    assert spare.residual_px.std() == pytest.approx(predicted.std(), rel=0.1, abs=5e-3)
+
+
+def test_a_camera_turned_by_a_twentieth_of_a_degree_is_off_by_its_focal_length_times_the_angle() -> None:
+    believed = turned(OTHER_CAMERA, degrees=(0.0, 0.05, 0.0))
+    spare = both(seen(CAMERA), seen(OTHER_CAMERA, believed=believed), other=believed)
+    focal_px = float(OTHER_CAMERA.matrix[0, 0])
+    # Turned towards +x of its rows, the world is expected further right than it is found; columns rise to the right.
+    assert spare.residual_px.mean() == pytest.approx(-focal_px * math.radians(0.05), rel=0.2)
+
+
+def test_a_turned_first_camera_shows_as_the_depth_it_gets_wrong() -> None:
+    believed = turned(CAMERA, degrees=(0.0, 0.05, 0.0))
+    spare = both(seen(CAMERA, believed=believed), seen(OTHER_CAMERA))
+    wanted = []
+    for column in COLUMNS:
+        truth = lit_rows(column, ROWS, BALL)
+        wrong = on_column(believed, opencv_pixels(CAMERA, truth), column)
+        found = opencv_pixels(OTHER_CAMERA, truth)
+        wanted.append(((found - opencv_pixels(OTHER_CAMERA, wrong)) * normals_along(found)).sum(axis=1))
+    predicted = float(np.concatenate(wanted).mean())
+    assert abs(predicted) > 0.5
+    assert spare.residual_px.mean() == pytest.approx(predicted, rel=0.02)
+
+
+def on_column(camera: Pinhole, pixels: FloatArray, column_px: float) -> FloatArray:
+    """(n, 3): where rays meet the light of one column, by bisection on OpenCV's projection."""
+    rays = opencv_rays(camera, pixels)
+    near, far = np.full(len(rays), 200.0), np.full(len(rays), 900.0)
+
+    def off(depth: FloatArray) -> FloatArray:
+        return opencv_pixels(PROJECTOR, camera.centre_mm + depth[:, None] * rays)[:, 0] - column_px
+
+    rising = off(far) > off(near)
+    for _ in range(60):
+        middle = (near + far) / 2
+        beyond = (off(middle) > 0) == rising
+        near, far = np.where(beyond, near, middle), np.where(beyond, middle, far)
+    return np.asarray(camera.centre_mm + near[:, None] * rays)
+
+
+def test_the_sign_is_that_of_rising_columns_however_the_stripes_were_found() -> None:
+    # A second camera on its side: its stripes lie along its rows, and columns rise upwards or downwards.
+    for roll in (90.0, 180.0, -90.0):
+        rolled = turned(OTHER_CAMERA, degrees=(0.0, 0.0, roll))
+        lifted = turned(rolled, degrees=(0.0, 0.05, 0.0) if abs(roll) == 180 else (0.05, 0.0, 0.0))
+        spare = both(seen(CAMERA), seen(rolled, believed=lifted), other=lifted)
+        middle = lit_rows(150.0, np.array([120.0]), BALL)
+        higher = lit_rows(151.0, np.array([120.0]), BALL)
+        rising = (opencv_pixels(rolled, higher) - opencv_pixels(rolled, middle))[0]
+        shift = (opencv_pixels(rolled, middle) - opencv_pixels(lifted, middle))[0]
+        assert np.sign(spare.residual_px.mean()) == np.sign(rising @ shift)
+        assert abs(spare.residual_px.mean()) > 0.8
+
+
+def test_rows_of_light_count_towards_higher_rows() -> None:
+    columns = [60.0, 100.0, 140.0]
+    along = np.arange(60.0, 200.0, 0.8)
+    above = turned(OTHER_CAMERA, degrees=(0.05, 0.0, 0.0))
+
+    def rows_seen(camera: Pinhole, believed: Pinhole) -> SheetCurves:
+        lit = [lit_row(row, along) for row in columns]
+        pixels = [opencv_pixels(camera, each) for each in lit]
+        return camera_projector(ensemble_of(pixels, columns, normal=(0.0, 1.0)), believed, PROJECTOR, Axis.ROW)
+
+    spare = spare_equation(
+        rows_seen(CAMERA, CAMERA), rows_seen(OTHER_CAMERA, above), above, Axis.ROW, widest_gap_px=GAP_PX
+    )
+    point = lit_row(100.0, along[:1])
+    shift = (opencv_pixels(OTHER_CAMERA, point) - opencv_pixels(above, point))[0]
+    # Rows rise downwards in the image, as y does.
+    assert spare.residual_px.mean() == pytest.approx(shift[1], rel=0.1)
+
+
+def lit_row(row_px: float, columns_px: FloatArray) -> FloatArray:
+    """(n, 3) float64: points of the ball lit by one projector row."""
+    pixels = np.column_stack([columns_px, np.full(len(columns_px), row_px)])
+    return BALL.seen_along(PROJECTOR.centre_mm, opencv_rays(PROJECTOR, pixels))
+
+
+def test_points_on_a_gap_of_the_other_camera_have_no_partner() -> None:
+    gap = (ROWS > 100) & (ROWS < 120)
+    spare = both(seen(CAMERA), seen(OTHER_CAMERA, rows=ROWS[~gap]))
+    whole = both(seen(CAMERA), seen(OTHER_CAMERA))
+    assert len(whole.residual_px) - len(spare.residual_px) == pytest.approx(len(COLUMNS) * gap.sum(), abs=12)
+    assert np.abs(spare.residual_px).max() < 1e-3
+
+
+def test_sheets_that_one_camera_has_alone_are_left_out() -> None:
+    first, second = seen(CAMERA), seen(OTHER_CAMERA)
+    apart = replace(second, position_px=second.position_px + 1)
+    assert len(both(first, apart).residual_px) == 0
+    found = redundancy([first, apart], {"left": CAMERA, "right": OTHER_CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
+    assert found.pairs == ()
+    assert found.reason == "the cameras share no point of any light sheet"
+
+
+def figures(residual: FloatArray, pixels: FloatArray, sigma: float = 0.02) -> PairRedundancy:
+    spare = SpareEquation(residual, np.full(len(residual), sigma), pixels)
+    return in_figures(spare, "left", "right", Size(600, 480))
+
+
+def test_the_map_tells_each_cell_of_the_reference_image_apart() -> None:
+    rng = np.random.default_rng(5)
+    pixels = rng.uniform([-0.5, -0.5], [599.5, 479.5], (20_000, 2))
+    cell = np.stack([(pixels[:, 1] + 0.5) // 80, (pixels[:, 0] + 0.5) // 100], axis=1).astype(int)
+    residual = 0.1 * cell[:, 0] + 0.01 * cell[:, 1] + rng.normal(0, 0.02, len(cell))
+    kept = ~((cell[:, 0] == 2) & (cell[:, 1] == 3)) | (np.cumsum((cell == (2, 3)).all(axis=1)) < FEWEST_PAIRS)
+    made = figures(residual[kept], pixels[kept])
+    assert made.outlying == 0
+    for row in range(CELLS):
+        for column in range(CELLS):
+            mine = residual[kept & (cell == (row, column)).all(axis=1)]
+            assert made.map_pairs[row, column] == len(mine)
+            if (row, column) == (2, 3):
+                assert len(mine) == FEWEST_PAIRS - 1
+                assert np.isnan(made.map_mean_px[row, column])
+                assert np.isnan(made.map_rms_px[row, column])
+            else:
+                assert made.map_mean_px[row, column] == pytest.approx(mine.mean())
+                assert made.map_rms_px[row, column] == pytest.approx(np.sqrt((mine**2).mean()))
+    assert made.pairs == made.map_pairs.sum() == kept.sum()
+    assert made.mean_px == pytest.approx(residual[kept].mean())
+    assert made.rms_px == pytest.approx(np.sqrt((residual[kept] ** 2).mean()))
+    assert made.median_absolute_px == pytest.approx(np.median(np.abs(residual[kept])))
+    assert made.stated_rms_px == pytest.approx(0.02)
+
+
+def test_points_of_two_different_things_are_counted_and_left_out() -> None:
+    rng = np.random.default_rng(6)
+    residual = rng.normal(0.5, 0.02, 1000)
+    residual[:7] = 3.0
+    made = figures(residual, np.tile([300.0, 200.0], (1000, 1)))
+    assert (made.outlying, made.pairs) == (7, 993)
+    assert made.mean_px == pytest.approx(0.5, abs=0.01)
+
+
+def test_without_a_spare_equation_the_reason_is_told() -> None:
+    part = seen(CAMERA)
+    alone = redundancy([part], {"left": CAMERA}, Axis.COLUMN, widest_gap_px=GAP_PX)
+    assert alone.pairs == ()
+    assert "one camera" in (alone.reason or "")
+    stereo = replace(part, source=np.full(len(part.source), Source.CAMERA_CAMERA, dtype=np.uint8))
+    devices = {"left": CAMERA, "right": OTHER_CAMERA}
+    spent = redundancy([stereo], devices, Axis.COLUMN, widest_gap_px=GAP_PX)
+    assert spent.pairs == ()
+    assert "projector is not calibrated" in (spent.reason or "")
+
+
+def test_three_cameras_make_three_pairs() -> None:
+    third = turned(CAMERA, degrees=(0.0, 0.0, 3.0))
+    devices = {"left": CAMERA, "right": OTHER_CAMERA, "third": third}
+    parts = [seen(device) for device in devices.values()]
+    found = redundancy(parts, devices, Axis.COLUMN, widest_gap_px=GAP_PX)
+    assert [(pair.reference, pair.camera) for pair in found.pairs] == [
+        ("left", "right"), ("left", "third"), ("right", "third"),
+    ]  # fmt: skip
+    assert found.reason is None
+    for pair in found.pairs:
+        assert abs(pair.mean_px) < 1e-3
+        assert pair.rms_px < 1e-3
