@@ -22,6 +22,7 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, Setting
 from slrig.bundle.description import CameraName
 from slrig.bundle.faults import Strict, explain, keys_of, read_text
 from slrig.errors import ConfigError
+from slrig.model import FlipRule
 
 MOST_CONFIG_BYTES = 2**20
 
@@ -42,6 +43,8 @@ class ScanDefaults(Strict):
     keep_holes: bool | None = None
     depth_edge_ratio: Annotated[float, Field(gt=1)] | None = None
     max_code_gap: Annotated[int, Field(ge=1)] | None = None
+    flip_rule: Annotated[FlipRule, Field(strict=False)] | None = None
+    smooth_boundary: bool | None = None
     exposure_s: ExposureSeconds | None = None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from slrig.api.openapi import problems
 from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
+from slrig.scan.artefacts import MESH, ON_REQUEST, write_converted
 from slrig.scan.folder import DataFolder
 from slrig.scan.records import ScanRecord, ScanState
 
@@ -23,11 +25,15 @@ MEDIA_TYPES = {
     "mesh.ply": "application/octet-stream",
     "mesh.glb": "model/gltf-binary",
     "mesh.stl": "model/stl",
+    "mesh.obj": "model/obj",
     "points.ply": "application/octet-stream",
     "report.json": "application/json",
     "preview.png": "image/png",
 }
 BUNDLE_ZIP = "bundle.zip"
+
+# A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
+_converting = threading.Lock()
 
 _CHUNK_BYTES = 2**20
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -42,10 +48,12 @@ def ready_files(folder: DataFolder, record: ScanRecord) -> dict[str, str]:
     place = folder.scan(record.id)
     if not record.state.final or not place.is_dir():
         return {}
-    names = sorted(path.name for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png")
+    names = {path.name for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png"}
+    if MESH in names:
+        names |= set(ON_REQUEST)
     if (place / "bundle").is_dir():
-        names.append(BUNDLE_ZIP)
-    return {name: f"/scan/{record.id}/{name}" for name in names}
+        names.add(BUNDLE_ZIP)
+    return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
 
 
 def _refuse_absent(record: ScanRecord, name: str) -> None:
@@ -64,7 +72,12 @@ def _refuse_absent(record: ScanRecord, name: str) -> None:
 
 def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: str | None) -> Response:
     record = service.store.get(scan_id)
-    path = service.folder.scan(scan_id) / name
+    place = service.folder.scan(scan_id)
+    path = place / name
+    if record.state.final and name in ON_REQUEST and (place / MESH).is_file():
+        with _converting:
+            if not path.is_file():
+                write_converted(place, name)
     if not record.state.final or not path.is_file():
         _refuse_absent(record, name)
     headers = _headers(scan_id, name)
@@ -89,7 +102,8 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
     def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
         return _file(service, scan_id, name, media_type, known)
 
-    fetch.__doc__ = f"Return {name} of a scan that succeeded. Ranges and ETags are honoured."
+    made = " It is made of mesh.ply when it is first asked for, and kept." if name in ON_REQUEST else ""
+    fetch.__doc__ = f"Return {name} of a scan that succeeded.{made} Ranges and ETags are honoured."
     return fetch
 
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
 
 from slrig.api.problems import fault_problem
 from slrig.config import ScanDefaults
+from slrig.model import FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 
@@ -53,6 +54,14 @@ class ReconstructionRequest(_Strict):
     max_code_gap: Annotated[int, Field(ge=1, le=64)] | None = Field(
         default=None,
         description="stripes whose columns differ by at most this many steps are meshed together. Default 1",
+    )
+    flip_rule: Annotated[FlipRule, Field(strict=False)] | None = Field(
+        default=None,
+        description="when an edge is exchanged for the other diagonal of its two triangles: Delaunay, or Delaunay "
+        "constrained against sharp triangles and folds. Default constrained",
+    )
+    smooth_boundary: bool | None = Field(
+        default=None, description="shrink and smooth the boundary of the mesh. Default true"
     )
 
 

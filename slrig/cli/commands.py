@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,12 +44,34 @@ Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is
 KeyFile = Annotated[
     Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
 ]
-KeepHoles = Annotated[bool, typer.Option("--keep-holes", help="Leave gaps within a stripe open.")]
+KeepHoles = Annotated[
+    bool | None,
+    typer.Option("--keep-holes/--close-holes", help="Leave gaps within a stripe open, or close them (default)."),
+]
 DepthEdgeRatio = Annotated[
     float | None,
     typer.Option(help="Longest triangle edge, in sampling distances, above 1. Default 6; longer skins cliffs."),
 ]
 MaxCodeGap = Annotated[int | None, typer.Option(help="Mesh stripes up to this many columns apart. Default 1.")]
+FlipRuleName = Annotated[
+    str | None,
+    typer.Option("--flip-rule", help="How edges of the mesh are flipped: constrained (default) or delaunay."),
+]
+SmoothBoundary = Annotated[
+    bool | None,
+    typer.Option(
+        "--smooth-boundary/--raw-boundary", help="Shrink and smooth the mesh's boundary (default), or leave it."
+    ),
+]
+
+
+class FurtherFormat(StrEnum):
+    """Formats of the mesh that are written only when they are asked for."""
+
+    STL = "stl"
+    OBJ = "obj"
+
+
 USUAL_URL = "http://127.0.0.1:8731"
 
 
@@ -103,7 +126,10 @@ def scan(
     output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("scans/latest"),
     file: Annotated[
         list[str] | None,
-        typer.Option(help="File to fetch; may be repeated. Default: mesh.ply, preview.png, report.json."),
+        typer.Option(
+            help="File to fetch, mesh.obj and mesh.stl among them; may be repeated. "
+            "Default: mesh.ply, preview.png, report.json."
+        ),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Free text, to find the scan again.")] = None,
     exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera, seconds.")] = None,
@@ -112,9 +138,11 @@ def scan(
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
     gray_only: Annotated[bool, typer.Option("--gray-only", help="Play the Gray code without shifted lines.")] = False,
     rows: Annotated[bool, typer.Option("--rows", help="Play the row axis as well.")] = False,
-    keep_holes: KeepHoles = False,
+    keep_holes: KeepHoles = None,
     depth_edge_ratio: DepthEdgeRatio = None,
     max_code_gap: MaxCodeGap = None,
+    flip_rule: FlipRuleName = None,
+    smooth_boundary: SmoothBoundary = None,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
     """Scan with a running service, follow the progress, and fetch the mesh."""
@@ -134,7 +162,11 @@ def scan(
         "if_busy": "queue" if queue else "reject",
         "patterns": patterns,
         "reconstruction": _given(
-            keep_holes=keep_holes or None, depth_edge_ratio=depth_edge_ratio, max_code_gap=max_code_gap
+            keep_holes=keep_holes,
+            depth_edge_ratio=depth_edge_ratio,
+            max_code_gap=max_code_gap,
+            flip_rule=flip_rule,
+            smooth_boundary=smooth_boundary,
         ),
     }
     with ServiceClient(url, read_key(key_file)) as client:
@@ -149,15 +181,28 @@ def reconstruct(
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration to use in place of the bundle's calibration.json.")
     ] = None,
-    keep_holes: KeepHoles = False,
+    mesh_format: Annotated[
+        list[FurtherFormat] | None,
+        typer.Option("--format", help="Write the mesh in this format as well as PLY and GLB; may be repeated."),
+    ] = None,
+    keep_holes: KeepHoles = None,
     depth_edge_ratio: DepthEdgeRatio = None,
     max_code_gap: MaxCodeGap = None,
+    flip_rule: FlipRuleName = None,
+    smooth_boundary: SmoothBoundary = None,
 ) -> None:
     """Make a mesh from a recorded scan. Needs no service and no rig."""
     from slrig.cli.reconstruct import reconstruct_with_progress
 
-    options = _given(keep_holes=keep_holes or None, depth_edge_ratio=depth_edge_ratio, max_code_gap=max_code_gap)
-    reconstruct_with_progress(bundle, output, calibration=calibration, options=options)
+    options = _given(
+        keep_holes=keep_holes,
+        depth_edge_ratio=depth_edge_ratio,
+        max_code_gap=max_code_gap,
+        flip_rule=flip_rule,
+        smooth_boundary=smooth_boundary,
+    )
+    formats = [each.value for each in mesh_format or ()]
+    reconstruct_with_progress(bundle, output, calibration=calibration, formats=formats, options=options)
 
 
 @app.command()

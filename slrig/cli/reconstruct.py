@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,18 @@ import typer
 
 from slrig.cli.display import progress_shown
 from slrig.cli.scan import quality_lines
+from slrig.scan.artefacts import MESH, write_converted
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.records import report_summary
 from slrig.scan.worker import prepare_kernel_cache
 
 
 def reconstruct_with_progress(
-    bundle: Path, output: Path, *, calibration: Path | None, options: Mapping[str, Any]
+    bundle: Path, output: Path, *, calibration: Path | None, formats: Sequence[str] = (), options: Mapping[str, Any]
 ) -> None:
     """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises.
 
-    options : fields of `ReconstructionPlan` that were given.
+    formats : further formats of the mesh, "stl" or "obj"; options : fields of `ReconstructionPlan` that were given.
     """
     plan = ReconstructionPlan(**options)
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
@@ -39,7 +40,12 @@ def reconstruct_with_progress(
             progress=display,
             cancelled=lambda: False,
         )
-    for what, name in (("mesh", "mesh.ply"), ("preview", "preview.png"), ("report", "report.json")):
+        further = [f"mesh.{name}" for name in dict.fromkeys(formats)]
+        for name in further:
+            display(f"writing {name}", 1.0, "")
+            write_converted(output, name)
+    told = [(Path(name).suffix[1:], name) for name in further]
+    for what, name in (("mesh", MESH), *told, ("preview", "preview.png"), ("report", "report.json")):
         typer.echo(f"{what:<10}{output / name}")
     for line in quality_lines(report_summary(report)):
         typer.echo(line)

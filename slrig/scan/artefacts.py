@@ -8,28 +8,58 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
-from slrig.bundle.storage import write_file
+from slrig.bundle.storage import refusals_of, write_file
+from slrig.errors import InvalidInputError
 from slrig.model import Mesh, PointCurves
+from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
 
-_METRES_PER_MM = 0.001
+MESH = "mesh.ply"
+ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {"mesh.stl": encode_mesh_stl, "mesh.obj": encode_mesh_obj}
+"""Files that are large, and made only when somebody wants them."""
+
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
+_END_OF_HEADER = b"\nend_header\n"
+_FACE = np.dtype([("count", "<u1"), ("vertices", "<i4", (3,))])
+_NO_MESH = Mesh(
+    vertices_mm=np.zeros((0, 3), dtype=np.float32),
+    faces=np.zeros((0, 3), dtype=np.int32),
+    normals=np.zeros((0, 3), dtype=np.float32),
+    grey=np.zeros(0, dtype=np.uint8),
+    sigma_mm=np.zeros(0, dtype=np.float32),
+    stripe=np.zeros(0, dtype=np.int32),
+)
 
 
 def write_mesh(mesh: Mesh, folder: Path) -> None:
-    """Write mesh.ply, mesh.glb and mesh.stl into `folder`. Raises StorageError."""
+    """Write mesh.ply and mesh.glb into `folder`; other formats are made of them on request. Raises StorageError."""
     # One at a time: each is as large as the mesh.
-    for name, encode in (("ply", encode_mesh_ply), ("glb", encode_mesh_glb), ("stl", encode_mesh_stl)):
-        write_file(folder / f"mesh.{name}", encode(mesh))
+    for name, encode in ((MESH, encode_mesh_ply), ("mesh.glb", encode_mesh_glb)):
+        write_file(folder / name, encode(mesh))
+
+
+def write_converted(folder: Path, name: str) -> None:
+    """Write one of `ON_REQUEST` beside the mesh.ply of a finished scan, of which it is made.
+
+    Raises
+    ------
+    InvalidInputError
+        mesh.ply is not as slrig wrote it.
+    StorageError
+        mesh.ply cannot be read, or the disk refused.
+    """
+    with refusals_of(folder / MESH):
+        data = (folder / MESH).read_bytes()
+    write_file(folder / name, ON_REQUEST[name](decode_mesh_ply(data)))
 
 
 def write_points(curves: PointCurves, path: Path) -> None:
@@ -53,21 +83,62 @@ def write_report(report: Mapping[str, object], path: Path) -> None:
 
 def encode_mesh_ply(mesh: Mesh) -> bytes:
     """Binary little-endian PLY in mm: position, normal, colour, `sigma_mm`, `stripe` per vertex; triangles."""
-    vertices = _records(
-        len(mesh.vertices_mm),
-        {
-            **_columns(("x", "y", "z"), "f4", mesh.vertices_mm),
-            **_columns(("nx", "ny", "nz"), "f4", mesh.normals),
-            **_columns(("red", "green", "blue"), "u1", _rgb(mesh.grey)),
-            "sigma_mm": ("f4", mesh.sigma_mm),
-            "stripe": ("i4", mesh.stripe),
-        },
-    )
-    faces = np.zeros(len(mesh.faces), dtype=[("count", "<u1"), ("vertices", "<i4", (3,))])
+    vertices = _records(len(mesh.vertices_mm), _vertex_properties(mesh))
+    faces = np.zeros(len(mesh.faces), dtype=_FACE)
     faces["count"] = 3
     faces["vertices"] = mesh.faces
-    header = [*_ply_header(vertices), f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    return _ply(header, vertices.tobytes(), faces.tobytes())
+    return _ply(_mesh_elements(vertices, len(faces)), vertices, faces)
+
+
+def decode_mesh_ply(data: bytes) -> Mesh:
+    """The mesh in a PLY that `encode_mesh_ply` made.
+
+    Raises
+    ------
+    InvalidInputError
+        The PLY is cut, or of another layout: it was changed, or made by another program or version.
+    """
+    head, mark, body = data.partition(_END_OF_HEADER)
+    counts = [int(count) for count in re.findall(rb"^element \w+ (\d{1,12})$", head, re.MULTILINE)]
+    none = _records(0, _vertex_properties(_NO_MESH))
+    vertex_count, face_count = counts if len(counts) == 2 else (0, 0)
+    vertex_bytes = vertex_count * none.dtype.itemsize
+    length = vertex_bytes + face_count * _FACE.itemsize
+    wanted = _ply_header(_mesh_elements(none, face_count, vertex_count=vertex_count))
+    if head + mark != wanted or len(body) != length:
+        message = (
+            f"mesh.ply: expected the header that slrig writes and {length} bytes after it, found "
+            f"{'another header' if head + mark != wanted else f'{len(body)} bytes'}; reconstruct the bundle again"
+        )
+        raise InvalidInputError(message)
+    vertices = np.frombuffer(body, dtype=none.dtype, count=vertex_count)
+    faces = np.frombuffer(body, dtype=_FACE, count=face_count, offset=vertex_bytes)["vertices"]
+    if len(faces) and not 0 <= faces.min() <= faces.max() < vertex_count:
+        message = "mesh.ply: a triangle names a vertex that is not there; reconstruct the bundle again"
+        raise InvalidInputError(message)
+    return Mesh(
+        vertices_mm=np.stack([vertices[name] for name in ("x", "y", "z")], axis=1),
+        faces=np.ascontiguousarray(faces),
+        normals=np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1),
+        grey=np.ascontiguousarray(vertices["red"]),
+        sigma_mm=np.ascontiguousarray(vertices["sigma_mm"]),
+        stripe=np.ascontiguousarray(vertices["stripe"]),
+    )
+
+
+def _vertex_properties(mesh: Mesh) -> dict[str, tuple[str, NDArray[Any]]]:
+    return {
+        **_columns(("x", "y", "z"), "f4", mesh.vertices_mm),
+        **_columns(("nx", "ny", "nz"), "f4", mesh.normals),
+        **_columns(("red", "green", "blue"), "u1", _rgb(mesh.grey)),
+        "sigma_mm": ("f4", mesh.sigma_mm),
+        "stripe": ("i4", mesh.stripe),
+    }
+
+
+def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count: int | None = None) -> list[str]:
+    faces = [f"element face {face_count}", "property list uchar int vertex_indices"]
+    return [*_vertex_element(vertices, count=vertex_count), *faces]
 
 
 def encode_points_ply(curves: PointCurves) -> bytes:
@@ -88,45 +159,7 @@ def encode_points_ply(curves: PointCurves) -> bytes:
             "bridge_after": ("u1", curves.bridge_after),
         },
     )
-    return _ply(_ply_header(points), points.tobytes())
-
-
-def encode_mesh_glb(mesh: Mesh) -> bytes:
-    """Binary glTF 2.0 with normals and colours.
-
-    glTF is in metres: the vertices keep their values in mm, under a node that scales by 0.001.
-    Normals are left out if one is not known, because glTF has no form for that.
-    """
-    scale = np.diag((_METRES_PER_MM, _METRES_PER_MM, _METRES_PER_MM, 1.0))
-    scene = trimesh.Scene()
-    scene.add_geometry(_trimesh(mesh), node_name="scan", geom_name="mesh_mm", transform=scale)
-    known = bool(np.isfinite(mesh.normals).all())
-    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=known, tree_postprocessor=_made_of_plaster))
-
-
-def _made_of_plaster(tree: dict[str, Any]) -> None:
-    """Give the glTF tree a dull material: without one a viewer assumes metal, which shows little but reflections."""
-    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}, "doubleSided": True}]
-    for shape in tree.get("meshes", ()):
-        for primitive in shape["primitives"]:
-            primitive["material"] = 0
-
-
-def encode_mesh_stl(mesh: Mesh) -> bytes:
-    """Binary STL, values in mm (the format has no unit)."""
-    return bytes(trimesh.exchange.stl.export_stl(_trimesh(mesh)))
-
-
-def _trimesh(mesh: Mesh) -> trimesh.Trimesh:
-    opaque = np.concatenate((_rgb(mesh.grey), np.full((len(mesh.grey), 1), 255, dtype=np.uint8)), axis=1)
-    return trimesh.Trimesh(
-        vertices=mesh.vertices_mm,
-        faces=mesh.faces,
-        vertex_normals=mesh.normals,
-        vertex_colors=opaque,
-        process=False,
-        validate=False,
-    )
+    return _ply(_vertex_element(points), points)
 
 
 def _rgb(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -145,17 +178,22 @@ def _records(count: int, properties: Mapping[str, tuple[str, NDArray[Any]]]) -> 
     return records
 
 
-def _ply_header(vertices: NDArray[np.void]) -> list[str]:
+def _vertex_element(vertices: NDArray[np.void], *, count: int | None = None) -> list[str]:
     names = vertices.dtype.names or ()
     kinds = [_PLY_TYPES[vertices.dtype[name].str[1:]] for name in names]
     properties = [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=True)]
-    return [f"element vertex {len(vertices)}", *properties]
+    return [f"element vertex {len(vertices) if count is None else count}", *properties]
 
 
-def _ply(elements: list[str], *bodies: bytes) -> bytes:
+def _ply(elements: list[str], *bodies: NDArray[np.void]) -> bytes:
+    # A view is not copied before it is joined.
+    return b"".join([_ply_header(elements), *(body.view(np.uint8).data for body in bodies)])
+
+
+def _ply_header(elements: list[str]) -> bytes:
     comments = ["comment unit mm", "comment sigma_mm standard deviation along the surface normal"]
-    header = ["ply", "format binary_little_endian 1.0", *comments, *elements, "end_header", ""]
-    return "\n".join(header).encode("ascii") + b"".join(bodies)
+    lines = ["ply", "format binary_little_endian 1.0", *comments, *elements]
+    return "\n".join(lines).encode("ascii") + _END_OF_HEADER
 
 
 def _plain(value: object, where: str) -> object:

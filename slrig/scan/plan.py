@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from slrig.errors import ConfigError
+from slrig.model import FlipRule
 
 
 class Progress(Protocol):
@@ -40,16 +41,20 @@ class ReconstructionPlan:
     keep_holes : drop triangles that use a bridge between two stripes of one code.
     depth_edge_ratio : a triangle edge longer than this many times the local sampling distance crosses a depth edge.
     max_code_gap : neighbouring curves whose columns differ by at most this many column steps are meshed together.
+    flip_rule : when an edge is exchanged for the other diagonal of its two triangles; `FlipRule` or its value.
+    smooth_boundary : shrink and smooth the boundary of the mesh (paper, section 3.4).
 
     Raises
     ------
     ConfigError
-        depth_edge_ratio is not above 1 and finite, or max_code_gap is below 1.
+        depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, or flip_rule is none of `FlipRule`.
     """
 
     keep_holes: bool = False
     depth_edge_ratio: float = 6.0
     max_code_gap: int = 1
+    flip_rule: FlipRule = FlipRule.CONSTRAINED
+    smooth_boundary: bool = True
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:
@@ -63,6 +68,12 @@ class ReconstructionPlan:
                 f"max_code_gap: expected 1 or more, found {self.max_code_gap}; 1 meshes each curve with the next one"
             )
             raise ConfigError(message)
+        try:
+            # Requests and stored plans bring plain text.
+            object.__setattr__(self, "flip_rule", FlipRule(self.flip_rule))
+        except ValueError as cause:
+            message = f"flip_rule: expected {' or '.join(FlipRule)}, found {self.flip_rule!r}; constrained is usual"
+            raise ConfigError(message) from cause
 
 
 @dataclass(frozen=True, slots=True)

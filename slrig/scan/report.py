@@ -5,15 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
-from slrig.meshing.initial import InitialMesh
+from slrig.meshing.optimisation import Optimised
+from slrig.meshing.surface import FinishedMesh, Stage
 from slrig.model import Axis, Calibration, Capture, LineShift, Mesh, Pinhole, PointCurves, Refusal, Source
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.merging import MergedCurves
+from slrig.reconstruction.redundancy import PairRedundancy, Redundancy
 from slrig.scan.output import REPORT_FORMAT
 
 
@@ -71,13 +75,24 @@ def camera_report(curves: CameraCurves) -> dict[str, object]:
         "stripes": curves.stripe_count,
         "curves": len(curves.ensemble.position_px),
         "bridges": int(curves.ensemble.bridge_after.sum()),
+        "refined_by_all_lines": curves.refined,
+        "frame_disagreement_px": curves.disagreement_px.tolist(),
     }
 
 
-def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8]) -> dict[str, object]:
-    """What several cameras say of one another: points by source, and the distance between their points of one ray."""
+def redundancy_report(
+    curves: MergedCurves, source: NDArray[np.uint8], spare: Redundancy | None = None
+) -> dict[str, object]:
+    """What several cameras say of one another: points by source, and how far their points of one ray are apart.
+
+    `residual_px` has one entry per pair of cameras, or is null, and then `residual_px_absent` says why.
+    """
     counts = np.bincount(source, minlength=len(Source))
     report: dict[str, object] = {"points_by_source": {kind.name.lower(): int(counts[kind]) for kind in Source}}
+    if spare is not None:
+        report["residual_px"] = [_pair_report(pair) for pair in spare.pairs] or None
+        if spare.reason is not None:
+            report["residual_px_absent"] = spare.reason
     if len(curves.residual_mm):
         report["residual_mm"] = {
             "pairs": len(curves.residual_mm),
@@ -89,23 +104,67 @@ def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8]) -> dict[s
     return report
 
 
-def mesh_report(surface: InitialMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
-    """The mesh by stage (the paper's Table 1 as far as it is built), and its stated error."""
-    sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
+def _pair_report(pair: PairRedundancy) -> dict[str, object]:
+    """Pixels are those of `camera`; the map has the rows and columns of cells of the image of `reference`."""
     return {
+        "reference": pair.reference,
+        "camera": pair.camera,
+        "pairs": pair.pairs,
+        "outlying": pair.outlying,
+        "mean": pair.mean_px,
+        "rms": pair.rms_px,
+        "median_absolute": pair.median_absolute_px,
+        "stated_rms": pair.stated_rms_px,
+        "map": {
+            "mean": pair.map_mean_px.tolist(),
+            "rms": pair.map_rms_px.tolist(),
+            "pairs": pair.map_pairs.tolist(),
+        },
+    }
+
+
+def mesh_report(surface: FinishedMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
+    """What each step did to the mesh, and its stated error."""
+    sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
+    initial, shrunk, smoothed = surface.initial, surface.shrunk, surface.smoothed
+    report: dict[str, object] = {
         "points": len(curves.points_mm),
         "curves": len(curves.column_px),
         "initial": {
-            "strips": surface.strip_pairs,
-            "strip_triangles": surface.strip_triangles,
-            "dropped_at_depth_edges": surface.dropped_at_depth_edges,
-            "dropped_at_bridges": surface.dropped_at_bridges,
-            "dropped_as_dust": surface.dropped_as_dust,
-            "dropped_triangles": surface.dropped_triangles,
-            "triangles": len(surface.faces),
+            "strips": initial.strip_pairs,
+            "strip_triangles": initial.strip_triangles,
+            "dropped_at_depth_edges": initial.dropped_at_depth_edges,
+            "dropped_at_bridges": initial.dropped_at_bridges,
+            "dropped_as_dust": initial.dropped_as_dust,
+            "dropped_triangles": initial.dropped_triangles,
+            "triangles": len(initial.faces),
         },
-        "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])},
+        "optimisation": _optimisation_report(surface.optimised),
     }
+    if shrunk is not None and smoothed is not None and surface.boundary_optimised is not None:
+        report["boundary"] = {
+            "shrunk_triangles": shrunk.removed_triangles,
+            "added_triangles": int(np.count_nonzero(smoothed.added)),
+            "removed_triangles": smoothed.removed_triangles,
+            "rounds": smoothed.rounds,
+            "optimisation": _optimisation_report(surface.boundary_optimised),
+        }
+    return {**report, "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])}}
+
+
+def _optimisation_report(optimised: Optimised) -> dict[str, object]:
+    """The paper's Fig. 10, turn by turn."""
+    return {
+        "harmonic_index_before": optimised.harmonic_index_before,
+        "turns": [asdict(turn) for turn in optimised.turns],
+        "flipped_edges": sum(turn.flipped_edges for turn in optimised.turns),
+        "ended_by": optimised.ended_by,
+    }
+
+
+def with_seconds(stages: Sequence[Stage], seconds: Mapping[str, float]) -> list[dict[str, object]]:
+    """The paper's Table 1: each meshing stage with its triangles, boundary points and time."""
+    return [{**asdict(stage), "seconds": seconds.get(stage.name)} for stage in stages]
 
 
 def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> dict[str, object]:

@@ -25,6 +25,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
+from slrig.scan.feed import FrameSink
 from slrig.scan.folder import DataFolder, sync_tree
 from slrig.scan.holding import HeldRig, RigFacts, check_plan, driver_errors
 from slrig.scan.plan import ScanPlan
@@ -52,8 +53,9 @@ class CaptureBundle(Protocol):
         *,
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
+        frames: FrameSink,
     ) -> None:
-        """Play the patterns and write a complete bundle into `folder`."""
+        """Play the patterns and write a complete bundle into `folder`; show each frame to `frames`."""
         ...
 
 
@@ -358,10 +360,12 @@ class Runner:
         staged = self._folder.stage(task.id)
         bundle = staged / "bundle"
         progress.span(0.0, CAPTURE_SHARE)
+        feed = self._worker.feed()
         try:
             with driver_errors(self._rig.name):
-                self._capture(rig, task.plan, bundle, progress=progress, cancelled=task.stop.is_set)
+                self._capture(rig, task.plan, bundle, progress=progress, cancelled=task.stop.is_set, frames=feed)
         except Exception as error:
+            feed.abandon()
             kind = fault_of(error).kind
             failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
             if failed or kind == UNEXPECTED:
@@ -372,12 +376,13 @@ class Runner:
         with disk_errors(staged):
             sync_tree(bundle)
         if task.stop.is_set():
+            feed.abandon()
             message = "The scan was cancelled."
             raise ScanCancelledError(message)
         self._store.advance(task.id, ScanState.RECONSTRUCTING)
         progress.span(CAPTURE_SHARE, 1.0)
         job = Job(bundle, staged / "result", task.plan.reconstruction)
-        report = self._worker.run(job, progress=progress, cancelled=task.stop.is_set)
+        report = self._worker.run(job, progress=progress, cancelled=task.stop.is_set, feed=feed)
         self._folder.commit(task.id)
         return report_summary(report)
 

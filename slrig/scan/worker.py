@@ -25,6 +25,7 @@ import structlog
 
 from slrig.errors import ScanCancelledError, SlrigError
 from slrig.scan.faults import ScanFault, WorkerLostError, error_classes, fault_of
+from slrig.scan.feed import FedFrames, FrameFeed
 from slrig.scan.plan import ReconstructionPlan
 
 RECONSTRUCT = "slrig.scan.pipeline:reconstruct_bundle"
@@ -48,6 +49,14 @@ class Job:
     bundle: Path
     output: Path
     plan: ReconstructionPlan
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Parent to child: do this job, with the frames that were sent before if `fed`."""
+
+    job: Job
+    fed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +107,8 @@ class ReconstructionWorker:
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
         self._guard = threading.Lock()
+        self._sending = threading.Lock()
+        self._fed: tuple[FrameFeed, Connection | None] | None = None
         self._closed = False
         self._running = False
         self._condition = LOADING
@@ -131,7 +142,9 @@ class ReconstructionWorker:
             if self._closed or (self._process is not None and self._process.is_alive()):
                 return
             if self._pipe is not None:
-                self._pipe.close()
+                # A feed may still be in the middle of a message to the process that ended.
+                with self._sending:
+                    self._pipe.close()
             self._condition = LOADING
             self._pipe, far_end = self._spawning.Pipe()
             self._process = self._spawning.Process(
@@ -141,10 +154,29 @@ class ReconstructionWorker:
             # The child holds the only other end now, so its death reads as end of file here.
             far_end.close()
 
+    def feed(self) -> FrameFeed:
+        """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards."""
+        self.start()
+        with self._guard:
+            pipe = self._pipe
+
+        def send(message: object) -> bool:
+            # A feed that was abandoned in the middle of a message finishes it before anyone sends the next.
+            with self._sending:
+                return pipe is not None and _sent(pipe, message)
+
+        self._fed = FrameFeed(send), pipe
+        return self._fed[0]
+
     def run(
-        self, job: Job, *, progress: Callable[[str, float, str], None], cancelled: Callable[[], bool]
+        self,
+        job: Job,
+        *,
+        progress: Callable[[str, float, str], None],
+        cancelled: Callable[[], bool],
+        feed: FrameFeed | None = None,
     ) -> Mapping[str, Any]:
-        """Reconstruct, and return the report.
+        """Reconstruct, and return the report. Frames that `feed` has sent, all of them, are not read again.
 
         Raises
         ------
@@ -165,20 +197,43 @@ class ReconstructionWorker:
             message = "The service is ending and reconstructs no more."
             raise ScanCancelledError(message)
         try:
-            return self._answered(process, pipe, job, progress, cancelled)
+            # A process that was started since the capture has not seen its frames.
+            fed = feed is not None and self._fed == (feed, pipe) and self._settled(feed, process, cancelled)
+            return self._answered(process, pipe, _Run(job, fed), progress, cancelled)
         finally:
             with self._guard:
                 self._running = False
+
+    def _settled(self, feed: FrameFeed, process: BaseProcess, cancelled: Callable[[], bool]) -> bool:
+        """Wait until the frames of a capture have been sent, or cannot be; return whether all were."""
+        stop_after: float | None = None
+        while not feed.settled(_POLL_S):
+            if cancelled():
+                if stop_after is None:
+                    stop_after = time.monotonic() + CANCEL_LIMIT_S
+                    feed.abandon()
+                elif time.monotonic() > stop_after:
+                    self._end(process)
+                    message = "The reconstruction was cancelled."
+                    raise ScanCancelledError(message)
+        return feed.whole
+
+    def _end(self, process: BaseProcess) -> None:
+        _log.warning("reconstruction did not stop when asked, ending its process", pid=process.pid)
+        process.kill()
+        process.join()
 
     def _answered(
         self,
         process: BaseProcess,
         pipe: Connection,
-        job: Job,
+        run: _Run,
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
     ) -> Mapping[str, Any]:
-        if not _sent(pipe, job):
+        with self._sending:
+            begun = _sent(pipe, run)
+        if not begun:
             # What it last said may lie in the pipe still: why it could not be loaded.
             with self._guard:
                 self._note(_received(pipe))
@@ -205,11 +260,10 @@ class ReconstructionWorker:
             if cancelled():
                 if stop_after is None:
                     stop_after = time.monotonic() + CANCEL_LIMIT_S
-                    _sent(pipe, _Stop())
+                    with self._sending:
+                        _sent(pipe, _Stop())
                 elif time.monotonic() > stop_after:
-                    _log.warning("reconstruction did not stop when asked, ending its process", pid=process.pid)
-                    process.kill()
-                    process.join()
+                    self._end(process)
                     message = "The reconstruction was cancelled."
                     raise ScanCancelledError(message)
 
@@ -278,26 +332,35 @@ def _serve(pipe: Connection, task: str) -> None:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     module, _, name = task.partition(":")
     try:
-        warm = getattr(importlib.import_module(module), "warm_kernels", None)
+        loaded = importlib.import_module(module)
+        warm = getattr(loaded, "warm_kernels", None)
         if warm is not None:
             warm()
         reconstruct = pkgutil.resolve_name(f"{module}:{name}")
+        begin = getattr(loaded, "LiveScan", None)
     except Exception as error:
         _sent(pipe, _Unloadable(f"{type(error).__name__}: {error}"))
         # The traceback goes to the service's log.
         raise
     _sent(pipe, _Ready())
-    while (job := _received(pipe)) is not None:
-        if isinstance(job, Job):
+    frames = FedFrames(begin)
+    while (message := _received(pipe)) is not None:
+        if isinstance(message, _Run):
+            live = frames.taken() if message.fed else None
+            frames.forget()
             try:
-                answer = _answer(pipe, reconstruct, job)
+                answer = _answer(pipe, reconstruct, message.job, live)
             except (ConnectionError, EOFError):
                 return
+            del live
             _sent(pipe, answer)
+        else:
+            frames.hear(message)
 
 
-def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job: Job) -> _Done | _Failed:
+def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job: Job, live: Any) -> _Done | _Failed:
     stopped = False
+    seen = {} if live is None else {"live": live}
 
     def progress(stage: str, fraction: float, detail: str) -> None:
         pipe.send(_Progressed(stage, fraction, detail))
@@ -309,7 +372,7 @@ def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job
         return stopped
 
     try:
-        return _Done(reconstruct(job.bundle, job.output, plan=job.plan, progress=progress, cancelled=cancelled))
+        return _Done(reconstruct(job.bundle, job.output, plan=job.plan, progress=progress, cancelled=cancelled, **seen))
     except (ConnectionError, EOFError):
         # The parent is gone: nobody waits for an answer.
         raise

@@ -53,10 +53,10 @@ blur_px = 0.6
 """
 
 
-def write_rig(folder: Path, *, head: str = "", faults: str = "") -> Path:
+def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str = "") -> Path:
     """Write a small rendered rig and its scene into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "scene.toml").write_text(SCENE)
+    (folder / "scene.toml").write_text(scene)
     rig = folder / "rig.toml"
     rig.write_text(RIG.format(head=head, faults=faults))
     return rig

@@ -15,7 +15,9 @@ from slrig.scan.plan import ReconstructionPlan
 
 pytestmark = pytest.mark.shared
 
-SCENES = ("vase", "terrace", "gauge")
+# rms_mm and p99_mm of the mesh's area.
+GOALS = {"vase": (0.022, 0.07), "terrace": (0.016, 0.06), "gauge": (0.025, 0.09)}
+SCENES = tuple(GOALS)
 
 
 def reconstructed(bundle: Path, output: Path) -> Any:
@@ -29,11 +31,20 @@ def reconstructed(bundle: Path, output: Path) -> Any:
 def test_a_line_shift_bundle_meets_its_figures(shared: Path, tmp_path: Path, scene: str) -> None:
     report = reconstructed(shared / "bundles" / scene, tmp_path / "out")
     truth = report["truth"]
-    assert truth["rms_mm"] <= 0.05
-    assert truth["complete_0.3mm"] >= 0.90
-    assert truth["gross_fraction"] <= 0.003
-    assert truth["false_area_0.5mm"] <= 0.01
-    assert truth["nonmanifold_edges"] == truth["misoriented_edges"] == truth["duplicate_faces"] == 0
+    rms_mm, p99_mm = GOALS[scene]
+    assert truth["rms_mm"] <= rms_mm
+    assert truth["p99_mm"] <= p99_mm
+    assert truth["complete_0.1mm"] >= 0.92
+    assert truth["complete_0.3mm"] >= 0.96
+    assert truth["false_area_0.5mm"] <= 0.003
+    assert truth["gross_fraction"] <= 0.0005
+    # Both cameras of the gauge's truth see the wall behind its balls, where there are two surfaces to measure.
+    assert truth["extra_layer_fraction"] <= (0.06 if scene == "gauge" else 0.002)
+    assert report["mesh"]["figures"]["min_angle_p5_deg"] >= 18
+    assert report["mesh"]["figures"]["sliver_fraction_below_10deg"] <= 0.01
+    assert truth["nonmanifold_edges"] == truth["misoriented_edges"] == 0
+    assert truth["duplicate_faces"] == truth["degenerate_faces"] == 0
+    assert 0.8 <= truth["error_over_sigma_p68"] <= 1.25
     assert truth["facing_camera_area"] > 0.98
     assert report["method"] == "Gray code and line shift"
     assert report["evidence"]["patterns_verified"] == "30/30"
@@ -67,5 +78,5 @@ def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
 def test_one_bundle_gives_the_same_bytes_of_mesh_twice(shared: Path, tmp_path: Path) -> None:
     for run in ("first", "second"):
         reconstructed(shared / "bundles" / "vase", tmp_path / run)
-    for name in ("mesh.ply", "mesh.glb", "mesh.stl", "points.ply"):
+    for name in ("mesh.ply", "mesh.glb", "points.ply"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes(), name

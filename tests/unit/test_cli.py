@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slrig.api import system
+from slrig.api.schemas import ScanRequest
 from slrig.cli import client as client_module
 from slrig.cli.client import ServiceClient, read_key
 from slrig.cli.commands import INTERRUPTED, app
@@ -278,11 +279,39 @@ def test_reconstruction_option_out_of_range_is_told_by_the_plan(tmp_path: Path) 
     for option, value, words in (
         ("--depth-edge-ratio", "1", "depth_edge_ratio: expected a finite number above 1, found 1;"),
         ("--max-code-gap", "0", "max_code_gap: expected 1 or more, found 0;"),
+        ("--flip-rule", "dyer", "flip_rule: expected constrained or delaunay, found 'dyer';"),
     ):
         result = CliRunner().invoke(
             app, ["reconstruct", str(tmp_path), "--output", str(tmp_path / "out"), option, value]
         )
         assert (result.exit_code, words in result.stderr) == (2, True), result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        ([], {}),
+        (["--keep-holes"], {"keep_holes": True}),
+        (["--close-holes", "--raw-boundary"], {"keep_holes": False, "smooth_boundary": False}),
+        (["--smooth-boundary", "--flip-rule", "delaunay"], {"smooth_boundary": True, "flip_rule": "delaunay"}),
+        (["--depth-edge-ratio", "9", "--max-code-gap", "2"], {"depth_edge_ratio": 9.0, "max_code_gap": 2}),
+    ],
+)
+def test_a_scan_asks_the_service_for_the_options_that_were_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], wanted: dict[str, Any]
+) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def scanned(_client: ServiceClient, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
+        asked.append(request)
+        return SCAN
+
+    monkeypatch.setattr("slrig.cli.scan.scan_with", scanned)
+    result = CliRunner().invoke(app, ["scan", "--output", str(tmp_path), *arguments])
+    assert result.exit_code == 0, result.output
+    assert asked[0]["reconstruction"] == wanted
+    # The service understands what it is asked.
+    assert ScanRequest.model_validate_json(json.dumps(asked[0])).reconstruction.model_dump(exclude_none=True) == wanted
 
 
 def test_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:

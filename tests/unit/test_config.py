@@ -9,6 +9,7 @@ import pytest
 
 from slrig.config import ScanDefaults, ServiceSettings, is_loopback, read_rig, read_settings
 from slrig.errors import ConfigError
+from slrig.model import FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
 RIGS = sorted((Path(__file__).resolve().parents[2] / "config" / "rigs").glob("*.toml"))
@@ -72,6 +73,12 @@ def test_a_head_is_read(tmp_path: Path) -> None:
     assert rig.calibration is None
 
 
+def test_the_rules_of_the_mesh_are_read(tmp_path: Path) -> None:
+    text = BENCH.replace("depth_edge_ratio = 6", 'flip_rule = "delaunay"\nsmooth_boundary = false')
+    scan = read_rig(_rig(tmp_path, text)).scan
+    assert (scan.flip_rule, scan.smooth_boundary) == (FlipRule.DELAUNAY, False)
+
+
 def test_there_are_rigs_to_read() -> None:
     assert RIGS
 
@@ -101,6 +108,8 @@ def test_scan_defaults_are_the_fields_of_a_plan() -> None:
         ("gain = 2", "gain = true", "camera[1].gain"),
         ("line_shift_period_px = 8", "line_shift_period_px = 3", "scan.line_shift_period_px"),
         ("line_shift_period_px = 8", "line_shift_periode_px = 8", "did you mean 'line_shift_period_px'?"),
+        ("depth_edge_ratio = 6", 'flip_rule = "dyer"', "scan.flip_rule"),
+        ("depth_edge_ratio = 6", "smooth_boundary = 1", "scan.smooth_boundary"),
         ("[scan]", '[head]\ndriver = "x"\n[scan]', "expected [head] alone"),
     ],
 )

@@ -6,9 +6,10 @@ import io
 import json
 import zipfile
 from typing import Any
-from uuid import uuid4
+from uuid import UUID, uuid4
 
 import pytest
+import trimesh
 from fastapi.testclient import TestClient
 
 from slrig.api.scans import fingerprint
@@ -49,6 +50,7 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     assert set(files) == {
         "bundle.zip",
         "mesh.glb",
+        "mesh.obj",
         "mesh.ply",
         "mesh.stl",
         "points.ply",
@@ -60,13 +62,56 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     assert client.get(files["report.json"]).json()["truth"] == {"rms_mm": 0.01}
 
 
+@pytest.mark.parametrize("name", ["mesh.obj", "mesh.stl"])
+def test_other_formats_of_the_mesh_are_made_when_asked_for_and_kept(
+    client: TestClient, served: ServedBench, name: str
+) -> None:
+    scan = client.post("/scan").json()
+    assert client.get(f"/scan/{scan['id']}/{name}").status_code in {200, 409}
+    ended(client, scan["id"])
+    place = served.service.folder.scan(UUID(scan["id"]))
+    assert (place / "mesh.ply").is_file()
+    first = client.get(f"/scan/{scan['id']}/{name}")
+    made = place / name
+    assert first.content == made.read_bytes()
+    found = trimesh.load(io.BytesIO(first.content), file_type=name[-3:], process=False)
+    assert found.triangles.tolist() == [[[0, 0, 0], [10, 0, 0], [0, 10, 0]]]
+    before = made.stat()
+    part = client.get(f"/scan/{scan['id']}/{name}", headers={"Range": "bytes=5-9"})
+    assert (part.status_code, part.content) == (206, first.content[5:10])
+    assert client.head(f"/scan/{scan['id']}/{name}").headers["Content-Length"] == str(len(first.content))
+    assert (made.stat().st_ino, made.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+
+
+def test_a_mesh_that_was_changed_is_told_and_a_failed_scan_has_no_other_formats(
+    client: TestClient, served: ServedBench
+) -> None:
+    scan = client.post("/scan").json()
+    ended(client, scan["id"])
+    ply = served.service.folder.scan(UUID(scan["id"])) / "mesh.ply"
+    ply.write_bytes(ply.read_bytes()[:-1])
+    refused = client.get(f"/scan/{scan['id']}/mesh.obj")
+    assert refused.status_code == 422
+    assert "reconstruct the bundle again" in refused.json()["detail"]
+    served.order = "fail"
+    failed = client.post("/scan").json()
+    assert "mesh.obj" not in ended(client, failed["id"])["links"]["files"]
+    assert client.get(f"/scan/{failed['id']}/mesh.obj").status_code == 409
+
+
 def test_plan_is_request_over_rig_file_over_default(client: TestClient) -> None:
-    request = {"patterns": {"line_width_px": 2}, "reconstruction": {"keep_holes": True}}
+    request = {"patterns": {"line_width_px": 2}, "reconstruction": {"keep_holes": True, "flip_rule": "delaunay"}}
     plan = client.post("/scan", json=request).json()["plan"]
     assert plan["patterns"]["line_width_px"] == 2
     assert plan["patterns"]["line_shift_period_px"] == 6
     assert plan["patterns"]["rows"] is False
-    assert plan["reconstruction"] == {"keep_holes": True, "depth_edge_ratio": 6.0, "max_code_gap": 1}
+    assert plan["reconstruction"] == {
+        "keep_holes": True,
+        "depth_edge_ratio": 6.0,
+        "max_code_gap": 1,
+        "flip_rule": "delaunay",
+        "smooth_boundary": True,
+    }
     # The rig file's exposure belongs to its cameras, not to the plan.
     assert plan["exposure_s"] is None
 

@@ -2,16 +2,57 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
+from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
+from slrig.model import Calibration, Mesh, Shot
+from slrig.scan.artefacts import write_mesh
+from slrig.scan.outline import Outline
 from slrig.scan.plan import ReconstructionPlan
 
-ARTEFACTS = ("mesh.ply", "mesh.glb", "mesh.stl", "points.ply", "preview.png")
+ARTEFACTS = ("points.ply", "preview.png")
+
+TRIANGLE = Mesh(
+    vertices_mm=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], dtype=np.float32),
+    faces=np.array([[0, 1, 2]], dtype=np.int32),
+    normals=np.array([[0, 0, 1]] * 3, dtype=np.float32),
+    grey=np.array([10, 100, 200], dtype=np.uint8),
+    sigma_mm=np.full(3, 0.01, dtype=np.float32),
+    stripe=np.array([3, 4, 5], dtype=np.int32),
+)
+
+
+class LiveScan:
+    """Counts the frames that come. The first pixel of a frame says what else to do: die (1), raise (2), hang (3)."""
+
+    def __init__(self, outline: Outline, _calibration: Calibration) -> None:
+        self.listed = len(outline.frames)
+        self.taken = 0
+        self.ended = False
+
+    def take(self, shot: Shot) -> None:
+        """Count it."""
+        match shot.image[0, 0]:
+            case 1:
+                os.kill(os.getpid(), signal.SIGKILL)
+            case 2:
+                message = "a frame that cannot be used"
+                raise ValueError(message)
+            case 3:
+                threading.Event().wait()
+        self.taken += 1
+
+    def end(self, _evidence: EvidenceSummary) -> None:
+        """Remember that it was the end."""
+        self.ended = True
 
 
 def reconstruct_bundle(
@@ -21,6 +62,7 @@ def reconstruct_bundle(
     plan: ReconstructionPlan,
     progress: Callable[[str, float, str], None],
     cancelled: Callable[[], bool],
+    live: LiveScan | None = None,
 ) -> Mapping[str, object]:
     """Do what `bundle/order` says: finish, fail, break, die, or wait to be cancelled."""
     order = (bundle / "order").read_text()
@@ -43,8 +85,12 @@ def reconstruct_bundle(
     partial.mkdir()
     for name in ARTEFACTS:
         (partial / name).write_bytes(f"{name} of {plan}".encode())
-    report = {"seconds": 1.5, "stages": [1, 2], "truth": {"rms_mm": 0.01}}
-    (partial / "report.json").write_text('{"seconds": 1.5, "stages": [1, 2], "truth": {"rms_mm": 0.01}}')
+    # A real one, because other formats are made of it.
+    write_mesh(TRIANGLE, partial)
+    report: dict[str, object] = {"seconds": 1.5, "stages": [1, 2], "truth": {"rms_mm": 0.01}}
+    if live is not None:
+        report["live"] = [live.taken, live.listed, live.ended]
+    (partial / "report.json").write_text(json.dumps(report))
     partial.rename(output)
     progress("done", 1.0, "")
     return report

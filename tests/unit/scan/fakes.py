@@ -8,13 +8,24 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import numpy as np
+
+from slrig.capture.evidence import EvidenceSummary
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
 from slrig.errors import ScanCancelledError
-from slrig.model import CameraFormat, Frame, PatternSequence, Size
+from slrig.model import Black, Calibration, CameraFormat, Frame, PatternSequence, Shot, Size, White
+from slrig.scan.feed import FrameSink
+from slrig.scan.outline import Outline
 from slrig.scan.plan import ScanPlan
 
 WAIT_S = 20.0
 """How long a test waits for an event that must come; a pass never waits for it to run out."""
+
+
+OUTLINE = Outline(Size(64, 40), (White(), Black()), {"cam0": CameraFormat(Size(64, 48), 8)}, ((0, "cam0"), (1, "cam0")))
+CALIBRATION = Calibration({}, None)
+SHOTS = tuple(Shot(index, "cam0", np.zeros((48, 64), dtype=np.uint8)) for index in range(2))
+EVIDENCE = EvidenceSummary(2, 2, {}, {}, {}, ())
 
 
 class SetClock:
@@ -136,8 +147,11 @@ class TameBench:
         *,
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
+        frames: FrameSink,
     ) -> None:
         rig.projector.show(0)
+        frames.begin(OUTLINE, CALIBRATION)
+        frames.take(SHOTS[0])
         progress("capture", 0.0, "frame 1 of 2")
         self.began.set()
         while not self.gate.wait(0.01):
@@ -152,4 +166,6 @@ class TameBench:
         (folder / "bundle.json").write_text(json.dumps({"exposure_s": plan.exposure_s}))
         (folder / "frames").mkdir()
         (folder / "frames" / "000.png").write_bytes(bytes(100))
+        frames.take(SHOTS[1])
+        frames.end(EVIDENCE)
         progress("capture", 1.0, "frame 2 of 2")

@@ -16,19 +16,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from slrig.errors import StorageError
+from slrig.errors import InvalidInputError, StorageError
 from slrig.model import Mesh, PointCurves, Refusal, Size
 from slrig.scan.artefacts import (
-    encode_mesh_glb,
+    ON_REQUEST,
+    decode_mesh_ply,
     encode_mesh_ply,
-    encode_mesh_stl,
     encode_points_ply,
+    write_converted,
     write_mesh,
     write_points,
     write_report,
 )
+from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
 
-ENCODERS = (encode_mesh_ply, encode_mesh_glb, encode_mesh_stl)
+ENCODERS = (encode_mesh_ply, encode_mesh_glb, encode_mesh_stl, encode_mesh_obj)
 
 
 def example_mesh(seed: int = 0) -> Mesh:
@@ -90,39 +92,57 @@ def test_ply_header_names_the_unit_and_the_layout() -> None:
     ]
 
 
-def test_glb_is_in_metres_with_normals_and_colours(tmp_path: Path) -> None:
+def test_ply_is_read_again_as_it_was_written() -> None:
+    mesh = example_mesh()
+    found = decode_mesh_ply(encode_mesh_ply(mesh))
+    for name in ("vertices_mm", "faces", "normals", "grey", "sigma_mm", "stripe"):
+        before, after = getattr(mesh, name), getattr(found, name)
+        assert after.dtype == before.dtype
+        assert np.array_equal(after, before, equal_nan=after.dtype.kind == "f")
+    nothing = replace(mesh, faces=np.zeros((0, 3), dtype=np.int32))
+    assert len(decode_mesh_ply(encode_mesh_ply(nothing)).faces) == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"ply\n", b"plyx\n"),
+        (b"property float sigma_mm\n", b""),
+        (b"element vertex 5\n", b"element vertex 6\n"),
+        (b"element vertex 5\n", b"element vertex five\n"),
+        (b"element face 4\n", b"element face 3\n"),
+        (b"end_header", b"end"),
+        (b"binary_little_endian", b"ascii"),
+        (b"\x03\x00\x00\x00\x00", b"\x03\x05\x00\x00\x00"),
+        (b"\x03\x00\x00\x00\x00", b"\x03\xff\xff\xff\xff"),
+    ],
+)
+def test_a_ply_that_was_changed_is_refused(old: bytes, new: bytes) -> None:
+    data = encode_mesh_ply(example_mesh())
+    assert old in data
+    with pytest.raises(InvalidInputError, match="reconstruct the bundle again"):
+        decode_mesh_ply(data.replace(old, new, 1))
+
+
+def test_a_ply_that_was_cut_is_refused() -> None:
+    data = encode_mesh_ply(example_mesh())
+    for end in (0, 10, len(data) // 2, len(data) - 1):
+        with pytest.raises(InvalidInputError, match="reconstruct the bundle again"):
+            decode_mesh_ply(data[:end])
+    with pytest.raises(InvalidInputError, match=r"expected .* 227 bytes after it, found 228 bytes"):
+        decode_mesh_ply(data + b"x")
+
+
+@pytest.mark.parametrize("name", ON_REQUEST)
+def test_other_formats_are_made_of_the_ply_beside_them(tmp_path: Path, name: str) -> None:
     mesh = example_mesh()
     write_mesh(mesh, tmp_path)
-    scene = load(tmp_path / "mesh.glb")
-    (placed,) = scene.dump()
-    assert placed.vertices == pytest.approx(mesh.vertices_mm * 1e-3, rel=1e-6)
-    (stored,) = scene.geometry.values()
-    assert np.array_equal(stored.vertices, mesh.vertices_mm)
-    assert np.array_equal(stored.faces, mesh.faces)
-    assert stored.vertex_normals == pytest.approx(mesh.normals, abs=1e-6)
-
-
-def glb_tree(data: bytes) -> Any:
-    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-
-
-def test_glb_has_a_dull_material_and_colours_and_leaves_unknown_normals_out() -> None:
-    mesh = example_mesh()
-    tree = glb_tree(encode_mesh_glb(mesh))
-    (primitive,) = tree["meshes"][0]["primitives"]
-    assert {"POSITION", "NORMAL", "COLOR_0"} <= primitive["attributes"].keys()
-    assert tree["materials"][primitive["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
-    unknown = mesh.normals.copy()
-    unknown[2] = np.nan
-    (primitive,) = glb_tree(encode_mesh_glb(replace(mesh, normals=unknown)))["meshes"][0]["primitives"]
-    assert "NORMAL" not in primitive["attributes"]
-
-
-def test_stl_is_in_millimetres(tmp_path: Path) -> None:
-    mesh = example_mesh()
-    write_mesh(mesh, tmp_path)
-    stl = load(tmp_path / "mesh.stl")
-    assert np.array_equal(stl.triangles.astype(np.float32), mesh.vertices_mm[mesh.faces])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.glb", "mesh.ply"]
+    write_converted(tmp_path, name)
+    assert (tmp_path / name).read_bytes() == ON_REQUEST[name](mesh)
+    (tmp_path / "mesh.ply").unlink()
+    with pytest.raises(StorageError, match=r"mesh\.ply: the disk refused"):
+        write_converted(tmp_path, name)
 
 
 def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:
@@ -162,13 +182,6 @@ def test_the_same_values_give_the_same_bytes_here_and_in_another_process() -> No
 @pytest.mark.parametrize("encode", ENCODERS)
 def test_another_mesh_gives_other_bytes(encode: Any) -> None:
     assert encode(example_mesh(0)) != encode(example_mesh(1))
-
-
-def test_a_mesh_without_triangles_can_be_written(tmp_path: Path) -> None:
-    mesh = replace(example_mesh(), faces=np.zeros((0, 3), dtype=np.int32))
-    write_mesh(mesh, tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.glb", "mesh.ply", "mesh.stl"]
-    assert (tmp_path / "mesh.stl").stat().st_size == 84
 
 
 class _Kind(StrEnum):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import read_bundle, write_bundle
+from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import (
@@ -23,10 +24,12 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
-from slrig.model import Axis, Capture, Gray, LineShift, Shot, Size, White
+from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Shot, Size, White
 from slrig.scan.acquisition import capture_bundle
+from slrig.scan.outline import Outline
 from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.stream import LiveScan
 
 RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
 
@@ -66,7 +69,7 @@ def refused(error: type[SlrigError], bundle: Path, output: Path) -> str:
 def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(recorded: Path, tmp_path: Path) -> None:
     report = run(recorded, tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"mesh.ply", "mesh.glb", "mesh.stl", "points.ply", "report.json", "preview.png"} <= names
+    assert {"mesh.ply", "mesh.glb", "points.ply", "report.json", "preview.png"} <= names
     assert any(name.startswith("rejected-") for name in names)
     written = json.loads((tmp_path / "out" / "report.json").read_text())
     assert written["mesh"]["initial"] == report["mesh"]["initial"]  # type: ignore[index]
@@ -247,3 +250,115 @@ def test_some_of_the_line_shifts_make_a_coarser_mesh(recorded: Path, tmp_path: P
     truth = run(bundle, tmp_path / "out")["truth"]
     assert truth["rms_mm"] < 0.05  # type: ignore[index]
     assert truth["complete_0.3mm"] > 0.90  # type: ignore[index]
+
+
+def seen_live(bundle: Path, *, upside_down: bool = False) -> LiveScan:
+    """What a reconstruction holds that was fed while this bundle was captured."""
+    recorded = read_bundle(bundle)
+    assert recorded.calibration is not None
+    live = LiveScan(Outline.of(recorded.capture), recorded.calibration)
+    for shot in recorded.capture.shots:
+        live.take(replace(shot, image=shot.image[::-1]) if upside_down else shot)
+    live.end(check_capture(recorded.capture))
+    return live
+
+
+def reports_alike(one: dict[str, object], other: dict[str, object]) -> bool:
+    """Whether two reports differ in seconds only."""
+    parts = ("notes", "axis", "frames", "evidence", "calibration", "plan", "cameras", "redundancy")
+    return all(one[part] == other[part] for part in parts)
+
+
+@pytest.mark.parametrize("change", ["none", "repeats", "a bracket", "no line frames"])
+def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, tmp_path: Path, change: str) -> None:
+    bundle = read_bundle(recorded)
+    capture = bundle.capture
+    shots = list(capture.shots)
+    if change == "repeats":
+        shots += [shot for shot in shots if isinstance(capture.patterns[shot.pattern], LineShift)]
+    elif change == "a bracket":
+        shots = [replace(shot, exposure_s=exposure_s) for exposure_s in (0.01, 0.02) for shot in shots]
+    elif change == "no line frames":
+        shots = [shot for shot in shots if not isinstance(capture.patterns[shot.pattern], LineShift)]
+    write_bundle(tmp_path / "bundle", replace(capture, shots=tuple(shots)), bundle.calibration)
+    plan = ReconstructionPlan()
+    live = reconstruct_bundle(
+        tmp_path / "bundle", tmp_path / "live", plan=plan, progress=lambda *_: None, cancelled=lambda: False,
+        live=seen_live(tmp_path / "bundle"),
+    )  # fmt: skip
+    assert "wait for frames" in live["stages_s"]  # type: ignore[operator]
+    read = run(tmp_path / "bundle", tmp_path / "read")
+    for name in ("mesh.ply", "points.ply", "preview.png", "rejected-camera.png"):
+        path = tmp_path / "live" / name
+        assert not path.exists() or path.read_bytes() == (tmp_path / "read" / name).read_bytes()
+    assert (tmp_path / "live" / "mesh.ply").exists()
+    assert reports_alike(live, read)
+
+
+def test_two_cameras_taken_live_give_the_bytes_that_the_bundle_gives(tmp_path: Path) -> None:
+    with open_rig(read_rig(RIG.with_name("two_cameras.toml"))) as rig:
+        capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+    live = reconstruct_bundle(
+        tmp_path / "bundle", tmp_path / "live", plan=ReconstructionPlan(), progress=lambda *_: None,
+        cancelled=lambda: False, live=seen_live(tmp_path / "bundle"),
+    )  # fmt: skip
+    read = run(tmp_path / "bundle", tmp_path / "read")
+    assert (tmp_path / "live" / "mesh.ply").read_bytes() == (tmp_path / "read" / "mesh.ply").read_bytes()
+    assert reports_alike(live, read)
+
+
+@pytest.mark.parametrize("what", ["another calibration", "other frames", "an end that never came"])
+def test_frames_taken_live_that_are_not_those_of_the_bundle_are_passed_over(
+    recorded: Path, tmp_path: Path, what: str
+) -> None:
+    live = seen_live(recorded, upside_down=True)
+    bundle = recorded
+    if what == "another calibration":
+        shutil.copytree(recorded, tmp_path / "bundle")
+        bundle = tmp_path / "bundle"
+        path = bundle / "calibration.json"
+        described = json.loads(path.read_text())
+        described["projector"]["translation_mm"][0] += 0.001
+        path.write_text(json.dumps(described))
+    elif what == "other frames":
+        live.take(read_bundle(recorded).capture.shots[0])
+    else:
+        live.evidence = None
+    report = reconstruct_bundle(
+        bundle, tmp_path / "out", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False,
+        live=live,
+    )  # fmt: skip
+    # Upside down there would be hardly anything.
+    assert report["mesh"]["points"] > 1000  # type: ignore[index]
+    assert "check frames" in report["stages_s"]  # type: ignore[operator]
+
+
+def test_capture_shows_each_frame_that_it_records(tmp_path: Path) -> None:
+    class Sink:
+        def __init__(self) -> None:
+            self.told: list[object] = []
+
+        def begin(self, outline: Outline, calibration: Calibration | None) -> None:
+            self.told += [outline, calibration]
+
+        def take(self, shot: Shot) -> None:
+            self.told.append(shot)
+
+        def end(self, evidence: EvidenceSummary) -> None:
+            self.told.append(evidence)
+
+    sink = Sink()
+    with open_rig(read_rig(RIG)) as rig:
+        calibration = rig.calibration
+        capture_bundle(
+            rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False, frames=sink
+        )
+    written = read_bundle(tmp_path / "bundle").capture
+    outline, known, *shots, evidence = sink.told
+    assert outline == Outline.of(written)
+    assert known is calibration
+    assert evidence == check_capture(written)
+    for shot, again in zip(shots, written.shots, strict=True):
+        assert isinstance(shot, Shot)
+        assert (shot.pattern, shot.camera, shot.exposure_s) == (again.pattern, again.camera, again.exposure_s)
+        np.testing.assert_array_equal(shot.image, again.image)

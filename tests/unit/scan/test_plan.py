@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
 
 from slrig.errors import ConfigError
+from slrig.model import FlipRule
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.records import plan_from_json, plan_json
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.0, -3.0, math.nan, math.inf])
@@ -19,6 +22,21 @@ def test_depth_edge_ratio_is_above_one_and_finite(ratio: float) -> None:
 def test_code_gap_is_at_least_one() -> None:
     with pytest.raises(ConfigError, match="max_code_gap: expected 1 or more, found 0;"):
         ReconstructionPlan(max_code_gap=0)
+
+
+def test_flip_rule_is_taken_by_its_value_and_another_is_refused() -> None:
+    assert ReconstructionPlan(flip_rule="delaunay").flip_rule is FlipRule.DELAUNAY  # type: ignore[arg-type]
+    assert ReconstructionPlan().flip_rule is FlipRule.CONSTRAINED
+    with pytest.raises(ConfigError, match="flip_rule: expected constrained or delaunay, found 'dyer';"):
+        ReconstructionPlan(flip_rule="dyer")  # type: ignore[arg-type]
+
+
+def test_a_plan_of_earlier_days_has_the_usual_mesh_and_a_stored_one_comes_back() -> None:
+    plan = ScanPlan(reconstruction=ReconstructionPlan(flip_rule=FlipRule.DELAUNAY, smooth_boundary=False))
+    document = json.loads(json.dumps(plan_json(plan)))
+    assert plan_from_json(document) == plan
+    del document["reconstruction"]["flip_rule"], document["reconstruction"]["smooth_boundary"]
+    assert plan_from_json(document) == ScanPlan()
 
 
 @pytest.mark.parametrize("exposure_s", [0.0, -0.1, math.nan, math.inf])

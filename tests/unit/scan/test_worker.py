@@ -63,7 +63,7 @@ def test_report_and_progress_come_back(worker: ReconstructionWorker, tmp_path: P
     report = worker.run(job(tmp_path, "finish"), progress=told, cancelled=never)
     assert report["truth"] == {"rms_mm": 0.01}
     assert json.loads((tmp_path / "result" / "report.json").read_text()) == report
-    assert b"keep_holes=True" in (tmp_path / "result" / "mesh.ply").read_bytes()
+    assert b"keep_holes=True" in (tmp_path / "result" / "points.ply").read_bytes()
     assert told.stages == [("decode", 0.1), ("done", 1.0)]
 
 

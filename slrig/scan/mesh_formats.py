@@ -1,0 +1,171 @@
+"""A mesh in the formats that other programs read: binary glTF (GLB), STL and OBJ.
+
+They are written here, from arrays and without a step through another program's mesh: a scan has millions of triangles,
+and whoever waits for it should not wait for checks of what is known. The same mesh gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model import Mesh
+
+_METRES_PER_MM = 0.001
+_MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
+
+_GLB_MAGIC, _GLB_VERSION = b"glTF", 2
+_FLOAT, _UNSIGNED_BYTE, _UNSIGNED_INT = 5126, 5121, 5125
+_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
+_POINTS, _TRIANGLES = 0, 4
+
+_OBJ_POSITION_DECIMALS, _OBJ_UNIT_DECIMALS = 5, 4
+
+
+def encode_mesh_glb(mesh: Mesh) -> bytes:
+    """Binary glTF 2.0 with normals and colours (Khronos, glTF 2.0 specification, sections 3 and 4).
+
+    glTF is in metres: the vertices keep their values in mm, under a node that scales by 0.001. Normals are left out if
+    one is not known, because glTF has no form for that; a mesh without triangles is shown as points.
+    """
+    positions = np.ascontiguousarray(mesh.vertices_mm, dtype="<f4")
+    opaque = np.full((len(mesh.grey), 4), 255, dtype=np.uint8)
+    opaque[:, :3] = mesh.grey[:, None]
+    parts: list[tuple[str, NDArray[Any], dict[str, object]]] = []
+    if len(positions):
+        ends = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+        parts.append(("POSITION", positions, {"componentType": _FLOAT, "type": "VEC3", **ends}))
+        if np.isfinite(mesh.normals).all():
+            normals = np.ascontiguousarray(mesh.normals, dtype="<f4")
+            parts.append(("NORMAL", normals, {"componentType": _FLOAT, "type": "VEC3"}))
+        parts.append(("COLOR_0", opaque, {"componentType": _UNSIGNED_BYTE, "type": "VEC4", "normalized": True}))
+    if len(mesh.faces):
+        indices = np.ascontiguousarray(mesh.faces, dtype="<u4").reshape(-1)
+        parts.append(("indices", indices, {"componentType": _UNSIGNED_INT, "type": "SCALAR"}))
+    length = sum(array.nbytes for _, array, _ in parts)
+    tree = json.dumps(_gltf_tree(parts, length), separators=(",", ":")).encode()
+    tree += b" " * (-len(tree) % 4)
+    chunks: list[bytes | memoryview] = [np.array([len(tree)], dtype="<u4").tobytes(), b"JSON", tree]
+    if parts:
+        chunks += [np.array([length], dtype="<u4").tobytes(), b"BIN\0"]
+        chunks += [array.reshape(-1).view(np.uint8).data for _, array, _ in parts]
+    whole = 12 + sum(len(chunk) for chunk in chunks)
+    return b"".join([_GLB_MAGIC, np.array([_GLB_VERSION, whole], dtype="<u4").tobytes(), *chunks])
+
+
+def _gltf_tree(parts: list[tuple[str, NDArray[Any], dict[str, object]]], length: int) -> dict[str, object]:
+    node: dict[str, object] = {"name": "scan", "scale": [_METRES_PER_MM] * 3}
+    tree: dict[str, object] = {
+        "asset": {"version": "2.0", "generator": "slrig"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+    }
+    tree["nodes"] = [node]
+    if not parts:
+        return tree
+    views, accessors, offset = [], [], 0
+    for index, (name, array, described) in enumerate(parts):
+        target = _ELEMENT_ARRAY_BUFFER if name == "indices" else _ARRAY_BUFFER
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
+        accessors.append({"bufferView": index, "count": len(array), **described})
+        offset += array.nbytes
+    places = {name: index for index, (name, _, _) in enumerate(parts)}
+    indices = places.pop("indices", None)
+    drawn = {"mode": _POINTS} if indices is None else {"mode": _TRIANGLES, "indices": indices}
+    node["mesh"] = 0
+    tree["meshes"] = [{"name": "mesh_mm", "primitives": [{"attributes": places, "material": 0, **drawn}]}]
+    # Without a dull material a viewer assumes metal, which shows little but reflections.
+    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}, "doubleSided": True}]
+    tree |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": length}]}
+    return tree
+
+
+def encode_mesh_stl(mesh: Mesh) -> bytes:
+    """Binary STL, values in mm (the format has no unit): per triangle its normal and its three corners."""
+    triangles = np.zeros(
+        len(mesh.faces), dtype=[("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]
+    )
+    for rows in _slices(len(mesh.faces)):
+        corners = mesh.vertices_mm[mesh.faces[rows]]
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normal = np.stack(
+            [
+                first[:, 1] * second[:, 2] - first[:, 2] * second[:, 1],
+                first[:, 2] * second[:, 0] - first[:, 0] * second[:, 2],
+                first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0],
+            ],
+            axis=1,
+        )
+        length = np.sqrt((normal**2).sum(axis=1, keepdims=True))
+        triangles["normal"][rows] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+        triangles["corners"][rows] = corners
+    # The header must not begin with "solid", the mark of STL as text.
+    header = b"binary STL of slrig, millimetres".ljust(80) + np.array([len(triangles)], dtype="<u4").tobytes()
+    return header + triangles.tobytes()
+
+
+def encode_mesh_obj(mesh: Mesh) -> bytes:
+    """Wavefront OBJ in mm, with vertex normals, and grey as the three numbers that many programs read after x y z.
+
+    Positions have five decimals (10 nm), normals and colours four. Normals are left out if one is not known.
+    """
+    known = bool(np.isfinite(mesh.normals).all())
+    shades = np.rint(np.arange(256) * (10**_OBJ_UNIT_DECIMALS / 255)).astype(np.int64)
+    pieces = [b"# slrig mesh, millimetres; v x y z red green blue\no scan\n"]
+    for rows in _slices(len(mesh.vertices_mm)):
+        position = np.rint(mesh.vertices_mm[rows].astype(np.float64) * 10**_OBJ_POSITION_DECIMALS).astype(np.int64)
+        columns = [_written(column, _OBJ_POSITION_DECIMALS) for column in position.T]
+        shade = _written(shades[mesh.grey[rows]], _OBJ_UNIT_DECIMALS)
+        pieces.append(_lines(b"v", [*columns, shade, shade, shade]))
+    if known:
+        for rows in _slices(len(mesh.normals)):
+            normal = np.rint(mesh.normals[rows].astype(np.float64) * 10**_OBJ_UNIT_DECIMALS).astype(np.int64)
+            pieces.append(_lines(b"vn", [_written(column, _OBJ_UNIT_DECIMALS) for column in normal.T]))
+    for rows in _slices(len(mesh.faces)):
+        numbers = [_written(column, 0) for column in mesh.faces[rows].T.astype(np.int64) + 1]
+        if known:
+            slashes = np.full((2, numbers[0].shape[1]), ord("/"), dtype=np.uint8)
+            numbers = [np.concatenate([number, slashes, number]) for number in numbers]
+        pieces.append(_lines(b"f", numbers))
+    return b"".join(pieces)
+
+
+def _slices(count: int) -> Iterator[slice]:
+    return (slice(first, min(first + _MOST_ROWS, count)) for first in range(0, count, _MOST_ROWS))
+
+
+def _written(values: NDArray[np.int64], decimals: int) -> NDArray[np.uint8]:
+    """(characters, n) uint8: each value / 10^decimals in ASCII, down its column; 0 stands for no character."""
+    rest = np.abs(values)
+    largest = int(rest.max(initial=0))
+    if largest < 2**32:
+        # Half the bits divide in half the time.
+        rest = rest.astype(np.uint32)
+    places = max(len(str(largest)), decimals + 1)
+    text = np.zeros((1 + places + (decimals > 0), len(values)), dtype=np.uint8)
+    at = len(text)
+    for place in range(places):
+        if place == decimals and decimals > 0:
+            at -= 1
+            text[at] = ord(".")
+        at -= 1
+        tenth = rest // 10
+        digit = (rest - 10 * tenth).astype(np.uint8) + ord("0")
+        text[at] = digit if place <= decimals else np.where(rest > 0, digit, 0)
+        rest = tenth
+    text[0] = np.where(values < 0, ord("-"), 0)
+    return text
+
+
+def _lines(keyword: bytes, columns: list[NDArray[np.uint8]]) -> bytes:
+    """One line per row: the keyword and the columns, separated by single spaces."""
+    count = columns[0].shape[1]
+    space = np.full((1, count), ord(" "), dtype=np.uint8)
+    start = np.repeat(np.frombuffer(keyword, dtype=np.uint8)[:, None], count, axis=1)
+    end = np.full((1, count), ord("\n"), dtype=np.uint8)
+    text = np.ascontiguousarray(np.concatenate([start, *(part for each in columns for part in (space, each)), end]).T)
+    return bytes(text[text != 0].tobytes())

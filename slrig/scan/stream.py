@@ -1,0 +1,212 @@
+"""The frames of a scan on their way into the reconstruction, camera by camera, whether they are read or being taken.
+
+What can be done with a frame is done when it comes. The same code takes the frames of a recorded bundle, in the order
+of its list, so a scan that was watched while it was captured and the same scan read from disk give the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from slrig.capture.evidence import EvidenceSummary
+from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Pattern, Pinhole, Pixels, Shot, Size
+from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
+from slrig.reconstruction.frames import (
+    AxisFrames,
+    FrameStacks,
+    axis_frames,
+    axis_patterns,
+    ends_repeats,
+    mean_image,
+    telling,
+)
+from slrig.scan.outline import Outline
+from slrig.scan.report import Stopwatch
+
+Entered = Callable[[str, str], None]
+"""Told the name of a stage and of a camera as the one begins for the other."""
+
+
+WAITING = "wait for frames"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One camera: its calibration, its curves, and of its frames what the results still need.
+
+    white : (H, W) uint16, the white frame in camera units.
+    """
+
+    name: str
+    device: Pinhole
+    curves: CameraCurves
+    white: Pixels
+    largest_contrast: float
+    full_scale: float
+
+
+class ScanStream:
+    """Reconstructs the curves of every camera while frames come, along the axis that `triangulated_axis` chooses.
+
+    Raises
+    ------
+    PatternError
+        The frames announced cannot be decoded.
+    """
+
+    def __init__(self, outline: Outline, calibration: Calibration, *, entered: Entered) -> None:
+        self.outline = outline
+        self.axis = triangulated_axis(outline, calibration)
+        self._calibration = calibration
+        self._shots: list[Shot] = []
+        self._eyes = {name: _Eye(name, outline, self.axis, entered) for name in outline.cameras}
+
+    def take(self, shot: Shot) -> None:
+        """Take one frame."""
+        self._shots.append(shot)
+        self._eyes[shot.camera].take(shot)
+
+    @property
+    def capture(self) -> Capture:
+        """The frames taken so far."""
+        outline = self.outline
+        return Capture(outline.projector, outline.patterns, outline.cameras, tuple(self._shots))
+
+    def finish(self) -> list[Seen]:
+        """The curves of every camera, once all frames are in.
+
+        Raises
+        ------
+        PatternError
+            The frames cannot be decoded.
+        """
+        capture, seen = self.capture, []
+        for name in list(self._eyes):
+            # What it held of its frames is not needed any more, and the memory is.
+            curves, frames = self._eyes.pop(name).finish(capture)
+            seen.append(
+                Seen(
+                    name=name,
+                    device=self._calibration.cameras[name],
+                    curves=curves,
+                    white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
+                    largest_contrast=float(frames.contrast.max()),
+                    full_scale=frames.full_scale,
+                )
+            )
+        return seen
+
+
+class _Eye:
+    """One camera's share of a stream.
+
+    Frames of a sequence that shows each pattern once are used as they come. Repeats and exposure brackets tell nothing
+    before all of them are in, so they wait for `finish`.
+    """
+
+    def __init__(self, name: str, outline: Outline, axis: Axis, entered: Entered) -> None:
+        self._name = name
+        self._axis = axis
+        self._patterns = outline.patterns
+        self._projector = outline.projector
+        self._entered = lambda stage: entered(stage, name)
+        self._exposures_s: set[float | None] = set()
+        self._repeats: dict[Pattern, list[Pixels]] = {}
+        listed = [index for index, camera in outline.frames if camera == name]
+        shown = [outline.patterns[index] for index in listed]
+        tells = telling(shown, [None] * len(shown))
+        self._waiting = Counter(index for index, used in zip(listed, tells, strict=True) if used)
+        used = [outline.patterns[index] for index in self._waiting.elements()]
+        self._wanted = Counter(used)
+        self._stream: CameraStream | None = None
+        patterns = axis_patterns(self._wanted, name, axis)
+        if all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
+            form = outline.cameras[name]
+            stacks = FrameStacks(
+                patterns, form.size.shape, full_scale=float(form.full_scale), ends_repeats=ends_repeats(used, axis)
+            )
+            tables = _tables(patterns.gray, patterns.lines, outline.projector)
+            self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered)
+
+    def take(self, shot: Shot) -> None:
+        """Take one frame of this camera."""
+        self._exposures_s.add(shot.exposure_s)
+        if self._stream is None or self._waiting[shot.pattern] == 0:
+            return
+        self._waiting[shot.pattern] -= 1
+        pattern = self._patterns[shot.pattern]
+        repeats = self._repeats.setdefault(pattern, [])
+        repeats.append(shot.image)
+        if len(repeats) == self._wanted[pattern]:
+            self._stream.take(pattern, mean_image(self._repeats.pop(pattern)))
+
+    def finish(self, capture: Capture) -> tuple[CameraCurves, AxisFrames]:
+        """The curves, and the frames that they were found in."""
+        if self._stream is not None and len(self._exposures_s) == 1:
+            return self._stream.finish()
+        frames = axis_frames(capture, self._name, self._axis)
+        tables = _tables(frames.gray, frames.line_patterns, self._projector)
+        return camera_curves(frames, tables, Limits(), entered=self._entered), frames
+
+
+class LiveScan:
+    """A stream that is fed while the scan is captured, with the seconds it took so far."""
+
+    def __init__(self, outline: Outline, calibration: Calibration) -> None:
+        self.calibration = calibration
+        self.evidence: EvidenceSummary | None = None
+        self.watch = Stopwatch()
+        self._entered: Entered = lambda stage, _camera: self.watch.enter(stage)
+        self.stream = ScanStream(outline, calibration, entered=lambda stage, camera: self._entered(stage, camera))
+        self.watch.enter(WAITING)
+
+    def take(self, shot: Shot) -> None:
+        """Take one frame."""
+        self.stream.take(shot)
+        self.watch.enter(WAITING)
+
+    def end(self, evidence: EvidenceSummary) -> None:
+        """Hear that all frames have come, and what they have proven."""
+        self.evidence = evidence
+
+    def finish(self, entered: Entered) -> list[Seen]:
+        """As `ScanStream.finish`; `entered` is told the stages from here on."""
+        self._entered = entered
+        return self.stream.finish()
+
+
+def triangulated_axis(outline: Outline, calibration: Calibration) -> Axis:
+    """The axis to triangulate by: of those shown, the one that the first camera stands to the side of.
+
+    A light sheet that contains the camera's centre is seen edge on and tells no depth.
+    """
+    shown = {pattern.axis for pattern in outline.shown if isinstance(pattern, Gray)}
+    if len(shown) == 1:
+        return shown.pop()
+    if calibration.projector is None:
+        return Axis.COLUMN
+    camera = calibration.cameras[next(iter(outline.cameras))]
+    beside, above, _ = calibration.projector.rotation @ camera.centre_mm + calibration.projector.translation_mm
+    return Axis.COLUMN if abs(beside) >= abs(above) else Axis.ROW
+
+
+def step_px(shown: Collection[Pattern], axis: Axis) -> float:
+    """Greatest distance between neighbouring curves: of lines where there are any, of code edges otherwise."""
+    lines = sorted((p for p in shown if isinstance(p, LineShift) and p.axis is axis), key=lambda p: p.shift)
+    if lines:
+        shifts = [p.shift for p in lines]
+        return float(np.diff([*shifts, shifts[0] + lines[0].period_px]).max())
+    return float(next(p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis))
+
+
+def _tables(gray: Gray, lines: tuple[LineShift, ...], size: Size) -> CodeTables:
+    return CodeTables(
+        index_of_word=index_of_word(gray),
+        cell_position=cell_positions(gray, size),
+        position_of=line_positions(lines, gray, size) if lines else edge_positions(gray, size),
+    )

@@ -1,0 +1,55 @@
+"""Folds are counted by geometry alone, and phases are charged to the right account."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.bench.peers.figures import fold_count
+from tests.bench.peers.measuring import Meter, Phase, measured
+
+
+def two_triangles(bend_deg: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """An edge along x, one triangle in the plane, the other bent by `bend_deg` out of it."""
+    bend = np.radians(bend_deg)
+    return np.array([(0, 0, 0), (2, 0, 0), (0.5, 1, 0), (1.5, -np.cos(bend), np.sin(bend))])
+
+
+@pytest.mark.parametrize(("bend_deg", "folds"), [(0.0, 0), (59.0, 0), (-59.0, 0), (61.0, 1), (-61.0, 1), (179.0, 1)])
+@pytest.mark.parametrize("other", [(1, 0, 3), (0, 1, 3)], ids=["same winding", "opposite winding"])
+def test_an_edge_is_a_fold_when_it_bends_by_more_than_60_degrees(
+    bend_deg: float, folds: int, other: tuple[int, int, int]
+) -> None:
+    assert fold_count(two_triangles(bend_deg), np.array([(0, 1, 2), other], dtype=np.int32)) == folds
+
+
+def test_an_edge_of_three_triangles_is_not_a_fold() -> None:
+    vertices = np.concatenate((two_triangles(90.0), [(1.0, 0.0, -1.0)]))
+    faces = np.array([(0, 1, 2), (1, 0, 3), (0, 1, 4)], dtype=np.int32)
+    assert fold_count(vertices, faces) == 0
+
+
+def test_folds_of_a_box_are_its_edges() -> None:
+    corners = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))], dtype=np.int32)
+    assert fold_count(corners, faces) == 12
+
+
+def test_memory_is_charged_to_the_phase_that_took_it() -> None:
+    taken_mb = 64
+
+    def run(meter: Meter) -> int:
+        meter.enter(Phase.POINTS)
+        points = np.ones(taken_mb * 2**20, dtype=np.uint8)
+        count = len(points)
+        del points
+        meter.enter(Phase.MESH)
+        return count
+
+    count, cost = measured(run, compiles=True)
+    assert count == taken_mb * 2**20
+    assert cost.warm_runs >= 1
+    assert set(cost.warm_s) == {Phase.POINTS, Phase.MESH}
+    assert 0.9 * taken_mb < cost.peak_mb[Phase.POINTS] < 1.5 * taken_mb
+    assert cost.peak_mb[Phase.MESH] < 0.5 * taken_mb
