@@ -1,0 +1,286 @@
+"""Stripe centres of rendered scenes against the Cramér-Rao bound: what the tests of the stripe limit measure.
+
+Each scene is rendered once without noise. Many noisy captures of it walk through the same rooms as a scan's frames
+(white and black twice, Gray code with inverses, line shift), and every point that comes out is compared with the line's
+true projector column at the point's own sub-pixel position, traced by the renderer. Points that the reconstruction
+refuses, beside shadows and borders, are left out as a scan leaves them out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from simulated_rig import transport
+from simulated_rig.bound import ExposedView, pixel_bound, stripe_bound
+from simulated_rig.options import CameraOptions, ProjectorOptions
+from simulated_rig.rendering import Stage, View
+from simulated_rig.scene import Scene, surface_of
+from slrig.model import Axis, CameraFormat, Capture, FloatArray, Gray, LineShift, PatternSequence, Shot
+from slrig.patterns.positions import cell_positions, index_of_word, line_positions
+from slrig.patterns.sequence import encode, scan_patterns
+from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
+from slrig.reconstruction.frames import axis_frames
+
+PLANE: Mapping[str, object] = {"shape": "plane", "size_mm": [240.0, 240.0], "rotation_deg": [8.0, -12.0, 0.0]}
+SPHERE: Mapping[str, object] = {"shape": "sphere", "radius_mm": 60.0, "position_mm": [0.0, 0.0, 40.0]}
+SHARP_PX, SOFT_PX = 0.6, 0.9
+
+_ENDS_REPEATS = 2.0
+_WHITE_LEVEL = 0.8
+_FINEST_SMOOTHING_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A rendered camera and projector before one scene, and what the projector shows."""
+
+    camera: CameraOptions
+    projector: ProjectorOptions
+    stage: Stage
+    view: View
+    sequence: PatternSequence
+
+    def exposed(self, exposure_s: float, gain: float) -> ExposedView:
+        """Return the view at an exposure."""
+        projector = self.projector
+        return ExposedView(self.view, projector.size, projector.response(), self.camera.sensor(), exposure_s, gain)
+
+    def lines(self) -> list[tuple[int, FloatArray]]:
+        """Index of each line pattern, and the centres of its lines, which are one column wide."""
+        columns = self.projector.size.width_px
+        return [
+            (index, np.arange(pattern.centre_px, columns, pattern.period_px))
+            for index, pattern in enumerate(self.sequence.patterns)
+            if isinstance(pattern, LineShift)
+        ]
+
+    def columns_at(self, points_px: FloatArray) -> FloatArray:
+        """(n,) float64: true projector columns at camera positions (x, y), (n, 2) float64."""
+        stage, (u, v) = self.stage, points_px.T.copy()
+        return transport.trace(
+            u, v, self.camera.pinhole(), stage.projector, stage.surface, stage.rays,
+            working_distance_mm=stage.working_distance_mm,
+        ).column_px  # fmt: skip
+
+
+def rig(thing: Mapping[str, object], *, size_px: tuple[int, int], blur_px: float) -> Rig:
+    """Return a rig like those in `config/rigs`, whose projector lights all that the camera sees of `thing`.
+
+    blur_px : of both lenses. The sensor reads 8 bits, 30 000 electrons deep, above a pedestal that keeps its noise.
+    """
+    lamp = ProjectorOptions.model_validate({
+        "size_px": [512, 384], "focal_px": [2200.0, 2202.2], "distortion": [0.03, -0.02, 0.0003, 0.0, 0.0],
+        "position_mm": [105.0, -10.0, -590.0], "target_mm": [0.0, 0.0, 0.0], "blur_px": blur_px,
+    })  # fmt: skip
+    eye = CameraOptions.model_validate({
+        "name": "eye", "size_px": list(size_px), "focal_px": [1900.0, 1901.9], "saturation_s": 0.02,
+        "distortion": [-0.11, 0.15, -0.0003, 0.0005, 0.0], "position_mm": [-150.0, -12.0, -560.0],
+        "target_mm": [0.0, 0.0, 0.0], "blur_px": blur_px, "full_well_e": 30000.0, "pedestal_dn": 8.0,
+    })  # fmt: skip
+    scene = Scene.model_validate({"object": [{**thing, "albedo": 0.8}]})
+    stage = Stage(surface_of(scene, Path()), lamp.pinhole(), working_distance_mm=600.0)
+    view = View(
+        eye.pinhole(), stage, blur_px=eye.blur_px, ambient=0.01, samples_per_axis=4, jitter=False, seed=1, workers=2
+    )
+    patterns = scan_patterns(
+        lamp.size, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return Rig(eye, lamp, stage, view, encode(patterns, lamp.size))
+
+
+def exposed_at_snr(rig: Rig, snr: float) -> ExposedView:
+    """Return the view exposed so that the median stripe stands `snr` times its own noise above black.
+
+    The gain lifts white to four fifths of full scale at every exposure, as an operator sets it.
+    """
+    index, lines = rig.lines()[0]
+    white_e = float(np.percentile(rig.exposed(1.0, 1.0).ends[0], 99.5))
+    longest_s = _WHITE_LEVEL * rig.camera.full_well_e / white_e
+
+    def exposed(exposure_s: float) -> ExposedView:
+        return rig.exposed(exposure_s, longest_s / exposure_s)
+
+    def excess(exposure_s: float) -> float:
+        return float(np.median(stripe_bound(exposed(exposure_s), rig.sequence.profiles[index], lines).snr)) - snr
+
+    return exposed(float(brentq(excess, 0.005 * longest_s, longest_s, rtol=1e-3)))
+
+
+@dataclass(frozen=True)
+class Points:
+    """Every point of several captures that has a bound, n of them; a cell is one line in one image row.
+
+    error_px : (n,) float64, from the true line, across it, towards rising columns; cell : (n,) its cell.
+    stated_px : (n,) the deviation that the reconstruction states.
+    snr, width_px, row_px, bound_px, frames_bound_px : (n,) of the stripe there: its signal to noise, its width, and its
+    bound in one row, along the stripe, and along the stripe with the noise of white and black counted in.
+    pixel_px : (n,) the bound of the pixel that the point lies in, from its samples in all line frames.
+    scale_px : of the reconstruction's filter; smoothing_px : along which the bound is averaged.
+    """
+
+    error_px: FloatArray
+    cell: NDArray[np.intp]
+    stated_px: FloatArray
+    snr: FloatArray
+    width_px: FloatArray
+    row_px: FloatArray
+    bound_px: FloatArray
+    frames_bound_px: FloatArray
+    pixel_px: FloatArray
+    scale_px: float
+    smoothing_px: float
+
+    @property
+    def _mean_px(self) -> FloatArray:
+        count = np.bincount(self.cell)
+        return (np.bincount(self.cell, self.error_px) / np.maximum(count, 1))[self.cell]
+
+    @property
+    def _freedom(self) -> FloatArray:
+        # A point's distance from its cell's mean has (count - 1)/count of the variance.
+        count = np.bincount(self.cell)[self.cell]
+        return np.asarray((count - 1) / count)
+
+    @property
+    def scatter_px(self) -> FloatArray:
+        """(m,) float64: errors without the mean of their cell, of full variance; cells of one point are left out."""
+        freedom = self._freedom
+        several = freedom > 0
+        return (self.error_px - self._mean_px)[several] / np.sqrt(freedom[several])
+
+    @property
+    def bias_rms_px(self) -> float:
+        """What stays of the error when noise is averaged out, rms over the cells."""
+        left = float(np.mean(self._mean_px**2) - np.mean(self.scatter_px**2) * np.mean(1.0 - self._freedom))
+        return math.sqrt(max(left, 0.0))
+
+    @property
+    def bias_mean_px(self) -> float:
+        """The mean error."""
+        return float(self.error_px.mean())
+
+    @property
+    def ratio(self) -> float:
+        """Rms of the error over its bound: of the line frame alone, averaged along the stripe."""
+        return rms(self.error_px / self.bound_px)
+
+    @property
+    def scatter_ratio(self) -> float:
+        """Rms of the scatter, the error without bias, over the bound."""
+        return rms(self.scatter_px / self.bound_px[self._freedom > 0])
+
+    @property
+    def frames_ratio(self) -> float:
+        """Rms of the error over the bound of line, white and black frames."""
+        return rms(self.error_px / self.frames_bound_px)
+
+    @property
+    def pixels_worth(self) -> float:
+        """How many pixels' samples in all line frames, averaged without loss, would scatter as the points do."""
+        scatter = self.scatter_px / self.pixel_px[self._freedom > 0]
+        return float(1.0 / np.nanmean(scatter**2))
+
+    @property
+    def stated_ratio(self) -> float:
+        """Rms of the scatter over the deviation stated for it: 1 is honest."""
+        return rms(self.scatter_px / self.stated_px[self._freedom > 0])
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def measured(rig: Rig, exposed: ExposedView, *, captures: int, seed: int = 1) -> Points:
+    """Reconstruct noisy captures of one scene, and find the error and the bound of every point."""
+    rows = rig.camera.size.height_px
+    bounds = _bounds(rig, exposed)
+    means = [exposed.electrons(profile) for profile in rig.sequence.profiles]
+    pixel_columns, _ = pixel_bound(exposed, [rig.sequence.profiles[index] for index, _ in rig.lines()])
+    rng = np.random.default_rng(seed)
+    errors, pixels, stated, cells, scales = [], [], [], [], []
+    for _ in range(captures):
+        curves = _curves(rig, exposed, means, rng)
+        points = curves.ensemble.points_px
+        line = np.repeat(curves.ensemble.position_px, np.diff(curves.ensemble.offsets))
+        error, columns_per_px = _errors_px(rig, points, line)
+        errors.append(error)
+        at_column, at_row = np.rint(points).astype(np.intp).T
+        pixels.append(pixel_columns[at_row, at_column] / columns_per_px)
+        cells.append(np.rint(line).astype(np.intp) * rows + np.rint(points[:, 1]).astype(np.intp))
+        stated.append(curves.ensemble.sigma_px)
+        scales.append(curves.scale_px)
+    error, pixel = np.concatenate(errors), np.concatenate(pixels)
+    cell, deviation = np.concatenate(cells), np.concatenate(stated)
+    known = np.isfinite(error) & np.isfinite(bounds["frames_px"][cell])
+    error, pixel, cell, deviation = error[known], pixel[known], cell[known], deviation[known]
+    at = {name: values[cell] for name, values in bounds.items()}
+    return Points(
+        error_px=error,
+        cell=cell,
+        stated_px=deviation,
+        snr=at["snr"],
+        width_px=at["width_px"],
+        row_px=at["row_px"],
+        bound_px=at["alone_px"],
+        frames_bound_px=at["frames_px"],
+        pixel_px=pixel,
+        scale_px=float(np.median(scales)),
+        smoothing_px=float(at["smoothing_px"][0]),
+    )
+
+
+def _errors_px(rig: Rig, points_px: FloatArray, line_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distance of points from their true lines, px, and projector columns per px there; (n,) float64 each."""
+    here, right, left, below, above = (
+        rig.columns_at(points_px + np.array(step)) for step in ((0, 0), (0.25, 0), (-0.25, 0), (0, 0.25), (0, -0.25))
+    )
+    columns_per_px = 2.0 * np.hypot(right - left, below - above)
+    return np.asarray((here - line_px) / columns_per_px), np.asarray(columns_per_px)
+
+
+def _curves(rig: Rig, exposed: ExposedView, means: list[NDArray[np.float32]], rng: np.random.Generator) -> CameraCurves:
+    """The camera's curves from one noisy capture of frames whose expected electrons are given."""
+    sequence = rig.sequence
+    shots = tuple(
+        Shot(index, "eye", exposed.sensor.read_out(mean, gain=exposed.gain, rng=rng))
+        for index, mean in enumerate(means)
+    )
+    camera = CameraFormat(rig.camera.size, rig.camera.bit_depth)
+    frames = axis_frames(Capture(sequence.projector, sequence.patterns, {"eye": camera}, shots), "eye", Axis.COLUMN)
+    gray = next(pattern for pattern in sequence.patterns if isinstance(pattern, Gray))
+    tables = CodeTables(
+        index_of_word(gray),
+        cell_positions(gray, sequence.projector),
+        line_positions(frames.line_patterns, gray, sequence.projector),
+    )
+    return camera_curves(frames, tables, Limits(), entered=lambda _stage: None)
+
+
+def _bounds(rig: Rig, exposed: ExposedView) -> dict[str, FloatArray]:
+    """What is known of each cell, (lines * rows,) float64, by name; NaN where there is no stripe."""
+    rows, columns = rig.camera.size.height_px, rig.projector.size.width_px
+    told = {
+        name: np.full(rows * columns, np.nan)
+        for name in ("snr", "width_px", "row_px", "alone_px", "frames_px", "smoothing_px")
+    }
+    pairs = [
+        tuple(stripe_bound(exposed, rig.sequence.profiles[index], lines, ends_repeats=n) for n in (None, _ENDS_REPEATS))
+        for index, lines in rig.lines()
+    ]
+    width_px = float(np.median(np.concatenate([alone.width_px for alone, _ in pairs])))
+    smoothing_px = max(width_px, _FINEST_SMOOTHING_PX)
+    for alone, frames in pairs:
+        at, frames_at = (np.rint(each.line_px).astype(np.intp) * rows + each.row for each in (alone, frames))
+        told["snr"][at], told["width_px"][at], told["row_px"][at] = alone.snr, alone.width_px, alone.row_px
+        told["alone_px"][at] = alone.averaged_px(smoothing_px)
+        told["frames_px"][frames_at] = frames.averaged_px(smoothing_px)
+    told["smoothing_px"][:] = smoothing_px
+    return told
