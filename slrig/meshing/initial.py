@@ -9,8 +9,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.meshing.normals import vertex_normals
 from slrig.meshing.strips import neighbouring_curves, strip_neighbours, strips, to_drop
-from slrig.meshing.topology import component_sizes, vertex_normals
+from slrig.meshing.topology import component_sizes
 from slrig.model import FloatArray, IntArray
 
 _BLOCK = 4096

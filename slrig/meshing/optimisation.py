@@ -32,12 +32,13 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.meshing.adjacency import neighbours
-from slrig.meshing.flips import GAMMA, constraint, prefers_flip
+from slrig.meshing.flips import BLOCK, GAMMA, constraint, prefer_flips, prefers_flip
 from slrig.model import FlipRule, FloatArray, IntArray
 
 NO_FLIPS, INDEX, TURN_LIMIT = "no flips", "index", "turn limit"
 _FLAT_INDEX = 1e5
 _UNITS_PER_INDEX = 2.0**20
+_FACES_AT_ONCE = 16384
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +99,8 @@ def optimised(
             message = f"{name}: expected shape {shape}, as of the {len(faces)} faces, found {array.shape}"
             raise ValueError(message)
     cosine, sine = constraint(rule, gamma)
-    across = neighbours(faces, vertex_count=len(points)) if adjacency is None else adjacency.copy(order="C")
-    faces = faces.copy(order="C")
+    across = neighbours(faces, vertex_count=len(points)) if adjacency is None else adjacency
+    faces, across = faces.copy(order="C"), across.copy(order="C")
     everyone = np.ones(len(faces), dtype=np.bool_) if among is None else among
     flagged = np.zeros(len(faces), dtype=np.uint8)
     units, flat = _scanned(points, faces, across, everyone, cosine, sine, flagged)
@@ -188,20 +189,35 @@ def _corner_across(across: Any, face: int, other: int) -> int:
 def _scanned(points: Any, faces: Any, across: Any, among: Any, cosine: float, sine: float, flagged: Any) -> Any:
     """Flag edges to flip, bit k of the lower-numbered face; return the sum of the indices in units, and flat faces."""
     units, flat = 0, 0
-    for face in prange(len(faces)):
-        index = _index_units(points, faces[face, 0], faces[face, 1], faces[face, 2])
-        if index >= 0:
-            units += index
-        else:
-            flat += 1
-        wanted = 0
-        for k in range(3):
-            other = across[face, k]
-            if other > face and (among[face] or among[other]):
-                f, p, q = faces[face, k], faces[face, k + 1 if k < 2 else 0], faces[face, k - 1 if k else 2]
-                w = faces[other, _corner_across(across, other, face)]
-                wanted |= prefers_flip(points, p, q, f, w, cosine, sine) << k
-        flagged[face] = wanted
+    for part in prange(-(-len(faces) // _FACES_AT_ONCE)):
+        corners, wanted = np.zeros(12 * BLOCK), np.zeros(BLOCK, dtype=np.bool_)
+        edges = np.zeros(BLOCK, dtype=np.int32)
+        count, last = 0, min((part + 1) * _FACES_AT_ONCE, len(faces))
+        for face in range(part * _FACES_AT_ONCE, last):
+            index = _index_units(points, faces[face, 0], faces[face, 1], faces[face, 2])
+            if index >= 0:
+                units += index
+            else:
+                flat += 1
+            for k in range(3):
+                other = across[face, k]
+                if other > face and (among[face] or among[other]):
+                    p, q = faces[face, k + 1 if k < 2 else 0], faces[face, k - 1 if k else 2]
+                    # Which corner cannot be foreseen: reckoned without a jump.
+                    w = faces[other, (across[other, 1] == face) + 2 * (across[other, 2] == face)]
+                    for axis in range(3):
+                        corners[axis * BLOCK + count] = points[p, axis]
+                        corners[(3 + axis) * BLOCK + count] = points[q, axis]
+                        corners[(6 + axis) * BLOCK + count] = points[faces[face, k], axis]
+                        corners[(9 + axis) * BLOCK + count] = points[w, axis]
+                    edges[count] = 4 * face + k
+                    count += 1
+            if count > BLOCK - 3 or face + 1 == last:
+                prefer_flips(count, corners, cosine, sine, wanted)
+                for at in range(count):
+                    if wanted[at]:
+                        flagged[edges[at] >> 2] |= 1 << (edges[at] & 3)
+                count = 0
     return units, flat
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from slrig.meshing.boundary import Shrunk, Smoothed, boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
 from slrig.meshing.initial import InitialMesh, initial_mesh
+from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import Optimised, optimised
-from slrig.meshing.topology import vertex_normals
 from slrig.model import FlipRule, FloatArray, IntArray
 
 
@@ -42,6 +42,8 @@ class Stage:
 class FinishedMesh:
     """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye; normals : (n, 3) float32,
     unit, NaN for points in no triangle; stages in order, and what the single steps did.
+
+    The triangles of `smoothed` are those of `boundary_optimised`, which was done on them.
     """
 
     faces: IntArray
@@ -72,8 +74,10 @@ def finished_mesh(
     """
     stages: list[Stage] = []
 
-    def done(name: str, faces: IntArray, adjacency: IntArray) -> None:
-        stages.append(Stage(name, len(faces), boundary_point_count(faces, adjacency)))
+    def done(name: str, faces: IntArray, adjacency: IntArray | None) -> None:
+        # Flips leave the boundary as it is: without an adjacency it is that of the stage before.
+        points = stages[-1].boundary_points if adjacency is None else boundary_point_count(faces, adjacency)
+        stages.append(Stage(name, len(faces), points))
 
     entered("initial meshing")
     initial = initial_mesh(
@@ -83,7 +87,7 @@ def finished_mesh(
     done("initial meshing", initial.faces, initial.adjacency)
     entered("global optimisation")
     best = optimised(points_mm, initial.faces, rule=limits.flip_rule, adjacency=initial.adjacency)
-    done("global optimisation", best.faces, best.adjacency)
+    done("global optimisation", best.faces, None)
     faces, less, smooth, mended = best.faces, None, None, None
     if limits.smooth_boundary and len(faces):
         entered("shrinking boundary")
@@ -99,9 +103,10 @@ def finished_mesh(
         done("smoothing boundary", smooth.faces, smooth.adjacency)
         entered("optimising boundary")
         mended = optimised(
-            points_mm, smooth.faces, rule=limits.flip_rule, among=smooth.added, adjacency=smooth.adjacency
-        )
-        done("optimising boundary", mended.faces, mended.adjacency)
+            points_mm, smooth.faces, rule=limits.flip_rule, among=smooth.added, adjacency=smooth.adjacency,
+            # Nothing is flipped unless triangles were added, and then the arrays are the smoothing's own.
+        )  # fmt: skip
+        done("optimising boundary", mended.faces, None)
         faces = mended.faces
     entered("vertex normals")
     return FinishedMesh(

@@ -1,6 +1,6 @@
-"""How the triangles of a mesh hang together: edges, borders, faults of orientation, components, vertex normals.
+"""How the triangles of a mesh hang together: edges, borders, faults of orientation, components.
 
-`faces` is (F, 3) int32, vertex indices, throughout. Coordinates play no part, except in `vertex_normals`.
+`faces` is (F, 3) int32, vertex indices, throughout. Coordinates play no part.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.model import IntArray
@@ -99,12 +99,8 @@ def duplicate_face_count(faces: IntArray) -> int:
     """Number of faces whose three vertices, in any order, an earlier face has already."""
     if not len(faces):
         return 0
-    low, high = faces.min(axis=1), faces.max(axis=1)
-    middle = faces.sum(axis=1, dtype=np.int64) - low - high
-    order = np.lexsort((high, middle, low))
-    low, middle, high = low[order], middle[order], high[order]
-    same = (low[1:] == low[:-1]) & (middle[1:] == middle[:-1]) & (high[1:] == high[:-1])
-    return int(same.sum())
+    faces = np.ascontiguousarray(faces)
+    return int(_duplicates(faces, *_faces_by_lowest_vertex(faces, _vertex_bound(faces))))
 
 
 def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
@@ -138,8 +134,7 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
     bound = _vertex_bound(faces)
     border = np.zeros(bound, dtype=np.bool_)
     edges, boundary, nonmanifold, misoriented = _edge_counts(faces, *_halves_by_lower_vertex(faces, bound), border)
-    labels = component_labels(faces)
-    vertices = _marked_count(faces)
+    vertices, components = _used_and_roots(faces, _joined(faces, np.ones(len(faces), dtype=np.bool_), bound))
     return TopologyCounts(
         vertices=vertices,
         edges=edges,
@@ -149,7 +144,7 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
         misoriented_edges=misoriented,
         duplicate_faces=duplicate_face_count(faces),
         degenerate_faces=int(degenerate_faces(faces).sum()),
-        components=int(labels.max()) + 1 if len(labels) else 0,
+        components=components,
         euler_characteristic=vertices - edges + len(faces),
     )
 
@@ -158,18 +153,9 @@ def compact(faces: IntArray, *, vertex_count: int) -> CompactIndex:
     """How to leave out the vertices that no face uses, keeping the order of the others."""
     faces = np.ascontiguousarray(faces)
     renumbered, kept = _renumbered(faces, vertex_count)
-    return CompactIndex(kept, np.asarray(_gathered(faces, renumbered)))
-
-
-def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> NDArray[np.float32]:
-    """(V, 3) float32, unit: the mean normal of the triangles at each vertex, weighted by their angle there.
-
-    Weighting by angle makes the normal independent of how the surface is cut into triangles
-    (Thürmer and Wüthrich 1998, "Computing vertex normals from polygonal facets").
-    NaN where no triangle with an area meets the vertex.
-    """
-    points = np.ascontiguousarray(vertices_mm, dtype=np.float64)
-    return np.asarray(_vertex_normals(points, np.ascontiguousarray(faces), get_num_threads()))
+    found = np.zeros(faces.shape, dtype=np.int32)
+    _gathered(faces, renumbered, found)
+    return CompactIndex(kept, found)
 
 
 def _directed_edges(faces: IntArray) -> IntArray:
@@ -258,6 +244,52 @@ def _edge_counts(faces: IntArray, starts: IntArray, halves: IntArray, border: An
 
 
 @njit(cache=True, nogil=True)
+def _faces_by_lowest_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArray, IntArray]:
+    """Where the faces of each lowest vertex begin, and the faces in that order."""
+    starts = np.zeros(vertex_bound + 2, dtype=np.int32)
+    for face in range(len(faces)):
+        starts[min(faces[face, 0], faces[face, 1], faces[face, 2]) + 2] += 1
+    for vertex in range(vertex_bound):
+        starts[vertex + 2] += starts[vertex + 1]
+    order = np.zeros(len(faces), dtype=np.int32)
+    for face in range(len(faces)):
+        # A start stands one place to the right until its faces have moved it on to its end.
+        place = min(faces[face, 0], faces[face, 1], faces[face, 2]) + 1
+        order[starts[place]] = face
+        starts[place] += 1
+    return starts, order
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _duplicates(faces: IntArray, starts: IntArray, order: IntArray) -> int:
+    count = 0
+    for vertex in prange(len(starts) - 2):
+        for at in range(starts[vertex], starts[vertex + 1]):
+            a, b, c = faces[order[at]]
+            middle, high = a + b + c - vertex - max(a, b, c), max(a, b, c)
+            for earlier in range(starts[vertex], at):
+                d, e, f = faces[order[earlier]]
+                if max(d, e, f) == high and d + e + f - vertex - high == middle:
+                    count += 1
+                    break
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _used_and_roots(faces: IntArray, roots: IntArray) -> tuple[int, int]:
+    """Number of vertices that a face uses, and of those among them that stand for their piece."""
+    used = np.zeros(len(roots), dtype=np.bool_)
+    for face in range(len(faces)):
+        for corner in range(3):
+            used[faces[face, corner]] = True
+    vertices, pieces = 0, 0
+    for vertex in range(len(roots)):
+        vertices += used[vertex]
+        pieces += used[vertex] and roots[vertex] == vertex
+    return vertices, pieces
+
+
+@njit(cache=True, nogil=True)
 def _renumbered(faces: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
     """The new number of each vertex, and the old number of each that stays."""
     used = np.zeros(vertex_count, dtype=np.bool_)
@@ -277,12 +309,10 @@ def _renumbered(faces: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _gathered(faces: IntArray, renumbered: IntArray) -> IntArray:
-    found = np.zeros_like(faces)
+def _gathered(faces: IntArray, renumbered: IntArray, found: IntArray) -> None:
     for face in prange(len(faces)):
         for corner in range(3):
             found[face, corner] = renumbered[faces[face, corner]]
-    return found
 
 
 @njit(cache=True, nogil=True)
@@ -301,6 +331,8 @@ def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
         if not among[face]:
             continue
         first = _root(parents, faces[face, 0])
+        if parents[faces[face, 1]] == first and parents[faces[face, 2]] == first:
+            continue
         for corner in (1, 2):
             second = _root(parents, faces[face, corner])
             if first < second:
@@ -339,39 +371,3 @@ def _component_sizes(faces: IntArray, among: Any, roots: IntArray) -> IntArray:
         if among[face]:
             sizes[face] = counts[roots[faces[face, 0]]]
     return sizes
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _vertex_normals(points: NDArray[np.float64], faces: IntArray, parts: int) -> NDArray[np.float32]:
-    # Each part owns a range of vertices, goes over all faces and adds to its own vertices only: every vertex has its
-    # sum taken in the order of the faces, so the result is the same for any number of threads.
-    sums = np.zeros((len(points), 3))
-    for part in prange(parts):
-        low, high = len(points) * part // parts, len(points) * (part + 1) // parts
-        for face in range(len(faces)):
-            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-            if not (low <= a < high or low <= b < high or low <= c < high):
-                continue
-            ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-            vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            twice_area = np.sqrt(nx * nx + ny * ny + nz * nz)
-            if not twice_area > 0.0:
-                continue
-            nx, ny, nz = nx / twice_area, ny / twice_area, nz / twice_area
-            # The cross product of any two edges is twice the area: each angle is atan2(2 A, dot of the edges there).
-            at_a = np.arctan2(twice_area, ux * vx + uy * vy + uz * vz)
-            at_b = np.arctan2(twice_area, ux * (ux - vx) + uy * (uy - vy) + uz * (uz - vz))
-            at_c = np.pi - at_a - at_b
-            for corner, angle in ((a, at_a), (b, at_b), (c, at_c)):
-                if low <= corner < high:
-                    sums[corner, 0] += angle * nx
-                    sums[corner, 1] += angle * ny
-                    sums[corner, 2] += angle * nz
-    normals = np.full((len(points), 3), np.nan, dtype=np.float32)
-    for vertex in prange(len(points)):
-        x, y, z = sums[vertex, 0], sums[vertex, 1], sums[vertex, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        if length > 0.0:
-            normals[vertex, 0], normals[vertex, 1], normals[vertex, 2] = x / length, y / length, z / length
-    return normals

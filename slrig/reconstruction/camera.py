@@ -14,12 +14,13 @@ from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
-from slrig.reconstruction.edges import EdgeLimits, near_edges
+from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.identification import identify, with_refused_points
 from slrig.reconstruction.linking import StripeEnsemble, link
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
-from slrig.reconstruction.phase import has_phase, position_map, refined
+from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.refinement import refined
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -52,15 +53,15 @@ class Limits:
 
     largest_disagreement_px : where the stripes of one frame lie further than this from where all frames together put
     them, the light changed from frame to frame, and each stripe stands as its own frame shows it.
-    camera_blur_px : standard deviation of the camera's own blur: a lens in focus, half a pixel, and the pixel's own
-    square, 1/12 px² of variance.
+    camera_blur_px : standard deviation of the camera's own blur: a lens in focus, 0.58 px, and the pixel's own square,
+    1/12 px² of variance.
     """
 
     decoding: DecodingLimits = field(default_factory=DecodingLimits)
     stripes: StripeLimits = field(default_factory=StripeLimits)
     edges: EdgeLimits = field(default_factory=EdgeLimits)
     largest_disagreement_px: float = 0.03
-    camera_blur_px: float = 0.58
+    camera_blur_px: float = 0.65
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,11 +84,16 @@ class CameraCurves:
 
 @dataclass(frozen=True, slots=True)
 class _Coded:
-    """What white, black and code frames tell of every pixel."""
+    """What white, black and code frames tell of every pixel.
+
+    near_shadow : (H, W) bool, for a fit to pixels; contrast_deviation : (H, W) float32, of white minus black by noise.
+    """
 
     frames: AxisFrames
     noise: NoiseModel
     code: CodeMap
+    near_shadow: NDArray[np.bool_]
+    contrast_deviation: NDArray[np.float32]
 
     @property
     def unlit(self) -> NDArray[np.bool_]:
@@ -98,7 +104,7 @@ class CameraStream:
     """The reconstruction of one camera and axis, fed frame by frame.
 
     What a frame allows is done when it comes: the code is read once its last frame is in, stripes are located in each
-    line frame once the code is known, and the rest waits for `finish`. Frames may come in any order, with the same
+    line frame once the code is known, and the rest is done once all are in. Frames may come in any order, with the same
     result to the bit.
 
     entered : told the name of each stage as it begins.
@@ -114,6 +120,7 @@ class CameraStream:
         self._coded: _Coded | None = None
         self._scales: _Scales | None = None
         self._points: list[LinePoints] = []
+        self._curves: CameraCurves | None = None
 
     def take(self, pattern: Pattern, image: NDArray[Any]) -> None:
         """Take the (H, W) image of a pattern. Repeats of one pattern come as their mean."""
@@ -129,11 +136,11 @@ class CameraStream:
             Frames are missing.
         """
         coded = self._go_on()
-        if coded is None or self._scales is None or self._stacks.missing:
+        if coded is None or self._curves is None:
             missing = sorted(map(repr, self._stacks.missing))
             message = f"{len(missing)} of the frames announced did not come: {'; '.join(missing)}; capture them again"
             raise PatternError(message)
-        return _curves(coded, self._points, self._scales, self._tables, self._limits, self._entered), coded.frames
+        return self._curves, coded.frames
 
     def _go_on(self) -> _Coded | None:
         """Do what the frames so far allow."""
@@ -141,6 +148,10 @@ class CameraStream:
             self._coded = self._decoded(self._stacks.frames())
         if self._coded is not None:
             self._locate(self._coded)
+            if self._curves is None and self._scales is not None and not self._stacks.missing:
+                self._curves = _curves(
+                    self._coded, self._points, self._scales, self._tables, self._limits, self._entered
+                )
         return self._coded
 
     def _decoded(self, frames: AxisFrames) -> _Coded:
@@ -148,7 +159,9 @@ class CameraStream:
         noise = estimate_noise(frames)
         tables = self._tables
         code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding)
-        return _Coded(frames, noise, code)
+        near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
+        ends = noise.variance(frames.white) + noise.variance(frames.black)
+        return _Coded(frames, noise, code, near_shadow, np.sqrt(ends / np.float32(frames.ends_repeats)))
 
     def _locate(self, coded: _Coded) -> None:
         if self._scales is None and not self._stacks.patterns.lines:
@@ -202,9 +215,9 @@ def _curves(
     disagreement_px = np.zeros(0)
     phase = has_phase(frames)
     if phase:
-        seen = at_pixel_centres(seen, frames.contrast, limits.camera_blur_px)
+        seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, limits.camera_blur_px)
     resolution_px = 0.0 if phase else float(frames.gray.cell_px)
-    near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges)
+    near_shadow, near_step = coded.near_shadow, near_steps(seen, resolution_px, limits.edges)
     if phase:
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
         refinement = refined(points, seen, usable, code, tables.position_of)
@@ -212,7 +225,7 @@ def _curves(
         phase = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)
     if phase:
         points = refinement.points
-        code = with_refused_points(code, found, frames, tables.position_of, near_shadow, near_step)
+        code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
     else:
         # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
         near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))

@@ -50,12 +50,21 @@ def near_edges(
 
     unlit : (H, W) bool; resolution_px : step of the position map (0 where phase makes it continuous).
     """
-    dark = _without_specks(unlit, limits.smallest_shadow_px)
+    return near_shadows(unlit, limits), near_steps(seen, resolution_px, limits)
+
+
+def near_shadows(unlit: NDArray[np.bool_], limits: EdgeLimits, /) -> NDArray[np.bool_]:
+    """(H, W) bool: pixels near the lit area's border; see `near_edges`."""
+    return _within(_without_specks(unlit, limits.smallest_shadow_px), limits.shadow_px)
+
+
+def near_steps(seen: PositionMap, resolution_px: float, limits: EdgeLimits, /) -> NDArray[np.bool_]:
+    """(H, W) bool: pixels near a depth step; see `near_edges`."""
     bends = _bend_kernel(
         seen.position, np.nan_to_num(seen.sigma), limits.bend_px + 2 * resolution_px, limits.bend_share,
         limits.bend_sigma,
     )  # fmt: skip
-    return _within(dark, limits.shadow_px), _within(bends, limits.depth_px)
+    return _within(bends, limits.depth_px)
 
 
 def _without_specks(unlit: NDArray[np.bool_], smallest: int) -> NDArray[np.bool_]:

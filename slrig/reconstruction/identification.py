@@ -77,41 +77,48 @@ def with_refused_points(
     code: CodeMap,
     found: Sequence[LinePoints],
     frames: AxisFrames,
+    position: NDArray[np.float32],
     position_of: FloatArray,
     near_shadow: NDArray[np.bool_],
     near_step: NDArray[np.bool_],
     /,
 ) -> CodeMap:
-    """The code map with the causes of those points marked that a filter found and that `phase.refined` leaves out.
+    """The code map with the causes of those points marked that a filter found and that the refinement leaves out.
 
-    Arguments as for `identify`; found : the points of each line frame, as the filter found them.
+    Arguments as for `identify`; found : the points of each line frame, as the filter found them; position : (H, W)
+    float32, that of `phase.position_map`, NaN where a line frame is clipped.
     """
     refusal = code.refusal.copy()
     clipped_at = np.float32(frames.clipped_at)
     for index, points in enumerate(found):
-        _refused_kernel(
-            points.points_px, position_of[index], code.lowest, code.highest, frames.lines, clipped_at, near_shadow,
-            near_step, refusal,
+        cause = _cause_kernel(
+            points.points_px, position_of[index], code.lowest, code.highest, frames.lines, clipped_at, position,
+            near_shadow, near_step,
         )  # fmt: skip
+        # One after another: the last of the points that share a pixel stands.
+        refused = np.flatnonzero(cause)
+        columns, rows = np.rint(points.points_px[refused]).astype(np.int32).T
+        refusal[rows, columns] = cause[refused]
     return replace(code, refusal=refusal)
 
 
-@njit(cache=True, nogil=True)
-def _refused_kernel(
-    points: Any, position_of: Any, lowest: Any, highest: Any, lines: Any, clipped_at: float, near_shadow: Any,
-    near_step: Any, refusal: Any,
-) -> None:  # fmt: skip
-    for i in range(len(points)):
+@njit(cache=True, nogil=True, parallel=True)
+def _cause_kernel(
+    points: Any, position_of: Any, lowest: Any, highest: Any, lines: Any, clipped_at: float, position: Any,
+    near_shadow: Any, near_step: Any,
+) -> Any:  # fmt: skip
+    """(n,) uint8: why each point of a frame is refused, 0 where it is not."""
+    cause = np.zeros(len(points), dtype=np.uint8)
+    for i in prange(len(points)):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         if lowest[y, x] < 0:
             continue
-        cause = _cause(position_of[lowest[y, x]], position_of[highest[y, x]], near_shadow[y, x], near_step[y, x])
-        if not cause:
+        cause[i] = _cause(position_of[lowest[y, x]], position_of[highest[y, x]], near_shadow[y, x], near_step[y, x])
+        if not cause[i] and np.isnan(position[y, x]):
             for k in range(len(lines)):
                 if lines[k, y, x] >= clipped_at:
-                    cause = _SATURATED
-        if cause:
-            refusal[y, x] = cause
+                    cause[i] = _SATURATED
+    return cause
 
 
 @njit(cache=True, nogil=True, inline="always")

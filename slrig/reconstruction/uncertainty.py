@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Pinhole
@@ -15,8 +18,9 @@ def sigma_along_normal(deviation_mm: FloatArray, normals: NDArray[np.float32]) -
     deviation_mm : (n, 3), displacement for one standard deviation; normals : (n, 3), unit. Where no triangle gives a
     normal the whole displacement stands: an upper bound.
     """
-    along = np.abs(np.sum(deviation_mm * normals, axis=1))
-    return np.asarray(np.where(np.isfinite(along), along, np.linalg.norm(deviation_mm, axis=1)))
+    sigma = np.zeros(len(deviation_mm))
+    _along_normal(deviation_mm, normals, sigma)
+    return sigma
 
 
 def sampling_mm(points_mm: FloatArray, camera: Pinhole, projector: Pinhole | None, step_px: float) -> FloatArray:
@@ -28,3 +32,11 @@ def sampling_mm(points_mm: FloatArray, camera: Pinhole, projector: Pinhole | Non
     if projector is None:
         return np.asarray(pixel * step_px)
     return np.asarray(np.maximum(pixel, step_px * to_depths(projector, points_mm) / projector.matrix[0, 0]))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _along_normal(deviation: Any, normals: Any, sigma: Any) -> None:
+    for point in prange(len(sigma)):
+        x, y, z = deviation[point, 0], deviation[point, 1], deviation[point, 2]
+        along = abs(x * normals[point, 0] + y * normals[point, 1] + z * normals[point, 2])
+        sigma[point] = along if np.isfinite(along) else np.sqrt(x * x + y * y + z * z)

@@ -20,7 +20,7 @@ from slrig.capture.evidence import check_capture
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
-from slrig.meshing.topology import compact
+from slrig.meshing.vertices import brightness, compact_mesh
 from slrig.model import Axis, Calibration, Mesh, Pinhole, PointCurves, Refusal
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.merging import MergedCurves, merged
@@ -283,7 +283,10 @@ def _meshed(
     _require(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
     entered("vertices", 0.72, count)
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
-    grey = _grey(joined_curves, cameras)
+    grey = brightness(
+        points.pixels_px, joined_curves.camera,
+        [seen.white for seen in cameras], [float(seen.full_scale) for seen in cameras],
+    )  # fmt: skip
     curves = PointCurves(
         offsets=points.offsets,
         column_px=points.position_px,
@@ -293,31 +296,13 @@ def _meshed(
         source=points.source,
         grey=grey,
     )
-    kept = compact(surface.faces, vertex_count=len(points.points_mm))
-    used = kept.kept
-    mesh = Mesh(
-        vertices_mm=points.points_mm[used].astype(np.float32),
-        faces=kept.faces,
-        normals=surface.normals[used],
-        grey=grey[used],
-        sigma_mm=sigma[used].astype(np.float32),
-        stripe=np.floor(points.position_px[points.curve_of_point()[used]]).astype(np.int32),
+    mesh = compact_mesh(
+        surface.faces, points.points_mm, surface.normals, grey, sigma, points.offsets, points.position_px
     )
     figures = mesh_report(surface, mesh, curves)
     return _Meshed(
         mesh, curves, cameras, surface.stages, figures, redundancy_report(joined_curves, points.source, spare)
     )
-
-
-def _grey(joined_curves: MergedCurves, cameras: list[Seen]) -> NDArray[np.uint8]:
-    """(n,) uint8: brightness of each point in the white frame of the camera whose pixel it has."""
-    pixels = joined_curves.curves.pixels_px
-    grey = np.zeros(len(pixels), dtype=np.uint8)
-    for index, seen in enumerate(cameras):
-        mine = joined_curves.camera == index
-        columns, rows = np.rint(pixels[mine]).astype(int).T
-        grey[mine] = np.clip(np.rint(seen.white[rows, columns] * (255 / seen.full_scale)), 0, 255)
-    return grey
 
 
 def _write_pictures(mesh: Mesh, cameras: list[Seen], staging: Path) -> None:

@@ -19,7 +19,7 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.edges import EdgeLimits
-from slrig.reconstruction.phase import refined
+from slrig.reconstruction.refinement import refined
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slrig.meshing.normals import vertex_normals
 from slrig.meshing.quality import TruthScore, score
-from slrig.meshing.topology import vertex_normals
 from slrig.model import FloatArray, IntArray, Mesh, Surface
 
 HALF_MM = 50.0

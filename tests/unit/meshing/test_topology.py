@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import pytest
 
+from slrig.meshing.normals import vertex_normals
 from slrig.meshing.topology import (
     boundary_edges,
     boundary_vertex_count,
@@ -20,7 +21,6 @@ from slrig.meshing.topology import (
     misoriented_edge_count,
     nonmanifold_edge_count,
     topology_counts,
-    vertex_normals,
 )
 from slrig.model import FloatArray, IntArray
 

@@ -249,7 +249,7 @@ def test_lines_are_looked_for_in_the_frames_that_show_them() -> None:
     assert np.sqrt(np.mean(errors_px(curves, slope) ** 2)) < 0.03
 
 
-def streamed(capture: Capture, order: Sequence[int]) -> CameraCurves:
+def streamed(capture: Capture, order: Sequence[int], entered: Callable[[str], None] = lambda _: None) -> CameraCurves:
     """The curves by the frames that tell, as they come in this order."""
     shots = telling_shots(capture, "eye")
     shown = [capture.patterns[shot.pattern] for shot in shots]
@@ -261,9 +261,11 @@ def streamed(capture: Capture, order: Sequence[int]) -> CameraCurves:
         cell_positions(patterns.gray, PROJECTOR),
         line_positions(lines, patterns.gray, PROJECTOR) if lines else edge_positions(patterns.gray, PROJECTOR),
     )
-    stream = CameraStream(stacks, tables, Limits(), entered=lambda _: None)
+    stream = CameraStream(stacks, tables, Limits(), entered=entered)
     for index in order:
+        entered(f"frame {index}")
         stream.take(shown[index], shots[index].image)
+    entered("finish")
     return stream.finish()[0]
 
 
@@ -278,6 +280,16 @@ def test_frames_that_come_one_by_one_in_any_order_give_the_same_bits(line_shift:
             assert getattr(got.ensemble, name).tobytes() == getattr(wanted.ensemble, name).tobytes()
         assert got.refusal.tobytes() == wanted.refusal.tobytes()
         assert (got.scale_px, got.stripe_count) == (wanted.scale_px, wanted.stripe_count)
+
+
+def test_nothing_waits_once_every_frame_is_in() -> None:
+    capture = rendered(slope, patterns())
+    count = len(telling_shots(capture, "eye"))
+    told: list[str] = []
+    streamed(capture, range(count), told.append)
+    last = told.index(f"frame {count - 1}")
+    assert told[last + 1 :] == ["locate stripes", "refine stripes", "identify stripes", "link stripes", "finish"]
+    assert "refine stripes" not in told[:last]
 
 
 def test_a_stream_that_lacks_a_frame_says_which() -> None:

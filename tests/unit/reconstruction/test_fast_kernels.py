@@ -11,6 +11,7 @@ import pytest
 from slrig.model import FloatArray
 from slrig.reconstruction.chaining import _order_kernel, chain, chain_frames
 from slrig.reconstruction.optics import normalised_from_pixel, normalised_near, packed
+from slrig.reconstruction.refinement import _keep_kernel
 from slrig.reconstruction.sheet_curves import SheetCurves
 from slrig.reconstruction.steger import (
     _TAYLOR_BOX,
@@ -174,3 +175,14 @@ def test_a_start_nearby_leads_to_the_same_ray() -> None:
         for away in ((0.0, 0.0), (2e-3, -1e-3), (1e-8, 1e-8)):
             got = normalised_near(device, u, v, wanted[0] + away[0], wanted[1] + away[1])
             np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12)
+
+
+def test_what_is_kept_is_kept_in_its_order() -> None:
+    rng = np.random.default_rng(11)
+    for count in (0, 1, 8192, 20_001):
+        keep = rng.random(count) < 0.6
+        given = rng.random((count, 2)), rng.random((count, 2)), rng.random(count)
+        out = tuple(np.zeros_like(each[keep]) for each in given)
+        _keep_kernel(keep, *given, *out)
+        for got, each in zip(out, given, strict=True):
+            np.testing.assert_array_equal(got, each[keep])

@@ -1,0 +1,315 @@
+"""Stripe points refined by the light of all line frames, and the stripes that a filter misses.
+
+A local surface fitted to the position map, solved for the line's own column, uses the light of all shifts. It holds
+where stripes are squeezed together at a grazing view, and beside a shadow, where a filter reaches over the border
+and a fit merely has fewer pixels. What it asks for is the same light in every frame, and that is checked: each frame's
+own stripes must lie where all frames together put them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, IntArray
+from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.phase import FittedPoints, PositionMap, no_points, windows
+from slrig.reconstruction.stripes import LinePoints
+from slrig.reconstruction.surface_fit import fit_kernel
+
+_LEAST_GRADIENT = 0.05
+_SURE_PX = 0.15
+_FAINT = 1e-6
+_POINTS_TIED = 5
+_POINTS = 8192  # that one thread takes at a time
+_CLEAR_PX = 0.12
+_LINES_KEPT = 2  # of the lines that begin at one pixel, which are neighbours, these many are remembered
+_MOST_FOR_MEDIAN = 20_000
+_CROSSING_PX = 0.62  # more than half a pixel: two neighbours' noisy slopes must not both miss a line between them
+
+
+def line_crossings(
+    seen: PositionMap, usable: NDArray[np.bool_], code: CodeMap, position_of: FloatArray, /
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Where lines cross pixels, by the position map alone: a start for every stripe that the light can hold.
+
+    position_of : (frames, cells) float64, as for `identify`, of all shifts. A line crosses a pixel when it passes
+    within 0.62 px of its centre, along either axis.
+    Returns frame (n,) int32, starts_px (n, 2) and targets_px (n,), frame by frame, row by row.
+    """
+    started, landed = _nothing_taken(len(position_of), usable.shape)
+    return _crossings(
+        seen, usable, code, position_of, started, landed, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+    )  # fmt: skip
+
+
+def _crossings(
+    seen: PositionMap,
+    usable: NDArray[np.bool_],
+    code: CodeMap,
+    position_of: FloatArray,
+    started: IntArray,
+    landed: NDArray[np.uint8],
+    moved: FloatArray,
+    normals: FloatArray,
+    targets: FloatArray,
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The crossings, less those from which a fit would surely land at a pixel that has its point."""
+    by_cell = np.ascontiguousarray(position_of.T)
+    frames, rows = len(position_of), len(usable)
+    shown = position_of[np.isfinite(position_of)]
+    if not len(shown):
+        return np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)
+    # All shifts are shown: line n of them all, counted across the projector, is at first + n and in frame n mod frames.
+    frame = int(np.flatnonzero(np.isfinite(position_of).any(axis=1))[0])
+    first = float(shown[0]) - frame
+    given = (
+        seen.position, usable, code.lowest, code.highest, by_cell, first, started, landed, moved, normals, targets,
+    )  # fmt: skip
+    counts = np.zeros((rows, frames), dtype=np.int64)
+    crossed = np.zeros(usable.shape, dtype=np.bool_)
+    _crossing_kernel(*given, crossed, counts, False, np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
+    ends = np.cumsum(counts.T.ravel()).reshape(frames, rows)
+    total = int(ends[-1, -1]) if ends.size else 0
+    found = np.zeros(total, dtype=np.int32), np.zeros((total, 2)), np.zeros(total)
+    _crossing_kernel(*given, crossed, np.ascontiguousarray(ends.T) - counts, True, *found)
+    return found
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _crossing_kernel(
+    position: Any, usable: Any, lowest: Any, highest: Any, by_cell: Any, first: float,
+    started: Any, landed: Any, moved: Any, normals: Any, begun_targets: Any,
+    crossed: Any, place: Any, fill: bool, frame: Any, starts: Any, targets: Any,
+) -> None:  # fmt: skip
+    """Count the crossings of each row and frame in `place`, and note the pixels in `crossed`; or put them where `place`
+    says that they begin.
+    """
+    rows, columns = position.shape
+    frames = by_cell.shape[1]
+    for y in prange(1, rows - 1):
+        for x in range(1, columns - 1):
+            if not usable[y, x] or (fill and not crossed[y, x]):
+                continue
+            here = position[y, x]
+            gx = _slope(position[y, x - 1], here, position[y, x + 1], usable[y, x - 1], usable[y, x + 1])
+            gy = _slope(position[y - 1, x], here, position[y + 1, x], usable[y - 1, x], usable[y + 1, x])
+            squared = gx * gx + gy * gy
+            if not squared > _LEAST_GRADIENT * _LEAST_GRADIENT:
+                continue
+            reach = _CROSSING_PX * (abs(gx) + abs(gy)) + 1e-6
+            low_cell, high_cell = lowest[y, x], highest[y, x]
+            nearest = int(np.ceil(here - reach - first))
+            for line in range(nearest, int(np.floor(here + reach - first)) + 1):
+                k = line % frames
+                low = by_cell[low_cell, k]
+                miss = low - here
+                if not abs(miss) <= reach or low != by_cell[high_cell, k]:
+                    continue
+                dx, dy = miss * gx / squared, miss * gy / squared
+                if abs(dx) > _CROSSING_PX or abs(dy) > _CROSSING_PX:
+                    continue
+                i = started[int(np.rint(y + dy)), int(np.rint(x + dx)), k % _LINES_KEPT] - 1
+                if i >= 0 and begun_targets[i] == low:
+                    # The same surface was fitted for a point that began here: this one would end beside it, straight
+                    # across the line from where it began.
+                    away = (moved[i, 0] - x - dx) * normals[i, 0] + (moved[i, 1] - y - dy) * normals[i, 1]
+                    end_x, end_y = x + dx + away * normals[i, 0], y + dy + away * normals[i, 1]
+                    at_x, at_y = int(np.rint(end_x)), int(np.rint(end_y))
+                    clear = max(abs(end_x - at_x), abs(end_y - at_y)) < 0.5 - _CLEAR_PX
+                    if clear and landed[k, at_y, at_x]:
+                        continue
+                if fill:
+                    at = place[y, k]
+                    frame[at] = k
+                    starts[at, 0], starts[at, 1] = x + dx, y + dy
+                    targets[at] = low
+                crossed[y, x] = True
+                place[y, k] += 1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slope(before: float, here: float, after: float, before_usable: bool, after_usable: bool) -> float:
+    if before_usable and after_usable:
+        return 0.5 * (after - before)
+    if after_usable:
+        return after - here
+    if before_usable:
+        return here - before
+    return np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """Points of each line frame moved to where the light of all frames puts them, and those that a filter misses.
+
+    disagreement_px : (frames,) float64, median distance from each frame's own stripes to the refined ones, along the
+    normals, less three standard deviations of that median; NaN for a frame without any. Where the light was the same
+    in all frames it is next to nothing.
+    """
+
+    points: list[LinePoints]
+    disagreement_px: FloatArray
+
+
+def refined(
+    found: Sequence[LinePoints],
+    seen: PositionMap,
+    usable: NDArray[np.bool_],
+    code: CodeMap,
+    position_of: FloatArray,
+    /,
+    *,
+    coarsest_px: float = 0.5,
+) -> Refinement:
+    """Refine the points of all line frames of one axis.
+
+    Points of mixed light (not `usable`) or of no single line are left out, as are those whose standard deviation
+    exceeds coarsest_px pixels. position_of : (frames, cells) float64, as for `identify`.
+    """
+    borders = np.concatenate([[0], np.cumsum([len(each.points_px) for each in found], dtype=np.int64)])
+    parts = [slice(a, b) for a, b in pairwise(borders)]
+    count = int(borders[-1])
+    given = windows(seen, usable)
+    clear = cv2.erode(usable.view(np.uint8), np.ones((7, 7), dtype=np.uint8), borderValue=0)
+    old = no_points(count)
+    moved, normals, _, good = old
+    targets, away = np.zeros(count), np.zeros(count)
+    started, landed = _nothing_taken(len(found), usable.shape)
+    for index, (points, part) in enumerate(zip(found, parts, strict=True)):
+        starts = np.ascontiguousarray(points.points_px)
+        _target_kernel(starts, code.lowest, code.highest, position_of[index], targets[part])
+        fit_kernel(*given, starts, targets[part], *(each[part] for each in old))
+        own = np.ascontiguousarray(points.sigma_px)
+        _settle_kernel(starts, own, clear, coarsest_px, *(each[part] for each in old), away[part])
+        _taken_kernel(starts, moved[part], good[part], part.start, index % _LINES_KEPT, started, landed[index])
+    disagreement = np.array([_sure_median(_drawn(away[p], good[p])) for p in parts])
+    frame, missed_starts, missed_targets = _crossings(
+        seen, usable, code, position_of, started, landed, moved, normals, targets
+    )
+    missed = no_points(len(frame))
+    fit_kernel(*given, missed_starts, missed_targets, *missed)
+    _new_kernel(frame, coarsest_px, landed, missed[0], missed[2], missed[3])
+    new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
+    new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
+    pairs = zip(found, parts, new_parts, strict=True)
+    return Refinement([_joined(points, old, part, missed, more) for points, part, more in pairs], disagreement)
+
+
+def _joined(points: LinePoints, old: FittedPoints, part: slice, missed: FittedPoints, more: slice) -> LinePoints:
+    """The good points of one frame: those that the filter found, and those that it missed."""
+    kept, added = old[3][part], missed[3][more]
+    first, count = int(np.count_nonzero(kept)), int(np.count_nonzero(added))
+    out = np.zeros((first + count, 2)), np.zeros((first + count, 2)), np.zeros(first + count)
+    strength, strong = np.zeros(first + count), np.zeros(first + count, dtype=np.bool_)
+    _keep_kernel(kept, *(each[part] for each in old[:3]), *(each[:first] for each in out))
+    _keep_kernel(added, *(each[more] for each in missed[:3]), *(each[first:] for each in out))
+    np.compress(kept, points.strength, out=strength[:first])
+    np.compress(kept, points.strong, out=strong[:first])
+    # Chains begin at what the filter found; what it missed comes after, the surest first.
+    strength[first:] = _FAINT / out[2][first:]
+    strong[first:] = out[2][first:] < _SURE_PX
+    return LinePoints(points_px=out[0], normals=out[1], strength=strength, strong=strong, sigma_px=out[2])
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _keep_kernel(
+    keep: Any, points: Any, normals: Any, sigma: Any, points_out: Any, normals_out: Any, sigma_out: Any
+) -> None:
+    """Copy what `keep` tells."""
+    blocks = (len(keep) + _POINTS - 1) // _POINTS
+    ends = np.zeros(blocks + 1, dtype=np.int64)
+    for block in prange(blocks):
+        ends[block + 1] = keep[block * _POINTS : (block + 1) * _POINTS].sum()
+    ends = np.cumsum(ends)
+    for block in prange(blocks):
+        at = ends[block]
+        for i in range(block * _POINTS, min(len(keep), (block + 1) * _POINTS)):
+            if keep[i]:
+                points_out[at, 0], points_out[at, 1] = points[i, 0], points[i, 1]
+                normals_out[at, 0], normals_out[at, 1] = normals[i, 0], normals[i, 1]
+                sigma_out[at] = sigma[i]
+                at += 1
+
+
+def _drawn(away: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
+    """The good ones of an even sample."""
+    step = max(1, -(-len(away) // _MOST_FOR_MEDIAN))
+    return away[::step][good[::step]]
+
+
+def _sure_median(away: FloatArray) -> float:
+    """The median, less three of its own standard deviations: of few or noisy points it tells little. NaN of none."""
+    if not len(away):
+        return np.nan
+    median = float(np.median(away))
+    scatter = 1.4826 * float(np.median(np.abs(away - median)))
+    # A median's standard deviation is 1.2533/√n of its values', and a filter ties some five points together.
+    error = 1.2533 * scatter * np.sqrt(_POINTS_TIED / len(away))
+    return float(np.copysign(max(abs(median) - 3 * error, 0.0), median))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _settle_kernel(
+    starts: Any, own_sigma: Any, clear: Any, coarsest: float, moved: Any, normals: Any, sigma: Any, good: Any, away: Any
+) -> None:
+    """Give each point what its own frame knows of it, and put how far the other frames moved it into `away`.
+
+    Where the camera's pixels are finer than the projector's, five of them hold but a part of a stripe, and the stripe's
+    own frame may know better: its part in the mean is its share of the inverse variance. A filter is trusted clear of
+    borders only, and where both agree.
+    """
+    for i in prange(len(starts)):
+        good[i] = good[i] and sigma[i] < coarsest
+        x, y = starts[i, 0], starts[i, 1]
+        away[i] = (moved[i, 0] - x) * normals[i, 0] + (moved[i, 1] - y) * normals[i, 1]
+        if not good[i] or not own_sigma[i] < sigma[i] or not clear[int(np.rint(y)), int(np.rint(x))]:
+            continue
+        variance = sigma[i] * sigma[i]
+        both = variance + own_sigma[i] * own_sigma[i]
+        if away[i] * away[i] < 9 * both:
+            weight = variance / max(both, 1e-30)
+            moved[i, 0] -= weight * away[i] * normals[i, 0]
+            moved[i, 1] -= weight * away[i] * normals[i, 1]
+            sigma[i] *= np.sqrt(1 - weight)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _target_kernel(points: Any, lowest: Any, highest: Any, position_of: Any, targets: Any) -> None:
+    """The position of the line that each point lies on, NaN where its pixel may mean two. position_of : (cells,)."""
+    for i in prange(len(points)):
+        x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
+        targets[i] = np.nan
+        if lowest[y, x] >= 0:
+            low = position_of[lowest[y, x]]
+            if low == position_of[highest[y, x]]:
+                targets[i] = low
+
+
+def _nothing_taken(frames: int, shape: tuple[int, int]) -> tuple[IntArray, NDArray[np.uint8]]:
+    """What `_taken_kernel` fills in: (H, W, 2) int32 and (frames, H, W) uint8."""
+    return np.zeros((*shape, _LINES_KEPT), dtype=np.int32), np.zeros((frames, *shape), dtype=np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, slot: int, started: Any, landed: Any) -> None:
+    """Note which good point of a frame began at each pixel (one more than its index), and whether one landed there."""
+    for i in range(len(starts)):
+        if good[i]:
+            started[int(np.rint(starts[i, 1])), int(np.rint(starts[i, 0])), slot] = first + i + 1
+            landed[int(np.rint(moved[i, 1])), int(np.rint(moved[i, 0]))] = 1
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _new_kernel(frame: Any, coarsest: float, landed: Any, points: Any, sigma: Any, good: Any) -> None:
+    """Leave good only points that are fine enough and land where their line has none."""
+    for i in prange(len(frame)):
+        x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
+        good[i] = good[i] and sigma[i] < coarsest and not landed[frame[i], y, x]
