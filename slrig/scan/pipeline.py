@@ -84,7 +84,7 @@ def reconstruct_bundle(
 
     `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
 
-    Writes mesh.ply, mesh.glb, mesh.stl, points.ply, report.json, preview.png and a picture of the refused pixels per
+    Writes mesh.ply, mesh.glb, points.ply, report.json, preview.png and a picture of the refused pixels per
     camera. `output` appears whole or not at all; results of an earlier run there are replaced.
 
     Raises

@@ -80,19 +80,16 @@ def camera_report(curves: CameraCurves) -> dict[str, object]:
     }
 
 
-def redundancy_report(
-    curves: MergedCurves, source: NDArray[np.uint8], spare: Redundancy | None = None
-) -> dict[str, object]:
+def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8], spare: Redundancy) -> dict[str, object]:
     """What several cameras say of one another: points by source, and how far their points of one ray are apart.
 
     `residual_px` has one entry per pair of cameras, or is null, and then `residual_px_absent` says why.
     """
     counts = np.bincount(source, minlength=len(Source))
     report: dict[str, object] = {"points_by_source": {kind.name.lower(): int(counts[kind]) for kind in Source}}
-    if spare is not None:
-        report["residual_px"] = [_pair_report(pair) for pair in spare.pairs] or None
-        if spare.reason is not None:
-            report["residual_px_absent"] = spare.reason
+    report["residual_px"] = [_pair_report(pair) for pair in spare.pairs] or None
+    if spare.reason is not None:
+        report["residual_px_absent"] = spare.reason
     if len(curves.residual_mm):
         report["residual_mm"] = {
             "pairs": len(curves.residual_mm),
