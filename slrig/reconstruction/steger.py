@@ -36,7 +36,7 @@ def kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], 
     return zero.astype(np.float32), one.astype(np.float32), two.astype(np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, parallel=True)
 def taylor_kernel(image: Any, noise: Any, lit: Any, weak: Any, zero: Any, one: Any, two: Any, kind: int) -> Any:
     """One Taylor step at every lit pixel whose response exceeds `weak` times its noise: offset and response.
 
@@ -80,7 +80,7 @@ def taylor_kernel(image: Any, noise: Any, lit: Any, weak: Any, zero: Any, one: A
     return offset, response
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
     """Fill (3, columns + 2 radius) with the image's rows round y, smoothed and differentiated once and twice.
 
@@ -105,7 +105,7 @@ def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out
             out[k, radius + columns - 1 + t] = out[k, radius + _reflected(columns - 1 + t, columns)]
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
     """Fill (6, columns) with r, rx, ry, rxx, rxy, ryy of one row."""
     columns = out.shape[1]
@@ -131,13 +131,13 @@ def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -
 
 
 # Loops of three arrays each: with more, the compiler gives up proving that they do not overlap, and uses no vectors.
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
         out[x] += weight * (right[x] + left[x])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def _subtract(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
         out[x] += weight * (right[x] - left[x])
@@ -169,7 +169,7 @@ def _ridge_normal(rxx: float, rxy: float, ryy: float) -> Any:
     return ax / length, ay / length, value
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, parallel=True)
 def newton_kernel(image: Any, offset: Any, columns: Any, rows: Any, sigma: float, kind: int) -> Any:
     """One Newton step from each pixel's offset on kernels centred there; response and normal are those of the start."""
     count = len(columns)

@@ -41,7 +41,7 @@ def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
     return quadratic, terms, linear[0], freedom
 
 
-@njit(cache=True, nogil=True, parallel=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, parallel=True)
 def fit_kernel(
     position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
     whole_freedom: float, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
@@ -166,7 +166,7 @@ def _reached(usable: Any, y: int, x: int, dy: int, dx: int) -> bool:
     return usable[y + dy, x + dx] and (dy == 0 or dx == 0 or usable[y + dy, x] or usable[y, x + dx])
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _plane_freedom(member: Any, members: int, gains: Any, basis: Any) -> float:
     """Trace of (1 - H)ᵀ(1 - H) of the weighted plane: n - 2 tr H + |H|²."""
     trace: float = 0.0
@@ -184,7 +184,7 @@ def _plane_freedom(member: Any, members: int, gains: Any, basis: Any) -> float:
     return members - 2 * trace + square
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _plane_gains(member: Any, members: int, plane: Any, basis: Any, gains: Any) -> bool:
     """Fill the first three rows of gains with those of a weighted plane; False when the pixels fix none.
 
@@ -217,7 +217,7 @@ def _plane_gains(member: Any, members: int, plane: Any, basis: Any, gains: Any) 
     return True
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _fill_row(member: Any, plane: Any, basis: Any, one: float, of_x: float, of_y: float, row: Any) -> None:
     p, q, r = np.float32(one), np.float32(of_x), np.float32(of_y)
     for j in range(_LANES):

@@ -49,6 +49,13 @@ def test_a_module_is_named_for_its_subject(path: Path) -> None:
     assert not BANNED_NAMES & set(path.relative_to(ROOT).with_suffix("").parts)
 
 
+@pytest.mark.parametrize("path", SOURCES, ids=_name)
+def test_kernels_keep_to_the_rules_of_ieee_arithmetic(path: Path) -> None:
+    # Free association or contraction lets a kernel that was compiled just now round otherwise than the same kernel
+    # from the cache, and a bundle would no longer give the bytes of its scan.
+    assert "fastmath" not in path.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.__name__)
 def test_an_error_says_when_to_raise_it(error: type[slrig.errors.SlrigError]) -> None:
     own = error.__dict__.get("__doc__")
