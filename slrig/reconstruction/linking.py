@@ -181,7 +181,7 @@ def _bend(a: Any, direction_a: Any, b: Any, direction_b: Any) -> float:
     that any line could have.
     """
     dx, dy = b[0] - a[0], b[1] - a[1]
-    norm = np.sqrt(dx * dx + dy * dy)
+    norm = np.hypot(dx, dy)
     if norm == 0:
         turn = -direction_a[0] * direction_b[0] - direction_a[1] * direction_b[1]
         return float(np.arccos(min(1.0, max(-1.0, turn))))
