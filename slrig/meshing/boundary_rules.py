@@ -46,23 +46,27 @@ def boundary_half_edges(adjacency: Any) -> Any:
 @njit(cache=True, nogil=True)
 def following(faces: Any, adjacency: Any, half_edge: int) -> int:
     """The boundary half-edge that leaves the corner which `half_edge` runs into."""
-    face, corner = half_edge // 3, (half_edge + 2) % 3
-    vertex = faces[face, corner]
-    while adjacency[face, (corner + 2) % 3] >= 0:
-        face = adjacency[face, (corner + 2) % 3]
-        corner = corner_of(faces, face, vertex)
-    return 3 * face + (corner + 2) % 3
+    return int(_round_the_corner(faces, adjacency, half_edge, 2))
 
 
 @njit(cache=True, nogil=True)
 def preceding(faces: Any, adjacency: Any, half_edge: int) -> int:
     """The boundary half-edge that runs into the corner which `half_edge` leaves."""
-    face, corner = half_edge // 3, (half_edge + 1) % 3
+    return int(_round_the_corner(faces, adjacency, half_edge, 1))
+
+
+@njit(cache=True, nogil=True)
+def _round_the_corner(faces: Any, adjacency: Any, half_edge: int, side: int) -> int:
+    """From face to face round the vertex at one end of `half_edge`, to the boundary on the other side of it.
+
+    side : corners onward from the half-edge's own number to that vertex, 1 where the half-edge leaves, 2 where it ends.
+    """
+    face, corner = half_edge // 3, (half_edge + side) % 3
     vertex = faces[face, corner]
-    while adjacency[face, (corner + 1) % 3] >= 0:
-        face = adjacency[face, (corner + 1) % 3]
+    while adjacency[face, (corner + side) % 3] >= 0:
+        face = adjacency[face, (corner + side) % 3]
         corner = corner_of(faces, face, vertex)
-    return 3 * face + (corner + 1) % 3
+    return 3 * face + (corner + side) % 3
 
 
 @njit(cache=True, nogil=True)

@@ -209,24 +209,22 @@ def _curves(
 ) -> CameraCurves:
     """What is left when all points are found: refine, number and link them."""
     frames, noise, code = coded.frames, coded.noise, coded.code
-    points = found
+    points, disagreement_px, steady = found, np.zeros(0), False
     entered("refine stripes")
     seen = position_map(frames, noise, code, tables.cell_position)
-    disagreement_px = np.zeros(0)
-    phase = has_phase(frames)
-    if phase:
+    resolution_px = float(frames.gray.cell_px)
+    if has_phase(frames):
+        resolution_px = 0.0
         seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, limits.camera_blur_px)
-    resolution_px = 0.0 if phase else float(frames.gray.cell_px)
-    near_shadow, near_step = coded.near_shadow, near_steps(seen, resolution_px, limits.edges)
-    if phase:
+        near_shadow, near_step = coded.near_shadow, near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
-        refinement = refined(points, seen, usable, code, tables.position_of)
+        refinement = refined(found, seen, usable, code, tables.position_of)
         disagreement_px = refinement.disagreement_px
-        phase = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)
-    if phase:
-        points = refinement.points
-        code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
-    else:
+        steady = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)
+        if steady:
+            points = refinement.points
+            code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
+    if not steady:
         # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
         near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))
     entered("identify stripes")
@@ -243,7 +241,7 @@ def _curves(
         decoded_pixels=int((coded.code.refusal == Refusal.NONE).sum()),
         stripe_points=len(stripes.points_px),
         stripe_count=len(numbered.stripes),
-        refined=phase,
+        refined=steady,
         disagreement_px=disagreement_px,
     )
 
