@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.meshing.adjacency import neighbours
@@ -35,6 +35,7 @@ PSI = math.pi / 2
 LONGEST_MM = 5.0
 _SPACINGS = 4.0
 _MOST_TRIANGLES_OF_A_SPIKE = 6
+_FACES = 16384  # that one thread takes at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,29 +221,38 @@ def _shrink(points: Any, faces: Any, adjacency: Any, longest_mm: Any, alive: Any
     return removed
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _kept(faces: Any, adjacency: Any, alive: Any) -> Any:
     """The faces that are alive, in their order, and their neighbours in the new numbering."""
+    blocks = (len(faces) + _FACES - 1) // _FACES
+    first = np.zeros(blocks + 1, dtype=np.int32)
+    for block in prange(blocks):
+        first[block + 1] = np.count_nonzero(alive[block * _FACES : (block + 1) * _FACES])
+    first = np.cumsum(first).astype(np.int32)
     number = np.full(len(faces) + 1, -1, dtype=np.int32)
-    count = 0
-    for face in range(len(faces)):
-        if alive[face]:
-            number[face] = count
-            count += 1
-    kept, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
-    for face in range(len(faces)):
-        if alive[face]:
-            for corner in range(3):
-                kept[number[face], corner] = faces[face, corner]
-                # -1 reads the last entry, which is -1.
-                across[number[face], corner] = number[adjacency[face, corner]]
+    for block in prange(blocks):
+        place = first[block]
+        for face in range(block * _FACES, min(len(faces), (block + 1) * _FACES)):
+            if alive[face]:
+                number[face] = place
+                place += 1
+    kept, across = np.zeros((first[-1], 3), dtype=np.int32), np.zeros((first[-1], 3), dtype=np.int32)
+    for block in prange(blocks):
+        place = first[block]
+        for face in range(block * _FACES, min(len(faces), (block + 1) * _FACES)):
+            if alive[face]:
+                for corner in range(3):
+                    kept[place, corner] = faces[face, corner]
+                    # -1 reads the last entry, which is -1.
+                    across[place, corner] = number[adjacency[face, corner]]
+                place += 1
     return kept, across
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _lengthened(rows: Any, length: int) -> Any:
     longer = np.zeros((length, 3), dtype=rows.dtype)
-    for row in range(len(rows)):
+    for row in prange(len(rows)):
         for k in range(3):
             longer[row, k] = rows[row, k]
     return longer

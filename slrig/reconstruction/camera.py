@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
@@ -28,6 +27,7 @@ from slrig.reconstruction.stripes import (
     edge_points,
     measured_sigma_px,
     normalised,
+    normalised_line,
     stripe_points,
 )
 
@@ -107,13 +107,21 @@ class CameraStream:
     line frame once the code is known, and the rest is done once all are in. Frames may come in any order, with the same
     result to the bit.
 
-    entered : told the name of each stage as it begins.
+    noise : where it is known already; it is estimated otherwise. entered : told the name of each stage as it begins.
     """
 
     def __init__(
-        self, stacks: FrameStacks, tables: CodeTables, limits: Limits, /, *, entered: Callable[[str], None]
+        self,
+        stacks: FrameStacks,
+        tables: CodeTables,
+        limits: Limits,
+        /,
+        *,
+        entered: Callable[[str], None],
+        noise: NoiseModel | None = None,
     ) -> None:
         self._stacks = stacks
+        self._noise = noise
         self._tables = tables
         self._limits = limits
         self._entered = entered
@@ -156,7 +164,7 @@ class CameraStream:
 
     def _decoded(self, frames: AxisFrames) -> _Coded:
         self._entered("decode")
-        noise = estimate_noise(frames)
+        noise = estimate_noise(frames) if self._noise is None else self._noise
         tables = self._tables
         code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding)
         near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
@@ -184,10 +192,16 @@ class CameraStream:
 
 
 def camera_curves(
-    frames: AxisFrames, tables: CodeTables, limits: Limits, /, *, entered: Callable[[str], None]
+    frames: AxisFrames,
+    tables: CodeTables,
+    limits: Limits,
+    /,
+    *,
+    entered: Callable[[str], None],
+    noise: NoiseModel | None = None,
 ) -> CameraCurves:
-    """Reconstruct the curves of one camera. `entered` is told the name of each stage as it begins."""
-    stream = CameraStream(FrameStacks.of(frames), tables, limits, entered=entered)
+    """Reconstruct the curves of one camera; `entered` and `noise` as for `CameraStream`."""
+    stream = CameraStream(FrameStacks.of(frames), tables, limits, entered=entered, noise=noise)
     return stream.finish()[0]
 
 
@@ -248,27 +262,17 @@ def _curves(
 
 def _normalised_line(coded: _Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Line frame `index` relative to white, and its noise."""
-    frames, noise = coded.frames, coded.noise
-    deviation = _line_noise_kernel(
-        frames.lines[index], frames.white, frames.black, noise.read_variance, noise.slope, frames.ends_repeats
-    )
-    return normalised(frames.lines[index], frames.black, frames.contrast, deviation)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _line_noise_kernel(line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float) -> Any:
-    """(H, W) float32: standard deviation of a line frame less black, with the noise of white and black counted."""
-    out = np.zeros(line.shape, dtype=np.float32)
-    for y in prange(line.shape[0]):
-        for x in range(line.shape[1]):
-            # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
-            light = (line[y, x] - black[y, x]) / max(white[y, x] - black[y, x], np.float32(1))
-            light = min(max(light, np.float32(0)), np.float32(1))
-            of_white = (read + slope * max(white[y, x], np.float32(0))) / ends_repeats
-            of_black = (read + slope * max(black[y, x], np.float32(0))) / ends_repeats
-            own = read + slope * max(line[y, x], np.float32(0))
-            out[y, x] = np.sqrt(own + (1 - light) ** 2 * of_black + light**2 * of_white)
-    return out
+    frames, noise, line = coded.frames, coded.noise, coded.frames.lines[index]
+    if noise.read_share is None:
+        return normalised_line(
+            line, frames.white, frames.black, noise.read_variance, noise.slope, frames.ends_repeats
+        )  # fmt: skip
+    above = line - frames.black
+    light = np.clip(above / np.maximum(frames.contrast, np.float32(1)), 0, 1)
+    # As there: (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
+    ends = (1 - light) ** 2 * noise.variance(frames.black) + light**2 * noise.variance(frames.white)
+    deviation = np.sqrt(noise.variance(line) + ends / np.float32(frames.ends_repeats))
+    return normalised(line, frames.black, frames.contrast, deviation)
 
 
 def _matched_scale_px(stripe_sigma_px: float) -> float:

@@ -1,13 +1,12 @@
 """The frames of one camera and one axis, sorted by what they show, ready for decoding.
 
-Repeats of a pattern at one exposure are averaged. Several exposures are a bracket: each pixel takes the longest
-exposure at which nothing it showed was clipped, and values are scaled to the longest.
+Repeats of a pattern at one exposure are averaged. Several exposures are a bracket: see `slrig.reconstruction.fusion`.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Shot, White
+from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Shot, White, exposure_groups
 
 Image = NDArray[np.float32]
 
@@ -28,7 +27,7 @@ class AxisFrames:
     lines : (L, H, W) float32, one per shift; line_patterns says which.
     full_scale : the value of a saturated sample of one exposure.
     ends_repeats : white and black are means of so many times more frames than the others.
-    exposure_ratio : the longest exposure of a bracket over the shortest; 1 without a bracket.
+    exposure_ratio : the light of a bracket's longest exposure over that of its shortest; 1 without a bracket.
     """
 
     axis: Axis
@@ -72,6 +71,13 @@ class AxisPatterns:
     def paired(self) -> bool:
         """Whether every bit comes with its inverse."""
         return len(self.direct) == len(self.inverted) == self.gray.bits
+
+    @property
+    def needed(self) -> frozenset[Pattern]:
+        """The patterns whose images decoding takes."""
+        direct = (replace(self.gray, bit=bit) for bit in self.direct)
+        inverted = (replace(self.gray, bit=bit, inverted=True) for bit in self.inverted)
+        return frozenset((*self.ends, *direct, *inverted, *self.lines))
 
 
 def axis_patterns(shown: Collection[Pattern], camera: str, axis: Axis) -> AxisPatterns:
@@ -128,10 +134,15 @@ def telling(shown: Sequence[Pattern], exposures_s: Sequence[float | None]) -> li
     or nothing opens the sequence, all do.
     """
     bodies = [i for i, p in enumerate(shown) if isinstance(p, Gray | LineShift)]
-    once = len({shown[i] for i in bodies}) == len(bodies) and len(set(exposures_s)) <= 1
+    once = len({shown[i] for i in bodies}) == len(bodies) and exposure_count(exposures_s) <= 1
     if not (once and bodies and {White(), Black()} <= set(shown[: bodies[0]])):
         return [True] * len(shown)
     return [i < bodies[0] or not isinstance(p, White | Black) for i, p in enumerate(shown)]
+
+
+def exposure_count(exposures_s: Collection[float | None]) -> int:
+    """How many different exposure times these are."""
+    return len(set(exposure_groups(exposures_s).values()))
 
 
 class FrameStacks:
@@ -158,12 +169,7 @@ class FrameStacks:
         self._inverses = np.zeros((bits if patterns.inverted else 0, *shape), dtype=np.float32)
         self._lines = np.zeros((len(patterns.lines), *shape), dtype=np.float32)
         self._ends: dict[Pattern, Image] = {}
-        self._missing: set[Pattern] = {
-            *patterns.ends,
-            *(replace(patterns.gray, bit=bit) for bit in patterns.direct),
-            *(replace(patterns.gray, bit=bit, inverted=True) for bit in patterns.inverted),
-            *patterns.lines,
-        }
+        self._missing = set(patterns.needed)
 
     @classmethod
     def of(cls, frames: AxisFrames) -> FrameStacks:
@@ -234,24 +240,32 @@ class FrameStacks:
 
 
 def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
-    """Sort the frames of one camera for decoding along one axis.
+    """Sort the frames of one camera, all of one exposure, for decoding along one axis.
 
     Raises
     ------
     PatternError
-        As `axis_patterns` does, or an exposure bracket is incomplete.
+        As `axis_patterns` does, or there are several exposures, which have to be fused.
     """
     shots = telling_shots(capture, camera)
-    images, exposure_ratio = _fused_images(capture, camera, shots)
+    if exposure_count([shot.exposure_s for shot in shots]) > 1:
+        message = (
+            f"camera '{camera}': expected frames of one exposure, found "
+            f"{sorted({str(shot.exposure_s) for shot in shots})} s; fuse them first"
+        )
+        raise PatternError(message)
+    repeats: dict[Pattern, list[NDArray[Any]]] = {}
+    for shot in shots:
+        repeats.setdefault(capture.patterns[shot.pattern], []).append(shot.image)
     stacks = FrameStacks(
-        axis_patterns(images, camera, axis),
+        axis_patterns(repeats, camera, axis),
         capture.cameras[camera].size.shape,
         full_scale=float(capture.cameras[camera].full_scale),
-        exposure_ratio=exposure_ratio,
         ends_repeats=ends_repeats([capture.patterns[shot.pattern] for shot in shots], axis),
     )
-    for pattern, image in images.items():
-        stacks.put(pattern, image)
+    for pattern, images in repeats.items():
+        if not stacks.has(pattern):
+            stacks.put(pattern, mean_image(images))
     return stacks.frames()
 
 
@@ -267,44 +281,6 @@ def ends_repeats(shown: Sequence[Pattern], axis: Axis) -> float:
     counts = Counter(shown)
     others = [n for p, n in counts.items() if isinstance(p, Gray | LineShift) and p.axis is axis]
     return max(1.0, min(counts[White()], counts[Black()]) / max(others, default=1))
-
-
-def _fused_images(capture: Capture, camera: str, telling: Sequence[Shot]) -> tuple[dict[Pattern, NDArray[Any]], float]:
-    """The image of each pattern, and the longest exposure over the shortest."""
-    shots: dict[Pattern, dict[float | None, list[Shot]]] = {}
-    for shot in telling:
-        shots.setdefault(capture.patterns[shot.pattern], {}).setdefault(shot.exposure_s, []).append(shot)
-    averaged = {
-        pattern: {exposure: mean_image([shot.image for shot in repeats]) for exposure, repeats in by_exposure.items()}
-        for pattern, by_exposure in shots.items()
-    }
-    exposures = {frozenset(by_exposure) for by_exposure in averaged.values()}
-    if not exposures or (len(exposures) == 1 and len(next(iter(exposures))) == 1):
-        return {pattern: next(iter(by_exposure.values())) for pattern, by_exposure in averaged.items()}, 1.0
-    return _fused_bracket(averaged, camera, float(capture.cameras[camera].full_scale))
-
-
-def _fused_bracket(
-    averaged: Mapping[Pattern, Mapping[float | None, NDArray[Any]]], camera: str, full_scale: float
-) -> tuple[dict[Pattern, NDArray[Any]], float]:
-    sets = {frozenset(by_exposure) for by_exposure in averaged.values()}
-    if len(sets) > 1 or None in next(iter(sets)):
-        message = (
-            f"camera '{camera}': an exposure bracket needs the same exposures, stated, for every pattern; "
-            f"found {[sorted(str(e) for e in each) for each in sets]}"
-        )
-        raise PatternError(message)
-    times = sorted((float(e) for e in next(iter(sets)) if e is not None), reverse=True)
-    chosen = np.full(next(iter(next(iter(averaged.values())).values())).shape, len(times) - 1)
-    for rank in range(len(times) - 2, -1, -1):
-        clipped = np.max([by_exposure[times[rank]] for by_exposure in averaged.values()], axis=0) >= full_scale
-        chosen = np.where(clipped, chosen, rank)
-    scale = np.array([times[0] / t for t in times], dtype=np.float32)
-    fused = {
-        pattern: np.choose(chosen, [by_exposure[t] * scale[rank] for rank, t in enumerate(times)]).astype(np.float32)
-        for pattern, by_exposure in averaged.items()
-    }
-    return fused, float(scale[-1])
 
 
 def mean_image(repeats: Sequence[NDArray[Any]]) -> NDArray[Any]:

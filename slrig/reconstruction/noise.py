@@ -5,7 +5,10 @@ Model: variance(I) = read + slope · I, in camera units (photon transfer; EMVA 1
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from slrig.reconstruction.frames import AxisFrames
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0
-_SAMPLES = 200_000
+_MOST_SAMPLES = 200_000
 _LEAST_RANGE = 10.0
 _BINS = 24
 _LEAST_PER_BIN = 50
@@ -23,14 +26,24 @@ _BOX = np.ones((3, 3), dtype=np.uint8)
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """variance(I) = read_variance + slope · I, camera units squared."""
+    """variance(I) = read_variance · read_share + slope · shot_share · I, camera units squared.
+
+    read_variance, slope : of a frame as the camera gives it.
+    read_share, shot_share : (H, W) float32, what is left of them at each pixel of frames that are fused of several
+    exposures (`slrig.reconstruction.fusion`); None for frames as the camera gives them, where both are 1.
+    """
 
     read_variance: float
     slope: float
+    read_share: NDArray[np.float32] | None = None
+    shot_share: NDArray[np.float32] | None = None
 
     def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """(H, W) float32: the variance expected of each sample of `image`."""
-        return np.asarray(self.read_variance + self.slope * np.maximum(image, 0), dtype=np.float32)
+        if self.read_share is None or self.shot_share is None:
+            return np.asarray(self.read_variance + self.slope * np.maximum(image, 0), dtype=np.float32)
+        read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
+        return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
 
 
 def estimate_noise(frames: AxisFrames) -> NoiseModel:
@@ -43,14 +56,30 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     (Immerkær 1996, DOI 10.1006/cviu.1996.0060) tells the noise of the dark. Without inverses that scatter of white and
     black stands alone.
     """
+    return fitted_noise([noise_samples(frames)])
+
+
+def fitted_noise(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> NoiseModel:
+    """Fit the noise model to what `noise_samples` found in the frames of each exposure of one camera."""
+    levels, variances = zip(*samples, strict=True)
+    return _fitted(np.concatenate(levels), np.concatenate(variances))
+
+
+def noise_samples(
+    frames: AxisFrames, where: NDArray[np.bool_] | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(n,) levels and (n,) variances of single samples: what `estimate_noise` fits its model to.
+
+    where : (H, W) bool, the pixels to take them from; all if it is None.
+    """
     if frames.inverses is None or len(frames.bits) < 3:
-        return _fitted(*_scatter_between_neighbours(frames, frames.white, frames.black))
+        return _scatter_between_neighbours(frames, where, frames.white, frames.black)
     coarse = max(3, len(frames.bits) // 2)
-    level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at)
+    level, variance = _scatter_of_sums(frames.bits[:coarse], frames.inverses[:coarse], frames.clipped_at, where)
     if len(level) and not _tells_slope(level, variance):
-        dark, dark_variance = _scatter_between_neighbours(frames, frames.black)
+        dark, dark_variance = _scatter_between_neighbours(frames, where, frames.black)
         level, variance = np.concatenate([level, dark]), np.concatenate([variance, dark_variance])
-    return _fitted(level, variance)
+    return level, variance
 
 
 def _tells_slope(level: NDArray[np.float32], variance: NDArray[np.float32]) -> bool:
@@ -60,13 +89,15 @@ def _tells_slope(level: NDArray[np.float32], variance: NDArray[np.float32]) -> b
 
 
 def _scatter_of_sums(
-    bits: NDArray[np.float32], inverses: NDArray[np.float32], clipped_at: float
+    bits: NDArray[np.float32], inverses: NDArray[np.float32], clipped_at: float, where: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Levels and variances of single samples, half those of the sums."""
-    step = max(1, int(np.sqrt(bits[0].size / _SAMPLES)))
+    step = math.ceil(math.sqrt(bits[0].size / _MOST_SAMPLES))
     direct, inverse = bits[:, ::step, ::step], inverses[:, ::step, ::step]
     sums = direct + inverse
     unclipped = (np.maximum(direct, inverse).max(axis=0) < clipped_at) & (np.minimum(direct, inverse).min(axis=0) > 0)
+    if where is not None:
+        unclipped &= where[::step, ::step]
     count = len(sums) - 1
     variance = sums.var(axis=0, ddof=1, dtype=np.float64)
     # A bin takes the median, which lies below the mean of a chi-square (Wilson-Hilferty).
@@ -75,7 +106,7 @@ def _scatter_of_sums(
 
 
 def _scatter_between_neighbours(
-    frames: AxisFrames, *images: NDArray[np.float32]
+    frames: AxisFrames, where: NDArray[np.bool_] | None, *images: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     levels, variances = [], []
     for image in images:
@@ -85,6 +116,8 @@ def _scatter_between_neighbours(
         mean = cv2.blur(image, (3, 3))[1:-1, 1:-1]
         lowest, highest = cv2.erode(image, _BOX)[1:-1, 1:-1], cv2.dilate(image, _BOX)[1:-1, 1:-1]
         unclipped = (lowest > 0) & (highest < frames.clipped_at)
+        if where is not None:
+            unclipped &= where[1:-1, 1:-1]
         levels.append(mean[unclipped])
         # median of a squared normal = 0.4549 of its variance; the mask has norm² 36
         variances.append(both[unclipped] ** 2 * (frames.ends_repeats / 36 / 0.4549))
@@ -95,12 +128,16 @@ def _fitted(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseM
     floor = NoiseModel(_QUANTISATION_VARIANCE, 0.0)
     if len(level) < _LEAST_PER_BIN:
         return floor
+    # In order of level a bin is a stretch, and its median level the stretch's middle.
+    order = np.argsort(level)
+    level, variance = level[order], variance[order]
     borders = np.unique(np.quantile(level, np.linspace(0, 1, _BINS + 1)))
-    which = np.clip(np.searchsorted(borders, level, side="right") - 1, 0, max(len(borders) - 2, 0))
+    # A sample on a border belongs to the bin above it, the largest to the last.
+    ends = np.searchsorted(level, borders[1:-1], side="left")
     points = [
-        (float(np.median(level[which == b])), float(np.median(variance[which == b])), int((which == b).sum()))
-        for b in range(len(borders) - 1)
-        if (which == b).sum() >= _LEAST_PER_BIN
+        (float(np.median(level[a:b])), float(np.median(variance[a:b])), int(b - a))
+        for a, b in pairwise([0, *ends, len(level)])
+        if b - a >= _LEAST_PER_BIN
     ]
     if not points:
         return floor

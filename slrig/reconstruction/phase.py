@@ -58,11 +58,14 @@ def position_map(frames: AxisFrames, noise: NoiseModel, code: CodeMap, cell_posi
         return PositionMap(middle, np.full_like(middle, np.nan))
     period = patterns[0].period_px
     angle = 2 * np.pi / period * np.array([p.centre_px for p in patterns])
-    position, sigma = _phase_kernel(
-        frames.lines, np.cos(angle), np.sin(angle), float(period), middle, noise.read_variance, noise.slope,
-        np.float32(frames.clipped_at),
-    )  # fmt: skip
-    return PositionMap(position, sigma)
+    given = frames.lines, np.cos(angle), np.sin(angle), float(period), middle
+    clipped_at = np.float32(frames.clipped_at)
+    if noise.read_share is None or noise.shot_share is None:
+        return PositionMap(*_phase_kernel(*given, noise.read_variance, noise.slope, clipped_at))
+    # The variance is a sum of one part by read noise and one by shot noise, each with its own share at each pixel.
+    position, by_read = _phase_kernel(*given, noise.read_variance, 0.0, clipped_at)
+    _, by_shot = _phase_kernel(*given, 0.0, noise.slope, clipped_at)
+    return PositionMap(position, np.sqrt(noise.read_share * by_read**2 + noise.shot_share * by_shot**2))
 
 
 @njit(cache=True, nogil=True, parallel=True)

@@ -20,6 +20,8 @@ from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.chaining import chain_frames
 from slrig.reconstruction.steger import EDGE, RIDGE, kernels, newton_kernel, taylor_kernel
 
+_POINTS = 8192  # that one thread takes at a time
+
 
 @dataclass(frozen=True, slots=True)
 class StripeLimits:
@@ -129,15 +131,55 @@ def normalised(
 def _normalised_kernel(image: Any, black: Any, contrast: Any, noise: Any) -> Any:
     light = np.zeros(image.shape, dtype=np.float32)
     deviation = np.zeros(image.shape, dtype=np.float32)
-    three = np.float32(3)
     for y in prange(image.shape[0]):
         for x in range(image.shape[1]):
-            damping = three * noise[y, x]
-            squared = contrast[y, x] * contrast[y, x] + damping * damping
-            weight = contrast[y, x] / squared if squared > 0 else np.float32(0)
+            weight = _weight(contrast[y, x], noise[y, x])
             light[y, x] = (image[y, x] - black[y, x]) * weight
             deviation[y, x] = noise[y, x] * abs(weight)
     return light, deviation
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _weight(contrast: Any, noise: Any) -> Any:
+    """1/contrast, damped to zero where the contrast is not above the noise."""
+    damping = np.float32(3) * noise
+    squared = contrast * contrast + damping * damping
+    return contrast / squared if squared > 0 else np.float32(0)
+
+
+def normalised_line(
+    line: NDArray[np.float32],
+    white: NDArray[np.float32],
+    black: NDArray[np.float32],
+    read_variance: float,
+    slope: float,
+    ends_repeats: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """A line frame as `normalised` gives it, with the noise of line, white and black counted, as the light has it.
+
+    read_variance, slope : of the camera's noise; ends_repeats : how many frames the mean white and black are of.
+    """
+    light, deviation = _normalised_line_kernel(line, white, black, read_variance, slope, ends_repeats)
+    return light, deviation
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _normalised_line_kernel(line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float) -> Any:
+    normal = np.zeros(line.shape, dtype=np.float32)
+    deviation = np.zeros(line.shape, dtype=np.float32)
+    for y in prange(line.shape[0]):
+        for x in range(line.shape[1]):
+            contrast, above = white[y, x] - black[y, x], line[y, x] - black[y, x]
+            # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
+            light = min(max(above / max(contrast, np.float32(1)), np.float32(0)), np.float32(1))
+            of_white = (read + slope * max(white[y, x], np.float32(0))) / ends_repeats
+            of_black = (read + slope * max(black[y, x], np.float32(0))) / ends_repeats
+            own = read + slope * max(line[y, x], np.float32(0))
+            noise = np.float32(np.sqrt(own + (1 - light) ** 2 * of_black + light**2 * of_white))
+            weight = _weight(contrast, noise)
+            normal[y, x] = above * weight
+            deviation[y, x] = noise * abs(weight)
+    return normal, deviation
 
 
 def measured_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], lit: NDArray[np.bool_]) -> float:
@@ -146,11 +188,13 @@ def measured_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], li
     For a Gaussian bar smoothed to scale S the response is -r/S² at the centre, so S² = -r/r_nn.
     """
     probe = 1.2
-    x, y, _, strength, _ = _points(image, noise, lit, probe, RIDGE, 12.0, 0.12)
-    if len(x) < 50:
+    found = _points(image, noise, lit, StripeLimits(weak_sigma=12.0), probe, RIDGE)
+    strength = found.strength
+    if len(strength) < 50:
         return probe
     smooth = cv2.GaussianBlur(image, (0, 0), probe)
-    value = smooth[np.rint(y).astype(int), np.rint(x).astype(int)]
+    x, y = np.rint(found.points_px).astype(int).T
+    value = smooth[y, x]
     clear = strength > np.median(strength)
     squared = np.median(value[clear] / strength[clear]) - probe**2
     return float(np.sqrt(max(squared, 0.25)))
@@ -169,7 +213,7 @@ def stripe_points(
 
     image, noise : (H, W) float32; lit : (H, W) bool, pixels that can hold a point; sigma_px : scale of the Gaussian.
     """
-    return _limited(image, noise, lit, limits, sigma_px, RIDGE)
+    return _points(image, noise, lit, limits, sigma_px, RIDGE)
 
 
 def edge_points(
@@ -182,23 +226,7 @@ def edge_points(
     sigma_px: float,
 ) -> LinePoints:
     """Zero crossings of a bit minus its inverse; arguments as for `stripe_points`."""
-    return _limited(image, noise, lit, limits, sigma_px, EDGE)
-
-
-def _limited(
-    image: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    lit: NDArray[np.bool_],
-    limits: StripeLimits,
-    sigma_px: float,
-    kind: int,
-) -> LinePoints:
-    x, y, normals, strength, deviation = _points(
-        image, noise, lit, sigma_px, kind, limits.weak_sigma, limits.weak_fraction
-    )
-    weakest = limits.strong_sigma * _response_noise_factor(sigma_px, kind)
-    strong = strength > noise[np.rint(y).astype(int), np.rint(x).astype(int)] * np.float32(weakest)
-    return LinePoints(np.stack([x, y], axis=1), normals, strength, strong, deviation)
+    return _points(image, noise, lit, limits, sigma_px, EDGE)
 
 
 def _response_noise_factor(sigma_px: float, kind: int) -> float:
@@ -213,20 +241,67 @@ def _points(
     image: NDArray[np.float32],
     noise: NDArray[np.float32],
     lit: NDArray[np.bool_],
+    limits: StripeLimits,
     sigma_px: float,
     kind: int,
-    weak_sigma: float,
-    weak_fraction: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    weak = np.float32(weak_sigma * _response_noise_factor(sigma_px, kind))
-    offset, strength = taylor_kernel(image, noise, lit, weak, *kernels(sigma_px), kind)
-    at = np.flatnonzero(strength)
-    height = strength.ravel()[at]
-    if len(at):
-        at = at[height > weak_fraction * np.percentile(height, 90)]
-    rows, columns = np.divmod(at.astype(np.int32), np.int32(image.shape[1]))
+) -> LinePoints:
+    factor = _response_noise_factor(sigma_px, kind)
+    offset, strength = taylor_kernel(
+        image, noise, lit, np.float32(limits.weak_sigma * factor), *kernels(sigma_px), kind
+    )  # fmt: skip
+    rows, columns, height = _responses_kernel(strength)
+    if len(height):
+        counts = height > limits.weak_fraction * np.percentile(height, 90)
+        rows, columns = rows[counts], columns[counts]
     x, y, normals, response, kept = newton_kernel(image, offset, columns, rows, sigma_px, kind)
     # Noise of the numerator of the last step over its slope: ∫ g_x² for the ridge, ∫ g² = 1/(4 π σ²) for the edge.
     gain = np.sqrt(1 / (8 * np.pi)) / sigma_px**2 if kind == RIDGE else np.sqrt(1 / (4 * np.pi)) / sigma_px
-    deviation = noise[rows, columns] * gain / np.maximum(response, 1e-12)
-    return x[kept], y[kept], normals[kept], response[kept], deviation[kept].astype(np.float64)
+    weakest = np.float32(limits.strong_sigma * factor)
+    return LinePoints(*_kept_kernel(kept, x, y, normals, response, noise, rows, columns, gain, weakest))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _responses_kernel(strength: Any) -> Any:
+    """Row, column (int32) and value of every pixel that is not zero, in the order of the image."""
+    count = np.zeros(len(strength) + 1, dtype=np.int64)
+    for y in prange(len(strength)):
+        count[y + 1] = np.count_nonzero(strength[y])
+    first = np.cumsum(count)
+    rows = np.zeros(first[-1], dtype=np.int32)
+    columns = np.zeros(first[-1], dtype=np.int32)
+    height = np.zeros(first[-1], dtype=np.float32)
+    for y in prange(len(strength)):
+        at = first[y]
+        for x in range(strength.shape[1]):
+            if strength[y, x] != 0:
+                rows[at], columns[at], height[at] = y, x, strength[y, x]
+                at += 1
+    return rows, columns, height
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _kept_kernel(
+    kept: Any, x: Any, y: Any, normals: Any, response: Any, noise: Any, rows: Any, columns: Any, gain: float,
+    weakest: float,
+) -> Any:  # fmt: skip
+    """What `LinePoints` holds, of the points that are kept: gain and weakest make noise a deviation and a threshold."""
+    blocks = (len(kept) + _POINTS - 1) // _POINTS
+    count = np.zeros(blocks + 1, dtype=np.int64)
+    for block in prange(blocks):
+        count[block + 1] = np.count_nonzero(kept[block * _POINTS : (block + 1) * _POINTS])
+    first = np.cumsum(count)
+    total = first[-1]
+    points, across = np.zeros((total, 2)), np.zeros((total, 2))
+    strength, sigma = np.zeros(total), np.zeros(total)
+    strong = np.zeros(total, dtype=np.bool_)
+    for block in prange(blocks):
+        at = first[block]
+        for i in range(block * _POINTS, min(len(kept), (block + 1) * _POINTS)):
+            if kept[i]:
+                points[at, 0], points[at, 1] = x[i], y[i]
+                across[at, 0], across[at, 1] = normals[i, 0], normals[i, 1]
+                strength[at] = response[i]
+                sigma[at] = noise[rows[i], columns[i]] * gain / max(response[i], 1e-12)
+                strong[at] = response[i] > noise[int(np.rint(y[i])), int(np.rint(x[i]))] * weakest
+                at += 1
+    return points, across, strength, strong, sigma

@@ -16,8 +16,13 @@ _LONGEST_MOVE_PX = 1.0
 _LEAST_GRADIENT = 0.05
 _LEAST_FREEDOM = 0.5
 _PIXELS = 25
-_LANES = 32  # 25 pixels, padded to whole vectors
+_LANES = 32  # 25 pixels, or points side by side: whole vectors
 _BLOCK = 1024
+
+# Rows of the working memory of points side by side: the surface's six coefficients, then these.
+_X, _Y, _NOISE, _MISFIT, _VALUE = 6, 7, 8, 9, 10
+_VARIANCE = _VALUE + _PIXELS
+_ROWS = _VARIANCE + _PIXELS
 
 
 def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], float]:
@@ -55,10 +60,15 @@ def fit_kernel(
     rows, columns = position.shape
     flat_position, flat_sigma = position.reshape(-1), sigma.reshape(-1)
     for block in prange((count + _BLOCK - 1) // _BLOCK):
+        # A small image of pixels, for one point whose neighbours are not all usable.
         value = np.zeros(_LANES, dtype=np.float32)
         variance_at = np.ones(_LANES, dtype=np.float32)
-        every, some = basis[0], np.zeros(_LANES, dtype=np.float32)
+        member = np.zeros(_LANES, dtype=np.float32)
         gains = np.zeros((6, _LANES), dtype=np.float32)
+        # Points whose neighbours are all usable, side by side, so that they are worked off in vector registers.
+        work = np.zeros(_ROWS * _LANES, dtype=np.float32)
+        which = np.zeros(_LANES, dtype=np.int64)
+        waiting = 0
         for i in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
             points[i, 0], points[i, 1] = starts[i, 0], starts[i, 1]
             if np.isnan(targets[i]):
@@ -67,72 +77,163 @@ def fit_kernel(
             if ix < _REACH or iy < _REACH or ix >= columns - _REACH or iy >= rows - _REACH or not usable[iy, ix]:
                 continue
             origin = position[iy, ix]
-            members = _PIXELS
-            weights = stencils
             if whole[iy, ix]:
                 corner = (iy - _REACH) * columns + ix - _REACH
                 for dy in range(5):
                     for dx in range(5):
                         at = np.uintp(corner + dy * columns + dx)
-                        value[5 * dy + dx] = flat_position[at] - origin
-                        variance_at[5 * dy + dx] = flat_sigma[at] * flat_sigma[at]
-                member = every
-            else:
-                members = _members(position, sigma, usable, iy, ix, value, variance_at, some)
-                if not _plane_gains(some, members, plane, basis, gains):
-                    continue
-                weights = gains
-                member = some
-            f0 = f1 = f2 = f3 = f4 = f5 = np.float32(0)
-            for j in range(_LANES):
-                f0 += weights[0, j] * value[j]
-                f1 += weights[1, j] * value[j]
-                f2 += weights[2, j] * value[j]
-                f3 += weights[3, j] * value[j]
-                f4 += weights[4, j] * value[j]
-                f5 += weights[5, j] * value[j]
-            x, y = starts[i, 0] - ix, starts[i, 1] - iy
-            gx = gy = 0.0
-            target = targets[i] - origin
-            for _ in range(3):
-                gx = f1 + 2.0 * f3 * x + f4 * y
-                gy = f2 + f4 * x + 2.0 * f5 * y
-                squared = gx * gx + gy * gy
-                if squared < _LEAST_GRADIENT * _LEAST_GRADIENT:
-                    break
-                miss = (f0 + f1 * x + f2 * y + f3 * x * x + f4 * x * y + f5 * y * y - target) / squared
-                x -= miss * gx
-                y -= miss * gy
-                if abs(x) > 2 or abs(y) > 2:
-                    break
-            gradient = np.sqrt(gx * gx + gy * gy)
-            mx, my = x + ix - starts[i, 0], y + iy - starts[i, 1]
-            if not gradient >= _LEAST_GRADIENT or not mx * mx + my * my <= _LONGEST_MOVE_PX * _LONGEST_MOVE_PX:
+                        pixel = 5 * dy + dx
+                        work[(_VALUE + pixel) * _LANES + waiting] = flat_position[at] - origin
+                        work[(_VARIANCE + pixel) * _LANES + waiting] = flat_sigma[at] * flat_sigma[at]
+                which[waiting] = i
+                waiting += 1
+                if waiting == _LANES:
+                    _fit_side_by_side(
+                        work, waiting, which, stencils, basis, whole_freedom,
+                        position, starts, targets, points, normals, deviation, found,
+                    )  # fmt: skip
+                    waiting = 0
                 continue
+            members = _members(position, sigma, usable, iy, ix, value, variance_at, member)
+            if not _plane_gains(member, members, plane, basis, gains):
+                continue
+            f0 = f1 = f2 = np.float32(0)
+            for j in range(_PIXELS):
+                f0 += gains[0, j] * value[j]
+                f1 += gains[1, j] * value[j]
+                f2 += gains[2, j] * value[j]
+            x, y, gx, gy = _solved(
+                f0, f1, f2, np.float32(0), np.float32(0), np.float32(0),
+                starts[i, 0] - ix, starts[i, 1] - iy, targets[i] - origin,
+            )  # fmt: skip
             noise = misfit = np.float32(0)
             x1, y1 = np.float32(x), np.float32(y)
-            xx, xy, yy = x1 * x1, x1 * y1, y1 * y1
-            for j in range(_LANES):
-                gain = (
-                    weights[0, j] + weights[1, j] * x1 + weights[2, j] * y1
-                    + weights[3, j] * xx + weights[4, j] * xy + weights[5, j] * yy
-                )  # fmt: skip
+            for j in range(_PIXELS):
+                gain = gains[0, j] + gains[1, j] * x1 + gains[2, j] * y1
                 noise += gain * gain * variance_at[j]
-                fitted = (
-                    f0 * basis[0, j] + f1 * basis[1, j] + f2 * basis[2, j]
-                    + f3 * basis[3, j] + f4 * basis[4, j] + f5 * basis[5, j]
-                )  # fmt: skip
-                residual = value[j] - fitted
+                residual = value[j] - (f0 + f1 * basis[1, j] + f2 * basis[2, j])
                 misfit += member[j] * residual * residual / variance_at[j]
-            freedom = whole_freedom if whole[iy, ix] else _plane_freedom(member, members, gains, basis)
-            excess = max(1.0, misfit / freedom) if freedom > _LEAST_FREEDOM else 1.0
-            variance = noise * excess
-            if not variance < np.inf:
-                continue
-            points[i, 0], points[i, 1] = ix + x, iy + y
-            normals[i, 0], normals[i, 1] = gx / gradient, gy / gradient
-            deviation[i] = np.sqrt(variance) / gradient
-            found[i] = True
+            freedom = _plane_freedom(member, members, gains, basis)
+            _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found)
+        _fit_side_by_side(
+            work, waiting, which, stencils, basis, whole_freedom,
+            position, starts, targets, points, normals, deviation, found,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_side_by_side(
+    work: Any, count: int, which: Any, stencils: Any, basis: Any, freedom: float,
+    position: Any, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
+) -> None:  # fmt: skip
+    """Fit a quadratic surface to each of the first `count` columns of `work`: the points `which`.
+
+    Row r of `work` is work[r * _LANES :]. Lanes beyond `count` hold anything, and nobody looks at them.
+    """
+    _surface_of(work, stencils)
+    for lane in range(count):
+        i = which[lane]
+        ix, iy = int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1]))
+        x, y, gx, gy = _solved(
+            work[lane], work[_LANES + lane], work[2 * _LANES + lane],
+            work[3 * _LANES + lane], work[4 * _LANES + lane], work[5 * _LANES + lane],
+            starts[i, 0] - ix, starts[i, 1] - iy, targets[i] - position[iy, ix],
+        )  # fmt: skip
+        points[i, 0], points[i, 1] = x, y
+        normals[i, 0], normals[i, 1] = gx, gy
+        work[_X * _LANES + lane], work[_Y * _LANES + lane] = x, y
+    _scatter_of(work, stencils, basis)
+    for lane in range(count):
+        i = which[lane]
+        ix, iy = int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1]))
+        x, y, gx, gy = points[i, 0], points[i, 1], normals[i, 0], normals[i, 1]
+        points[i, 0], points[i, 1] = starts[i, 0], starts[i, 1]
+        normals[i, 0] = normals[i, 1] = 0.0
+        _put(
+            i, ix, iy, x, y, gx, gy, work[_NOISE * _LANES + lane], work[_MISFIT * _LANES + lane], freedom,
+            starts, points, normals, deviation, found,
+        )  # fmt: skip
+
+
+# Nothing else stands in these loops, and one array holds all: so the compiler sees that rows do not overlap.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _surface_of(work: Any, stencils: Any) -> None:
+    """Rows 0 to 5: the coefficients of 1, x, y, x², xy, y²."""
+    work[: 6 * _LANES] = 0
+    for j in range(_PIXELS):
+        w0, w1, w2 = stencils[0, j], stencils[1, j], stencils[2, j]
+        w3, w4, w5 = stencils[3, j], stencils[4, j], stencils[5, j]
+        row = (_VALUE + j) * _LANES
+        for lane in range(_LANES):
+            value = work[row + lane]
+            work[lane] += w0 * value
+            work[_LANES + lane] += w1 * value
+            work[2 * _LANES + lane] += w2 * value
+            work[3 * _LANES + lane] += w3 * value
+            work[4 * _LANES + lane] += w4 * value
+            work[5 * _LANES + lane] += w5 * value
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scatter_of(work: Any, stencils: Any, basis: Any) -> None:
+    """Rows _NOISE and _MISFIT: variance of the surface at (_X, _Y), and the residuals' squares over their variances."""
+    work[_NOISE * _LANES : (_MISFIT + 1) * _LANES] = 0
+    for j in range(_PIXELS):
+        w0, w1, w2 = stencils[0, j], stencils[1, j], stencils[2, j]
+        w3, w4, w5 = stencils[3, j], stencils[4, j], stencils[5, j]
+        row = (_VARIANCE + j) * _LANES
+        for lane in range(_LANES):
+            x, y = work[_X * _LANES + lane], work[_Y * _LANES + lane]
+            gain = w0 + w1 * x + w2 * y + w3 * (x * x) + w4 * (x * y) + w5 * (y * y)
+            work[_NOISE * _LANES + lane] += gain * gain * work[row + lane]
+    for j in range(_PIXELS):
+        b0, b1, b2, b3, b4, b5 = basis[0, j], basis[1, j], basis[2, j], basis[3, j], basis[4, j], basis[5, j]
+        values, variances = (_VALUE + j) * _LANES, (_VARIANCE + j) * _LANES
+        for lane in range(_LANES):
+            fitted = (
+                work[lane] * b0 + work[_LANES + lane] * b1 + work[2 * _LANES + lane] * b2
+                + work[3 * _LANES + lane] * b3 + work[4 * _LANES + lane] * b4 + work[5 * _LANES + lane] * b5
+            )  # fmt: skip
+            residual = work[values + lane] - fitted
+            work[_MISFIT * _LANES + lane] += residual * residual / work[variances + lane]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: float, target: float) -> Any:
+    """Move (x, y) along the gradient to where the surface is `target`: x, y and the gradient before the last step."""
+    gx = gy = 0.0
+    for _ in range(3):
+        gx = f1 + 2.0 * f3 * x + f4 * y
+        gy = f2 + f4 * x + 2.0 * f5 * y
+        squared = gx * gx + gy * gy
+        if squared < _LEAST_GRADIENT * _LEAST_GRADIENT:
+            break
+        miss = (f0 + f1 * x + f2 * y + f3 * x * x + f4 * x * y + f5 * y * y - target) / squared
+        x -= miss * gx
+        y -= miss * gy
+        if abs(x) > 2 or abs(y) > 2:
+            break
+    return x, y, gx, gy
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _put(
+    i: int, ix: int, iy: int, x: float, y: float, gx: float, gy: float, noise: float, misfit: float, freedom: float,
+    starts: Any, points: Any, normals: Any, deviation: Any, found: Any,
+) -> None:  # fmt: skip
+    """Take point i as found, at (x, y) from the pixel (ix, iy), unless it moved too far or the surface is too flat."""
+    gradient = np.sqrt(gx * gx + gy * gy)
+    mx, my = x + ix - starts[i, 0], y + iy - starts[i, 1]
+    if not gradient >= _LEAST_GRADIENT or not mx * mx + my * my <= _LONGEST_MOVE_PX * _LONGEST_MOVE_PX:
+        return
+    excess = max(1.0, misfit / freedom) if freedom > _LEAST_FREEDOM else 1.0
+    variance = noise * excess
+    if not variance < np.inf:
+        return
+    points[i, 0], points[i, 1] = ix + x, iy + y
+    normals[i, 0], normals[i, 1] = gx / gradient, gy / gradient
+    deviation[i] = np.sqrt(variance) / gradient
+    found[i] = True
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Frames sorted by what they show: averages, brackets, stand-ins, and the words of the errors."""
+"""Frames sorted by what they show: averages, stand-ins, and the words of the errors."""
 
 from __future__ import annotations
 
@@ -16,15 +16,11 @@ from slrig.model import (
     Gray,
     LineShift,
     Pattern,
-    Refusal,
     Shot,
     Size,
     White,
 )
-from slrig.patterns.positions import index_of_word
-from slrig.reconstruction.decoding import DecodingLimits, decode
 from slrig.reconstruction.frames import axis_frames
-from slrig.reconstruction.noise import NoiseModel
 
 CAMERA = CameraFormat(Size(3, 2), 8)
 BITS = [Gray(Axis.COLUMN, bit, 2) for bit in range(2)]
@@ -114,37 +110,11 @@ def test_ends_that_are_shown_several_times_before_the_code_have_less_noise(openi
     assert frames.ends_repeats == opening
 
 
-def test_a_bracket_takes_the_longest_exposure_that_nothing_clipped() -> None:
-    # Columns: clipped in the longest; clipped in the two longest; never clipped.
-    values: dict[Pattern, dict[float, list[int]]] = {
-        White(): {0.04: [255, 255, 160], 0.02: [180, 255, 81], 0.01: [91, 140, 40]},
-        Black(): {0.04: [8, 8, 8], 0.02: [5, 5, 5], 0.01: [2, 3, 2]},
-        BITS[0]: {0.04: [255, 255, 159], 0.02: [179, 250, 80], 0.01: [90, 139, 39]},
-        BITS[1]: {0.04: [9, 9, 9], 0.02: [6, 6, 6], 0.01: [3, 4, 3]},
-    }
-    seen: list[Seen] = [(p, value, e) for p, by_time in values.items() for e, value in by_time.items()]
+def test_one_exposure_that_the_camera_names_a_little_differently_is_one() -> None:
+    seen = [(p, v, 0.02 + 1e-4 * index) for index, (p, v, _) in enumerate([*ENDS, *plain(*BITS), *ENDS])]
     frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
-    np.testing.assert_allclose(frames.white[0], [2 * 180, 4 * 140, 160])
-    np.testing.assert_allclose(frames.black[0], [2 * 5, 4 * 3, 8])
-    np.testing.assert_allclose(frames.bits[:, 0], [[2 * 179, 4 * 139, 159], [2 * 6, 4 * 4, 9]])
-
-
-def bracket(bright: Sequence[int]) -> list[Seen]:
-    """White, black and both bits lit at 10 and 20 ms; `bright` is what 10 ms show, per column."""
-    seen: list[Seen] = []
-    for pattern, share in ((White(), 1.0), (Black(), 0.05), (BITS[0], 0.05), (BITS[1], 1.0)):
-        short = [round(share * value) for value in bright]
-        seen += [(pattern, short, 0.01), (pattern, [min(2 * value, 255) for value in short], 0.02)]
-    return seen
-
-
-def test_a_pixel_rescued_by_the_short_exposure_is_decoded() -> None:
-    # 200 at 10 ms clips at 20 ms. Scaled to the longest it is 400, and no sample of it was clipped.
-    frames = axis_frames(capture_of(*bracket([60, 200, 255])), "eye", Axis.COLUMN)
-    assert frames.inverses is None
-    code = decode(frames, NoiseModel(1.0, 0.0), index_of_word(frames.gray), 4, DecodingLimits())
-    assert code.refusal[0].tolist() == [Refusal.NONE, Refusal.NONE, Refusal.SATURATED]
-    assert code.lowest[0].tolist() == [1, 1, -1]
+    assert (frames.white == 200).all()
+    assert frames.exposure_ratio == 1.0
 
 
 def test_missing_inverses_are_said_to_be_missing() -> None:
@@ -186,17 +156,9 @@ REFUSED = {
         [(White(), 200, None), *plain(*BITS)],
         ["camera 'eye'", "no white and black frames", "no bit with its inverse", "add a white and a black frame"],
     ),
-    "a bracket with a hole": (
-        [(White(), 200, 0.01), (White(), 255, 0.02), (Black(), 5, 0.01), *((bit, 50, 0.01) for bit in BITS)],
-        ["camera 'eye'", "bracket", "for every pattern", "0.02"],
-    ),
-    "a bracket without its exposures": (
-        [seen for e in (0.01, None) for seen in exposed(e, White(), Black(), *BITS)],
-        ["bracket", "stated", "None"],
-    ),
-    "patterns at different exposures": (
-        [(White(), 200, 0.01), (Black(), 5, 0.01), *((bit, 50, 0.02) for bit in BITS)],
-        ["camera 'eye'", "0.01", "0.02"],
+    "several exposures": (
+        [seen for e in (0.01, 0.02) for seen in exposed(e, White(), Black(), *BITS)],
+        ["camera 'eye'", "frames of one exposure", "0.01", "0.02", "fuse them first"],
     ),
 }  # type: dict[str, tuple[list[Seen], list[str]]]
 
@@ -211,7 +173,7 @@ def test_frames_that_cannot_be_decoded_are_refused_in_words_that_help(case: str)
 
 
 def test_recorded_frames_are_left_alone() -> None:
-    capture = capture_of(*bracket([60, 200, 255]))
+    capture = capture_of(*ENDS, *plain(*BITS), *plain(*BITS, value=60), *plain(INVERSES[0]), *ENDS)
     before = [shot.image.copy() for shot in capture.shots]
     axis_frames(capture, "eye", Axis.COLUMN)
     for shot, image in zip(capture.shots, before, strict=True):

@@ -20,7 +20,7 @@ from slrig.reconstruction.steger import (
     newton_kernel,
     taylor_kernel,
 )
-from slrig.reconstruction.stripes import LinePoints, StripeLimits, Stripes, _points, chained, edge_points, stripe_points
+from slrig.reconstruction.stripes import LinePoints, StripeLimits, Stripes, chained, edge_points, stripe_points
 from tests.unit.reconstruction.builders import gaussian_stripe, grid
 
 SHAPE = (80, 90)
@@ -172,9 +172,10 @@ def test_the_frame_is_filtered_by_correlation() -> None:
     """A point's place before the second step follows from sums over windows, written out."""
     image = gaussian_stripe(grid((30, 30))[0] - 14.3, 1.3)
     noise = np.full(image.shape, 0.01, dtype=np.float32)
-    x, y, _, strength, _ = _points(image, noise, np.ones(image.shape, dtype=np.bool_), 1.3, RIDGE, 4.0, 0.12)
+    points = stripe_points(image, noise, np.ones(image.shape, dtype=np.bool_), StripeLimits(), sigma_px=1.3)
+    x, y = points.points_px.T
     # A straight bar smoothed to S² = 2σ² answers with -g'' = σ/S³ on its centre line.
-    np.testing.assert_allclose(strength, 1.3 / (2 * 1.3**2) ** 1.5, rtol=5e-3)
+    np.testing.assert_allclose(points.strength, 1.3 / (2 * 1.3**2) ** 1.5, rtol=5e-3)
     np.testing.assert_allclose(x, 14.3, atol=1e-3)
     assert sorted(np.rint(y).astype(int).tolist()) == list(range(5, 25))
 
