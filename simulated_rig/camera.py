@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from simulated_rig.light import Float32Array, LightTable
 from simulated_rig.options import CameraOptions, Faults
 from simulated_rig.rendering import View
-from simulated_rig.world import Clock, Lamp, nanoseconds
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Trigger
+from simulated_rig.world import Flicker, Lamp, nanoseconds
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Clock, Trigger
 from slrig.errors import DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels
 
-_NOISE, _FATE, _GARBLE = range(3)
+_NOISE, _FATE, _GARBLE, _STALE, _CORRUPT, _START, _DELIVERY = range(7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +37,15 @@ class SimulatedCamera:
     """
 
     def __init__(
-        self, options: CameraOptions, view: View, lamp: Lamp, clock: Clock, *, faults: Faults, seed: tuple[int, int]
+        self,
+        options: CameraOptions,
+        view: View,
+        lamp: Lamp,
+        clock: Clock,
+        *,
+        faults: Faults,
+        seed: tuple[int, int],
+        ambient_flicker: Flicker | None = None,
     ) -> None:
         self._options = options
         self._view = view
@@ -43,6 +53,7 @@ class SimulatedCamera:
         self._clock = clock
         self._faults = faults
         self._seed = seed
+        self._ambient_flicker = ambient_flicker
         self._sensor = options.sensor()
         self._settings = AppliedSettings(options.exposure_s, 1.0)
         self._trigger: Trigger | None = None
@@ -113,7 +124,8 @@ class SimulatedCamera:
         if self._trigger is not Trigger.SOFTWARE:
             message = f"camera '{self._options.name}' is not armed for software triggers; call arm first"
             raise DeviceStateError(message)
-        start_ns = max(self._clock.now_ns() + nanoseconds(self._options.trigger_latency_s), self._t_busy_ns)
+        latency_s = self._options.trigger_latency_s + self._jitter_s(_START, self._made)
+        start_ns = max(self._clock.now_ns() + nanoseconds(latency_s), self._t_busy_ns)
         exposure = self._exposure(self._made, start_ns)
         self._made += 1
         self._t_busy_ns = exposure.t_end_ns
@@ -130,6 +142,9 @@ class SimulatedCamera:
         while True:
             exposure = self._upcoming(after_ns, deadline_ns)
             ready = exposure is not None and exposure.t_ready_ns <= deadline_ns
+            if exposure is not None and ready and not self._is_dropped(exposure.number):
+                # Tracing its light takes a while of real time: better while it shines than after its read-out.
+                self._view.image(self._lights(exposure))
             self._clock.wait_until(exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._closed)
             self._require_usable()
             if exposure is None or not ready:
@@ -159,12 +174,18 @@ class SimulatedCamera:
 
     @property
     def _period_ns(self) -> int:
-        shortest = nanoseconds(self._settings.exposure_s + self._options.readout_s)
+        shortest = self._span_ns + nanoseconds(self._options.readout_s)
         return max(shortest, nanoseconds(self._options.period_s or 0.0), 1)
 
+    @property
+    def _span_ns(self) -> int:
+        """From the first row's start to the last row's end."""
+        return nanoseconds(self._settings.exposure_s) + nanoseconds(self._options.shutter_skew_s)
+
     def _exposure(self, number: int, start_ns: int) -> _Exposure:
-        end_ns = start_ns + nanoseconds(self._settings.exposure_s)
+        end_ns = start_ns + self._span_ns
         late_s = self._faults.late_s if self._befalls(self._faults.late_frames, number) else 0.0
+        late_s += self._jitter_s(_DELIVERY, number)
         return _Exposure(number, start_ns, end_ns, end_ns + nanoseconds(self._options.readout_s + late_s))
 
     def _upcoming(self, after_ns: int, deadline_ns: int) -> _Exposure | None:
@@ -205,14 +226,19 @@ class SimulatedCamera:
 
     def _finished(self, t_ns: int) -> int:
         """How many free-running exposures were read out by `t_ns`."""
-        first_ns = self._t_armed_ns + nanoseconds(self._settings.exposure_s + self._options.readout_s)
+        first_ns = self._t_armed_ns + self._span_ns + nanoseconds(self._options.readout_s)
         return max((t_ns - first_ns) // self._period_ns + 1, 0)
 
     def _frame(self, exposure: _Exposure) -> Frame:
-        repeated = self._last_image if self._befalls(self._faults.stale_frames, exposure.number) else None
+        stale = self._befalls(self._faults.stale_frames, exposure.number) or self._chance(
+            self._faults.stale_probability, _STALE, exposure.number
+        )
+        repeated = self._last_image if stale else None
         image = repeated if repeated is not None else self._rendered(exposure)
         self._last_image = image
-        if self._befalls(self._faults.corrupt_frames, exposure.number):
+        if self._befalls(self._faults.corrupt_frames, exposure.number) or self._chance(
+            self._faults.corrupt_probability, _CORRUPT, exposure.number
+        ):
             image = self._garbled(image, exposure.number)
         return Frame(
             camera=self._options.name,
@@ -224,12 +250,38 @@ class SimulatedCamera:
             dropped_count=self._dropped,
             exposure_s=self._settings.exposure_s,
             gain=self._settings.gain,
+            shutter_skew_s=self._options.shutter_skew_s,
         )
 
     def _rendered(self, exposure: _Exposure) -> Pixels:
-        mean = self._view.image(self._lamp.light_between(exposure.t_start_ns, exposure.t_end_ns))
+        mean = self._view.image(self._lights(exposure), ambient=self._ambient(exposure))
         electrons = self._sensor.electrons(mean, self._settings.exposure_s)
         return self._sensor.read_out(electrons, gain=self._settings.gain, rng=self._rng(_NOISE, exposure.number))
+
+    def _lights(self, exposure: _Exposure) -> Sequence[tuple[float | Float32Array, LightTable]]:
+        """Each light that an exposure saw, with its fraction: one number, or (H, 1) when each row saw its own."""
+        together = self._lamp.light_between(exposure.t_start_ns, exposure.t_end_ns)
+        if self._options.line_time_s == 0 or (len(together) == 1 and self._lamp.flicker is None):
+            return together
+        rows = self._options.size.height_px
+        lights = {id(light): light for _, light in together}
+        fractions = {key: np.zeros((rows, 1), np.float32) for key in lights}
+        for row in range(rows):
+            for fraction, light in self._lamp.light_between(*self._row_times_ns(exposure, row)):
+                fractions[id(light)][row] += np.float32(fraction)
+        return [(fractions[key], light) for key, light in lights.items()]
+
+    def _row_times_ns(self, exposure: _Exposure, row: int) -> tuple[int, int]:
+        begin_ns = exposure.t_start_ns + nanoseconds(row * self._options.line_time_s)
+        return begin_ns, begin_ns + nanoseconds(self._settings.exposure_s)
+
+    def _ambient(self, exposure: _Exposure) -> Float32Array | None:
+        """The room's light over its mean: (1, 1), or (H, 1) when each row saw its own; None if it does not flicker."""
+        if self._ambient_flicker is None:
+            return None
+        rows = self._options.size.height_px if self._options.line_time_s > 0 else 1
+        means = [self._ambient_flicker.mean(*self._row_times_ns(exposure, row)) for row in range(rows)]
+        return np.array(means, np.float32)[:, None]
 
     def _garbled(self, image: Pixels, number: int) -> Pixels:
         rng = self._rng(_GARBLE, number)
@@ -250,10 +302,16 @@ class SimulatedCamera:
         return self._is_faulty and number in frames
 
     def _is_dropped(self, number: int) -> bool:
-        chance = self._faults.drop_probability if self._is_faulty else 0.0
-        return self._befalls(self._faults.drop_frames, number) or (
-            chance > 0 and bool(self._rng(_FATE, number).random() < chance)
+        return self._befalls(self._faults.drop_frames, number) or self._chance(
+            self._faults.drop_probability, _FATE, number
         )
+
+    def _chance(self, probability: float, purpose: int, number: int) -> bool:
+        return self._is_faulty and probability > 0 and bool(self._rng(purpose, number).random() < probability)
+
+    def _jitter_s(self, purpose: int, number: int) -> float:
+        most_s = self._faults.jitter_s if self._is_faulty else 0.0
+        return float(self._rng(purpose, number).uniform(0, most_s)) if most_s else 0.0
 
     def _require_usable(self) -> None:
         if self._closed.is_set():

@@ -13,8 +13,8 @@ from simulated_rig.projector import SimulatedProjector
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import SceneSurface, read_scene, surface_of
 from simulated_rig.tables import checked
-from simulated_rig.world import Clock, MonotonicClock, VirtualClock
-from slrig.devices import Camera, Head
+from simulated_rig.world import Flicker, VirtualClock
+from slrig.devices import Camera, Clock, Head, SystemClock
 from slrig.model import Calibration, Surface, Truth
 
 
@@ -25,7 +25,7 @@ class SimulatedHead:
     """
 
     def __init__(self, options: HeadOptions, surface: SceneSurface) -> None:
-        self.clock: Clock = MonotonicClock() if options.realtime else VirtualClock()
+        self.clock: Clock = SystemClock() if options.realtime else VirtualClock()
         lens = options.projector.pinhole()
         stage = Stage(
             surface,
@@ -34,6 +34,9 @@ class SimulatedHead:
         )
         self._surface = surface
         self._projector = SimulatedProjector(options.projector, self.clock, faults=options.faults, seed=options.seed)
+        swing = None
+        if options.ambient_flicker_depth > 0:
+            swing = Flicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
         self._views = {
             camera.name: View(
                 camera.pinhole(),
@@ -55,6 +58,7 @@ class SimulatedHead:
                 self.clock,
                 faults=options.faults,
                 seed=(options.seed, index),
+                ambient_flicker=swing,
             )
             for index, camera in enumerate(options.camera)
         }

@@ -15,7 +15,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.signal import upfirdn
 from scipy.special import ndtr
 
 from simulated_rig.transport import Paths
@@ -57,12 +56,14 @@ class Response:
 class LightTable:
     """The light of one pattern: along(columns) * along(rows), NODES_PER_PX samples per projector pixel.
 
-    columns, rows : (n,) float32; node i lies at the projector coordinate i / NODES_PER_PX - margin_px.
+    columns, rows : (n,) float32; node i lies at the projector coordinate i / NODES_PER_PX - margin_px. glow : light
+    that falls on everything alike, from elsewhere.
     """
 
     columns: Float32Array
     rows: Float32Array
     margin_px: int
+    glow: float = 0.0
 
     @property
     def peak(self) -> float:
@@ -89,6 +90,16 @@ def no_light(projector: Size) -> LightTable:
         np.zeros(projector.height_px * NODES_PER_PX, np.float32),
         0,
     )
+
+
+def desktop_light(projector: Size, response: Response) -> LightTable:
+    """Return the light of a computer's desktop: a bright ground, two windows side by side, a dark bar at the foot."""
+    across, down = np.full((1, projector.width_px), 180, np.uint8), np.full((projector.height_px, 1), 255, np.uint8)
+    across[:, projector.width_px // 8 : projector.width_px // 2] = 255
+    across[:, projector.width_px // 2 : projector.width_px * 5 // 8] = 90
+    down[-max(projector.height_px // 12, 1) :] = 60
+    windows, bar = light_table(across, projector, response), light_table(down, projector, response)
+    return LightTable(windows.columns, bar.rows, windows.margin_px)
 
 
 def radiance(paths: Paths, table: LightTable, *, blur_px: float) -> Float32Array:
@@ -137,6 +148,9 @@ def _spread_of_one_pixel(blur_px: float) -> FloatArray:
 
 
 def _spread(light: FloatArray, blur_px: float) -> Float32Array:
+    # Half a second to import: whoever only lists drivers is spared it.
+    from scipy.signal import upfirdn
+
     return np.asarray(upfirdn(_spread_of_one_pixel(blur_px), light, up=NODES_PER_PX), np.float32)
 
 

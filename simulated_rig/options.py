@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -76,7 +76,8 @@ class ProjectorOptions(Device):
 
     gamma, leak, signal_blur_px : response (see `light.Response`). working_distance_mm : where a white diffuser has
     unit brightness; absent, the distance from the projector to the world's origin. latency_s : from `show` to light,
-    each time off by at most visible_error_s.
+    each time off by at most visible_error_s; then at the next refresh, if the projector has a refresh_hz.
+    flicker_hz, flicker_depth : its light swings about its mean by that fraction, as under a colour wheel.
     """
 
     gamma: Annotated[float, Field(gt=0, le=5)] = 1.0
@@ -85,6 +86,9 @@ class ProjectorOptions(Device):
     working_distance_mm: Positive | None = None
     latency_s: NotNegative = 0.02
     visible_error_s: NotNegative = 0.0005
+    refresh_hz: Positive | None = None
+    flicker_hz: Positive = 120.0
+    flicker_depth: Fraction = 0.0
     max_patterns: Annotated[int, Field(ge=1)] = 1024
 
     def response(self) -> Response:
@@ -99,6 +103,7 @@ class CameraOptions(Device):
     trigger_latency_s : from `trigger` to the exposure's start. readout_s : from its end to the delivered frame.
     period_s : between the starts of free-running exposures; absent, exposure and readout. stamp_error_s : how well
     the times of a frame are known. buffers : how many finished frames a free-running camera keeps.
+    line_time_s : a rolling shutter's: each row is exposed this much later than the row above it; 0 is a global shutter.
     """
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_-]+$")]
@@ -116,6 +121,12 @@ class CameraOptions(Device):
     period_s: Positive | None = None
     stamp_error_s: NotNegative = 0.0
     buffers: Annotated[int, Field(ge=1, le=1000)] = 4
+    line_time_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+
+    @property
+    def shutter_skew_s(self) -> float:
+        """How much later than the first row the last row is exposed."""
+        return (self.size.height_px - 1) * self.line_time_s
 
     @model_validator(mode="after")
     def _consistent(self) -> CameraOptions:
@@ -148,9 +159,13 @@ class Faults(Table):
     """What goes wrong, on demand: `[head.faults]`. Frames count from 0 for each camera, from its opening.
 
     cameras : whom it befalls; absent, all. drop_* : the frame is made and lost. late_frames : delivered late_s late.
-    stale_frames : the image of the frame before, under fresh time stamps. corrupt_frames : a third of the rows garbled.
+    stale_* : the image of the frame before, under fresh time stamps. corrupt_* : a third of the rows garbled.
+    *_probability : of each frame. jitter_s : each exposure starts, and each frame comes, up to this much later.
     unplug_camera_at_frame, unplug_projector_at_show : gone from then on. lamp_off : the projector answers and stays
-    dark. light_delay_s : light comes this much later than the projector says.
+    dark. light_delay_s : light comes this much later than the projector says. picture : how the patterns lie on the
+    projector; "rotated" is by half a turn. other_display : patterns go to another display, and the projector lights the
+    scene with a desktop; other_display_glow of white is what that display sends to the scene, as a fraction of the
+    projector's.
     """
 
     cameras: Names | None = None
@@ -159,11 +174,17 @@ class Faults(Table):
     late_frames: Counts = ()
     late_s: Positive = 1.0
     stale_frames: Counts = ()
+    stale_probability: Fraction = 0.0
     corrupt_frames: Counts = ()
+    corrupt_probability: Fraction = 0.0
+    jitter_s: NotNegative = 0.0
     unplug_camera_at_frame: Count | None = None
     unplug_projector_at_show: Count | None = None
     lamp_off: bool = False
     light_delay_s: NotNegative = 0.0
+    picture: Literal["upright", "mirrored", "upside_down", "rotated"] = "upright"
+    other_display: bool = False
+    other_display_glow: Fraction = 0.0
 
 
 class HeadOptions(Table):
@@ -171,7 +192,8 @@ class HeadOptions(Table):
 
     scene : a scene file, from the rig file's folder. seed : of all noise. realtime : run by CLOCK_MONOTONIC instead of
     as fast as possible. samples_per_axis, jitter : sub-pixel samples (see `transport.paths`). ambient : light of the
-    room, as a fraction of the projector's white at the working distance. workers : threads that trace.
+    room, as a fraction of the projector's white at the working distance; ambient_flicker_hz, ambient_flicker_depth : it
+    swings about its mean by that fraction (lamps on mains of 50 Hz flicker at 100 Hz). workers : threads that trace.
     """
 
     scene: Annotated[str, Field(min_length=1)]
@@ -180,6 +202,8 @@ class HeadOptions(Table):
     samples_per_axis: Annotated[int, Field(ge=1, le=16)] = 2
     jitter: bool = False
     ambient: NotNegative = 0.0
+    ambient_flicker_hz: Positive = 100.0
+    ambient_flicker_depth: Fraction = 0.0
     workers: Annotated[int, Field(ge=1, le=64)] = 2
     projector: ProjectorOptions
     camera: Annotated[tuple[CameraOptions, ...], Field(strict=False), AfterValidator(at_least_one)]

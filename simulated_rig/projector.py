@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 
-from simulated_rig.light import LightTable, light_table, no_light
+from simulated_rig.light import LightTable, desktop_light, light_table, no_light
 from simulated_rig.options import Faults, ProjectorOptions
-from simulated_rig.world import Clock, Lamp, nanoseconds
-from slrig.devices import ProjectorInfo, Shown
+from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
+from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -25,7 +26,8 @@ class SimulatedProjector:
         self._faults = faults
         self._response = options.response()
         self._dark = self._table(np.zeros((1, 1), np.uint8))
-        self.lamp = Lamp(self._dark)
+        swing = Flicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
+        self.lamp = Lamp(self._dark, swing)
         self._rng = np.random.default_rng((seed, 0x70726F6A))
         self._sequence: PatternSequence | None = None
         self._tables: dict[int, LightTable] = {}
@@ -44,6 +46,7 @@ class SimulatedProjector:
             size=self._options.size,
             plays=False,
             latency_s=self._options.latency_s,
+            refresh_s=None if self._options.refresh_hz is None else 1 / self._options.refresh_hz,
         )
 
     @property
@@ -96,7 +99,7 @@ class SimulatedProjector:
         if index not in self._tables:
             self._tables[index] = self._table(self._sequence.profiles[index])
         error_s = self._options.visible_error_s
-        t_visible_ns = self._clock.now_ns() + nanoseconds(self._options.latency_s)
+        t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
         off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
         self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
         self._showing = index
@@ -132,9 +135,20 @@ class SimulatedProjector:
         self._showing, self._sequence, self._tables = None, None, {}
         self._closed.set()
 
+    def _at_refresh(self, t_ns: int) -> int:
+        refresh_hz = self._options.refresh_hz
+        return t_ns if refresh_hz is None else round(-(-t_ns * refresh_hz // NS_PER_S) / refresh_hz * NS_PER_S)
+
     def _table(self, profile: np.ndarray[tuple[int, ...], np.dtype[np.unsignedinteger]]) -> LightTable:
         if self._faults.lamp_off:
             return no_light(self._options.size)
+        if self._faults.picture in ("mirrored", "rotated"):
+            profile = profile[:, ::-1]
+        if self._faults.picture in ("upside_down", "rotated"):
+            profile = profile[::-1]
+        if self._faults.other_display:
+            glow = self._faults.other_display_glow * float(self._response.light(profile).mean())
+            return replace(desktop_light(self._options.size, self._response), glow=glow)
         return light_table(profile, self._options.size, self._response)
 
     def _require_usable(self) -> None:

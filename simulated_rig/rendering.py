@@ -78,21 +78,30 @@ class View:
             )
         return self._paths
 
-    def image(self, lights: Sequence[tuple[float, LightTable]]) -> Float32Array:
+    def image(
+        self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
+    ) -> Float32Array:
         """(H, W) float32: the mean light on each pixel when each light was on for its fraction of the exposure.
 
+        A fraction is one number for the whole image, or (H, 1): one for each row. `ambient` is the room's light in
+        this exposure over its mean, (H, 1) or (1, 1); absent, the mean.
         1 is a white diffuser, at the working distance and facing the projector, under full white.
         """
         paths = self.prepare()
         total = blurred(paths.albedo * np.float32(self._ambient), self._blur_px)
+        if ambient is not None:
+            total *= ambient
         for fraction, light in lights:
-            total += np.float32(fraction) * self._under(paths, light)
+            total += np.asarray(fraction, np.float32) * self._under(paths, light)
         return total
 
     def _under(self, paths: Paths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
         if self._last is None or self._last[0] is not light:
-            self._last = (light, radiance(paths, light, blur_px=self._blur_px))
+            image = radiance(paths, light, blur_px=self._blur_px)
+            if light.glow > 0:
+                image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
+            self._last = (light, image)
         return self._last[1]
 
     def truth(self) -> CameraTruth:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import threading
-import time
 from collections import deque
-from typing import Protocol
+from dataclasses import dataclass
 
 from simulated_rig.light import LightTable
 
@@ -19,18 +19,6 @@ def nanoseconds(seconds: float) -> int:
     return round(seconds * NS_PER_S)
 
 
-class Clock(Protocol):
-    """The world's time, ns."""
-
-    def now_ns(self) -> int:
-        """The time now."""
-        ...
-
-    def wait_until(self, t_ns: int, stop: threading.Event) -> None:
-        """Return when it is `t_ns` or later, or as soon as `stop` is set."""
-        ...
-
-
 class VirtualClock:
     """Time that passes only when somebody waits: as fast as possible, and the same in every run."""
 
@@ -39,36 +27,38 @@ class VirtualClock:
         self._lock = threading.Lock()
 
     def now_ns(self) -> int:
-        """See `Clock`."""
+        """See `slrig.devices.Clock`."""
         return self._now_ns
 
     def wait_until(self, t_ns: int, stop: threading.Event) -> None:
-        """See `Clock`. Returns at once; no time passes for a device that has stopped."""
+        """See `slrig.devices.Clock`. Returns at once; no time passes for a device that has stopped."""
         if stop.is_set():
             return
         with self._lock:
             self._now_ns = max(self._now_ns, t_ns)
 
 
-class MonotonicClock:
-    """CLOCK_MONOTONIC: the rig takes as long as a real one."""
+@dataclass(frozen=True, slots=True)
+class Flicker:
+    """Light that swings about its mean, 1 + depth · sin(2π f t): the mains' in a lamp, or a colour wheel's."""
 
-    def now_ns(self) -> int:
-        """See `Clock`."""
-        return time.monotonic_ns()
+    frequency_hz: float
+    depth: float
 
-    def wait_until(self, t_ns: int, stop: threading.Event) -> None:
-        """See `Clock`."""
-        while (left_ns := t_ns - self.now_ns()) > 0:
-            if stop.wait(left_ns / NS_PER_S):
-                return
+    def mean(self, t_start_ns: int, t_end_ns: int) -> float:
+        """The mean of an interval: 1 over whole periods."""
+        middle_s, half_s = (t_start_ns + t_end_ns) / 2 / NS_PER_S, (t_end_ns - t_start_ns) / 2 / NS_PER_S
+        turn = 2 * math.pi * self.frequency_hz
+        left = math.sin(turn * half_s) / (turn * half_s) if half_s > 0 else 1.0
+        return 1 + self.depth * left * math.sin(turn * middle_s)
 
 
 class Lamp:
     """What the projector shows, and showed: a list of changes in time. Dark at first. Safe between threads."""
 
-    def __init__(self, dark: LightTable) -> None:
+    def __init__(self, dark: LightTable, flicker: Flicker | None = None) -> None:
         self._dark = dark
+        self.flicker = flicker
         self._changes: deque[tuple[int, LightTable]] = deque([(0, dark)], maxlen=_CHANGES_KEPT)
         self._lock = threading.Lock()
 
@@ -91,7 +81,10 @@ class Lamp:
         return self.light_between(t_ns, t_ns)[0][1]
 
     def light_between(self, t_start_ns: int, t_end_ns: int) -> list[tuple[float, LightTable]]:
-        """Each light shown in an interval, with the fraction of the interval that it was on; fractions sum to 1."""
+        """Each light shown in an interval, with the fraction of the interval that it was on; fractions sum to 1.
+
+        A lamp that flickers gives more or less than that.
+        """
         with self._lock:
             changes = list(self._changes)
         first = max((i for i, (at_ns, _) in enumerate(changes) if at_ns <= t_start_ns), default=0)
@@ -103,6 +96,7 @@ class Lamp:
         for i in range(first, len(changes)):
             end = min(changes[i + 1][0], t_end_ns) if i + 1 < len(changes) else t_end_ns
             if end > begin:
-                shown.append(((end - begin) / span, changes[i][1]))
+                swing = 1.0 if self.flicker is None else self.flicker.mean(begin, end)
+                shown.append(((end - begin) / span * swing, changes[i][1]))
                 begin = end
         return shown

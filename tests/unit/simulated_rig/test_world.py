@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from simulated_rig.light import LightTable
-from simulated_rig.world import Lamp, MonotonicClock, VirtualClock, nanoseconds
+from simulated_rig.world import Lamp, VirtualClock, nanoseconds
+from slrig.devices import SystemClock
 
 
 def table(level: float) -> LightTable:
@@ -36,14 +37,14 @@ def test_virtual_time_stands_still_for_a_stopped_device() -> None:
 
 
 def test_real_time_is_waited_for() -> None:
-    clock, stop = MonotonicClock(), threading.Event()
+    clock, stop = SystemClock(), threading.Event()
     until = time.monotonic_ns() + 2_000_000
     clock.wait_until(until, stop)
     assert time.monotonic_ns() >= until
 
 
 def test_real_waiting_ends_when_the_device_is_stopped() -> None:
-    clock, stop = MonotonicClock(), threading.Event()
+    clock, stop = SystemClock(), threading.Event()
     waiter = threading.Thread(target=clock.wait_until, args=(time.monotonic_ns() + nanoseconds(600), stop))
     waiter.start()
     stop.set()
