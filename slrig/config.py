@@ -16,17 +16,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
 from slrig.bundle.description import CameraName
 from slrig.bundle.faults import Strict, explain, keys_of, read_text
 from slrig.errors import ConfigError
-from slrig.model import FlipRule
+from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, FlipRule, bracket_fault
 
 MOST_CONFIG_BYTES = 2**20
 
+
+def _a_bracket(exposures_s: tuple[float, ...]) -> tuple[float, ...]:
+    fault = bracket_fault(exposures_s)
+    if fault is not None:
+        raise ValueError(fault)
+    return exposures_s
+
+
 ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
+BracketSeconds = Annotated[
+    tuple[ExposureSeconds, ...],
+    # A list in TOML and in JSON. Its length is checked with the rest, or one wrong time would be told as two faults.
+    Field(strict=False, json_schema_extra={"minItems": FEWEST_EXPOSURES, "maxItems": MOST_EXPOSURES}),
+    AfterValidator(_a_bracket),
+]
+LineSeconds = Annotated[float, Field(ge=0, le=0.1)]
 Gain = Annotated[float, Field(gt=0, le=1000)]
 DriverName = Annotated[str, Field(min_length=1)]
 
@@ -46,6 +61,11 @@ class ScanDefaults(Strict):
     flip_rule: Annotated[FlipRule, Field(strict=False)] | None = None
     smooth_boundary: bool | None = None
     exposure_s: ExposureSeconds | None = None
+    exposures_s: BracketSeconds | None = Field(
+        default=None,
+        description="a bracket: play the sequence once for each of these exposures, and fuse the frames. On a video "
+        "projector, whole refresh periods",
+    )
 
 
 class DriverTable(Strict):
@@ -76,6 +96,14 @@ class CameraTable(DriverTable):
     gain: Gain = 1.0
 
 
+class SynchronisationTable(Strict):
+    """What `slrig latency` measured: how much later than stated light comes, and the line time of rolling shutters."""
+
+    latency_s: Annotated[float, Field(ge=-10, le=10)]
+    latency_error_s: Annotated[float, Field(ge=0, le=10)]
+    line_time_s: Annotated[dict[CameraName, LineSeconds], Field(default_factory=dict)]
+
+
 class RigTable(Strict):
     """A rig file: either `[head]`, or `[projector]` and one `[[camera]]` or more."""
 
@@ -84,6 +112,7 @@ class RigTable(Strict):
     head: HeadTable | None = None
     projector: DriverTable | None = None
     camera: Annotated[list[CameraTable], Field(default_factory=list)]
+    synchronisation: SynchronisationTable | None = None
     scan: ScanDefaults = ScanDefaults()
 
     @model_validator(mode="after")
@@ -99,6 +128,14 @@ class RigTable(Strict):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             message = f"expected each camera to have a name of its own, found {', '.join(twice)} twice; rename one"
+            raise ValueError(message)
+        timed = set() if self.synchronisation is None else set(self.synchronisation.line_time_s)
+        unknown = sorted(timed - set(names)) if names else []
+        if unknown:
+            message = (
+                f"expected synchronisation.line_time_s to name cameras of this rig ({', '.join(names)}), found "
+                f"{', '.join(unknown)}; correct or remove it"
+            )
             raise ValueError(message)
         return self
 
@@ -117,6 +154,7 @@ class RigConfig:
     projector: DriverTable | None
     cameras: tuple[CameraTable, ...]
     scan: ScanDefaults
+    synchronisation: SynchronisationTable | None = None
 
 
 def read_rig(path: Path) -> RigConfig:
@@ -142,6 +180,7 @@ def read_rig(path: Path) -> RigConfig:
         projector=table.projector,
         cameras=tuple(table.camera),
         scan=table.scan,
+        synchronisation=table.synchronisation,
     )
 
 

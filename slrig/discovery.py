@@ -20,8 +20,27 @@ from pydantic import ValidationError
 from slrig.bundle.calibration_file import check_calibration, read_calibration
 from slrig.bundle.faults import explain
 from slrig.config import DriverTable, RigConfig
-from slrig.devices import Camera, CameraInfo, CameraSettings, FoundDevice, Head, Projector, Rig
-from slrig.errors import ConfigError, DriverBrokenError, DriverNotFoundError, SlrigError
+from slrig.devices import (
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    Clock,
+    FoundDevice,
+    Head,
+    KeepsTime,
+    Projector,
+    Rig,
+    Synchronisation,
+    SystemClock,
+)
+from slrig.errors import (
+    ConfigError,
+    DeviceError,
+    DriverBrokenError,
+    DriverNotFoundError,
+    LibraryMissingError,
+    SlrigError,
+)
 from slrig.model import Calibration
 
 GROUPS: Mapping[str, str] = {
@@ -47,10 +66,20 @@ class InstalledDriver:
 
 
 @dataclass(frozen=True, slots=True)
+class MissingLibrary:
+    """A driver that cannot look for its devices until the command `install` has been run."""
+
+    driver: str
+    install: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
-    """What the finders found, and the finders that failed."""
+    """What the finders found, the libraries that some of them lack, and the finders that failed otherwise."""
 
     devices: tuple[FoundDevice, ...]
+    missing: tuple[MissingLibrary, ...]
     faults: tuple[DriverBrokenError, ...]
 
 
@@ -72,18 +101,21 @@ def installed_drivers() -> tuple[InstalledDriver, ...]:
 def found_devices() -> Findings:
     """Ask every installed finder for the devices that are plugged in; one that fails does not hide the others."""
     devices: list[FoundDevice] = []
+    missing: list[MissingLibrary] = []
     faults: list[DriverBrokenError] = []
     for entry in sorted(importlib.metadata.entry_points(group=GROUPS["finder"]), key=lambda entry: entry.name):
         try:
             finder = _load("finder", entry)
             with _told("finder", entry.name, {}):
-                devices.extend(finder())
+                devices.extend(_devices(entry.name, finder()))
+        except LibraryMissingError as error:
+            missing.append(MissingLibrary(entry.name, error.install, str(error)))
         except DriverBrokenError as error:
             faults.append(error)
         except SlrigError as error:
             message = f"finder '{entry.name}' failed: {error}"
             faults.append(DriverBrokenError(message))
-    return Findings(tuple(devices), tuple(faults))
+    return Findings(tuple(devices), tuple(missing), tuple(faults))
 
 
 def open_rig(config: RigConfig) -> Rig:
@@ -129,7 +161,16 @@ def open_rig(config: RigConfig) -> Rig:
             for name, camera in cameras.items()
         }
         calibration = _calibration(config, head, projector, cameras)
-        rig = Rig(config.name, cameras, projector, settings, calibration, head)
+        rig = Rig(
+            config.name,
+            cameras,
+            projector,
+            settings,
+            calibration,
+            head,
+            _synchronisation(config, cameras),
+            _clock(head),
+        )
         opened.pop_all()
         return rig
 
@@ -140,6 +181,24 @@ def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) ->
             return exposure_s
     least_s, most_s = camera.exposure_range_s
     return min(max(USUAL_EXPOSURE_S, least_s), most_s)
+
+
+def _clock(head: object) -> Clock:
+    return head.clock if isinstance(head, KeepsTime) else SystemClock()
+
+
+def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchronisation | None:
+    table = config.synchronisation
+    if table is None:
+        return None
+    unknown = sorted(set(table.line_time_s) - set(cameras))
+    if unknown:
+        message = (
+            f"rig '{config.name}': synchronisation.line_time_s names {', '.join(unknown)}, the rig's cameras are "
+            f"{', '.join(sorted(cameras))}; correct it, or measure again: slrig latency"
+        )
+        raise ConfigError(message)
+    return Synchronisation(table.latency_s, table.latency_error_s, dict(table.line_time_s))
 
 
 def _calibration(
@@ -184,7 +243,7 @@ def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *nam
         message = f"{kind} driver '{table.driver}' is provided by several packages: {packages}; uninstall all but one"
         raise DriverBrokenError(message)
     factory = _load(kind, entries[0])
-    with _told(kind, table.driver, table.options):
+    with _told(kind, table.driver, table.options), _refusals(kind, table.driver):
         device = factory(*name, table.options, folder)
         if not isinstance(device, protocol):
             message = (
@@ -198,7 +257,7 @@ def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]
     package, version = _package(entry)
     try:
         factory = entry.load()
-    except Exception as cause:
+    except (Exception, SystemExit) as cause:  # a package must not end the service, whatever it does at import
         message = (
             f"{kind} driver '{entry.name}' of {package} {version} cannot be loaded ({entry.value}): "
             f"{type(cause).__name__}: {cause}; install what it needs or uninstall it"
@@ -214,6 +273,19 @@ def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]
 
 
 @contextmanager
+def _refusals(kind: str, name: str) -> Iterator[None]:
+    """Tell what the operating system refuses while a device is opened as a fault of the device, not of its driver."""
+    try:
+        yield
+    except OSError as cause:
+        message = (
+            f"{kind} driver '{name}' failed to open its device: {cause}; check cable, power and permissions, and that "
+            "no other program holds it"
+        )
+        raise DeviceError(message) from cause
+
+
+@contextmanager
 def _told(kind: str, name: str, options: Mapping[str, object]) -> Iterator[None]:
     """Give what a driver's factory raises a name and a kind."""
     try:
@@ -223,9 +295,20 @@ def _told(kind: str, name: str, options: Mapping[str, object]) -> Iterator[None]
     except ValidationError as cause:
         message = f"{kind} driver '{name}' does not take these options:\n{explain(cause, options, ())}"
         raise ConfigError(message) from cause
-    except Exception as cause:
+    except (Exception, SystemExit) as cause:
         message = f"{kind} driver '{name}' failed: {type(cause).__name__}: {cause}; report it to the driver's package"
         raise DriverBrokenError(message) from cause
+
+
+def _devices(name: str, found: Any) -> tuple[FoundDevice, ...]:
+    devices = tuple(found)
+    strange = sorted({type(each).__name__ for each in devices if not isinstance(each, FoundDevice)})
+    if strange:
+        message = (
+            f"finder '{name}' returned {', '.join(strange)}, which is no FoundDevice; report it to the driver's package"
+        )
+        raise DriverBrokenError(message)
+    return devices
 
 
 def _package(entry: importlib.metadata.EntryPoint) -> tuple[str, str]:

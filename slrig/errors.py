@@ -49,6 +49,10 @@ class DeviceGoneError(DeviceError):
     """The device was there and is not any more: unplugged, powered off. Reopening is the only way on."""
 
 
+class DeviceBusyError(DeviceError):
+    """Another program holds the device. Name the device, and the other program where the system tells it."""
+
+
 class DeviceStateError(DeviceError):
     """The call came in the wrong state: show before load, trigger before arm, anything after close.
     This is a fault of the caller, not of the device.
@@ -71,6 +75,16 @@ class DriverBrokenError(DeviceError):
     """A driver is installed and cannot be loaded. Name the package and the cause; other drivers keep working."""
 
 
+class LibraryMissingError(DriverBrokenError):
+    """A driver is installed and the library that it drives its devices with is not. Name the command that installs it:
+    `install` is that command alone.
+    """
+
+    def __init__(self, message: str, *, install: str) -> None:
+        super().__init__(message)
+        self.install = install
+
+
 class RigBusyError(SlrigError):
     """The rig is held by another piece of work. Name the holder and since when."""
 
@@ -86,6 +100,10 @@ class QueueFullError(SlrigError):
 
 class ScanCancelledError(SlrigError):
     """Somebody asked for this scan to stop. Not a failure."""
+
+
+class CameraNotFoundError(SlrigError):
+    """The rig has no camera of this name. Name those that it has."""
 
 
 class ScanNotFoundError(SlrigError):

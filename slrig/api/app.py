@@ -11,7 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from slrig.api import artefacts, events, rig, scans, system
+from slrig.api import artefacts, events, preview, rig, scans, system
 from slrig.api.events import OpenStreams
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
@@ -34,7 +34,7 @@ def bare_app() -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         lifespan=_life,
     )
-    for part in (scans, events, artefacts, rig, system):
+    for part in (scans, events, artefacts, rig, preview, system):
         app.include_router(part.router)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)

@@ -21,6 +21,9 @@ from slrig.scan.faults import ScanFault
 from slrig.scan.records import ScanEvent
 from slrig.scan.store import ScanStore
 
+_LAST_WORD_S = 2.0
+"""How much longer than its scan an event stream may live when the service ends."""
+
 router = APIRouter(prefix="/scan", tags=["scan"])
 
 _STREAM: dict[int | str, dict[str, Any]] = {
@@ -72,7 +75,11 @@ async def follow_scan(
         return Response(status_code=204)
     streams.require_room()
     return EventSourceResponse(
-        _told(service.store, scan_id, last_event_id, streams), ping=service.settings.keepalive_s, sep="\n"
+        _told(service.store, scan_id, last_event_id, streams),
+        ping=service.settings.keepalive_s,
+        sep="\n",
+        # At the end of the service every scan ends, and its stream by that; without this the stream would end first.
+        shutdown_grace_period=service.settings.shutdown_s + _LAST_WORD_S,
     )
 
 

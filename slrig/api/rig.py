@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from fastapi import APIRouter
 
-from slrig.api.schemas import CameraBody, DeviceBody, DeviceList, DriverBody, ProjectorBody, RigBody
+from slrig.api.schemas import CameraBody, DeviceBody, DeviceList, DriverBody, MissingLibraryBody, ProjectorBody, RigBody
 from slrig.api.service import Serving
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.discovery import found_devices, installed_drivers
@@ -37,7 +37,7 @@ def look_at_rig(service: Serving) -> RigBody:
 
 @router.get("/device")
 def list_devices() -> DeviceList:
-    """Return the drivers that are installed and the devices that are plugged in."""
+    """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing."""
     found = found_devices()
     return DeviceList(
         drivers=[
@@ -51,6 +51,7 @@ def list_devices() -> DeviceList:
             for driver in installed_drivers()
         ],
         devices=[DeviceBody(**asdict(device)) for device in found.devices],
+        missing=[MissingLibraryBody(**asdict(library)) for library in found.missing],
         faults=[str(fault) for fault in found.faults],
     )
 

@@ -8,10 +8,10 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict, Field, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from slrig.api.problems import fault_problem
-from slrig.config import ScanDefaults
+from slrig.config import BracketSeconds, ScanDefaults
 from slrig.model import FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
@@ -76,23 +76,42 @@ class ScanRequest(_Strict):
     exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = Field(
         default=None, description="exposure time of every camera, seconds. Default: as the rig file says per camera"
     )
+    exposures_s: BracketSeconds | None = Field(
+        default=None,
+        description="a bracket, for what is dark here and shines there: the sequence is played once for each of these "
+        "exposure times of every camera, seconds, and the frames are fused. Two to six in place of exposure_s; on a "
+        "video projector, whole refresh periods. Default: as the rig file says",
+    )
     if_busy: Literal["reject", "queue"] = Field(
         default="reject", description="what to do while the rig is held: answer 409, or wait in line"
     )
+
+    @field_validator("exposures_s")
+    @classmethod
+    def _alone(cls, exposures_s: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+        if exposures_s is not None and info.data.get("exposure_s") is not None:
+            message = "expected exposure_s or exposures_s, found both; keep exposures_s for a bracket"
+            raise ValueError(message)
+        return exposures_s
 
 
 def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
     """The plan that a request means on a rig with these defaults.
 
-    The rig file's exposure is no part of it: it is among the settings that each camera was opened with.
+    The rig file's exposure is no part of it: it is among the settings that each camera was opened with. Its bracket is,
+    unless the request asks for one exposure.
 
     >>> scan_plan(ScanRequest(), ScanDefaults(line_shift_period_px=12)).patterns.line_shift_period_px
     12
+    >>> scan_plan(ScanRequest(exposure_s=0.02), ScanDefaults(exposures_s=(0.01, 0.04))).exposures_s is None
+    True
     """
+    usual = defaults.exposures_s if request.exposure_s is None else None
     return ScanPlan(
         patterns=PatternPlan(**_chosen(PatternPlan, request.patterns, defaults)),
         reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, defaults)),
         exposure_s=request.exposure_s,
+        exposures_s=request.exposures_s if request.exposures_s is not None else usual,
     )
 
 
@@ -232,11 +251,20 @@ class DeviceBody(BaseModel):
     label: str
 
 
+class MissingLibraryBody(BaseModel):
+    """A driver that lacks the library of its devices."""
+
+    driver: str
+    install: str = Field(description="the command that installs it")
+    message: str
+
+
 class DeviceList(BaseModel):
-    """What is installed and what is plugged in."""
+    """What is installed, what is plugged in, and what is missing."""
 
     drivers: list[DriverBody]
     devices: list[DeviceBody]
+    missing: list[MissingLibraryBody]
     faults: list[str]
 
 

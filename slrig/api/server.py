@@ -11,9 +11,11 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 
 import structlog
 import uvicorn
+from starlette.concurrency import run_in_threadpool
 
 from slrig.api.app import create_app
 from slrig.api.security import KEY_VARIABLE, claim_key
@@ -140,10 +142,10 @@ def serve(
             log_level="warning",
             access_log=False,
             server_header=False,
-            # sse-starlette ends event streams by itself; this is for every other request under way.
+            # Streams end by themselves once their scans have; this is for every other request under way.
             timeout_graceful_shutdown=1,
         )
-        server = uvicorn.Server(config)
+        server = _Server(config, service.runner, settings.shutdown_s)
         with suppress(KeyboardInterrupt):
             server.run(sockets=[listener])
         if wrong:
@@ -152,6 +154,20 @@ def serve(
         service.close()
         with suppress(OSError):
             address.unlink(missing_ok=True)
+
+
+class _Server(uvicorn.Server):
+    """Ends the scans first, while everybody who follows one can still be told, and the connections after that."""
+
+    def __init__(self, config: uvicorn.Config, runner: Runner, patience_s: float) -> None:
+        super().__init__(config)
+        self._runner = runner
+        self._patience_s = patience_s
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """See `uvicorn.Server`."""
+        await run_in_threadpool(partial(self._runner.close, timeout_s=self._patience_s))
+        await super().shutdown(sockets)
 
 
 def _stop_at_eof() -> None:
@@ -179,6 +195,18 @@ def _listener(settings: ServiceSettings) -> socket.socket:
     return listener
 
 
+class _Log(structlog.PrintLogger):
+    """A log that never fails whoever writes it: a full disk, a reader that is gone. The line is lost, not the work."""
+
+    def msg(self, message: str) -> None:
+        """Print a line if it can be printed."""
+        with suppress(OSError):
+            super().msg(message)
+
+    log = debug = info = warn = warning = msg
+    fatal = failure = err = error = critical = exception = msg
+
+
 def _set_up_logs(level: str) -> None:
     on_terminal = sys.stderr.isatty()
     renderer: structlog.typing.Processor = (
@@ -196,7 +224,7 @@ def _set_up_logs(level: str) -> None:
             renderer,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=lambda *_: _Log(sys.stderr),
         cache_logger_on_first_use=False,
     )
 

@@ -8,7 +8,8 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,16 +19,26 @@ import cv2
 from slrig.bundle.calibration_file import write_calibration
 from slrig.bundle.description import CAMERA_NAME, DESCRIPTION
 from slrig.bundle.reading import CALIBRATION
+from slrig.bundle.refused import FOLDER, LIST, Refused, RefusedEntry, RefusedList
 from slrig.bundle.storage import refusals_of, staging_name, sync_folder, write_durably
-from slrig.errors import BundleError
+from slrig.errors import BundleError, CalibrationError, StorageError
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Pixels, Shot, Size
+
+
+@dataclass(slots=True)
+class _Place:
+    """Where a frame is listed; `vacant` from its refusal until another frame takes its place."""
+
+    frame: dict[str, Any]
+    vacant: bool = False
 
 
 class BundleWriter:
     """Writes a scan bundle while the frames arrive. A context manager.
 
     The bundle grows in a hidden folder beside `folder`, which is renamed into place when the block ends well. Any
-    error, in the block or on the disk, removes it: the folder is whole or absent.
+    error, in the block or on the disk, removes it: the folder is whole or absent. Only `keep` leaves a bundle of a
+    capture that was cut short, and says so in it.
 
     Raises
     ------
@@ -59,8 +70,10 @@ class BundleWriter:
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
         self._calibration = calibration
-        self._frames: list[dict[str, Any]] = []
+        self._places: list[_Place] = []
+        self._refused: list[RefusedEntry] = []
         self._count: Counter[str] = Counter()
+        self._ended: str | None = None
 
     def __enter__(self) -> Self:
         if self.folder.exists():
@@ -79,7 +92,7 @@ class BundleWriter:
         return self
 
     def add(self, shot: Shot) -> None:
-        """Write one frame to disk now.
+        """Write one frame to disk now. One that takes the place of a refused frame is listed where that was.
 
         Raises
         ------
@@ -93,12 +106,42 @@ class BundleWriter:
         with refusals_of(self._staging / file):
             write_durably(self._staging / file, _png(shot.image, file))
         self._count[shot.camera] += 1
-        frame: dict[str, Any] = {"pattern": shot.pattern, "camera": shot.camera, "file": file}
-        if shot.exposure_s is not None:
-            frame["exposure_s"] = float(shot.exposure_s)
-        if shot.time_s is not None:
-            frame["time_s"] = float(shot.time_s)
-        self._frames.append(frame)
+        frame = {"pattern": shot.pattern, "camera": shot.camera, "file": file, **_times(shot)}
+        place = self._latest(shot.pattern, shot.camera, vacant=True)
+        if place is None:
+            self._places.append(_Place(frame))
+        else:
+            place.frame, place.vacant = frame, False
+
+    def refuse(self, refused: Refused) -> None:
+        """Keep a refused frame apart: the one given, or the one that was added before, taken back.
+
+        Raises
+        ------
+        StorageError
+            The disk refused.
+        """
+        file = f"{FOLDER}/{len(self._refused):03d}.png"
+        entry: dict[str, Any] = {"pattern": refused.pattern, "camera": refused.camera, "attempt": refused.attempt}
+        with refusals_of(self._staging / FOLDER):
+            (self._staging / FOLDER).mkdir(exist_ok=True)
+            place = self._latest(refused.pattern, refused.camera, vacant=not refused.delivered)
+            if refused.shot is not None:
+                write_durably(self._staging / file, _png(refused.shot.image, file))
+                entry |= {"file": file, **_times(refused.shot)}
+            elif refused.delivered and place is not None:
+                (self._staging / place.frame["file"]).rename(self._staging / file)
+                entry |= {**place.frame, "file": file}
+        if place is None:
+            # Frames stay in the order of their patterns, however often one is shot.
+            place = _Place({"pattern": refused.pattern, "camera": refused.camera})
+            self._places.append(place)
+        place.vacant = True
+        self._refused.append(RefusedEntry.model_validate({**entry, "cause": refused.cause}))
+
+    def keep(self, ended: str) -> None:
+        """Have what was written stay although the block will end with an error; `ended` says which."""
+        self._ended = ended
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -106,11 +149,16 @@ class BundleWriter:
         try:
             if error is None:
                 self._commit()
+            elif self._ended is not None and (self._places or self._refused):
+                # What ended the capture is the error to tell, not what its remains meet.
+                with suppress(BundleError, CalibrationError, StorageError):
+                    self._commit()
         finally:
             self._discard()
 
     def _commit(self) -> None:
-        if not self._frames:
+        frames = [place.frame for place in self._places if not place.vacant]
+        if not frames and self._ended is None:
             message = f"{self.folder}: expected frames, found none; a bundle holds at least one frame"
             raise BundleError(message)
         data = {
@@ -122,19 +170,35 @@ class BundleWriter:
                 for name, camera in self._cameras.items()
             },
             "patterns": [_pattern(pattern) for pattern in self._patterns],
-            "frames": self._frames,
+            "frames": frames,
         }
         if self._calibration is not None:
             write_calibration(self._staging / CALIBRATION, self._calibration)
         with refusals_of(self.folder):
-            text = json.dumps(data, indent=1, allow_nan=False) + "\n"
-            write_durably(self._staging / DESCRIPTION, text.encode())
+            if frames:
+                # Without a frame it would be no bundle; what was refused is kept all the same.
+                write_durably(self._staging / DESCRIPTION, _json(data))
+            self._write_refused()
             for name in self._cameras:
                 sync_folder(self._staging / "frames" / name)
             sync_folder(self._staging / "frames")
             sync_folder(self._staging)
             self._staging.rename(self.folder)
             sync_folder(self.folder.parent)
+
+    def _latest(self, pattern: int, camera: str, *, vacant: bool) -> _Place | None:
+        """The last place of one pattern and camera that is vacant, or that is not."""
+        wanted = (pattern, camera, vacant)
+        mine = (p for p in reversed(self._places) if (p.frame["pattern"], p.frame["camera"], p.vacant) == wanted)
+        return next(mine, None)
+
+    def _write_refused(self) -> None:
+        if self._refused or self._ended is not None:
+            folder = self._staging / FOLDER
+            folder.mkdir(exist_ok=True)
+            listed = RefusedList(ended=self._ended, frames=self._refused)
+            write_durably(folder / LIST, _json(listed.model_dump(exclude_none=True)))
+            sync_folder(folder)
 
     def _discard(self) -> None:
         shutil.rmtree(self._staging, ignore_errors=True)
@@ -182,6 +246,15 @@ def _png(image: Pixels, file: str) -> bytes:
         message = f"{file}: expected an image that PNG can hold, found {image.shape} {image.dtype}"
         raise BundleError(message)
     return bytes(data)
+
+
+def _json(data: Mapping[str, Any]) -> bytes:
+    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()
+
+
+def _times(shot: Shot) -> dict[str, float]:
+    times = {"exposure_s": shot.exposure_s, "time_s": shot.time_s}
+    return {key: float(value) for key, value in times.items() if value is not None}
 
 
 def _extent(size: Size) -> list[int]:

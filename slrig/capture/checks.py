@@ -61,7 +61,7 @@ class Reference:
         return np.asarray((frame - self.black)[self.judged] / self.contrast[self.judged])
 
 
-def lighting(white: Samples, black: Samples, *, full_scale: int) -> Lighting | str:
+def lighting(white: Samples, black: Samples, *, full_scale: int, row: NDArray[np.intp]) -> Lighting | str:
     """Compare white with black: what the projector lights, or what is wrong and what to do about it."""
     contrast = white - black
     high, low = float(np.percentile(contrast, 99.5)), -float(np.percentile(contrast, 0.5))
@@ -78,6 +78,12 @@ def lighting(white: Samples, black: Samples, *, full_scale: int) -> Lighting | s
         return (
             f"white is darker than black ({levels}): the projector shows its patterns inverted, or later than it "
             "says; set its input to normal polarity, check its latency, and scan again"
+        )
+    darker = _darker(contrast, high, row)
+    if darker is not None:
+        return (
+            f"white is darker than black on {darker}: one of the two frames was damaged in transfer, or the room's "
+            "light changed; check the cable and the light, and scan again"
         )
     threshold = max(2.0, 0.1 * high, 4 * noise)
     lit = contrast >= threshold
@@ -107,9 +113,22 @@ def reference(
     lit = contrast >= threshold_dn
     usable = lit & (white < full_scale)
     judged = usable & (contrast >= np.median(contrast[usable]))
-    edges = np.quantile(row, np.arange(1, BANDS) / BANDS)
-    band = np.searchsorted(edges, row, side="right")
-    return Reference(white, black, np.maximum(contrast, np.float32(1)), lit, judged, row, band)
+    return Reference(white, black, np.maximum(contrast, np.float32(1)), lit, judged, row, _bands(row))
+
+
+def _bands(row: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Bands of equally many samples."""
+    return np.searchsorted(np.quantile(row, np.arange(1, BANDS) / BANDS), row, side="right")
+
+
+def _darker(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None:
+    """Words for a band in which white − black is far below zero, which no light can do."""
+    band = _bands(row)
+    # Noise by the middle band: damage is not everywhere.
+    lower = [float(np.percentile(contrast[band == b], 2.0)) for b in range(BANDS) if (band == b).any()]
+    noise = max(0.0, -float(np.median(lower)) / 2.05)
+    wrong = contrast < -max(3.0, 0.25 * high, 6 * noise)
+    return _worst(wrong, band, row, whole=0.05, quarter=0.1, of="pixels")
 
 
 def noise_dn(bit: Samples, inverse: Samples, ref: Reference) -> float:
@@ -129,7 +148,7 @@ def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str |
     u = ref.relative(frame)
     slack = np.maximum(0.3, 6 * noise / ref.contrast[ref.judged]) if noise is not None else np.float32(0.6)
     outside = (u < -slack) | (u > 1 + slack)
-    worst = _worst(outside, ref, whole=0.05)
+    worst = _worst_judged(outside, ref, whole=0.05)
     if worst is None:
         return None
     return (
@@ -147,7 +166,7 @@ def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float) 
     excess = ref.relative(bit) + ref.relative(inverse) - 1
     slack = np.clip(8 * max(noise, noise_dn(bit, inverse, ref)) / ref.contrast[ref.judged], 0.2, 0.5)
     wrong = (excess < -slack) | (excess > 0.8)
-    worst = _worst(wrong, ref, whole=0.1)
+    worst = _worst_judged(wrong, ref, whole=0.1)
     if worst is None:
         return None
     apart = float(np.median(np.abs((bit - inverse)[ref.judged]) / ref.contrast[ref.judged]))
@@ -220,17 +239,61 @@ def drift_fault(seen: Drift) -> str | None:
     return None
 
 
-def _worst(wrong: Chosen, ref: Reference, *, whole: float) -> str | None:
-    """Words for the share of wrong pixels: None below `whole` of the image and below a quarter of every band."""
+def changed_fault(
+    first: Samples,
+    again: Samples,
+    brighter: tuple[Samples, Samples],
+    *,
+    threshold_dn: float,
+    noise: float | None,
+    row: NDArray[np.intp],
+) -> str | None:
+    """Compare two white or two black frames wherever either of them says that the projector lights.
+
+    The pixels that all other tests ask were chosen by the first two frames, and damage may have chosen them.
+
+    brighter : white − black, with the first and with the second of the two frames, at pixels of the whole image.
+    """
+    contrast = np.maximum(*brighter)
+    lit = contrast >= threshold_dn
+    if np.count_nonzero(lit) < BAND_SAMPLES:
+        return None
+    change = np.abs(again - first)[lit]
+    if noise is None:
+        noise = max(NOISE_FLOOR_DN, 1.4826 * float(np.median(change)) / 2**0.5)
+    wrong = change > np.maximum(0.3 * contrast[lit], 8 * noise)
+    where = _worst(wrong, _bands(row[lit]), row[lit], whole=0.05)
+    if where is None:
+        return None
+    return (
+        f"{where} changed since this pattern was first shown: the object, the projector or a camera moved, or one of "
+        "the two frames was damaged or shows another pattern; hold them still, check the cable, and scan again"
+    )
+
+
+def _worst_judged(wrong: Chosen, ref: Reference, *, whole: float) -> str | None:
+    return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole)
+
+
+def _worst(
+    wrong: Chosen,
+    band: NDArray[np.intp],
+    row: NDArray[np.intp],
+    *,
+    whole: float,
+    quarter: float = 0.25,
+    of: str = "lit pixels",
+) -> str | None:
+    """Words for the share of wrong pixels: None below `whole` of the image and below `quarter` of every band."""
     total = float(np.mean(wrong))
     if total > whole:
-        return f"{total:.0%} of the lit pixels"
-    band = ref.band[ref.judged]
+        return f"{total:.0%} of the {of}"
     counts = np.bincount(band, minlength=BANDS)
     shares = np.bincount(band, weights=wrong, minlength=BANDS) / np.maximum(counts, 1)
     shares[counts < BAND_SAMPLES // 4] = 0.0
     top = int(np.argmax(shares))
-    return f"{shares[top]:.0%} of the lit pixels in {rows_of(ref, top)}" if shares[top] > 0.25 else None
+    inside = row[band == top]
+    return f"{shares[top]:.0%} of the {of} in {_rows(inside)}" if shares[top] > quarter else None
 
 
 def _contrast(ref: Reference) -> str:
@@ -242,5 +305,8 @@ def _contrast(ref: Reference) -> str:
 
 def rows_of(ref: Reference, band: int) -> str:
     """Words for where a band lies."""
-    rows = ref.row[ref.band == band]
-    return f"rows {rows.min()} to {rows.max()}"
+    return _rows(ref.row[ref.band == band])
+
+
+def _rows(row: NDArray[np.intp]) -> str:
+    return f"rows {row.min()} to {row.max()}"

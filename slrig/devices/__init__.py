@@ -1,19 +1,24 @@
 """What slrig asks of a camera, a projector and a rig: protocols and the values they exchange."""
 
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
+from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.projector import Projector, ProjectorInfo, Shown
-from slrig.devices.rig import FoundDevice, Head, Rig
+from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
 __all__ = [
     "AppliedSettings",
     "Camera",
     "CameraInfo",
     "CameraSettings",
+    "Clock",
     "FoundDevice",
     "Head",
+    "KeepsTime",
     "Projector",
     "ProjectorInfo",
     "Rig",
     "Shown",
+    "Synchronisation",
+    "SystemClock",
     "Trigger",
 ]

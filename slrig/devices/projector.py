@@ -13,7 +13,8 @@ class ProjectorInfo:
     """Declared data about a projector.
 
     `plays` says whether it can step through a loaded sequence by itself, triggering the cameras by wire.
-    `latency_s` is the typical time from `show` to light.
+    `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
+    is steady over whole ones only; None where exposures may have any length.
     """
 
     name: str
@@ -22,6 +23,7 @@ class ProjectorInfo:
     size: Size
     plays: bool
     latency_s: float
+    refresh_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
 from slrig.devices.camera import Camera, CameraSettings
+from slrig.devices.clock import Clock, SystemClock
 from slrig.devices.projector import Projector
 from slrig.model import Calibration, Truth
 
@@ -46,8 +47,26 @@ class FoundDevice:
 
 
 @dataclass(frozen=True, slots=True)
+class Synchronisation:
+    """What a flash test found of a rig's timing, as its rig file keeps it.
+
+    latency_s : from the instant that the projector states to the change of light, on average, as the cameras' time
+    stamps see it; it holds what either of them states wrongly, and may be negative. latency_error_s : how much later
+    than that a change may be, beyond the error that the projector states itself. line_time_s : of each camera with a
+    rolling shutter, from one row's exposure to the next row's; 0 or absent is a global shutter.
+    """
+
+    latency_s: float
+    latency_error_s: float
+    line_time_s: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Rig:
-    """Open devices, with what is known about them. A context manager: leaving it darkens and closes everything."""
+    """Open devices, with what is known about them. A context manager: leaving it darkens and closes everything.
+
+    `synchronisation` is None where latency was not measured. All time stamps count in `clock`.
+    """
 
     name: str
     cameras: Mapping[str, Camera]
@@ -55,6 +74,8 @@ class Rig:
     settings: Mapping[str, CameraSettings]
     calibration: Calibration | None = None
     head: Head | None = field(default=None)
+    synchronisation: Synchronisation | None = None
+    clock: Clock = field(default_factory=SystemClock)
 
     def truth(self) -> Truth | None:
         """What a rendered rig knows of its scene; None on metal."""

@@ -9,14 +9,22 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import structlog
+
 from slrig.bundle import BundleWriter, write_truth
-from slrig.capture.evidence import Evidence
-from slrig.capture.sequencer import capture
+from slrig.bundle.refused import FOLDER
+from slrig.capture.exposure import whole_refreshes_s
+from slrig.capture.session import SETTINGS_TOLERANCE
 from slrig.devices import Rig
+from slrig.errors import FrameTimeoutError, ScanEvidenceError
+from slrig.scan.exposing import Exposing
 from slrig.scan.feed import FrameSink
 from slrig.scan.holding import pattern_sequence
 from slrig.scan.outline import Outline
 from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.recording import Recorder
+
+_log = structlog.get_logger(__name__)
 
 
 def capture_bundle(
@@ -30,37 +38,79 @@ def capture_bundle(
 ) -> None:
     """Play the plan's patterns on the rig and record a bundle in `folder`, which must not exist.
 
-    `frames` is shown each frame that has passed its test, before it is written.
+    `frames` is shown each frame that has passed its test, and once more the frames that took another one's place.
 
     Raises
     ------
+    ScanEvidenceError, FrameTimeoutError
+        Frames contradict their patterns, or do not come, however often they are shot. What there is of them is kept
+        for whoever looks for the cause: `folder` holds the frames that counted, and in `refused` those that did not.
     PatternError
         The plan does not fit the projector.
-    DeviceError, ScanEvidenceError
-        The rig failed, or the frames contradict the patterns.
+    DeviceError
+        The rig failed.
     ScanCancelledError
         `cancelled()` became true.
     StorageError
-        The disk refused. In every case nothing is left in `folder` and the projector is dark.
+        The disk refused. In these cases nothing is left in `folder`. In every case the projector is dark.
     """
     sequence = pattern_sequence(plan.patterns, rig.projector.info.size)
-    if plan.exposure_s is not None:
-        asked = plan.exposure_s
-        rig = replace(rig, settings={name: replace(each, exposure_s=asked) for name, each in rig.settings.items()})
+    rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
+    for words in told:
+        _log.info(words, rig=rig.name)
+        progress("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-    total = len(sequence) * len(formats)
-    with BundleWriter(folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration) as writer:
-        evidence = Evidence(sequence.patterns, formats)
+    writer = BundleWriter(folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration)
+    with writer, Recorder(writer) as recorder:
+        exposing = Exposing(rig, sequence, exposures_s, cancelled=cancelled, refused=recorder.refuse)
         if frames is not None:
-            listed = tuple((index, name) for index in range(len(sequence)) for name in formats)
+            once = tuple((index, name) for index in range(len(sequence)) for name in formats)
+            listed = once * max(len(exposures_s), 1)
             frames.begin(Outline(sequence.projector, sequence.patterns, formats, listed), rig.calibration)
-        for count, shot in enumerate(capture(rig, sequence, cancelled=cancelled, evidence=evidence), start=1):
-            if frames is not None:
-                frames.take(shot)
-            writer.add(shot)
-            progress("capture", count / total, f"frame {count} of {total}")
+        try:
+            for shot in exposing.shots():
+                if frames is not None:
+                    frames.take(shot)
+                recorder.add(shot)
+                progress("capture", exposing.done / exposing.total, _detail(exposing))
+        except (ScanEvidenceError, FrameTimeoutError) as error:
+            recorder.finish()
+            writer.keep(str(error))
+            message = f"{error}. The frames are kept: see bundle.json for those that counted, {FOLDER}/ for the others"
+            raise type(error)(message) from error
+        recorder.finish()
         if frames is not None:
-            frames.end(evidence.summary())
+            frames.end(exposing.summary())
     truth = rig.truth()
     if truth is not None:
         write_truth(folder, truth)
+
+
+def _detail(exposing: Exposing) -> str:
+    again = exposing.refused_count
+    return f"frame {exposing.done} of {exposing.total}" + (f", {again} shot again" if again else "")
+
+
+def _steady(rig: Rig, exposures_s: tuple[float, ...]) -> tuple[Rig, tuple[float, ...], list[str]]:
+    """The rig and the exposures asked for, in whole refresh periods of its projector, and words for what changed."""
+    refresh_s = rig.projector.info.refresh_s
+    if refresh_s is None:
+        return rig, exposures_s, []
+    told: list[str] = []
+
+    def snapped(asked_s: float, whose: str) -> float:
+        exposure_s = whole_refreshes_s(asked_s, refresh_s)
+        if abs(exposure_s - asked_s) > SETTINGS_TOLERANCE * asked_s:
+            told.append(
+                f"{whose} exposes for {exposure_s:.6g} s instead of {asked_s:.6g} s: whole periods of the projector "
+                f"({refresh_s:.6g} s)"
+            )
+        return exposure_s
+
+    if exposures_s:
+        return rig, tuple(dict.fromkeys(snapped(each, "every camera") for each in exposures_s)), told
+    settings = {
+        name: replace(each, exposure_s=snapped(each.exposure_s, f"camera '{name}'"))
+        for name, each in rig.settings.items()
+    }
+    return replace(rig, settings=settings), (), told

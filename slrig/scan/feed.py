@@ -60,7 +60,7 @@ class FrameSink(Protocol):
         ...
 
     def take(self, shot: Shot) -> None:
-        """Take a frame that has passed its test. Returns at once."""
+        """Take a frame that has passed its test. Returns at once. One that comes again takes the place of the first."""
         ...
 
     def end(self, evidence: EvidenceSummary) -> None:
@@ -80,6 +80,7 @@ class FrameFeed:
         self._changed = threading.Condition()
         self._waiting: deque[Begin | Take | End] = deque()
         self._waiting_bytes = 0
+        self._taken: set[tuple[int, str, float | None]] = set()
         self._ended = False
         self._given_up = False
         self._thread: threading.Thread | None = None
@@ -94,10 +95,17 @@ class FrameFeed:
         self._thread.start()
 
     def take(self, shot: Shot) -> None:
-        """Queue a frame; with too many waiting, give up."""
+        """Queue a frame. With too many waiting, or when it takes another one's place, give up."""
+        which = (shot.pattern, shot.camera, shot.exposure_s)
+        again = which in self._taken
+        self._taken.add(which)
         with self._changed:
             behind = not self._given_up and self._waiting_bytes + shot.image.nbytes > self._most_bytes
-        if behind:
+        if again:
+            # What was concluded from the first one cannot be taken back.
+            _log.info("a frame was shot again; the reconstruction will read the bundle", pattern=shot.pattern)
+            self.abandon()
+        elif behind:
             _log.info("the reconstruction falls behind the capture; it will read the bundle")
             self.abandon()
         else:

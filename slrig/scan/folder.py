@@ -124,7 +124,7 @@ class DataFolder:
             _sync(self.incoming)
 
     def keep_bundle(self, scan_id: UUID) -> None:
-        """Commit the bundle of a scan that got no mesh, and nothing else of it."""
+        """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it."""
         staged = self.staging(scan_id)
         for other in staged.iterdir():
             if other.name != "bundle":

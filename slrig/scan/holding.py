@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import structlog
 
+from slrig.bundle.description import MOST_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.scan.faults import ScanFault, fault_of
+from slrig.scan.guarding import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
 from slrig.scan.plan import PatternPlan, ScanPlan
+
+_LAST_RESORT_S = 1.0
 
 _log = structlog.get_logger(__name__)
 
@@ -41,34 +46,48 @@ def driver_errors(rig: str) -> Iterator[None]:
 
 
 class HeldRig:
-    """A rig and the one thread that may touch it: all but `facts`, `fault` and `darken_from_outside` belong to it."""
+    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `give_up` and
+    `darken_from_outside` belong to it.
+    """
 
-    def __init__(self, name: str, open_rig: Callable[[], Rig]) -> None:
+    def __init__(self, name: str, open_rig: Callable[[], Rig], *, calls: Calls | None = None) -> None:
         self.name = name
+        self.calls = Calls() if calls is None else calls
         self._open_rig = open_rig
         self._rig: Rig | None = None
+        self._bare: Rig | None = None
         self.facts: RigFacts | None = None
         self.fault: ScanFault | None = None
         self._dropped = False
 
     def open(self) -> Rig:
         """Return the rig, opened if it is not open yet. Raises what the driver raises, an OSError as DeviceError."""
+        self._drop_failed()
         if self._rig is None:
             self._dropped = False
             rig: Rig | None = None
             try:
-                with driver_errors(self.name):
-                    rig = self._open_rig()
-                    cameras = {name: camera.info for name, camera in rig.cameras.items()}
-                    self.facts = RigFacts(cameras, rig.projector.info, rig.calibration is not None)
+                rig = self.calls.make(f"rig '{self.name}'", OPEN, OPEN_LIMIT_S, self._opened)
+                cameras = {name: camera.info for name, camera in rig.cameras.items()}
+                self.facts = RigFacts(cameras, rig.projector.info, rig.calibration is not None)
             except Exception as error:
                 self.fault = fault_of(error)
                 if rig is not None:
                     self._close(rig)
                 raise
-            self._rig = rig
+            self._rig, self._bare = guarded(rig, self.calls), rig
+            self.calls.failure = None
             self.fault = None
         return self._rig
+
+    def _opened(self) -> Rig:
+        with driver_errors(self.name):
+            return self._open_rig()
+
+    def _drop_failed(self) -> None:
+        """Let the rig go if a device failed and nobody was told, as at the end of a scan that had all its frames."""
+        if self._rig is not None and self.calls.failure is not None:
+            self.let_go(self.calls.failure)
 
     def try_open(self) -> Exception | None:
         """Open the rig, or return why it cannot be opened, which `fault` keeps. The next scan tries again."""
@@ -80,6 +99,7 @@ class HeldRig:
 
     def recover(self) -> Exception | None:
         """Open the rig again, once, if it was let go because of a failure; return why that cannot be done."""
+        self._drop_failed()
         return self.try_open() if self._dropped else None
 
     def darken(self) -> None:
@@ -94,14 +114,21 @@ class HeldRig:
             self.let_go(error)
 
     def darken_from_outside(self) -> None:
-        """Try to make the projector dark on a thread that does not own it: for when the owner never comes back."""
-        rig = self._rig
+        """Try to make the projector dark past the thread that owns it: for when that one does not come back."""
+        rig = self._bare
         if rig is None:
             return
-        try:
-            rig.projector.blank()
-        except Exception as error:  # noqa: BLE001 - nothing is left to be tried
-            _log.error("the projector may still be lit", rig=self.name, cause=repr(error))
+
+        def darken() -> None:
+            try:
+                rig.projector.blank()
+            except Exception as error:  # noqa: BLE001 - nothing is left to be tried
+                _log.error("the projector may still be lit", rig=self.name, cause=repr(error))
+
+        # On a thread of its own: a driver that hangs may hold back this call as well.
+        last_resort = threading.Thread(target=darken, name="slrig-dark", daemon=True)
+        last_resort.start()
+        last_resort.join(_LAST_RESORT_S)
 
     def let_go(self, error: BaseException | None = None) -> None:
         """Close every device. `error` says why, where that is a failure."""
@@ -111,6 +138,12 @@ class HeldRig:
         if rig is not None:
             self._dropped = error is not None
             self._close(rig)
+            self._bare = None
+
+    def give_up(self, call: Call) -> ScanFault:
+        """Take note that a call hangs, and return what to tell of it. It ends the rig when it returns after all."""
+        fault = self.fault = fault_of(DeviceError(call.hangs()))
+        return fault
 
     def _close(self, rig: Rig) -> None:
         for fault in rig.close():
@@ -139,18 +172,27 @@ def check_plan(plan: ScanPlan, facts: RigFacts) -> int:
     PatternError
         The patterns do not fit the projector.
     UnsupportedByDeviceError
-        A camera cannot expose that long, or that briefly.
+        A camera cannot expose that long, or that briefly, or the frames are more than a bundle holds.
     """
-    count = len(pattern_sequence(plan.patterns, facts.projector.size))
+    exposures_s = plan.rising_exposures_s
+    count = len(pattern_sequence(plan.patterns, facts.projector.size)) * max(len(exposures_s), 1)
+    key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0
     for name, camera in facts.cameras.items():
         least_s, most_s = camera.exposure_range_s
-        if plan.exposure_s is not None and not least_s <= plan.exposure_s <= most_s:
-            message = (
-                f"exposure_s: {plan.exposure_s:g} s was asked for, camera '{name}' can do {least_s:g} s to "
-                f"{most_s:g} s. Ask for a value in that range."
-            )
-            raise UnsupportedByDeviceError(message)
+        for asked_s in exposures_s:
+            if not least_s <= asked_s <= most_s:
+                message = (
+                    f"{key}: {asked_s:g} s was asked for, camera '{name}' can do {least_s:g} s to {most_s:g} s. "
+                    "Ask for a value in that range."
+                )
+                raise UnsupportedByDeviceError(message)
         size = camera.format.size
         total += count * size.width_px * size.height_px * (1 if camera.format.bit_depth <= 8 else 2)
+    if total > MOST_CAPTURE_BYTES:
+        message = (
+            f"The frames of this scan would take {total / 1e9:.1f} GB, a bundle holds {MOST_CAPTURE_BYTES / 1e9:.1f} "
+            "GB at most. Ask for fewer exposures or fewer patterns."
+        )
+        raise UnsupportedByDeviceError(message)
     return total

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from slrig.bundle import read_bundle, read_calibration, read_truth
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION
-from slrig.capture.evidence import check_capture
+from slrig.bundle.refused import read_refused
+from slrig.capture.exposure import check_exposures
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
@@ -126,7 +127,7 @@ def reconstruct_bundle(
         report = {
             **walked.sections,
             "plan": asdict(plan),
-            "cameras": {camera.name: camera_report(camera.curves) for camera in cameras},
+            "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
             "redundancy": dict(meshed.redundancy),
             "mesh": {**figures, "stages": with_seconds(meshed.stages, seconds)},
             **known,
@@ -194,7 +195,7 @@ def _walked(
             message = f"{folder}: {cause}"
             raise PatternError(message) from cause
         entered("check frames", 0.58, "")
-        evidence = check_capture(recorded.capture)
+        evidence = check_exposures(recorded.capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
     sections["calibration"] = {"id": calibration_id(devices)}
     return _Walked(devices, stream.axis, seen, step_px(stream.outline.shown, stream.axis), sections)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from slrig.errors import ConfigError
-from slrig.model import FlipRule
+from slrig.model import FlipRule, bracket_fault
 
 
 class Progress(Protocol):
@@ -80,17 +80,39 @@ class ReconstructionPlan:
 class ScanPlan:
     """One scan: patterns, exposure, reconstruction. `exposure_s` None keeps what the rig file says per camera.
 
+    exposures_s : a bracket, for an object that is dark here and shines there: the sequence is played once for each of
+    these exposure times, and the frames are fused. They are times and not multiples of what each camera has, like
+    `exposure_s`: so every one can be a whole number of a projector's refreshes (of 1/60 s, say), and is checked against
+    what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order.
+
     Raises
     ------
     ConfigError
-        exposure_s is not above 0 and finite.
+        exposure_s is not above 0 and finite, exposures_s is no bracket, or both are given.
     """
 
     patterns: PatternPlan = field(default_factory=PatternPlan)
     reconstruction: ReconstructionPlan = field(default_factory=ReconstructionPlan)
     exposure_s: float | None = None
+    exposures_s: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
             message = f"exposure_s: expected a finite time above 0 s, found {self.exposure_s:g} s; 0.0167 is usual"
             raise ConfigError(message)
+        if self.exposures_s is None:
+            return
+        if self.exposure_s is not None:
+            message = "expected exposure_s or exposures_s, found both; keep exposures_s for a bracket"
+            raise ConfigError(message)
+        fault = bracket_fault(self.exposures_s)
+        if fault is not None:
+            message = f"exposures_s: {fault}"
+            raise ConfigError(message)
+
+    @property
+    def rising_exposures_s(self) -> tuple[float, ...]:
+        """The exposure times asked for, from short to long; none where the rig file's are kept."""
+        if self.exposures_s is not None:
+            return tuple(sorted(self.exposures_s))
+        return () if self.exposure_s is None else (self.exposure_s,)

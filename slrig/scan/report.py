@@ -12,13 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
+from slrig.capture.exposure import LEFT_OUT, left_out
 from slrig.meshing.optimisation import Optimised
 from slrig.meshing.surface import FinishedMesh, Stage
 from slrig.model import Axis, Calibration, Capture, LineShift, Mesh, Pinhole, PointCurves, Refusal, Source
 from slrig.reconstruction.camera import CameraCurves
+from slrig.reconstruction.fusion import ExposureUse
 from slrig.reconstruction.merging import MergedCurves
 from slrig.reconstruction.redundancy import PairRedundancy, Redundancy
 from slrig.scan.output import REPORT_FORMAT
+
+_MOST_OFF = 0.1
 
 
 class Stopwatch:
@@ -62,10 +66,16 @@ def calibration_id(calibration: Calibration) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def camera_report(curves: CameraCurves) -> dict[str, object]:
-    """One camera's part: pixels by cause, stripes, noise."""
+def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -> dict[str, object]:
+    """One camera's part: pixels by cause, stripes, noise; and what each exposure of a bracket gave to good pixels."""
     counts = np.bincount(curves.refusal.ravel(), minlength=len(Refusal))
-    return {
+    bracket: dict[str, object] = {"exposures": [asdict(each) for each in exposures]} if exposures else {}
+    if any(abs(each.light - 1) > _MOST_OFF for each in exposures):
+        bracket["exposures_note"] = (
+            "the light does not follow the exposure times (`light` would be 1): a video projector needs whole refresh "
+            "periods, or the camera does not expose as it says. The frames are fused by the light as measured"
+        )
+    return bracket | {
         "decoded_pixels": curves.decoded_pixels,
         "refused_pixels": {cause.name.lower(): int(counts[cause]) for cause in Refusal if cause is not Refusal.NONE},
         "noise": {"read_variance": curves.noise.read_variance, "slope": curves.noise.slope},
@@ -174,6 +184,7 @@ def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> d
         "format": REPORT_FORMAT,
         "version": 1,
         "method": "Gray code and line shift" if line_shift else "Gray-only",
+        "identity": str(evidence),
         "notes": _notes(line_shift, evidence),
         "axis": axis.value,
         "frames": {
@@ -184,6 +195,8 @@ def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> d
         },
         "evidence": {
             "patterns_verified": f"{evidence.verified}/{evidence.patterns}",
+            "shot_again": evidence.shot_again,
+            "shot_again_because": [cause for cause in evidence.causes if LEFT_OUT not in cause],
             "light_drift": dict(evidence.light_drift),
             "contradictions": list(evidence.faults),
         },
@@ -196,5 +209,6 @@ def _notes(line_shift: bool, evidence: EvidenceSummary) -> list[str]:
         notes.append(
             "Gray-only: no line-shift frames, so points lie on the edges of the Gray code, located to sub-pixel"
         )
+    notes += [f"an exposure was {words}" for words in left_out(evidence.causes)]
     notes += [f"the frames contradict their patterns: {fault}" for fault in evidence.faults]
     return notes

@@ -5,92 +5,38 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from datetime import datetime
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from uuid import UUID
 
 import structlog
 
-from slrig.devices import Rig
 from slrig.errors import (
+    CameraNotFoundError,
+    DeviceBusyError,
     DeviceError,
     InvalidInputError,
     QueueFullError,
-    RigBusyError,
     ScanCancelledError,
     ScanStateError,
     SlrigError,
     UnsupportedByDeviceError,
 )
+from slrig.scan.endings import Ending, Endings
 from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
-from slrig.scan.feed import FrameSink
 from slrig.scan.folder import DataFolder, sync_tree
-from slrig.scan.holding import HeldRig, RigFacts, check_plan, driver_errors
+from slrig.scan.guarding import Call, Watchdog
+from slrig.scan.holding import HeldRig, check_plan, driver_errors
 from slrig.scan.plan import ScanPlan
+from slrig.scan.preview import Light, Previews, Watch
 from slrig.scan.records import ScanRecord, ScanState, report_summary
 from slrig.scan.store import ProgressRecorder, ScanStore
+from slrig.scan.work import CaptureBundle, RunnerStatus, Task, busy
 from slrig.scan.worker import Job, ReconstructionWorker
 
 CAPTURE_SHARE = 0.5
 """The part of a scan's progress that is capture."""
 
-_LAST_RESORT_S = 1.0
-
 _log = structlog.get_logger(__name__)
-
-
-class CaptureBundle(Protocol):
-    """`slrig.scan.acquisition.capture_bundle`, or what a test puts in its place."""
-
-    def __call__(
-        self,
-        rig: Rig,
-        plan: ScanPlan,
-        folder: Path,
-        /,
-        *,
-        progress: Callable[[str, float, str], None],
-        cancelled: Callable[[], bool],
-        frames: FrameSink,
-    ) -> None:
-        """Play the patterns and write a complete bundle into `folder`; show each frame to `frames`."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class RunnerStatus:
-    """What the runner is at: the rig as far as it is known, who holds it and since when, and how many wait.
-
-    `reconstruction` is `ReconstructionWorker.condition`.
-    """
-
-    rig: str
-    facts: RigFacts | None
-    fault: str | None
-    holder: UUID | None
-    since: datetime | None
-    waiting: int
-    queue_length: int
-    reconstruction: str
-    ending: bool
-
-
-@dataclass(slots=True)
-class _Task:
-    id: UUID
-    plan: ScanPlan
-    since: datetime
-    stop: threading.Event = field(default_factory=threading.Event)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Ending:
-    id: UUID
-    state: ScanState
-    fault: ScanFault | None
-    summary: Mapping[str, Any] | None = None
 
 
 class Runner:
@@ -123,15 +69,18 @@ class Runner:
         self._closing = threading.Lock()
         self._closed = False
         self._changed = threading.Condition()
-        self._waiting: deque[_Task] = deque()
-        self._active: _Task | None = None
-        self._unrecorded: list[_Ending] = []
+        self._waiting: deque[Task] = deque()
+        self._active: Task | None = None
+        self._endings = Endings(store)
+        self._previews = Previews(self._wake)
         self._ending = False
         self._owner = threading.Thread(target=self._own_rig, name="slrig-rig", daemon=True)
+        self._watchdog = Watchdog(rig.calls, self._give_up_on)
 
     def start(self) -> None:
         """Start the owner thread, which opens the rig, and the reconstruction process, which loads its kernels."""
         self._owner.start()
+        self._watchdog.start()
         self._worker.start()
 
     def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> ScanRecord:
@@ -147,7 +96,10 @@ class Runner:
             The rig is held, and `wait` is False.
         QueueFullError
             As many scans are waiting as may.
+        DeviceError
+            A driver hangs.
         """
+        self._refuse_while_stuck()
         # Before the rig was first open nothing is known about it; the scan then fails with the same errors.
         frame_bytes = 0 if self._rig.facts is None else check_plan(plan, self._rig.facts)
         # Frames once as captured, and as much again for meshes and the zipped bundle of a careful client.
@@ -157,21 +109,52 @@ class Runner:
                 raise interruption()
             holder = self._active or (self._waiting[0] if self._waiting else None)
             if holder is not None and not wait:
-                since = holder.since.isoformat(timespec="seconds")
-                message = (
-                    f"The rig is held by scan {holder.id} since {since}. Wait for it, cancel it with "
-                    f'POST /scan/{holder.id}/cancel, or send "if_busy": "queue" to wait in line.'
-                )
-                raise RigBusyError(message, holder=str(holder.id), since=since)
+                raise busy(holder)
             if len(self._waiting) >= self._queue_length and holder is not None:
                 message = (
                     f"The rig is held and {len(self._waiting)} scans are waiting, as many as may. Try again later."
                 )
                 raise QueueFullError(message)
             record = self._store.create(plan, rig=self._rig.name, label=label, key=key)
-            self._waiting.append(_Task(record.id, plan, record.created_at))
+            self._waiting.append(Task(record.id, plan, record.created_at))
             self._changed.notify_all()
+        self._previews.interrupt()
         return record
+
+    def watch(self, camera: str, light: Light) -> Watch:
+        """Look through a camera; pictures come while the rig is idle.
+
+        Raises
+        ------
+        CameraNotFoundError
+            The rig has no camera of that name.
+        RigBusyError
+            A scan holds the rig now.
+        DeviceError
+            The rig is not open, or not yet.
+        """
+        self._refuse_while_stuck()
+        facts = self._rig.facts
+        if self._rig.fault is not None:
+            message = f"The rig cannot be opened: {self._rig.fault.message}"
+            raise DeviceError(message)
+        if facts is None:
+            message = "The rig is being opened. Ask again in a moment."
+            raise DeviceBusyError(message)
+        if camera not in facts.cameras:
+            message = f"The rig has no camera '{camera}'; it has {', '.join(facts.cameras)}."
+            raise CameraNotFoundError(message)
+        with self._changed:
+            if self._ending:
+                raise interruption()
+            if self._active is not None:
+                raise busy(self._active)
+        return self._previews.watch(camera, light)
+
+    def _refuse_while_stuck(self) -> None:
+        call = self._rig.calls.stuck
+        if call is not None:
+            raise DeviceError(call.hangs())
 
     def cancel(self, scan_id: UUID) -> ScanRecord:
         """Ask a scan to stop. Returns at once; a scan that has finished stays as it is. Raises ScanNotFoundError."""
@@ -181,13 +164,13 @@ class Runner:
             if queued is not None:
                 self._waiting.remove(queued)
                 message = "The scan was cancelled while it waited for the rig."
-                self._unrecorded.append(_Ending(scan_id, ScanState.CANCELLED, fault_of(ScanCancelledError(message))))
+                self._endings.add(Ending(scan_id, ScanState.CANCELLED, fault_of(ScanCancelledError(message))))
             elif self._active is not None and self._active.id == scan_id:
                 self._active.stop.set()
                 return record
-        self._settle()
+        self._endings.settle()
         with self._changed:
-            ended = any(ending.id == scan_id for ending in self._unrecorded)
+            ended = scan_id in self._endings
         if not ended:
             # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
             message = "Nothing works on this scan any more. Scan again."
@@ -204,7 +187,7 @@ class Runner:
         ScanStateError
             It is not finished.
         """
-        self._settle()
+        self._endings.settle()
         record = self._store.get(scan_id)
         if not record.state.final:
             message = (
@@ -252,20 +235,32 @@ class Runner:
             if self._active is not None:
                 self._active.stop.set()
             self._changed.notify_all()
+        self._watchdog.stop()
+        self._previews.fail(interruption())
         self._worker.close()
         if self._owner.is_alive():
             self._owner.join(timeout_s)
         if self._owner.is_alive():
             _log.error("the rig's driver does not return; the service ends without it", rig=self._rig.name)
-            # On a thread of its own: a driver that is stuck may hold back this call as well.
-            last_resort = threading.Thread(target=self._rig.darken_from_outside, name="slrig-dark", daemon=True)
-            last_resort.start()
-            last_resort.join(_LAST_RESORT_S)
+            self._rig.darken_from_outside()
         with self._changed:
             cut_off.extend([] if self._active is None else [self._active])
             fault = fault_of(interruption())
-            self._unrecorded.extend(_Ending(task.id, ScanState.INTERRUPTED, fault) for task in cut_off)
-        self._settle()
+        for task in cut_off:
+            self._endings.add(Ending(task.id, ScanState.INTERRUPTED, fault))
+        self._endings.settle()
+
+    def _give_up_on(self, call: Call) -> None:
+        """End, on the watchdog's thread, what waits for a call that hangs."""
+        _log.error("a driver hangs", rig=self._rig.name, device=call.device, step=call.step)
+        fault = self._rig.give_up(call)
+        self._rig.darken_from_outside()
+        with self._changed:
+            if self._active is not None:
+                state = ScanState.CANCELLED if self._active.stop.is_set() else ScanState.FAILED
+                self._endings.add(Ending(self._active.id, state, fault))
+        self._endings.settle()
+        self._previews.fail(DeviceError(fault.message))
 
     def _own_rig(self) -> None:
         error = self._rig.try_open()
@@ -281,17 +276,40 @@ class Runner:
         self._rig.darken()
         self._rig.let_go()
 
-    def _next(self) -> _Task | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._ending)
-            if self._ending:
-                return None
-            self._active = self._waiting.popleft()
-            return self._active
+    def _next(self) -> Task | None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted() or self._previews.wanted)
+                if self._ending:
+                    return None
+                if self._waiting:
+                    self._active = self._waiting.popleft()
+                    return self._active
+            self._show()
 
-    def _scan(self, task: _Task) -> None:
-        self._settle()
-        ending = _Ending(task.id, ScanState.FAILED, fault_of(RuntimeError()))
+    def _wanted(self) -> bool:
+        return self._ending or bool(self._waiting)
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _show(self) -> None:
+        """Take pictures for those who look, until a scan wants the rig."""
+        try:
+            rig = self._rig.open()
+            with driver_errors(self._rig.name):
+                self._previews.run(rig, stop=self._wanted)
+        except Exception as error:  # noqa: BLE001 - the owner thread outlives whatever happens to a picture
+            self._rig.let_go(error)
+            self._log_unopened(error)
+            fault = fault_of(error)
+            self._previews.fail(error if isinstance(error, SlrigError) else DeviceError(fault.message))
+            self._log_unopened(self._rig.recover())
+
+    def _scan(self, task: Task) -> None:
+        self._endings.settle()
+        ending = Ending(task.id, ScanState.FAILED, fault_of(RuntimeError()))
         try:
             ending = self._ended(task)
             self._rig.darken()
@@ -302,12 +320,12 @@ class Runner:
             # The rig is free before anyone can read that the scan is over: a client may start its next one at once.
             with self._changed:
                 self._active = None
-                self._unrecorded.append(ending)
-            self._settle()
+                self._endings.add(ending)
+            self._endings.settle()
         if not self._ending:
             self._log_unopened(self._rig.recover())
 
-    def _ended(self, task: _Task) -> _Ending:
+    def _ended(self, task: Task) -> Ending:
         log = _log.bind(scan=str(task.id))
         state, summary, fault = ScanState.FAILED, None, None
         try:
@@ -323,22 +341,7 @@ class Runner:
                 log.exception("scan failed", kind=fault.kind)
             else:
                 log.warning("scan failed", kind=fault.kind, cause=fault.message)
-        return _Ending(task.id, state, fault, summary)
-
-    def _settle(self) -> None:
-        """Record how scans ended. What the disk refuses is kept and tried again: before the next scan, and at close."""
-        with self._changed:
-            endings = list(self._unrecorded)
-        for ending in endings:
-            try:
-                made = self._store.finish(ending.id, ending.state, fault=ending.fault, summary=ending.summary)
-            except Exception:  # noqa: BLE001 - whatever refuses the record, the ending is not lost
-                _log.exception("the end of a scan could not be recorded", scan=str(ending.id), state=str(ending.state))
-                continue
-            with self._changed:
-                self._unrecorded = [each for each in self._unrecorded if each is not ending]
-            if made:
-                _log.info("scan finished", scan=str(ending.id), state=str(ending.state))
+        return Ending(task.id, state, fault, summary)
 
     def _log_unopened(self, error: Exception | None) -> None:
         if isinstance(error, SlrigError):
@@ -346,12 +349,12 @@ class Runner:
         elif error is not None:
             _log.error("the rig's driver failed with an error of its own", rig=self._rig.name, exc_info=error)
 
-    def _told(self, task: _Task, error: Exception) -> ScanFault:
+    def _told(self, task: Task, error: Exception) -> ScanFault:
         # The staging folder is gone when the message is read: what it names is then the scan's own bundle.
         fault = fault_of(error)
         return ScanFault(fault.kind, fault.message.replace(f"{self._folder.staging(task.id)}/", ""))
 
-    def _walk(self, task: _Task) -> Mapping[str, Any]:
+    def _walk(self, task: Task) -> Mapping[str, Any]:
         progress = ProgressRecorder(self._store, task.id, hidden=f"{self._folder.staging(task.id)}/")
         task.since = self._store.advance(task.id, ScanState.CAPTURING)
         rig = self._rig.open()
@@ -386,11 +389,10 @@ class Runner:
         self._folder.commit(task.id)
         return report_summary(report)
 
-    def _keep_evidence(self, task: _Task, state: ScanState) -> None:
-        """Keep a complete bundle of a scan that failed, so that its cause can be found; clear away all else."""
+    def _keep_evidence(self, task: Task, state: ScanState) -> None:
+        """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
         try:
-            captured = self._store.get(task.id).state is ScanState.RECONSTRUCTING
-            if captured and state is not ScanState.CANCELLED and self._folder.staging(task.id).is_dir():
+            if state is not ScanState.CANCELLED and (self._folder.staging(task.id) / "bundle").is_dir():
                 self._folder.keep_bundle(task.id)
         except Exception:  # noqa: BLE001 - see below
             # The scan's own fault is the one to tell; without its bundle it is told all the same.

@@ -11,9 +11,10 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
-from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Pattern, Pinhole, Pixels, Shot, Size
+from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Pattern, Pinhole, Pixels, Refusal, Shot, Size
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import (
@@ -22,9 +23,11 @@ from slrig.reconstruction.frames import (
     axis_frames,
     axis_patterns,
     ends_repeats,
+    exposure_count,
     mean_image,
     telling,
 )
+from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_frames
 from slrig.scan.outline import Outline
 from slrig.scan.report import Stopwatch
 
@@ -34,12 +37,15 @@ Entered = Callable[[str, str], None]
 
 WAITING = "wait for frames"
 
+_WHITE_OVER_USUAL = 2.5
+
 
 @dataclass(frozen=True, slots=True)
 class Seen:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
-    white : (H, W) uint16, the white frame in camera units.
+    white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white. A bracket's are
+    those of the longest exposure, and go beyond the camera's full scale. exposures : of a bracket, from short to long.
     """
 
     name: str
@@ -48,6 +54,7 @@ class Seen:
     white: Pixels
     largest_contrast: float
     full_scale: float
+    exposures: tuple[ExposureUse, ...] = ()
 
 
 class ScanStream:
@@ -88,7 +95,8 @@ class ScanStream:
         capture, seen = self.capture, []
         for name in list(self._eyes):
             # What it held of its frames is not needed any more, and the memory is.
-            curves, frames = self._eyes.pop(name).finish(capture)
+            curves, frames, fused = self._eyes.pop(name).finish(capture)
+            used = curves.refusal == Refusal.NONE
             seen.append(
                 Seen(
                     name=name,
@@ -96,7 +104,8 @@ class ScanStream:
                     curves=curves,
                     white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
                     largest_contrast=float(frames.contrast.max()),
-                    full_scale=frames.full_scale,
+                    full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
+                    exposures=() if fused is None else exposure_use(fused, used),
                 )
             )
         return seen
@@ -145,13 +154,18 @@ class _Eye:
         if len(repeats) == self._wanted[pattern]:
             self._stream.take(pattern, mean_image(self._repeats.pop(pattern)))
 
-    def finish(self, capture: Capture) -> tuple[CameraCurves, AxisFrames]:
-        """The curves, and the frames that they were found in."""
-        if self._stream is not None and len(self._exposures_s) == 1:
-            return self._stream.finish()
-        frames = axis_frames(capture, self._name, self._axis)
+    def finish(self, capture: Capture) -> tuple[CameraCurves, AxisFrames, FusedFrames | None]:
+        """The curves, and the frames that they were found in; and how these were fused, if they are a bracket's."""
+        fused = None
+        if exposure_count(self._exposures_s) > 1:
+            fused = fused_frames(capture, self._name, self._axis)
+            frames, noise = fused.frames, fused.noise
+        elif self._stream is not None:
+            return *self._stream.finish(), None
+        else:
+            frames, noise = axis_frames(capture, self._name, self._axis), None
         tables = _tables(frames.gray, frames.line_patterns, self._projector)
-        return camera_curves(frames, tables, Limits(), entered=self._entered), frames
+        return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
 
 
 class LiveScan:
@@ -178,6 +192,12 @@ class LiveScan:
         """As `ScanStream.finish`; `entered` is told the stages from here on."""
         self._entered = entered
         return self.stream.finish()
+
+
+def _shown_white(frames: AxisFrames, used: NDArray[np.bool_]) -> float:
+    """The value to show as white, of a bracket: what shines like a mirror is no measure of it."""
+    usual = float(np.median(frames.white[used])) if used.any() else frames.full_scale
+    return float(np.clip(_WHITE_OVER_USUAL * usual, 1, frames.clipped_at))
 
 
 def triangulated_axis(outline: Outline, calibration: Calibration) -> Axis:

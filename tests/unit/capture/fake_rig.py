@@ -117,11 +117,16 @@ class World:
     light: Pixels | None = None
     calls: list[str] = field(default_factory=list)
     on_wire: list[Callable[[], None]] = field(default_factory=list)
+    periods_s: list[tuple[float, float]] = field(default_factory=list)
 
 
 @dataclass
 class FakeProjector:
-    """Implements `Projector`. `swaps` shows another pattern than was asked for, and says nothing."""
+    """Implements `Projector`. `swaps` shows another pattern than was asked for, and says nothing.
+
+    missing_pulses, extra_pulses : indices of patterns that a wire trigger does not tell of, or before which it comes
+    once too often; in the first `spoilt_plays` plays.
+    """
 
     world: World
     size: Size = PROJECTOR
@@ -132,6 +137,9 @@ class FakeProjector:
     gone_at_show: int | None = None
     interrupt_at_show: int | None = None
     missing_pulses: frozenset[int] = frozenset()
+    extra_pulses: frozenset[int] = frozenset()
+    spoilt_plays: int = 99
+    played: int = 0
     sequence: PatternSequence | None = None
     shows: int = 0
     gone: bool = False
@@ -175,14 +183,23 @@ class FakeProjector:
 
     def play(self, exposure_s: float, period_s: float) -> None:
         self.world.calls.append("play")
+        self.world.periods_s.append((exposure_s, period_s))
         assert period_s > exposure_s
         assert self.sequence is not None
+        spoilt = self.played < self.spoilt_plays
+        self.played += 1
         for index in range(len(self.sequence)):
+            if spoilt and index in self.extra_pulses:
+                self._pulse(period_s)
             self._light(index)
-            if index not in self.missing_pulses:
-                for expose in self.world.on_wire:
-                    expose()
+            if not (spoilt and index in self.missing_pulses):
+                self._pulse(0.0)
             self.world.now_ns += round(period_s * 1e9)
+
+    def _pulse(self, wait_s: float) -> None:
+        for expose in self.world.on_wire:
+            expose()
+        self.world.now_ns += round(wait_s * 1e9)
 
     def stop(self) -> None:
         self.world.calls.append("stop")
@@ -244,7 +261,7 @@ class FakeCamera:
         self.world.calls.append(f"arm {self.name} {trigger}")
         assert count > 0
         assert trigger in self.triggers
-        self.armed = trigger
+        self.armed, self.dropped = trigger, 0
 
     def trigger(self) -> None:
         assert self.armed is Trigger.SOFTWARE

@@ -90,13 +90,28 @@ def test_frames_that_have_been_sent_wait_no_more() -> None:
     feed = FrameFeed(far, most_bytes=2 * SHOTS[0].image.nbytes)
     feed.begin(OUTLINE, CALIBRATION)
     assert far.arrived.acquire(timeout=WAIT_S)
-    for _ in range(5):
-        feed.take(SHOTS[0])
+    for index in range(5):
+        feed.take(replace(SHOTS[0], pattern=index))
         # Once this one is there, the one before it is counted no more.
         assert far.arrived.acquire(timeout=WAIT_S)
     feed.end(EVIDENCE)
     assert feed.settled(WAIT_S)
     assert feed.whole
+
+
+def test_a_frame_that_takes_anothers_place_costs_the_head_start_only() -> None:
+    far = Far()
+    feed = FrameFeed(far)
+    # The same pattern at another exposure is a frame of its own.
+    bracket = [replace(SHOTS[0], exposure_s=exposure_s) for exposure_s in (0.01, 0.02)]
+    fed(feed, *bracket, SHOTS[1])
+    assert feed.settled(WAIT_S)
+    assert feed.whole
+    again = FrameFeed(far)
+    fed(again, *bracket, SHOTS[1], bracket[0])
+    assert again.settled(WAIT_S)
+    assert not again.whole
+    assert far.kinds()[-1] is Abandon
 
 
 def test_abandoned_frames_are_forgotten() -> None:

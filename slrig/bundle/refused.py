@@ -1,0 +1,78 @@
+"""Frames that were refused, kept apart from those of the scan: `refused/` with its list, `refused/refused.json`.
+
+Whoever looks for a cause wants to see them; whoever reads the bundle does not meet them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from slrig.bundle.description import CameraName
+from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.errors import BundleError
+from slrig.model import Shot
+
+FOLDER = "refused"
+LIST = "refused.json"
+_MOST_BYTES = 16 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """One exposure that did not count: which pattern and camera, the how-manieth of that pattern, and why.
+
+    shot : its frame; None where no frame came, and where it had been accepted and `delivered` before.
+    """
+
+    pattern: int
+    camera: str
+    attempt: int
+    cause: str
+    shot: Shot | None = None
+    delivered: bool = False
+
+
+class RefusedEntry(Strict):
+    """One line of the list. `file` is None where no frame came; times are those of bundle.json."""
+
+    pattern: Annotated[int, Field(ge=0)]
+    camera: CameraName
+    attempt: Annotated[int, Field(ge=1)]
+    cause: str
+    file: str | None = None
+    exposure_s: Annotated[float, Field(gt=0)] | None = None
+    time_s: float | None = None
+
+
+class RefusedList(Strict):
+    """The whole of refused.json. `ended` says why the scan ended before its last pattern, None if it did not."""
+
+    format: Literal["slrig-refused"] = "slrig-refused"
+    version: Literal[1] = 1
+    ended: str | None = None
+    frames: list[RefusedEntry]
+
+
+def read_refused(folder: Path) -> tuple[Refused, ...]:
+    """What was refused while the bundle in `folder` was captured, without the frames themselves; often nothing.
+
+    Raises
+    ------
+    BundleError
+        The list is there and is not as slrig wrote it.
+    """
+    path = folder / FOLDER / LIST
+    if not path.is_file():
+        return ()
+    text = read_text(path, _MOST_BYTES, BundleError)
+    data = read_json(text, path, BundleError)
+    try:
+        listed = RefusedList.model_validate_json(text)
+    except ValidationError as cause:
+        message = f"{path} is not a valid list of refused frames:\n{explain(cause, data, keys_of(RefusedList))}"
+        raise BundleError(message) from cause
+    return tuple(Refused(entry.pattern, entry.camera, entry.attempt, entry.cause) for entry in listed.frames)

@@ -1,0 +1,200 @@
+"""Hardware synchronisation: the projector plays the sequence and triggers the cameras by wire; frame i shows pattern i.
+
+Nothing but their order tells such frames apart, so a play counts as a whole or not at all: exactly as many frames as
+patterns, numbered without a gap, that agree with one another. One that does not is played again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from slrig.bundle.refused import Refused
+from slrig.capture.evidence import Evidence
+from slrig.capture.identity import place
+from slrig.capture.judging import Judge, told
+from slrig.capture.session import Session
+from slrig.capture.synchronisation import shutter_skew_s
+from slrig.devices import Trigger
+from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
+from slrig.model import Frame, Gray, PatternSequence, Shot
+
+MOST_PLAYS = 3
+
+_ALIKE = 0.9
+_BETTER = 0.05
+
+
+@dataclass(slots=True)
+class _Play:
+    """One play: what was delivered of it, each camera's frames by their brightness, and what is wrong with it."""
+
+    number: int
+    delivered: list[tuple[int, str]] = field(default_factory=list)
+    withheld: list[Shot] = field(default_factory=list)
+    levels: dict[str, list[float]] = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+    missing: int = 0
+
+
+def played(session: Session, judge: Judge, refused: Callable[[Refused], None]) -> Iterator[Shot]:
+    """Play the sequence until every frame counts, three times at most.
+
+    Frames are delivered as they come. Those of a play that failed are refused, and all come again.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        A camera has no exposure set.
+    FrameTimeoutError, ScanEvidenceError
+        The third play failed.
+    """
+    rig, count = session.rig, len(session.sequence)
+    unset = sorted(set(rig.cameras) - set(session.applied))
+    if unset:
+        message = (
+            f"cameras {unset} have no exposure set, and the projector must know how long to show each pattern; "
+            "write exposure_s into their tables of the rig file"
+        )
+        raise UnsupportedByDeviceError(message)
+    rig.projector.load(session.sequence)
+    last: dict[str, Frame] = {}
+    causes: list[str] = []
+    timed_out = 0
+    for number in range(1, MOST_PLAYS + 1):
+        for camera in rig.cameras.values():
+            # Room for one more than there should be: it would tell.
+            camera.arm(count + 1, Trigger.HARDWARE)
+        play = _Play(number, levels={name: [] for name in rig.cameras})
+        yield from _frames(session, judge, play, last)
+        rig.projector.stop()
+        if not play.faults:
+            return
+        for camera in rig.cameras.values():
+            camera.disarm()
+        causes.append(_cause(play, session.sequence))
+        timed_out += play.missing == len(play.faults)
+        _refuse(play, judge.evidence, causes[-1], refused)
+    message = f"the sequence was played {MOST_PLAYS} times by wire: {told(causes)}"
+    raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
+
+
+def _frames(session: Session, judge: Judge, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
+    rig, count = session.rig, len(session.sequence)
+    exposure_s = max(applied.exposure_s for applied in session.applied.values())
+    skew_s = max(shutter_skew_s(camera, name, rig.synchronisation) for name, camera in rig.cameras.items())
+    # The last row of a rolling shutter must have had the pattern's light as long as the first.
+    lit_s = exposure_s + skew_s
+    # As long again for the sensors to be read out: most cannot expose meanwhile.
+    period_s = lit_s + exposure_s
+    before: dict[str, Frame] = {}
+    waiting_for, spoilt = list(rig.cameras), set[str]()
+    session.stop_if_cancelled(0)
+    rig.projector.play(lit_s, period_s)
+    for index in range(count):
+        for name in list(waiting_for):
+            session.stop_if_cancelled(index)
+            after_ns = last[name].t_end_ns if name in last else 0
+            try:
+                frame = session.read(name, after_ns, period_s + session.patience_s(name))
+            except FrameTimeoutError as error:
+                play.faults.append(
+                    f"camera '{name}' gave {index} of {count} frames, that of {session.pattern(index)} did not come "
+                    f"({error}): a trigger pulse was missed; check the trigger cable, and that exposure and read-"
+                    f"out fit into {period_s:.4f} s"
+                )
+                play.missing += 1
+                waiting_for.remove(name)
+                continue
+            play.levels[name].append(float(frame.image.mean()))
+            where = place(name, index, session.sequence.patterns[index])
+            own = session.own_fault(frame, after_ns, before.get(name)) or _gap(frame, before.get(name))
+            last[name] = before[name] = frame
+            shot = judge.shot(index, frame)
+            if own is not None:
+                if name not in spoilt:
+                    # One is enough: what is lost stays lost.
+                    play.faults.append(f"{where}: {own}")
+                spoilt.add(name)
+            elif not play.faults:
+                # After the first fault there is nothing left to prove, only to understand.
+                play.faults += map(str, judge.evidence.contradictions(shot))
+            if play.faults:
+                play.withheld.append(shot)
+            else:
+                play.delivered.append((index, name))
+                yield shot
+    for name in waiting_for:
+        extra = _extra(session, name, last[name], period_s)
+        if extra is not None:
+            play.levels[name].append(float(extra.image.mean()))
+            play.faults.append(
+                f"camera '{name}' gave more than the {count} frames of the sequence: something else triggers it; check "
+                "the trigger cable and its polarity, and shield it from the projector's other outputs"
+            )
+
+
+def _extra(session: Session, name: str, last: Frame, period_s: float) -> Frame | None:
+    """The frame beyond the last one. It would come within one period, as all of them did."""
+    try:
+        return session.read(name, last.t_end_ns, 1.5 * period_s)
+    except FrameTimeoutError:
+        return None
+
+
+def _gap(frame: Frame, before: Frame | None) -> str | None:
+    skipped = before is not None and frame.sequence_number != before.sequence_number + 1
+    if not skipped and not frame.dropped_count:
+        return None
+    return (
+        f"frame number {frame.sequence_number} follows {before.sequence_number if before is not None else 'none'}, "
+        f"{frame.dropped_count} were lost: which frame shows which pattern cannot be told; lower the camera's load or "
+        "lengthen the exposure, and scan again"
+    )
+
+
+def _cause(play: _Play, sequence: PatternSequence) -> str:
+    """What is wrong with a play: a shift of all frames, where their brightness shows one, explains everything else."""
+    shifts = {name: frame_shift(levels, sequence) for name, levels in play.levels.items()}
+    words = [
+        f"the frames of camera '{name}' are shifted by one: its frame 0 shows pattern 1. It missed the first trigger "
+        "pulse; let the projector wait longer before its first pattern, or arm the camera earlier"
+        if shift == 1
+        else f"the frames of camera '{name}' are shifted by one: its frame 1 shows pattern 0. It was triggered once "
+        "before the first pattern; check the polarity and the idle level of the trigger output"
+        for name, shift in shifts.items()
+        if shift
+    ]
+    return "; ".join([*words, *dict.fromkeys(play.faults)])
+
+
+def frame_shift(levels: Sequence[float], sequence: PatternSequence) -> int:
+    """By how many patterns the frames of a play are ahead of their numbers: 1, 0 or -1; 0 where it does not show.
+
+    levels : mean of each frame. They are held against white, black and line frames, whose brightness does not depend
+    on which part of the pattern a camera sees.
+    """
+    expected = np.array([profile.mean() for profile in sequence.profiles])
+    telling = np.array([not isinstance(pattern, Gray) for pattern in sequence.patterns])
+    agreement: dict[int, float] = {}
+    for shift in (0, 1, -1):
+        frames, shown = np.asarray(levels[max(-shift, 0) :]), expected[max(shift, 0) :]
+        length = min(len(frames), len(shown))
+        where = telling[max(shift, 0) :][:length]
+        frames, shown = frames[:length][where], shown[:length][where]
+        apart = len(frames) > 2 and np.ptp(frames) > 0 and np.ptp(shown) > 0
+        agreement[shift] = float(np.corrcoef(frames, shown)[0, 1]) if apart else 0.0
+    best = max(agreement, key=lambda shift: agreement[shift])
+    return best if agreement[best] > _ALIKE and agreement[best] > agreement[0] + _BETTER else 0
+
+
+def _refuse(play: _Play, evidence: Evidence, cause: str, refused: Callable[[Refused], None]) -> None:
+    """Take back every frame of a play."""
+    gone = [Refused(index, name, play.number, cause, delivered=True) for index, name in play.delivered]
+    gone += [Refused(shot.pattern, shot.camera, play.number, cause, shot) for shot in play.withheld]
+    evidence.forget()
+    for each in gone:
+        evidence.note(each)
+        refused(each)

@@ -1,0 +1,96 @@
+"""Software synchronisation: show a pattern, expose to it, and judge its frames while the next one is exposed.
+
+The next pattern is shown only when every camera's exposure has ended: its frame has been read, or did not come in time.
+So a pattern takes the wait for its light, the exposure, the read-out of the slowest camera, and hardly anything else.
+
+The wait for light is what `Projector.show` takes, typically `ProjectorInfo.latency_s`. On a screen it is the wait for
+the next refresh, half a refresh on average, and the display's own delay, often one to three refreshes more. For a
+projector that holds its patterns and is told their numbers over a wire it is the time of one command and its answer,
+and of the switch, a few milliseconds. For a measured rig what the latency test found beyond that comes on top.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from slrig.capture.judging import Judge
+from slrig.capture.session import Session
+from slrig.devices import Shown, Trigger
+from slrig.errors import FrameTimeoutError
+from slrig.model import Frame, Shot
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """What one camera gave for one pattern. `frame` None: nothing in time. `fault` : what speaks against it."""
+
+    index: int
+    camera: str
+    frame: Frame | None
+    fault: str | None
+
+
+def stepped(session: Session, judge: Judge) -> Iterator[Shot]:
+    """Show each pattern, and again where frames failed, until every frame counts. Raises as `Judge` does."""
+    rig = session.rig
+    rig.projector.load(session.sequence)
+    for name, camera in rig.cameras.items():
+        camera.arm(judge.most_shots, session.triggers[name])
+    ahead = iter(range(len(session.sequence)))
+    last: dict[str, Frame] = {}
+    waiting: list[_Taken] = []
+    while True:
+        turn = _next_turn(judge, ahead, list(rig.cameras))
+        if turn is None:
+            if not waiting:
+                return
+            yield from _judged(judge, waiting)
+            waiting = []
+            continue
+        index, names = turn
+        session.stop_if_cancelled(index)
+        shown = rig.projector.show(index)
+        stable_ns = session.settled_ns(shown)
+        for name in names:
+            judge.begin(name, index)
+            if session.triggers[name] is Trigger.SOFTWARE:
+                rig.cameras[name].trigger()
+        # The sensors are at work now: there is time for the frames before.
+        yield from _judged(judge, waiting)
+        waiting = [_taken(session, name, shown, stable_ns, last) for name in names]
+
+
+def _next_turn(judge: Judge, ahead: Iterator[int], cameras: list[str]) -> tuple[int, list[str]] | None:
+    """What is to be shot next: first what failed, in order."""
+    if judge.again:
+        index = min(judge.again)
+        return index, judge.again.pop(index)
+    ahead_index = next(ahead, None)
+    return None if ahead_index is None else (ahead_index, cameras)
+
+
+def _judged(judge: Judge, taken: list[_Taken]) -> Iterator[Shot]:
+    for each in taken:
+        if each.frame is None:
+            judge.missed(each.camera, each.index, each.fault or "no frame came")
+            continue
+        shot = judge.took(each.index, each.frame, each.fault)
+        if shot is not None:
+            yield shot
+
+
+def _taken(session: Session, name: str, shown: Shown, after_ns: int, last: dict[str, Frame]) -> _Taken:
+    session.stop_if_cancelled(shown.index)
+    timeout_s = session.patience_s(name)
+    try:
+        frame = session.read(name, after_ns, timeout_s)
+    except FrameTimeoutError as error:
+        cause = (
+            f"no frame came within {timeout_s:.3f} s of its light, visible since {shown.t_visible_ns} ns "
+            f"± {shown.t_err_ns} ns ({error}); check the camera's cable, bandwidth and trigger"
+        )
+        return _Taken(shown.index, name, None, cause)
+    fault = session.own_fault(frame, after_ns, last.get(name))
+    last[name] = frame
+    return _Taken(shown.index, name, frame, fault)

@@ -1,0 +1,368 @@
+"""One camera's frames of a sequence, judged against one another at a sample of pixels; each may be taken back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from slrig.capture import checks, code_checks
+from slrig.capture.checks import Lighting, Reference, Samples
+from slrig.capture.code_checks import Code
+from slrig.capture.identity import Contradiction, named, place
+from slrig.capture.sampling import Sampler
+from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, White
+
+
+@dataclass(slots=True)
+class _Findings:
+    """What the frames told so far: all of it follows from the frames, and is found again when one is taken back.
+
+    sound : a pair of a bit and its inverse has added up to white and black, which vouches for these two.
+    lined : axes of which a line frame lay where the Gray code says, which vouches for the code.
+    """
+
+    firsts: dict[Pattern, int] = field(default_factory=dict)
+    verified: set[int] = field(default_factory=set)
+    noises: list[float] = field(default_factory=list)
+    codes: dict[Axis, tuple[Code, Gray]] = field(default_factory=dict)
+    waiting_lines: list[int] = field(default_factory=list)
+    light_drift: float | None = None
+    sound: bool = False
+    lined: set[Axis] = field(default_factory=set)
+
+
+class Witness:
+    """One camera's frames so far: whole until white and black tell what is lit, then at sampled lit pixels."""
+
+    def __init__(self, name: str, form: CameraFormat, patterns: Sequence[Pattern]) -> None:
+        self.name = name
+        self.lighting: Lighting | None = None
+        self.told: list[Contradiction] = []
+        self.seen: set[int] = set()
+        self._format = form
+        self._patterns = patterns
+        self._anywhere = Sampler.of(form.size)
+        self._found = _Findings()
+        self._waiting: dict[int, Pixels] = {}
+        self._overview: dict[int, Samples] = {}
+        self._frames: dict[int, Samples] = {}
+        self._sampler: Sampler | None = None
+        self._reference: Reference | None = None
+        self._referees: tuple[int, ...] = ()
+        self._refused = False
+        self._untold: list[Contradiction] = []
+
+    @property
+    def verified(self) -> frozenset[int]:
+        """The patterns whose frames passed a test that another pattern would fail."""
+        return frozenset(self._found.verified)
+
+    @property
+    def light_drift(self) -> float | None:
+        """Largest change of the light between two frames of one pattern, as a share of white."""
+        return self._found.light_drift
+
+    @property
+    def measured_noise_dn(self) -> float | None:
+        """Noise of a frame, DN; None where no pair told."""
+        return float(np.median(self._found.noises)) if self._found.noises else None
+
+    @property
+    def _noise(self) -> float:
+        measured = self.measured_noise_dn
+        return checks.NOISE_FLOOR_DN if measured is None else measured
+
+    def judge(self, shot: Shot) -> list[Contradiction]:
+        """Take a frame in; return the contradictions that it brings to light."""
+        self.seen.add(shot.pattern)
+        fault = self._format_fault(shot)
+        if fault is not None:
+            found = [self._says(shot.pattern, fault, [shot.pattern])]
+        else:
+            found = [*self._untold, *self._admit(shot.pattern, shot.image)]
+            self._untold = []
+        self.told += found
+        return found
+
+    def retract(self, patterns: Collection[int]) -> tuple[int, ...]:
+        """Forget the frames of some patterns and all that was concluded from them; return the patterns forgotten.
+
+        With the white or the black frame that tells what is lit, every frame is forgotten: their pixels were chosen by
+        these two.
+        """
+        everything = not set(self._referees).isdisjoint(patterns)
+        gone = tuple(sorted(self.seen)) if everything else tuple(sorted(self.seen.intersection(patterns)))
+        self.seen -= set(gone)
+        for each in gone:
+            self._waiting.pop(each, None)
+            self._overview.pop(each, None)
+            self._frames.pop(each, None)
+        if everything:
+            self._sampler, self._reference, self._referees, self.lighting = None, None, (), None
+        self._refused = False
+        standing = self._again_from_start()
+        self._untold = [each for each in standing if each not in self.told]
+        self.told = [each for each in standing if each in self.told]
+        return gone
+
+    def _again_from_start(self) -> list[Contradiction]:
+        """Judge the frames that are left as if they came now, in the order in which they came."""
+        waiting, frames = self._waiting, self._frames
+        self._found, self._waiting, self._frames = _Findings(), {}, {}
+        found: list[Contradiction] = []
+        for index in [*waiting, *frames]:
+            self._found.firsts.setdefault(self._patterns[index], index)
+            if index in waiting:
+                self._waiting[index] = waiting[index]
+            else:
+                self._frames[index] = frames[index]
+                if index in self._referees:
+                    self._found.verified.add(index)
+                found += self._against_reference(index)
+        return found
+
+    def _admit(self, index: int, image: Pixels) -> list[Contradiction]:
+        pattern = self._patterns[index]
+        self._found.firsts.setdefault(pattern, index)
+        if isinstance(pattern, White | Black):
+            self._overview[index] = self._anywhere.take(image)
+        if self._sampler is None:
+            self._waiting[index] = image
+            return [] if self._refused else self._refer()
+        self._frames[index] = self._sampler.take(image)
+        return self._against_reference(index)
+
+    def _format_fault(self, shot: Shot) -> str | None:
+        image, size = shot.image, self._format.size
+        if image.shape != size.shape:
+            return f"the frame is {image.shape[1]} x {image.shape[0]}, the camera is {size}: scan again"
+        wanted = np.uint8 if self._format.bit_depth <= 8 else np.uint16
+        if image.dtype != wanted:
+            return f"the frame is {image.dtype}, {self._format.bit_depth} bits come as {np.dtype(wanted)}"
+        brightest = int(image.max())
+        if brightest > self._format.full_scale:
+            return (
+                f"a pixel has the value {brightest}, {self._format.bit_depth} bits end at {self._format.full_scale}: "
+                "the frame was damaged, or the camera sends another format"
+            )
+        return None
+
+    def _says(self, index: int, fault: str, suspects: Iterable[int], beyond: Iterable[int] = ()) -> Contradiction:
+        accused = tuple(sorted(set(suspects)))
+        rest = tuple(sorted(set(beyond) - set(accused)))
+        return Contradiction(self.name, place(self.name, index, self._patterns[index]), fault, accused, rest)
+
+    @property
+    def _unproven_reference(self) -> tuple[int, ...]:
+        """White and black, until a pair has vouched for them."""
+        return () if self._found.sound else self._referees
+
+    def _refer(self) -> list[Contradiction]:
+        """Once white and black are in: find what is lit, and judge the frames that waited."""
+        first_white, first_black = self._found.firsts.get(White()), self._found.firsts.get(Black())
+        if first_white is None or first_black is None:
+            return []
+        white, black = self._waiting[first_white], self._waiting[first_black]
+        full_scale = self._format.full_scale
+        lighting = checks.lighting(
+            self._overview[first_white], self._overview[first_black], full_scale=full_scale, row=self._anywhere.row
+        )
+        if isinstance(lighting, str):
+            self._refused = True
+            return [self._says(max(first_white, first_black), lighting, [first_white, first_black])]
+        threshold = math.ceil(lighting.threshold_dn)
+        lit = (white > black) & (white - black >= threshold) & (white < full_scale)
+        sampler = Sampler.of(self._format.size, np.flatnonzero(lit))
+        self.lighting, self._sampler, self._referees = lighting, sampler, (first_white, first_black)
+        self._reference = checks.reference(
+            sampler.take(white), sampler.take(black), threshold_dn=threshold, full_scale=full_scale, row=sampler.row
+        )
+        self._found.verified |= {first_white, first_black}
+        self._frames = {index: sampler.take(image) for index, image in self._waiting.items()}
+        waited, self._waiting = list(self._waiting), {}
+        return [each for index in waited for each in self._against_reference(index)]
+
+    def _against_reference(self, index: int) -> list[Contradiction]:
+        ref, pattern = self._reference, self._patterns[index]
+        if ref is None:
+            return []
+        first = self._found.firsts[pattern]
+        if first != index:
+            return self._again(index, first, ref)
+        if isinstance(pattern, White | Black):
+            return []
+        found = self._gray(index, pattern, ref) if isinstance(pattern, Gray) else self._range([index], ref)
+        if not found:
+            found += self._repetition(index, pattern, ref)
+        if not found and isinstance(pattern, LineShift):
+            found += self._line(index, pattern, ref)
+        return found
+
+    def _again(self, index: int, first: int, ref: Reference) -> list[Contradiction]:
+        noise = self.measured_noise_dn
+        seen = checks.drift(self._frames[first], self._frames[index], ref, noise=noise)
+        if self.light_drift is None or abs(seen.light) > abs(self.light_drift):
+            self._found.light_drift = seen.light
+        fault = checks.drift_fault(seen) or self._changed(index, first)
+        if fault is not None:
+            # Never the first one: shot again after a change, it would hide it.
+            return [self._says(index, fault, [index])]
+        if first in self._found.verified:
+            self._found.verified.add(index)
+        return []
+
+    def _changed(self, index: int, first: int) -> str | None:
+        if index not in self._overview or self.lighting is None:
+            return None
+        white, black = (self._overview[referee] for referee in self._referees)
+        again = self._overview[index]
+        brighter = again - black if first == self._referees[0] else white - again
+        return checks.changed_fault(
+            self._overview[first],
+            again,
+            (white - black, brighter),
+            threshold_dn=self.lighting.threshold_dn,
+            noise=self.measured_noise_dn,
+            row=self._anywhere.row,
+        )
+
+    def _range(self, indices: Sequence[int], ref: Reference) -> list[Contradiction]:
+        noise, beyond = self.measured_noise_dn, self._unproven_reference
+        judged = ((index, checks.range_fault(self._frames[index], ref, noise=noise)) for index in indices)
+        return [self._says(index, fault, [index], beyond) for index, fault in judged if fault is not None]
+
+    def _gray(self, index: int, pattern: Gray, ref: Reference) -> list[Contradiction]:
+        partner = self._found.firsts.get(_inverse(pattern))
+        # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
+        if partner is not None:
+            bit, inverse = self._frames[index], self._frames[partner]
+            fault = checks.pair_fault(bit, inverse, ref, noise=self._noise)
+            if fault is not None:
+                words = f"beside {named(partner, self._patterns[partner])}, {fault}"
+                return [self._says(index, words, [index, partner], self._unproven_reference)]
+            self._found.noises.append(checks.noise_dn(bit, inverse, ref))
+            found = self._range([partner, index], ref)
+            if not found:
+                self._found.verified |= {index, partner}
+                self._found.sound = True
+        else:
+            found = [] if _inverse(pattern) in self._patterns else self._range([index], ref)
+        return found or self._complete_code(pattern, ref)
+
+    def _family(self, pattern: Gray) -> list[Gray]:
+        """Every bit of the code that a pattern belongs to, as far as it is shown."""
+        return [p for p in self._patterns if isinstance(p, Gray) and _code_of(p) == _code_of(pattern)]
+
+    def _complete_code(self, pattern: Gray, ref: Reference) -> list[Contradiction]:
+        """Decode once the last frame of a code is in, and judge the line frames that waited for it."""
+        if pattern.axis in self._found.codes:
+            return []
+        family, firsts = self._family(pattern), self._found.firsts
+        if {p.bit for p in family} != set(range(pattern.bits)) or any(p not in firsts for p in family):
+            return []
+        differences = [self._difference(bit, family, ref) for bit in range(pattern.bits)]
+        code = code_checks.read_code(differences, ref)
+        exchanged = code_checks.swapped_bit(code)
+        if exchanged is not None:
+            fault = (
+                f"bit {exchanged} of the {pattern.axis} code is exchanged with its inverse: codes jump where coarser "
+                "bits change; check that the projector shows the patterns in the order they were loaded"
+            )
+            pair = [firsts[p] for p in family if p.bit == exchanged]
+            return [self._says(pair[0], fault, pair, [firsts[p] for p in family])]
+        self._found.codes[pattern.axis] = (code, pattern)
+        waited, self._found.waiting_lines = self._found.waiting_lines, []
+        found: list[Contradiction] = []
+        for index in waited:
+            line = self._patterns[index]
+            if isinstance(line, LineShift):
+                found += self._line(index, line, ref)
+        return found
+
+    def _difference(self, bit: int, family: Sequence[Gray], ref: Reference) -> Samples:
+        frames = {p.inverted: self._frames[self._found.firsts[p]] for p in family if p.bit == bit}
+        half = (ref.white + ref.black) / 2
+        return np.asarray(frames.get(False, half) - frames.get(True, half)) * (1 if len(frames) == 2 else 2)
+
+    def _repetition(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
+        own = {pattern, White(), Black()}
+        earlier = [i for i in self._frames if i != index and self._patterns[i] not in own]
+        # Wide lines move by a small part of their width: tell neighbours apart only where noise leaves room for it.
+        factor = max(40.0, 4.0 * pattern.line_width_px) if isinstance(pattern, LineShift) else 40.0
+        frames = [self._frames[i] for i in earlier]
+        found = checks.repeated(self._frames[index], frames, ref, noise=self._noise, factor=factor)
+        if found is None:
+            return []
+        twin = earlier[found]
+        fault = (
+            f"the frame equals that of {named(twin, self._patterns[twin])}: it was not exposed while its own "
+            "pattern was shown; check the trigger and the projector's latency, and scan again"
+        )
+        return [self._says(index, fault, [index], [twin, *self._unproven_reference])]
+
+    def _line(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
+        known = self._found.codes.get(pattern.axis)
+        if known is None:
+            self._found.waiting_lines.append(index)
+            return []
+        code, gray = known
+        expected = code_checks.expect_lines(
+            code,
+            ref,
+            cell_px=gray.cell_px,
+            offset_px=gray.offset_px,
+            shift=pattern.shift,
+            period_px=pattern.period_px,
+            width_px=pattern.line_width_px,
+        )
+        others = [
+            self._frames[i]
+            for p, i in self._found.firsts.items()
+            if isinstance(p, LineShift) and p.axis is pattern.axis and i != index
+        ]
+        duty = pattern.line_width_px / pattern.period_px
+        compared, fault = code_checks.line_fault(
+            self._frames[index], others, ref, expected, noise=self._noise, duty=duty
+        )
+        if fault is not None:
+            code_frames = (
+                [] if pattern.axis in self._found.lined else [self._found.firsts[p] for p in self._family(gray)]
+            )
+            return [self._says(index, fault, [index], code_frames)]
+        if compared:
+            self._found.verified.add(index)
+            self._found.lined.add(pattern.axis)
+        return self._line_order(index, pattern, ref)
+
+    def _line_order(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
+        """Judge the order of the line frames once the last one is in."""
+        family = [replace(pattern, shift=shift) for shift in range(pattern.period_px)]
+        firsts = self._found.firsts
+        if any(firsts.get(line) not in self._frames for line in family):
+            return []
+        frames = [self._frames[firsts[line]] for line in family]
+        shows, shift = code_checks.line_order(frames, ref, noise=self._noise)
+        members = [firsts[line] for line in family]
+        if shift is None:
+            # One frame that lies where the code says, and the right order, place them all.
+            if shows and set(members) & self._found.verified:
+                self._found.verified |= set(members)
+            return []
+        fault = (
+            f"the {pattern.axis} line frames are out of order at shift {shift}: its lines overlap those of the frame "
+            "before the last more than those of the last; check that the projector shows the patterns in the order "
+            "they were loaded"
+        )
+        around = [members[(shift + step) % len(members)] for step in (-1, 0, 1)]
+        return [self._says(index, fault, around, members)]
+
+
+def _inverse(pattern: Gray) -> Gray:
+    return replace(pattern, inverted=not pattern.inverted)
+
+
+def _code_of(pattern: Gray) -> tuple[Axis, int, int, int]:
+    return (pattern.axis, pattern.bits, pattern.cell_px, pattern.offset_px)

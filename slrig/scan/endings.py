@@ -1,0 +1,60 @@
+"""How scans ended, kept until the records have taken it: a disk that refuses now may take it later."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+import structlog
+
+from slrig.scan.faults import ScanFault
+from slrig.scan.records import ScanState
+from slrig.scan.store import ScanStore
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ending:
+    """The final state of a scan, why where that is not success, and the summary of its report where it is."""
+
+    id: UUID
+    state: ScanState
+    fault: ScanFault | None
+    summary: Mapping[str, Any] | None = None
+
+
+class Endings:
+    """The endings that are not on record yet. Any thread may call."""
+
+    def __init__(self, store: ScanStore) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._unrecorded: list[Ending] = []
+
+    def __contains__(self, scan_id: object) -> bool:
+        with self._lock:
+            return any(ending.id == scan_id for ending in self._unrecorded)
+
+    def add(self, ending: Ending) -> None:
+        """Keep an ending; `settle` records it."""
+        with self._lock:
+            self._unrecorded.append(ending)
+
+    def settle(self) -> None:
+        """Record what is kept. What the disk refuses stays for the next time."""
+        with self._lock:
+            endings = list(self._unrecorded)
+        for ending in endings:
+            try:
+                made = self._store.finish(ending.id, ending.state, fault=ending.fault, summary=ending.summary)
+            except Exception:  # noqa: BLE001 - whatever refuses the record, the ending is not lost
+                _log.exception("the end of a scan could not be recorded", scan=str(ending.id), state=str(ending.state))
+                continue
+            with self._lock:
+                self._unrecorded = [each for each in self._unrecorded if each is not ending]
+            if made:
+                _log.info("scan finished", scan=str(ending.id), state=str(ending.state))

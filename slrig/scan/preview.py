@@ -1,0 +1,238 @@
+"""Live pictures of a camera while nobody scans, to aim, to focus and to see what is lit.
+
+They are taken on the thread that owns the rig, between scans: a scan that wants the rig gets it after the picture that
+is being taken. The projector is dark unless somebody asked for light, and dark again when nobody looks any more.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import StrEnum
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.devices import Camera, Rig, Trigger
+from slrig.errors import FrameTimeoutError, SlrigError, UnsupportedByDeviceError
+from slrig.model import Frame, White
+from slrig.patterns.sequence import encode
+
+PICTURES_PER_S = 15.0
+_ARMED_FOR = 32  # pictures; some drivers hold a buffer for each
+_TRIES = 3
+_TIMEOUT_S = 1.0
+
+
+class Light(StrEnum):
+    """What the projector does while somebody looks."""
+
+    OFF = "off"
+    WHITE = "white"
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One picture of a camera. image : (H, W) uint8, 255 at full scale; `number` counts the camera's pictures."""
+
+    image: NDArray[np.uint8]
+    number: int
+
+
+class Watch:
+    """Somebody who looks through a camera. Leave the `with` block to look away."""
+
+    def __init__(self, room: Previews, camera: str, light: Light) -> None:
+        self.camera = camera
+        self.light = light
+        self._room = room
+
+    def picture(self, after: int, timeout_s: float) -> Picture | None:
+        """The next picture with a number above `after`; None when none came in time.
+
+        Raises
+        ------
+        SlrigError
+            The rig gives no more pictures: the device failed, or the service ends.
+        """
+        return self._room.picture(self, after, timeout_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._room.leave(self)
+
+
+class Previews:
+    """Who looks, and the latest picture of each camera. All but `run` may be called from any thread.
+
+    woken : called when somebody begins to look.
+    """
+
+    def __init__(self, woken: Callable[[], None]) -> None:
+        self._woken = woken
+        self._changed = threading.Condition()
+        self._watches: list[Watch] = []
+        self._pictures: dict[str, Picture] = {}
+        self._faults: dict[Watch, SlrigError] = {}
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody looks."""
+        with self._changed:
+            return bool(self._watches)
+
+    def watch(self, camera: str, light: Light) -> Watch:
+        """Begin to look through a camera."""
+        watch = Watch(self, camera, light)
+        with self._changed:
+            if not self._watches:
+                # What somebody saw earlier is not what is there now.
+                self._pictures.clear()
+            self._watches.append(watch)
+        self._woken()
+        return watch
+
+    def leave(self, watch: Watch) -> None:
+        """Look away. Idempotent."""
+        with self._changed:
+            self._watches = [each for each in self._watches if each is not watch]
+            self._faults.pop(watch, None)
+            self._changed.notify_all()
+
+    def picture(self, watch: Watch, after: int, timeout_s: float) -> Picture | None:
+        """See `Watch.picture`."""
+
+        def found() -> bool:
+            there = self._pictures.get(watch.camera)
+            return watch in self._faults or (there is not None and there.number > after)
+
+        with self._changed:
+            came = self._changed.wait_for(found, timeout_s)
+            if watch in self._faults:
+                raise self._faults[watch]
+            return self._pictures[watch.camera] if came else None
+
+    def fail(self, error: SlrigError) -> None:
+        """Send everybody away, and tell them why."""
+        with self._changed:
+            self._faults.update(dict.fromkeys(self._watches, error))
+            self._watches = []
+            self._changed.notify_all()
+
+    def run(self, rig: Rig, stop: Callable[[], bool]) -> None:
+        """Take pictures until nobody looks, or `stop` says so. For the thread that owns the rig.
+
+        Raises whatever the devices raise. The projector is dark and the cameras are disarmed afterwards.
+        """
+        eyes: dict[str, _Eye] = {}
+        light: Light | None = None
+        try:
+            while not stop():
+                began_s = time.monotonic()
+                asked = self._asked()
+                if not asked:
+                    break
+                wanted = Light.WHITE if Light.WHITE in asked.values() else Light.OFF
+                if wanted is not light:
+                    light = wanted
+                    _set_light(rig, light)
+                for name in [name for name in eyes if name not in asked]:
+                    eyes.pop(name).close()
+                for name in asked:
+                    if name not in eyes:
+                        eyes[name] = _Eye(rig, name)
+                    frame = eyes[name].frame(rig.clock.now_ns())
+                    self._put(name, _picture(frame, rig.cameras[name].info.format.full_scale))
+                self._rest(began_s + 1 / PICTURES_PER_S, stop)
+        finally:
+            for eye in eyes.values():
+                with suppress(Exception):
+                    eye.close()
+            rig.projector.blank()
+
+    def _asked(self) -> Mapping[str, Light]:
+        """The cameras that somebody looks through, each with the light that was asked for."""
+        with self._changed:
+            asked: dict[str, Light] = {}
+            for watch in self._watches:
+                if asked.get(watch.camera) is not Light.WHITE:
+                    asked[watch.camera] = watch.light
+            return asked
+
+    def _put(self, camera: str, image: NDArray[np.uint8]) -> None:
+        with self._changed:
+            before = self._pictures.get(camera)
+            self._pictures[camera] = Picture(image, 1 if before is None else before.number + 1)
+            self._changed.notify_all()
+
+    def _rest(self, until_s: float, stop: Callable[[], bool]) -> None:
+        """Keep to the pace, but not when somebody wants the rig or everybody has left."""
+        with self._changed:
+            self._changed.wait_for(lambda: stop() or not self._watches, max(until_s - time.monotonic(), 0.0))
+
+    def interrupt(self) -> None:
+        """Have `run` ask `stop` now."""
+        with self._changed:
+            self._changed.notify_all()
+
+
+class _Eye:
+    """A camera that is armed for pictures."""
+
+    def __init__(self, rig: Rig, name: str) -> None:
+        self._camera: Camera = rig.cameras[name]
+        self._left = 0
+        offered = self._camera.info.triggers
+        fit = [trigger for trigger in (Trigger.SOFTWARE, Trigger.FREE) if trigger in offered]
+        if not fit:
+            message = (
+                f"camera '{name}' takes pictures by a wire's pulses only ({', '.join(sorted(offered))}), and nothing "
+                "gives any while the rig is idle; scan instead"
+            )
+            raise UnsupportedByDeviceError(message)
+        self._trigger = fit[0]
+        if name in rig.settings:
+            self._camera.configure(rig.settings[name])
+
+    def frame(self, after_ns: int) -> Frame:
+        """One frame, begun after this instant."""
+        if not self._left:
+            self._camera.disarm()
+            self._camera.arm(_ARMED_FOR, self._trigger)
+            self._left = _ARMED_FOR
+        self._left -= 1
+        for _ in range(_TRIES - 1):
+            with suppress(FrameTimeoutError):
+                return self._shot(after_ns)
+        return self._shot(after_ns)
+
+    def _shot(self, after_ns: int) -> Frame:
+        if self._trigger is Trigger.SOFTWARE:
+            self._camera.trigger()
+        return self._camera.read(after_ns, _TIMEOUT_S)
+
+    def close(self) -> None:
+        self._camera.disarm()
+
+
+def _set_light(rig: Rig, light: Light) -> None:
+    if light is Light.OFF:
+        rig.projector.blank()
+    else:
+        rig.projector.load(encode((White(),), rig.projector.info.size))
+        rig.projector.show(0)
+
+
+def _picture(frame: Frame, full_scale: int) -> NDArray[np.uint8]:
+    if full_scale == 255:
+        return np.asarray(frame.image, dtype=np.uint8)
+    return np.asarray(frame.image.astype(np.float32) * np.float32(255 / full_scale), dtype=np.uint8)

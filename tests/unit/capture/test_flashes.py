@@ -1,0 +1,243 @@
+"""Latency from flashes: projectors and cameras of many kinds, each described by its light and its shutter in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slrig.capture.flashes import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels
+from slrig.devices import Shown
+from slrig.errors import ScanEvidenceError
+from slrig.model import FloatArray, Pixels
+
+ROWS, COLUMNS = 60, 20
+STATED_NS = 5_000_000_000
+GRID_S = 2e-5
+
+Light = Callable[[FloatArray], FloatArray]
+"""Light at times since the instant that the projector stated, 0 to 1."""
+
+
+def step(at_s: float) -> Light:
+    return lambda t: (t >= at_s).astype(np.float64)
+
+
+def ramp(begin_s: float, length_s: float) -> Light:
+    return lambda t: np.clip((t - begin_s) / length_s, 0, 1)
+
+
+@dataclass(frozen=True)
+class World:
+    """A projector by its light, and a camera. `light(to_white, rng)` is a change of light; steady light is 0 or 1."""
+
+    light: Callable[[bool, np.random.Generator], Light]
+    exposure_s: float = 0.01
+    period_s: float = 0.012
+    line_s: float = 0.0
+    scan_s: float = 0.0
+    stamp_offset_s: float = 0.0
+    noise_dn: float = 0.7
+    ambient_dn: float = 20.0
+    white_dn: float = 150.0
+    steady: Light = lambda t: np.ones_like(t)
+    full_scale: int = 255
+
+    def shares(self, light: Light, start_s: float) -> FloatArray:
+        """(ROWS,) float64: the mean light on each row during its own exposure."""
+        t = np.arange(-0.1, 0.4, GRID_S)
+        gathered = np.concatenate([[0.0], np.cumsum(light(t[:-1]) * GRID_S)])
+        begin = start_s + np.arange(ROWS) * (self.line_s - self.scan_s)
+        return np.asarray(
+            (np.interp(begin + self.exposure_s, t, gathered) - np.interp(begin, t, gathered)) / self.exposure_s
+        )
+
+    def image(self, shares: FloatArray, rng: np.random.Generator) -> Pixels:
+        # Albedo differs between rows and between columns; the outer columns see no projector.
+        albedo = np.linspace(0.5, 1.0, ROWS)[:, None] * np.linspace(1.0, 0.7, COLUMNS)
+        albedo[:, :3] = 0
+        dn = (
+            self.ambient_dn
+            + self.white_dn * albedo * shares[:, None]
+            + self.noise_dn * rng.standard_normal(albedo.shape)
+        )
+        return np.clip(np.rint(dn), 0, self.full_scale).astype(np.uint16)
+
+    def levels(self, rng: np.random.Generator) -> RowLevels:
+        black = [self.image(np.zeros(ROWS), rng) for _ in range(8)]
+        white = [self.image(self.shares(self.steady, float(rng.uniform(0, 0.1))), rng) for _ in range(8)]
+        return row_levels("eye", black, white, full_scale=self.full_scale)
+
+    def flashes(self, count: int, levels: RowLevels, rng: np.random.Generator) -> list[Flash]:
+        made = []
+        for number in range(count):
+            to_white = number % 2 == 1
+            light = self.light(to_white, rng)
+            first_s = -2 * self.period_s + float(rng.uniform(0, self.period_s))
+            frames = []
+            for start_s in first_s + self.period_s * np.arange(10):
+                image = self.image(self.shares(light, start_s), rng)
+                stamp_ns = STATED_NS + round((start_s + self.stamp_offset_s) * 1e9)
+                frames.append(FlashFrame(stamp_ns, self.exposure_s, levels.shares(image)))
+            made.append(Flash(to_white, Shown(0, STATED_NS, 500_000), tuple(frames)))
+        return made
+
+    def measured(self, *, count: int = 60, seed: int = 0) -> CameraLatency:
+        rng = np.random.default_rng(seed)
+        levels = self.levels(rng)
+        return fitted("eye", self.flashes(count, levels, rng), levels)
+
+
+def both_ways(light: Light) -> Callable[[bool, np.random.Generator], Light]:
+    """The same to white and to black, and the same every time."""
+    return lambda to_white, _: light if to_white else (lambda t: 1 - light(t))
+
+
+# ---- the fit
+
+
+@pytest.mark.parametrize("line_s", [0.0, 1.5e-5, 6e-5, 3e-4])
+@pytest.mark.parametrize("latency_s", [-0.004, 0.012])
+def test_latency_and_line_time_come_out_of_the_rows(latency_s: float, line_s: float) -> None:
+    found = World(both_ways(step(latency_s)), line_s=line_s, period_s=0.032).measured()
+    assert found.latency_s == pytest.approx(latency_s, abs=1e-4)
+    assert found.line_time_s == pytest.approx(line_s, rel=0.02, abs=5e-7)
+    assert abs(found.line_time_s - line_s) < 4 * found.line_time_error_s + 1e-9
+    assert found.rolling is (line_s > 0)
+    assert found.skew_s == pytest.approx((ROWS - 1) * line_s, rel=0.02)
+    assert found.jitter_s < 1e-4
+    assert found.settle_s == 0
+
+
+def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
+    for seed in range(40):
+        found = World(both_ways(step(0.012)), noise_dn=2.0).measured(count=30, seed=seed)
+        assert not found.rolling
+        assert not found.scanned
+
+
+def test_the_stated_error_of_the_line_time_is_its_scatter() -> None:
+    found = [World(both_ways(step(0.003)), line_s=3e-5, noise_dn=3.0).measured(count=30, seed=s) for s in range(30)]
+    scatter = np.std([each.line_time_s for each in found], ddof=1)
+    stated = np.median([each.line_time_error_s for each in found])
+    assert 0.6 < stated / scatter < 1.6
+
+
+def test_a_constant_error_of_the_time_stamps_is_part_of_the_latency() -> None:
+    world = World(both_ways(step(0.012)), line_s=5e-5)
+    late = replace(world, stamp_offset_s=-0.009).measured()
+    assert late.latency_s == pytest.approx(0.003, abs=1e-4)
+    assert late.line_time_s == pytest.approx(5e-5, rel=0.02)
+
+
+def test_light_that_waits_for_the_refresh_is_told_as_jitter() -> None:
+    period_s = 1 / 60
+
+    def at_next_refresh(to_white: bool, rng: np.random.Generator) -> Light:
+        return both_ways(step(0.004 + float(rng.uniform(0, period_s))))(to_white, rng)
+
+    found = World(at_next_refresh).measured(count=120)
+    assert found.latency_s == pytest.approx(0.004 + period_s / 2, abs=4 * found.standard_error_s)
+    assert found.jitter_s == pytest.approx(period_s / 12**0.5, rel=0.2)
+    assert found.latency_s < found.latency_p95_s <= found.latest_s
+    assert found.latest_s == pytest.approx(0.004 + period_s, abs=1e-3)
+
+
+def test_a_ramp_is_timed_at_its_middle_and_waited_for_to_its_end() -> None:
+    found = World(both_ways(ramp(0.010, 0.008)), exposure_s=0.02, period_s=0.022).measured()
+    assert found.latency_s == pytest.approx(0.014, abs=1e-3)
+    # Rows that begin from 2.5 ms before the ramp's end miss less than 2 %: stable by what counts as steady.
+    assert 0.0155 < found.latest_s < 0.019
+
+
+def test_darkening_more_slowly_than_brightening_is_told_and_waited_for() -> None:
+    def light(to_white: bool, rng: np.random.Generator) -> Light:
+        return both_ways(step(0.005 if to_white else 0.015))(to_white, rng)
+
+    found = World(light).measured()
+    assert found.rise_s == pytest.approx(0.005, abs=1e-4)
+    assert found.fall_s == pytest.approx(0.015, abs=1e-4)
+    assert found.latest_s == pytest.approx(0.015, abs=3e-4)
+
+
+def test_a_colour_wheel_is_told_as_flicker_and_hardly_moves_the_latency() -> None:
+    # Three colours of unlike brightness, each lit for a third of a turn, 120 turns a second, not in step with show.
+    turn_s, colours = 1 / 120, np.array([1.5, 1.0, 0.5])
+
+    def wheel(t: FloatArray) -> FloatArray:
+        return np.asarray(colours[np.floor(3 * t / turn_s).astype(int) % 3])
+
+    def light(to_white: bool, rng: np.random.Generator) -> Light:
+        off_s = float(rng.uniform(0, turn_s))
+        change = both_ways(step(0.012))(to_white, rng)
+        return lambda t: change(t) * wheel(t + 1.0 + off_s)
+
+    found = World(light, exposure_s=0.0125, period_s=0.0141, steady=lambda t: wheel(t + 1.0)).measured(count=120)
+    assert found.flicker > 0.02
+    assert found.latency_s == pytest.approx(0.012, abs=turn_s / 8)
+    assert found.jitter_s < turn_s / 4
+    assert not found.rolling
+    whole = World(light, exposure_s=2 * turn_s, period_s=0.0181, steady=lambda t: wheel(t + 1.0)).measured(count=120)
+    assert whole.flicker < 0.005
+    assert whole.latency_s == pytest.approx(0.012, abs=turn_s / 8)
+
+
+def test_a_picture_built_up_row_by_row_is_waited_for_to_its_last_row() -> None:
+    found = World(both_ways(step(0.003)), scan_s=2e-4, period_s=0.024).measured()
+    assert found.scanned
+    assert not found.rolling
+    assert found.latency_s == pytest.approx(0.003, abs=2e-4)
+    assert found.latest_s == pytest.approx(0.003 + (ROWS - 1) * 2e-4, abs=5e-4)
+
+
+def test_saturated_and_unlit_pixels_do_not_count() -> None:
+    # The upper right of the picture saturates; a share read from it would be too great.
+    found = World(both_ways(step(0.012)), white_dn=300.0, line_s=6e-5).measured()
+    assert found.latency_s == pytest.approx(0.012, abs=1e-4)
+    assert found.line_time_s == pytest.approx(6e-5, rel=0.02)
+
+
+def test_levels_leave_out_rows_that_tell_nothing() -> None:
+    world, rng = World(both_ways(step(0.0))), np.random.default_rng(0)
+    shares = np.where(np.arange(ROWS) < 20, 0.0, 1.0)
+    black = [world.image(np.zeros(ROWS), rng) for _ in range(8)]
+    white = [world.image(shares, rng) for _ in range(8)]
+    levels = row_levels("eye", black, white, full_scale=255)
+    found = levels.shares(world.image(0.5 * shares, rng))
+    assert np.isnan(found[:20]).all()
+    assert found[20:] == pytest.approx(0.5, abs=0.03)
+
+
+# ---- what cannot be measured
+
+
+def levels_of(**world: Any) -> RowLevels:
+    return World(both_ways(step(0.0)), **world).levels(np.random.default_rng(0))
+
+
+def test_a_lamp_that_is_off_is_said_to_be() -> None:
+    with pytest.raises(ScanEvidenceError, match=r"sees no flash.*lamp is on"):
+        levels_of(white_dn=0.0)
+
+
+def test_too_much_light_is_said_to_be() -> None:
+    with pytest.raises(ScanEvidenceError, match=r"saturated.*expose shorter"):
+        levels_of(white_dn=3000.0)
+
+
+def test_too_noisy_a_picture_is_said_to_be() -> None:
+    with pytest.raises(ScanEvidenceError, match="rows tell white from black"):
+        levels_of(white_dn=60.0, noise_dn=15.0)
+
+
+def test_flashes_between_two_exposures_are_said_to_be() -> None:
+    with pytest.raises(ScanEvidenceError, match=r"between two exposures .* raise its frame rate"):
+        World(both_ways(step(0.012)), exposure_s=5e-4, period_s=0.1).measured(count=20)
+
+
+def test_light_that_comes_too_late_is_said_to() -> None:
+    with pytest.raises(ScanEvidenceError, match="did not change while it was watched"):
+        World(both_ways(step(0.35))).measured(count=20)

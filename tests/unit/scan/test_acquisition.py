@@ -1,0 +1,225 @@
+"""What a capture leaves on disk and tells the reconstruction: when all goes well, when frames are shot again, and when
+they fail for good.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slrig.bundle import read_bundle
+from slrig.bundle.refused import read_refused
+from slrig.capture.evidence import EvidenceSummary, check_capture
+from slrig.errors import DeviceGoneError, FrameTimeoutError, ScanCancelledError, ScanEvidenceError, SlrigError
+from slrig.model import Calibration, Shot
+from slrig.scan.acquisition import capture_bundle
+from slrig.scan.feed import Abandon, FrameFeed
+from slrig.scan.outline import Outline
+from slrig.scan.plan import ScanPlan
+from slrig.scan.report import capture_report
+from slrig.scan.stream import ScanStream
+from tests.contract.benches import PROJECTOR, simulated
+from tests.contract.suite import rig_of
+from tests.samples import sample_calibration
+from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig
+from tests.unit.scan.fakes import WAIT_S
+
+
+def faulty(**faults: object) -> FakeRig:
+    return fake_rig(faults={"right": CameraFaults(**faults)})  # type: ignore[arg-type]
+
+
+class Sink:
+    """Hears what a reconstruction would."""
+
+    def __init__(self) -> None:
+        self.outline: Outline | None = None
+        self.shots: list[Shot] = []
+        self.evidence: EvidenceSummary | None = None
+
+    def begin(self, outline: Outline, _calibration: Calibration | None) -> None:
+        self.outline = outline
+
+    def take(self, shot: Shot) -> None:
+        self.shots.append(shot)
+
+    def end(self, evidence: EvidenceSummary) -> None:
+        self.evidence = evidence
+
+
+def captured(fake: FakeRig, folder: Path, sink: Sink | FrameFeed | None = None) -> list[tuple[float, str]]:
+    told: list[tuple[float, str]] = []
+    capture_bundle(
+        fake.rig,
+        ScanPlan(),
+        folder,
+        progress=lambda _stage, fraction, detail: told.append((fraction, detail)),
+        cancelled=lambda: False,
+        frames=sink,
+    )
+    assert fake.at_rest
+    return told
+
+
+def test_a_sound_capture_is_a_bundle(tmp_path: Path) -> None:
+    sink = Sink()
+    told = captured(fake_rig(), tmp_path / "bundle", sink)
+    capture = read_bundle(tmp_path / "bundle").capture
+    assert len(capture.shots) == len(sink.shots) == 44
+    assert sink.evidence == check_capture(capture)
+    assert told[-1] == (1.0, "frame 44 of 44")
+
+
+def test_a_frame_that_was_shot_again_is_right_in_the_bundle_and_kept_beside_it(tmp_path: Path) -> None:
+    sink = Sink()
+    told = captured(faulty(stale=frozenset({5}), garbled=frozenset({17})), tmp_path / "bundle", sink)
+    capture = read_bundle(tmp_path / "bundle").capture
+    assert [(shot.pattern, shot.camera) for shot in capture.shots] == [
+        (index, name) for index in range(22) for name in ("left", "right")
+    ]
+    refused = read_refused(tmp_path / "bundle")
+    assert {(each.pattern, each.camera) for each in refused} >= {(4, "right"), (5, "right")}
+    summary = check_capture(capture, refused)
+    assert (summary.verified, summary.faults, summary.shot_again) == (22, (), len(refused))
+    assert sink.evidence is not None
+    assert sink.evidence.causes == summary.causes
+    assert str(sink.evidence) == str(summary) == f"22/22 patterns verified, {len(refused)} frames shot again"
+    assert told[-1] == (1.0, f"frame 44 of 44, {len(refused)} shot again")
+    fractions = [fraction for fraction, _ in told]
+    assert fractions == sorted(fractions)
+
+
+def test_the_report_says_what_was_verified_and_what_was_shot_again(tmp_path: Path) -> None:
+    captured(faulty(garbled=frozenset({17})), tmp_path / "bundle")
+    bundle = read_bundle(tmp_path / "bundle")
+    stream = ScanStream(
+        Outline.of(bundle.capture), replace(sample_calibration(), projector=None), entered=lambda *_: None
+    )
+    report = capture_report(bundle.capture, stream.axis, check_capture(bundle.capture, read_refused(bundle.folder)))
+    assert report["identity"] == "22/22 patterns verified, 1 frame shot again"
+    evidence = report["evidence"]
+    assert isinstance(evidence, dict)
+    assert (evidence["patterns_verified"], evidence["shot_again"]) == ("22/22", 1)
+    (cause,) = evidence["shot_again_because"]
+    assert cause.startswith("camera 'right', pattern 17 (column lines, shift 5 of 8): ")
+
+
+def test_a_reconstruction_that_was_fed_a_frame_that_is_replaced_reads_the_bundle(tmp_path: Path) -> None:
+    sent: list[object] = []
+
+    def send(message: object) -> bool:
+        sent.append(message)
+        return True
+
+    feed = FrameFeed(send)
+    fake = faulty(stale=frozenset({5}))
+    captured(replace(fake, rig=replace(fake.rig, calibration=sample_calibration())), tmp_path / "b", feed)
+    assert feed.settled(WAIT_S)
+    assert not feed.whole
+    assert isinstance(sent[-1], Abandon)
+
+
+def test_a_reconstruction_that_was_fed_no_frame_that_is_replaced_goes_on(tmp_path: Path) -> None:
+    feed = FrameFeed(lambda _message: True)
+    # A line frame is judged as it comes, before anybody sees it.
+    fake = faulty(garbled=frozenset({17}))
+    captured(replace(fake, rig=replace(fake.rig, calibration=sample_calibration())), tmp_path / "b", feed)
+    assert feed.settled(WAIT_S)
+    assert feed.whole
+
+
+@pytest.mark.parametrize(
+    ("faults", "kind"),
+    [
+        ({"garbled": frozenset(range(17, 1000))}, ScanEvidenceError),
+        ({"drop": frozenset(range(17, 1000))}, FrameTimeoutError),
+    ],
+)
+def test_frames_that_fail_for_good_are_kept(tmp_path: Path, faults: dict[str, object], kind: type[SlrigError]) -> None:
+    folder = tmp_path / "bundle"
+    with pytest.raises(kind, match=r"failed 3 times.*The frames are kept: see bundle.json .*, refused/ for the others"):
+        captured(faulty(**faults), folder)
+    capture = read_bundle(folder).capture
+    assert {shot.pattern for shot in capture.shots if shot.camera == "right"} == set(range(17))
+    # As far as they go, they are right.
+    assert check_capture(capture).faults == ()
+    told = json.loads((folder / "refused" / "refused.json").read_text())
+    assert "failed 3 times" in told["ended"]
+    worst = [each for each in told["frames"] if each["pattern"] == 17]
+    assert [each["attempt"] for each in worst] == [1, 2, 3]
+    assert all((folder / each["file"]).is_file() for each in told["frames"] if "file" in each)
+    assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
+
+
+def test_a_lamp_that_is_off_leaves_what_the_cameras_saw(tmp_path: Path) -> None:
+    folder = tmp_path / "bundle"
+    with pytest.raises(ScanEvidenceError, match="is the lamp off"):
+        captured(fake_rig(projector={"lamp_off": True}), folder)
+    refused = json.loads((folder / "refused" / "refused.json").read_text())["frames"]
+    assert len(refused) >= 6
+    assert np.mean([(folder / each["file"]).is_file() for each in refused]) == 1
+
+
+def test_a_device_that_is_gone_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGoneError):
+        captured(faulty(unplug_at=9), tmp_path / "bundle")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cancel_after_a_refusal_leaves_nothing(tmp_path: Path) -> None:
+    count = 0
+
+    def cancelled() -> bool:
+        nonlocal count
+        count += 1
+        return count > 30
+
+    with pytest.raises(ScanCancelledError):
+        capture_bundle(
+            faulty(stale=frozenset({5})).rig,
+            ScanPlan(),
+            tmp_path / "bundle",
+            progress=lambda *_: None,
+            cancelled=cancelled,
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def steady(folder: Path, *, exposures_s: tuple[float, ...] | None = None) -> tuple[set[float | None], list[str]]:
+    """The exposures of a scan on a rendered display of 250 Hz, and what it told."""
+    display = {
+        "size_px": [PROJECTOR.width_px, PROJECTOR.height_px],
+        "focal_px": [440.0, 440.0],
+        "position_mm": [90.0, 0.0, -500.0],
+        "target_mm": [0.0, 0.0, 0.0],
+        "blur_px": 0.4,
+        "refresh_hz": 250.0,
+    }
+    told: list[str] = []
+    with simulated(folder, projector=display).head() as head:
+        capture_bundle(
+            rig_of(head),
+            ScanPlan(exposures_s=exposures_s),
+            folder / "bundle",
+            progress=lambda _stage, _fraction, detail: told.append(detail),
+            cancelled=lambda: False,
+        )
+    shots = read_bundle(folder / "bundle").capture.shots
+    return {None if shot.exposure_s is None else round(shot.exposure_s, 9) for shot in shots}, told
+
+
+def test_exposures_are_whole_refresh_periods_of_the_projector_and_it_says_so(tmp_path: Path) -> None:
+    exposures_s, told = steady(tmp_path)
+    assert exposures_s == {0.016}
+    words = "camera 'left' exposes for 0.016 s instead of 0.0166667 s: whole periods of the projector (0.004 s)"
+    assert words in told
+
+
+def test_exposures_of_a_bracket_that_become_one_are_played_once(tmp_path: Path) -> None:
+    exposures_s, told = steady(tmp_path, exposures_s=(0.0075, 0.0085, 0.02))
+    assert exposures_s == {0.008, 0.02}
+    assert sum("instead of" in words for words in told) == 2
