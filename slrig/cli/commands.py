@@ -1,4 +1,6 @@
-"""slrig's commands and their exit codes: 0 well, 1 a defect of slrig, 2 something to be put right, 130 Ctrl-C."""
+"""slrig's commands and their exit codes: 0 well, 1 a defect of slrig, 2 something to be put right, 130 Ctrl-C.
+`slrig conform` exits with 1 for a defect of a driver, `slrig doctor` for one of the rig, too.
+"""
 
 from __future__ import annotations
 
@@ -72,6 +74,13 @@ class FurtherFormat(StrEnum):
     OBJ = "obj"
 
 
+class WatchedBy(StrEnum):
+    """How a camera that watches flashes is triggered."""
+
+    FREE = "free"
+    SOFTWARE = "software"
+
+
 USUAL_URL = "http://127.0.0.1:8731"
 
 
@@ -132,7 +141,10 @@ def scan(
         ),
     ] = None,
     label: Annotated[str | None, typer.Option(help="Free text, to find the scan again.")] = None,
-    exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera, seconds.")] = None,
+    exposure_s: Annotated[
+        list[float] | None,
+        typer.Option(help="Exposure of every camera, seconds; repeated, a bracket for what is dark here, shiny there."),
+    ] = None,
     period_px: Annotated[int | None, typer.Option(help="Distance of two lines in one frame, projector pixels.")] = None,
     line_width_px: Annotated[int | None, typer.Option(help="Width of a line, projector pixels.")] = None,
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
@@ -158,7 +170,7 @@ def scan(
     )
     request = {
         "label": label,
-        "exposure_s": exposure_s,
+        **_exposure(exposure_s or []),
         "if_busy": "queue" if queue else "reject",
         "patterns": patterns,
         "reconstruction": _given(
@@ -213,6 +225,61 @@ def devices(
     from slrig.cli.devices import list_devices
 
     list_devices(as_json=as_json)
+
+
+@app.command()
+def conform(
+    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Examine a rig by the driver contract and score it; exit code 1 unless every check that applies passes."""
+    from slrig.cli.conform import conform as examine
+
+    if not examine(rig, as_json=as_json):
+        raise typer.Exit(1)
+
+
+@app.command()
+def latency(
+    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    flashes: Annotated[int, typer.Option(min=8, max=1000, help="Flashes that each camera must see happen.")] = 40,
+    search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
+    exposure_s: Annotated[
+        float | None, typer.Option(help="Exposure of every camera for this test. Default: the rig file's.")
+    ] = None,
+    trigger: Annotated[
+        WatchedBy | None, typer.Option(help="How exposures are started. Default: free where a camera can.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Flash the projector: how late is its light, and do the cameras have rolling shutters?"""
+    from slrig.cli.latency import tell_latency
+
+    kind = None if trigger is None else trigger.value
+    tell_latency(rig, trials=flashes, search_s=search_s, exposure_s=exposure_s, trigger=kind, as_json=as_json)
+
+
+def _exposure(times_s: list[float]) -> dict[str, object]:
+    """One exposure time is one, several are a bracket."""
+    return {"exposures_s": times_s} if len(times_s) > 1 else {"exposure_s": times_s[0] if times_s else None}
+
+
+@app.command()
+def doctor(
+    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
+    search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Examine a rig before a still object: light, timing, picture, focus, response, flicker, and what to do about them.
+
+    Exit code 1 if there is a fault.
+    """
+    from slrig.cli.doctor import doctor as examine
+
+    if not examine(rig, output=output, force=force, search_s=search_s, as_json=as_json):
+        raise typer.Exit(1)
 
 
 def _given(**options: object) -> dict[str, object]:

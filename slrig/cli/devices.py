@@ -1,44 +1,133 @@
-"""`slrig devices`: what is installed, what is plugged in."""
+"""`slrig devices`: what is installed, what is plugged in, what is missing, and the commands that put it right."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import asdict, dataclass
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from slrig.discovery import found_devices, installed_drivers
+from slrig.discovery import Findings, InstalledDriver, found_devices, installed_drivers
+
+_STDOUT, _STDERR = 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class BrokenPackage:
+    """An installed package with a driver that cannot be loaded: why, and the command that removes the package."""
+
+    package: str
+    drivers: tuple[str, ...]
+    fault: str
+    remove: str
 
 
 def list_devices(*, as_json: bool) -> None:
-    """Print the drivers that are installed and the devices that are plugged in."""
-    drivers = installed_drivers()
-    found = found_devices()
+    """Print the drivers that are installed, the devices that are plugged in, and what is missing to drive more."""
+    with _only_ours_on_stdout():
+        drivers = installed_drivers()
+        found = found_devices()
+    broken = broken_packages(drivers)
     if as_json:
         document = {
             "drivers": [asdict(driver) for driver in drivers],
             "devices": [asdict(device) for device in found.devices],
+            "missing": [asdict(library) for library in found.missing],
+            "broken": [asdict(package) for package in broken],
             "faults": [str(fault) for fault in found.faults],
         }
         typer.echo(json.dumps(document, indent=2))
         return
     console = Console()
-    table = Table("driver", "for a", "package", "state", title="Installed drivers", title_justify="left", box=None)
+    _tell_drivers(drivers, found, console)
+    _tell_devices(found, console)
+    _tell_remedies(found, broken, {driver.fault for driver in drivers})
+
+
+def broken_packages(drivers: Sequence[InstalledDriver]) -> tuple[BrokenPackage, ...]:
+    """The packages whose drivers cannot be loaded, by name, each with the first of its faults."""
+    faulty = [driver for driver in drivers if driver.fault is not None]
+    return tuple(
+        BrokenPackage(
+            package,
+            tuple(sorted({driver.name for driver in faulty if driver.package == package})),
+            next(driver.fault or "" for driver in faulty if driver.package == package),
+            f"pip uninstall {package}",
+        )
+        for package in sorted({driver.package for driver in faulty})
+    )
+
+
+def _tell_drivers(drivers: Sequence[InstalledDriver], found: Findings, console: Console) -> None:
+    missing = {library.driver for library in found.missing}
+    table = _table("Installed drivers", "driver", "for a", "package", "state")
     for driver in drivers:
+        if driver.kind == "finder":
+            continue
+        state = "ok"
+        if driver.fault is not None:
+            state = "broken, see below"
+        elif driver.name in missing:
+            state = "its library is missing, see below"
         package = f"{driver.package} {driver.version}".strip()
-        table.add_row(driver.name, driver.kind, package, "ok" if driver.fault is None else driver.fault)
+        table.add_row(escape(driver.name), driver.kind, escape(package), state)
     console.print(table)
     console.print()
-    if found.devices:
-        plugged = Table("driver", "device", "what it is", title="Plugged-in devices", title_justify="left", box=None)
-        for device in found.devices:
-            plugged.add_row(device.driver, device.device, device.label)
-        console.print(plugged)
-    else:
+
+
+def _tell_devices(found: Findings, console: Console) -> None:
+    if not found.devices:
         console.print(
-            "No device is plugged in that an installed driver can find. A rendered rig needs none: slrig demo"
+            "No device is plugged in that an installed driver can find. Check cable and power; if the system does see "
+            "the device, check your right to open it. A rendered rig needs none: slrig demo"
         )
-    for fault in found.faults:
-        console.print(f"[red]fault[/red] {fault}")
+        return
+    table = _table("Plugged-in devices", "driver", "device", "what it is")
+    for device in found.devices:
+        table.add_row(escape(device.driver), escape(device.device), escape(device.label))
+    console.print(table)
+    console.print('\nWrite driver and device into a rig file: driver = "…", device = "…".', markup=False)
+
+
+def _tell_remedies(found: Findings, broken: Sequence[BrokenPackage], told: set[str | None]) -> None:
+    # Neither wrapped nor styled: commands are there to be copied whole.
+    if found.missing:
+        typer.echo("\nMore devices can be used after:")
+        for library in found.missing:
+            typer.echo(f"  {library.driver}: {library.install}")
+    for package in broken:
+        names = ", ".join(package.drivers)
+        typer.echo(f"\nBroken: package {package.package} (drivers: {names}); the others work without it.")
+        typer.echo(f"  {package.fault}\n  to remove it: {package.remove}")
+    # A finder that cannot be loaded was told with its package.
+    for fault in map(str, found.faults):
+        if fault not in told:
+            typer.echo(f"\nNot looked for: {fault}")
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=None)
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    return table
+
+
+@contextmanager
+def _only_ours_on_stdout() -> Iterator[None]:
+    """Send what drivers and their libraries, Python or not, write on standard output to standard error."""
+    sys.stdout.flush()
+    ours = os.dup(_STDOUT)
+    try:
+        os.dup2(_STDERR, _STDOUT)
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        os.dup2(ours, _STDOUT)
+        os.close(ours)

@@ -84,8 +84,10 @@ def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...]
 
 
 def quality_lines(summary: Mapping[str, Any]) -> list[str]:
-    """What a report's summary says about the mesh and its error, one line each."""
+    """What a report's summary says about the frames, the mesh and its error, one line each."""
     lines = []
+    if summary.get("identity") is not None:
+        lines.append(f"{'frames':<10}{summary['identity']}")
     mesh = summary.get("mesh") or {}
     figures = mesh.get("figures") or {}
     if figures.get("triangles") is not None:

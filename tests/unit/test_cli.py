@@ -81,6 +81,7 @@ def test_error_of_ours_is_one_screen_and_exit_code_2(tmp_path: Path) -> None:
         ["scan", "--url", "http://127.0.0.1:9", "--output", str(tmp_path / "out")],
         ["scan", "--url", "http://127.0.0.1:9", "--key-file", str(tmp_path / "absent.key")],
         ["demo", str(tmp_path / "absent.toml"), "--output", str(tmp_path / "out")],
+        ["conform", str(tmp_path / "absent.toml")],
     ):
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == 2, arguments

@@ -1,0 +1,201 @@
+"""Frames: what is in one, when it was exposed, and that it shows the pattern it was asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slrig.conformance.check import Check, Need, check, expect, near
+from slrig.conformance.stand import Stand
+from slrig.devices import AppliedSettings, CameraInfo
+from slrig.model import Frame
+
+_ALTERNATIONS = 12
+_IDLE_BEFORE = (4, 9)
+_STEPPED = (Need.STEPPED,)
+_SEEN = (Need.STEPPED, Need.WHITE_AND_BLACK)
+
+
+@check(
+    asks=("Camera.info", "Camera.read", "Projector.show"),
+    needs=_STEPPED,
+)
+def frames_are_as_declared(stand: Stand) -> None:
+    """Frames have the name, extent, type and range that the camera declares."""
+    for name, trigger in stand.ways():
+        with stand.view(name, trigger) as view:
+            for index in range(len(stand.opening)):
+                expect_declared(view.expose(index), view.camera.info)
+
+
+@check(
+    asks=("Camera.configure", "Camera.read"),
+    needs=_STEPPED,
+)
+def frames_tell_their_exposure(stand: Stand) -> None:
+    """Frames tell the exposure and gain that were set, and lasted as long."""
+    for name, trigger in stand.ways():
+        with stand.view(name, trigger) as view:
+            for index in range(len(stand.opening)):
+                expect_exposed(view.expose(index), view.applied)
+
+
+@check(asks=("Camera.read",), needs=_STEPPED)
+def frame_numbers_and_times_rise(stand: Stand) -> None:
+    """Frame numbers and times only rise."""
+    for name, trigger in stand.ways():
+        with stand.view(name, trigger) as view:
+            last = view.expose(0)
+            for index in range(6):
+                frame = view.expose(index % len(stand.sequence))
+                expect(
+                    frame.sequence_number > last.sequence_number,
+                    asked=f"a frame number is above {last.sequence_number}, that of the frame before",
+                    found=frame.sequence_number,
+                    do="count every frame that the sensor made, unroll the device's counter, and return none twice",
+                )
+                expect(
+                    frame.t_start_ns + frame.t_err_ns >= last.t_end_ns - last.t_err_ns,
+                    asked=f"a frame begins after the end of the one before, {last.t_end_ns} ± {last.t_err_ns} ns",
+                    found=f"{frame.t_start_ns} ± {frame.t_err_ns} ns",
+                    do="take time stamps from the device, and return each frame once",
+                )
+                expect(
+                    frame.dropped_count >= last.dropped_count >= 0,
+                    asked=f"dropped_count goes on from {last.dropped_count} while the camera is armed",
+                    found=frame.dropped_count,
+                    do="count lost and corrupt frames since arm",
+                )
+                last = frame
+
+
+@check(
+    asks=("Camera.read", "Projector.show"),
+    needs=_STEPPED,
+)
+def frame_times_lie_on_the_projectors_clock(stand: Stand) -> None:
+    """Times of frames lie on the projector's clock."""
+    do = "convert the device's clock to CLOCK_MONOTONIC (time.monotonic_ns), and state the error in t_err_ns"
+    for name, trigger in stand.ways():
+        with stand.view(name, trigger) as view:
+            before = view.show(0)
+            for index in (1, 0, 1):
+                view.start()
+                frame = view.read(view.stable_ns(before))
+                expect(frame.t_err_ns >= 0, asked="t_err_ns is 0 or more", found=frame.t_err_ns, do=do)
+                after = view.show(index % len(stand.sequence))
+                expect(
+                    frame.t_start_ns >= view.stable_ns(before),
+                    asked=f"a frame read after {view.stable_ns(before)} ns begins after that",
+                    found=f"{frame.t_start_ns} ns",
+                    do=do,
+                )
+                expect(
+                    frame.t_end_ns - frame.t_err_ns <= view.stable_ns(after),
+                    asked=f"a frame that was in hand before a pattern lit at {after.t_visible_ns} ns ended before that",
+                    found=f"{frame.t_end_ns} ± {frame.t_err_ns} ns",
+                    do=do,
+                )
+                before = after
+
+
+@check(
+    asks=("Camera.read", "Camera.trigger", "Projector.show"),
+    needs=_SEEN,
+)
+def a_frame_lies_wholly_in_its_pattern(stand: Stand) -> None:
+    """Every frame shows its pattern and no other's light, at once and after a pause."""
+    for name, trigger in stand.ways(every=True):
+        with stand.view(name, trigger) as view:
+            view.learn()
+            for turn in range(_ALTERNATIONS):
+                index = turn % 2
+                if turn in _IDLE_BEFORE:
+                    view.show(1 - index)
+                    view.let_frames_pile_up()
+                view.expect_level(
+                    view.expose(index),
+                    index,
+                    asked="a frame that was read after a pattern became visible shows that pattern alone",
+                    do="read returns frames whose whole exposure, all rows, lies after after_ns; show returns once its "
+                    "light is on the scene",
+                )
+
+
+@check(asks=("Camera.read",), needs=_SEEN)
+def a_frame_keeps_its_pixels(stand: Stand) -> None:
+    """A frame keeps its pixels when the next ones come."""
+    for name, trigger in stand.ways():
+        with stand.view(name, trigger) as view:
+            frame = view.expose(0)
+            kept = frame.image.copy()
+            for index in (1, 1, 1, 1, 1, 1, 1, 1):
+                view.expose(index)
+            changed = int(np.count_nonzero(frame.image != kept))
+            expect(
+                changed == 0,
+                asked="a frame's image is its own after eight more frames",
+                found=f"{changed} of {kept.size} pixels changed",
+                do="copy the image out of the driver's buffer before the buffer is used again",
+            )
+
+
+def expect_declared(frame: Frame, info: CameraInfo) -> None:
+    """Expect that a frame is what its camera declares. Raises ExpectationError."""
+    declared = info.format
+    kind = np.dtype(np.uint8 if declared.bit_depth <= 8 else np.uint16)
+    expect(
+        frame.camera == info.name,
+        asked=f"a frame names its camera '{info.name}'",
+        found=f"'{frame.camera}'",
+        do="use the name that the factory is given",
+    )
+    expect(
+        frame.image.shape == declared.size.shape,
+        asked=f"a frame of a camera of {declared.size} has {declared.size.shape} rows and columns",
+        found=frame.image.shape,
+        do="declare the extent that the device delivers, as Size(width_px, height_px)",
+    )
+    expect(
+        frame.image.dtype == kind,
+        asked=f"{declared.bit_depth} bits come as {kind}",
+        found=frame.image.dtype,
+        do="unpack the samples, or declare their bit depth",
+    )
+    expect(
+        frame.image.max() <= declared.full_scale,
+        asked=f"no sample is above {declared.full_scale}, the full scale of {declared.bit_depth} bits",
+        found=int(frame.image.max()),
+        do="align samples to the right, or declare their bit depth",
+    )
+
+
+def expect_exposed(frame: Frame, applied: AppliedSettings) -> None:
+    """Expect that a frame was exposed as the camera was set. Raises ExpectationError."""
+    for what, got, wanted in (
+        ("exposure_s", frame.exposure_s, applied.exposure_s),
+        ("gain", frame.gain, applied.gain),
+    ):
+        expect(
+            near(got, wanted),
+            asked=f"a frame's {what} is {wanted:.6g}, which configure returned",
+            found=f"{got:.6g}",
+            do="switch automatic control off, read settings back, and pass over frames from before",
+        )
+    lasted_s = (frame.t_end_ns - frame.t_start_ns + 2 * frame.t_err_ns) / 1e9
+    spanned_s = frame.exposure_s + frame.shutter_skew_s
+    expect(
+        np.isnan(spanned_s) or lasted_s >= 0.99 * spanned_s,
+        asked=f"t_start_ns to t_end_ns spans exposure and shutter skew, {spanned_s:.6g} s",
+        found=f"{lasted_s:.6g} s, with what t_err_ns allows",
+        do="t_start_ns is when the first row begins, t_end_ns when the last row ends",
+    )
+
+
+CHECKS: tuple[Check, ...] = (
+    frames_are_as_declared,
+    frames_tell_their_exposure,
+    frame_numbers_and_times_rise,
+    frame_times_lie_on_the_projectors_clock,
+    a_frame_lies_wholly_in_its_pattern,
+    a_frame_keeps_its_pixels,
+)

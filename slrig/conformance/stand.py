@@ -1,0 +1,226 @@
+"""Where a rig stands to be examined: opened when needed, shared by the checks, and looked at through its cameras."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from slrig.capture.synchronisation import stable_from_ns
+from slrig.conformance.check import STEPPED, at, expect
+from slrig.conformance.light import DARK, LIT, Light, learn_light
+from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Shown, Trigger
+from slrig.model import Frame, PatternSequence
+
+SHORT_S = 0.05
+"""How long a frame is waited for that must not come."""
+
+LONG_S = 5.0
+"""How long a frame is waited for that must come, beyond its exposure."""
+
+FRAMES = 256
+"""Room for as many frames as any check takes from a camera that it armed once."""
+
+USUAL_EXPOSURE_S = 1 / 60
+
+_SETTLE_S = 0.1
+_MOST_LOOKS = 64
+_LEARNT_FROM = 3
+
+
+class Stand:
+    """A rig under examination. One thread uses it.
+
+    Parameters
+    ----------
+    open_rig
+        Opens the rig afresh; called again after `close`.
+    sequence
+        Patterns that its projector can show; most checks want white and black first.
+    """
+
+    def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence) -> None:
+        self._open_rig = open_rig
+        self._rig: Rig | None = None
+        self._lights: dict[str, Light] = {}
+        self.sequence = sequence
+        self.now_ns = 0
+
+    @property
+    def rig(self) -> Rig:
+        """The open rig. Raises what opening it raises."""
+        if self._rig is None:
+            # A rendered rig begins a time of its own.
+            self.now_ns = 0
+            self._rig = self._open_rig()
+        return self._rig
+
+    @property
+    def opening(self) -> PatternSequence:
+        """The first patterns of the sequence, where a few are enough."""
+        few = min(len(self.sequence), 4)
+        return PatternSequence(self.sequence.projector, self.sequence.patterns[:few], self.sequence.profiles[:few])
+
+    def close(self) -> None:
+        """Close the rig, whatever state it is in. Idempotent."""
+        rig, self._rig = self._rig, None
+        if rig is not None:
+            rig.close()
+
+    def rest(self) -> None:
+        """Leave the rig, if it is open, dark and disarmed for the next check."""
+        if self._rig is not None:
+            for camera in self._rig.cameras.values():
+                camera.disarm()
+            self._rig.projector.blank()
+
+    def noted(self, t_ns: int) -> None:
+        """Remember an instant that has passed, ns on the rig's clock: later frames may be asked to begin after it."""
+        self.now_ns = max(self.now_ns, t_ns)
+
+    def settings(self, name: str) -> CameraSettings:
+        """What the rig file asks of a camera, else one period of a usual projector, within what the camera can."""
+        return self.rig.settings.get(name) or usual_settings(self.rig.cameras[name])
+
+    def ways(self, *, every: bool = False) -> Iterator[tuple[str, Trigger]]:
+        """Each camera that can follow a stepping projector, with its best trigger for that, or with every one."""
+        for name, camera in self.rig.cameras.items():
+            possible = [trigger for trigger in STEPPED if trigger in camera.info.triggers]
+            for trigger in possible if every else possible[:1]:
+                yield name, trigger
+
+    @contextmanager
+    def view(self, name: str, trigger: Trigger, *, load: bool = True) -> Iterator[View]:
+        """A camera, set and armed, before the projector with its sequence loaded; disarmed afterwards."""
+        with at(f"camera '{name}', {trigger} trigger"):
+            camera = self.rig.cameras[name]
+            camera.disarm()
+            applied = camera.configure(self.settings(name))
+            if load:
+                self.rig.projector.load(self.sequence)
+            camera.arm(FRAMES, trigger)
+            try:
+                yield View(self, name, trigger, self.rig.projector, camera, applied)
+            except BaseException:
+                # The error that ended the block is the one to tell.
+                with suppress(Exception):
+                    camera.disarm()
+                raise
+            camera.disarm()
+
+    def light(self, view: View) -> Light:
+        """What the camera sees of the projector, learnt once. Raises ExpectationError where it sees nothing of it."""
+        known = self._lights.get(view.name)
+        if known is None:
+            white, black = ([view.expose(index).image for _ in range(_LEARNT_FROM)] for index in (0, 1))
+            known = learn_light(white, black, full_scale=view.camera.info.format.full_scale)
+            self._lights[view.name] = known
+        return known
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One armed camera before the projector."""
+
+    stand: Stand
+    name: str
+    trigger: Trigger
+    projector: Projector
+    camera: Camera
+    applied: AppliedSettings
+
+    @property
+    def exposure_s(self) -> float:
+        """The exposure in use; a usual one where the camera cannot tell."""
+        return self.applied.exposure_s if np.isfinite(self.applied.exposure_s) else USUAL_EXPOSURE_S
+
+    @property
+    def patience_s(self) -> float:
+        """How long a frame may take."""
+        return LONG_S + 2 * self.exposure_s
+
+    def show(self, index: int) -> Shown:
+        """Show a pattern; the instant from which its light is certain is remembered."""
+        shown = self.projector.show(index)
+        stable_ns = self.stable_ns(shown)
+        if self.stand.rig.synchronisation is not None:
+            # A display that is known to be slower than its driver says: its light is waited for before a trigger.
+            self.stand.rig.clock.wait_until(stable_ns, threading.Event())
+        self.stand.noted(stable_ns)
+        return shown
+
+    def stable_ns(self, shown: Shown) -> int:
+        """The instant from which a pattern's light is the only one, as far as the rig's latency is known."""
+        return stable_from_ns(shown, self.stand.rig.synchronisation)
+
+    def start(self) -> None:
+        """Start one exposure, if somebody has to."""
+        if self.trigger is Trigger.SOFTWARE:
+            self.camera.trigger()
+
+    def read(self, after_ns: int) -> Frame:
+        """Return the next frame that was exposed wholly after an instant."""
+        frame = self.camera.read(after_ns, self.patience_s)
+        self.stand.noted(frame.t_end_ns)
+        return frame
+
+    def expose(self, index: int) -> Frame:
+        """Show a pattern and return a frame of it."""
+        shown = self.show(index)
+        self.start()
+        return self.read(self.stable_ns(shown))
+
+    def look(self) -> Frame:
+        """Return a frame of whatever is shown now."""
+        self.start()
+        # A camera that runs by itself may still hold frames from before; one that was triggered just now cannot.
+        return self.read(self.stand.now_ns if self.trigger is Trigger.FREE else 0)
+
+    def learn(self) -> Light:
+        """Find out how white and black look, if nobody has yet: shows both. Raises ExpectationError."""
+        return self.stand.light(self)
+
+    def level(self, frame: Frame) -> float:
+        """How much of the projector's white is in a frame. Call `learn` first, before what is to be looked at."""
+        return self.stand.light(self).level(frame.image)
+
+    def expect_level(self, frame: Frame, index: int, *, asked: str, do: str) -> None:
+        """Expect a frame of pattern 0 to be white, one of pattern 1 to be black. Raises ExpectationError."""
+        level = self.level(frame)
+        expect(
+            level >= LIT if index == 0 else level <= DARK,
+            asked=asked,
+            found=f"a frame of {'white' if index == 0 else 'black'} with {level:.0%} of white's light, exposed from "
+            f"{frame.t_start_ns} to {frame.t_end_ns} ns",
+            do=do,
+        )
+
+    def darkest(self) -> float:
+        """The level of what is shown now, looked at until it is dark or the projector has had its time to go dark."""
+        measured = self.stand.rig.synchronisation
+        late_s = 0.0 if measured is None else measured.latency_s + measured.latency_error_s
+        allowed_s = min(self.projector.info.latency_s + max(late_s, 0.0), 1.0) + _SETTLE_S
+        first = last = self.look()
+        level = self.level(first)
+        for _ in range(_MOST_LOOKS):
+            if level <= DARK or last.t_start_ns - first.t_start_ns > allowed_s * 1e9:
+                break
+            last = self.look()
+            level = min(level, self.level(last))
+        return level
+
+    def let_frames_pile_up(self) -> None:
+        """Let time pass in which nobody reads, so that a camera that runs by itself fills its driver's buffers."""
+        clock = self.stand.rig.clock
+        waited_s = min(max(6 * self.exposure_s, 0.1), 0.5)
+        clock.wait_until(clock.now_ns() + round(waited_s * 1e9), threading.Event())
+
+
+def usual_settings(camera: Camera) -> CameraSettings:
+    """One period of a usual projector and no gain, within what a camera can."""
+    least_s, most_s = camera.info.exposure_range_s
+    least, most = camera.info.gain_range
+    return CameraSettings(min(max(USUAL_EXPOSURE_S, least_s), most_s), min(max(1.0, least), most))

@@ -1,0 +1,171 @@
+"""States: what may be asked of a device when, and that a call in the wrong state is refused."""
+
+from __future__ import annotations
+
+from slrig.conformance.check import STEPPED, Check, Need, at, check, expect, refused
+from slrig.conformance.stand import SHORT_S, Stand
+from slrig.devices import Trigger
+from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.model import Size, White
+from slrig.patterns.sequence import encode
+
+_ANOTHER_CLOCK_NS = 60 * 10**9
+"""Times that lie further apart count in different clocks: a recording need not have one that runs."""
+
+_STATE = "keep the state in the driver, and check it before the device is touched"
+
+
+@check(
+    asks=("Camera.configure", "Camera.arm", "Camera.read"),
+    needs=(Need.STEPPED,),
+)
+def an_armed_camera_refuses_to_be_set_or_armed(stand: Stand) -> None:
+    """An armed camera refuses to be set or armed, and goes on."""
+    for name, trigger in stand.ways():
+        with stand.view(name, trigger) as view:
+            with refused(DeviceStateError, asked="configure of an armed camera", do=_STATE):
+                view.camera.configure(stand.settings(name))
+            with refused(DeviceStateError, asked="arm of an armed camera", do=_STATE):
+                view.camera.arm(1, trigger)
+            view.expose(0)
+
+
+@check(
+    asks=("Camera.trigger", "Camera.read", "Camera.disarm"),
+)
+def trigger_and_read_need_an_armed_camera(stand: Stand) -> None:
+    """Trigger and read need an armed camera."""
+    for name, camera in stand.rig.cameras.items():
+        with at(f"camera '{name}'"):
+            camera.configure(stand.settings(name))
+            for state in ("that was not armed", "that was disarmed"):
+                with refused(DeviceStateError, asked=f"trigger of a camera {state}", do=_STATE):
+                    camera.trigger()
+                with refused(DeviceStateError, asked=f"read of a camera {state}", do=_STATE):
+                    camera.read(0, SHORT_S)
+                camera.arm(1, min(camera.info.triggers, key=(*STEPPED, Trigger.HARDWARE).index))
+                if Trigger.SOFTWARE in camera.info.triggers:
+                    camera.trigger()
+                camera.disarm()
+
+
+@check(
+    asks=("Projector.load", "Projector.show"),
+    fresh=True,
+)
+def show_needs_a_loaded_sequence(stand: Stand) -> None:
+    """Show needs a loaded sequence, and one of its patterns."""
+    projector, sequence = stand.rig.projector, stand.sequence
+    with at("projector"):
+        with refused(DeviceStateError, asked="show before load", do=_STATE):
+            projector.show(0)
+        projector.load(sequence)
+        for index in (-1, len(sequence)):
+            with refused(
+                UnsupportedByDeviceError,
+                asked=f"show({index}) of a sequence with patterns 0 to {len(sequence) - 1}",
+                do="compare the index with the length of the sequence",
+            ):
+                projector.show(index)
+        projector.show(0)
+
+
+@check(
+    asks=("Projector.show",),
+)
+def show_tells_which_pattern_is_lit_since_when(stand: Stand) -> None:
+    """Show tells which pattern is lit since when, once it is."""
+    projector = stand.rig.projector
+    with at("projector"):
+        projector.load(stand.sequence)
+        last = None
+        for index in (0, len(stand.sequence) - 1, 0):
+            shown = projector.show(index)
+            returned_ns = stand.rig.clock.now_ns()
+            expect(
+                shown.index == index and shown.t_err_ns >= 0,
+                asked=f"show({index}) tells of pattern {index}, with an error of 0 ns or more",
+                found=shown,
+                do="return the index that was asked for",
+            )
+            expect(
+                last is None or shown.t_visible_ns > last.t_visible_ns,
+                asked=f"a pattern becomes visible after the one before it, at {last and last.t_visible_ns} ns",
+                found=f"{shown.t_visible_ns} ns",
+                do="return the instant of this pattern's light, on CLOCK_MONOTONIC",
+            )
+            expect(
+                abs(shown.t_visible_ns - returned_ns) > _ANOTHER_CLOCK_NS
+                or shown.t_visible_ns - shown.t_err_ns <= returned_ns,
+                asked="show returns once the pattern is visible",
+                found=f"a return {(shown.t_visible_ns - returned_ns) / 1e6:.3f} ms before",
+                do="wait in show until t_visible_ns + t_err_ns has passed",
+            )
+            last = shown
+    for name, trigger in stand.ways():
+        if trigger is not Trigger.SOFTWARE:
+            continue
+        with stand.view(name, trigger) as view:
+            shown = view.show(0)
+            frame = view.look()
+            expect(
+                frame.t_start_ns + frame.t_err_ns >= shown.t_visible_ns - shown.t_err_ns,
+                asked=f"an exposure triggered when show returns begins after the light, {shown.t_visible_ns} ns",
+                found=f"{frame.t_start_ns} ns",
+                do="wait in show until t_visible_ns + t_err_ns has passed",
+            )
+
+
+@check(
+    asks=("Projector.load", "Projector.info"),
+    fresh=True,
+)
+def a_sequence_of_another_size_is_refused(stand: Stand) -> None:
+    """A sequence for a projector of another size is refused."""
+    projector = stand.rig.projector
+    size = projector.info.size
+    with at("projector"):
+        for other in (Size(size.width_px + 8, size.height_px), Size(size.width_px, size.height_px + 8)):
+            with refused(
+                UnsupportedByDeviceError,
+                asked=f"a sequence for {other} on a projector of {size}",
+                do="compare sequence.projector with the declared size in load: scaled patterns measure nothing",
+            ):
+                projector.load(encode((White(),), other))
+        with refused(DeviceStateError, asked="show after a load that was refused", do=_STATE):
+            projector.show(0)
+
+
+@check(
+    asks=("Projector.play", "Projector.stop", "Projector.info"),
+    fresh=True,
+)
+def a_projector_plays_only_if_it_says_so(stand: Stand) -> None:
+    """A projector plays if it says so, and else refuses."""
+    projector = stand.rig.projector
+    exposure_s = max((stand.settings(name).exposure_s for name in stand.rig.cameras), default=0.01)
+    with at("projector"):
+        if projector.info.plays:
+            with refused(DeviceStateError, asked="play before load", do=_STATE):
+                projector.play(exposure_s, 2 * exposure_s)
+            projector.load(stand.opening)
+            projector.play(exposure_s, 2 * exposure_s)
+        else:
+            projector.load(stand.opening)
+            with refused(
+                UnsupportedByDeviceError,
+                asked="play of a projector that declares plays=False",
+                do="refuse in play, or declare that it plays",
+            ):
+                projector.play(exposure_s, 2 * exposure_s)
+        projector.stop()
+
+
+CHECKS: tuple[Check, ...] = (
+    an_armed_camera_refuses_to_be_set_or_armed,
+    trigger_and_read_need_an_armed_camera,
+    show_needs_a_loaded_sequence,
+    show_tells_which_pattern_is_lit_since_when,
+    a_sequence_of_another_size_is_refused,
+    a_projector_plays_only_if_it_says_so,
+)

@@ -1,0 +1,260 @@
+"""Defects planted in a rendered rig are each named by `slrig doctor`, and none is invented."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from simulated_rig.device import SimulatedHead
+from slrig.capture.sequencer import capture
+from slrig.cli.commands import app
+from slrig.config import read_rig
+from slrig.devices import FoundDevice, Rig
+from slrig.discovery import open_rig
+from slrig.errors import ScanEvidenceError
+from slrig.model import PatternSequence
+from slrig.patterns.sequence import encode, scan_patterns
+from slrig.sessions.doctor import Diagnosis, examine
+from slrig.sessions.findings import Severity
+
+BOARD = """
+name = "board"
+[[object]]
+name = "board"
+shape = "plane"
+size_mm = [400.0, 400.0]
+rotation_deg = [6.0, -10.0, 0.0]
+albedo = 0.8
+texture = { kind = "checker", contrast = 0.6, scale_mm = 35.0 }
+"""
+
+RIG = """
+name = "bench"
+[head]
+driver = "simulated"
+scene = "board.toml"
+seed = 1
+ambient = 0.03
+exposure_s = 0.0166666667
+# head
+[head.projector]
+size_px = [256, 192]
+focal_px = [520.0, 520.0]
+position_mm = [90.0, 0.0, -500.0]
+target_mm = [0.0, 0.0, 0.0]
+blur_px = 0.5
+# projector
+[head.faults]
+# faults
+[[head.camera]]
+name = "left"
+size_px = [240, 192]
+focal_px = [600.0, 600.0]
+position_mm = [-60.0, 0.0, -500.0]
+target_mm = [0.0, 0.0, 0.0]
+saturation_s = 0.022
+blur_px = 0.5
+# camera
+"""
+
+
+@dataclass(frozen=True)
+class Planted:
+    """Options of the rig file, by their place, and the notes and faults that they must bring, and no others."""
+
+    options: tuple[tuple[str, str], ...]
+    named: frozenset[str] = frozenset()
+
+
+def planted(*named: str, **options: str) -> Planted:
+    return Planted(tuple(options.items()), frozenset(named))
+
+
+MAINS = "ambient_flicker_hz = {hz}\nambient_flicker_depth = 0.8"
+
+DEFECTS = {
+    "clean": planted(),
+    "gamma 2.2": planted("response.gamma", projector="gamma = 2.2"),
+    "40 ms latency": planted("timing.late", faults="light_delay_s = 0.04"),
+    "50 Hz flicker": planted("flicker.room", head=MAINS.format(hz=50.0)),
+    "saturation": planted("exposure.saturated", head="exposure_s = 0.08"),
+    "defocus of the projector": planted("focus.projector", projector="blur_px = 4.0"),
+    "defocus of the camera": planted("focus.camera", camera="blur_px = 4.0"),
+    "mirrored image": planted("picture.mirrored", faults='picture = "mirrored"'),
+    "second display swapped": planted("display.other", faults="other_display = true"),
+}
+FURTHER = {
+    "clean, 60 Hz display": planted(projector="refresh_hz = 60.0"),
+    "clean, rolling shutter, 12 bits": planted(camera="line_time_s = 3e-5\nbit_depth = 12", head="ambient = 0.2"),
+    "clean, noisy": planted(camera="read_noise_e = 60.0", head="seed = 7"),
+    "clean, latency known": planted(
+        faults="light_delay_s = 0.04", camera="[synchronisation]\nlatency_s = 0.04\nlatency_error_s = 0.002"
+    ),
+    "mains of 50 Hz": planted("flicker.room", head=MAINS.format(hz=100.0)),
+    "mains of 60 Hz": planted("flicker.room", head=MAINS.format(hz=120.0) + "\nexposure_s = 0.02"),
+    "mains, rolling shutter": planted("flicker.room", head=MAINS.format(hz=100.0), camera="line_time_s = 3e-5"),
+    "colour wheel": planted("flicker.projector", projector="flicker_hz = 180.0\nflicker_depth = 0.5"),
+    "exposure beside the refresh": planted("exposure.refresh", projector="refresh_hz = 60.0", head="exposure_s = 0.02"),
+    "too short": planted("exposure.short", head="exposure_s = 0.004"),
+    "far too short": planted("exposure.dark", head="exposure_s = 0.0004"),
+    "upside down": planted("picture.mirrored", faults='picture = "upside_down"'),
+    "half a turn": planted("picture.turned", faults='picture = "rotated"'),
+    "a little blurred": planted("focus.projector", projector="blur_px = 1.6"),
+    "another display's glow": planted("display.other", faults="other_display = true\nother_display_glow = 0.05"),
+    "lamp off": planted("light.none", faults="lamp_off = true"),
+    "four at once": planted(
+        "response.gamma",
+        "timing.late",
+        "flicker.room",
+        "picture.mirrored",
+        projector="gamma = 2.2",
+        faults='light_delay_s = 0.04\npicture = "mirrored"',
+        head=MAINS.format(hz=100.0),
+    ),
+}
+
+
+def written(folder: Path, defect: Planted) -> Path:
+    """A rig file with the defect; an option that is there already is replaced."""
+    (folder / "board.toml").write_text(BOARD)
+    text = RIG
+    for place, options in defect.options:
+        before, mark, after = text.partition(f"# {place}\n")
+        assert mark
+        for option in options.splitlines():
+            key = option.partition(" = ")[0]
+            lines, own = before.splitlines(), before.rpartition("\n[")[2]
+            if f"\n{key} = " in own:
+                last = max(number for number, line in enumerate(lines) if line.startswith(f"{key} = "))
+                before = "\n".join([*lines[:last], *lines[last + 1 :], ""])
+        text = f"{before}{options}\n{mark}{after}"
+    path = folder / "rig.toml"
+    path.write_text(text)
+    return path
+
+
+def own_sequence(rig: Rig) -> PatternSequence:
+    size = rig.projector.info.size
+    patterns = scan_patterns(
+        size, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return encode(patterns, size)
+
+
+def examined(path: Path) -> Diagnosis:
+    """Examine a rig, and see that its projector is dark afterwards."""
+    displays = (FoundDevice("screen", "DP-2", "a projector (1280 x 800)"),)
+    with open_rig(read_rig(path)) as rig:
+        diagnosis = examine(rig, own_sequence=own_sequence(rig), displays=displays)
+        assert isinstance(rig.head, SimulatedHead)
+        assert rig.head.projector.showing is None
+        assert not rig.head.projector.lit
+        return diagnosis
+
+
+def require(name: str, defect: Planted, diagnosis: Diagnosis) -> None:
+    told = [each for each in diagnosis.findings if each.severity is not Severity.OK]
+    words = "; ".join(f"{each.severity} {each.name}: {each.found}" for each in told) or "nothing"
+    sys.stdout.write(f"{name:32} {words[:150]}\n")
+    assert {each.name for each in told} == defect.named
+    assert all(each.remedy for each in told)
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_planted_defect_is_named_and_none_is_invented(tmp_path: Path, name: str) -> None:
+    require(name, DEFECTS[name], examined(written(tmp_path, DEFECTS[name])))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FURTHER)
+def test_further_defects_and_sound_rigs(tmp_path: Path, name: str) -> None:
+    require(name, FURTHER[name], examined(written(tmp_path, FURTHER[name])))
+
+
+@pytest.mark.slow
+def test_what_is_measured_is_what_was_planted(tmp_path: Path) -> None:
+    defect = planted(
+        projector="gamma = 2.2\nrefresh_hz = 60.0",
+        faults="light_delay_s = 0.04",
+        head=MAINS.format(hz=100.0),
+    )
+    found = examined(written(tmp_path, defect))
+    assert found.response is not None
+    assert found.response.gamma == pytest.approx(2.2, abs=0.06)
+    assert found.refresh_hz == pytest.approx(60.0, abs=0.02)
+    assert found.synchronisation is not None
+    assert found.synchronisation.latency_s == pytest.approx(0.04, abs=0.3e-3)
+    [swing] = found.flickers
+    assert (swing.source, swing.frequency_hz) == ("room", 100.0)
+    # A board that faces the projector less than fully reflects less of it, and as much of the room.
+    assert swing.share == pytest.approx(0.8 * 0.03, rel=0.3)
+    # One refresh period lets 0.5 % of white through; two, that let less through, saturate.
+    assert found.exposures["left"].exposure_s == pytest.approx(1 / 60, rel=1e-3)
+
+
+def test_the_rig_file_that_it_writes_scans_where_the_old_one_did_not(tmp_path: Path) -> None:
+    defect = planted(faults="light_delay_s = 0.04", head="exposure_s = 0.08")
+    path = written(tmp_path, defect)
+    (tmp_path / "new").mkdir()
+    better = tmp_path / "new" / "better.toml"
+    shown = CliRunner().invoke(app, ["doctor", str(path), "--output", str(better)])
+    assert shown.exit_code == 1, shown.output
+    told = " ".join(shown.stdout.split())
+    assert "2 faults, no notes" in told
+    assert "white is saturated on" in told
+    assert "do write latency_s = 0.040" in told
+    with open_rig(read_rig(path)) as rig, pytest.raises(ScanEvidenceError):
+        list(capture(rig, own_sequence(rig)))
+    with open_rig(read_rig(better)) as rig:
+        shots = list(capture(rig, own_sequence(rig)))
+    assert len(shots) == len(own_sequence(rig))
+    # The better rig is well, and its exit code says so.
+    again = CliRunner().invoke(app, ["doctor", str(better), "--json"])
+    assert again.exit_code == 0, again.output
+    document = json.loads(again.stdout)
+    assert document["healthy"] is True
+    assert {each["severity"] for each in document["findings"]} == {"ok"}
+    assert len(document["response"]["light"]) == 33
+
+
+def test_files_are_kept_unless_forced(tmp_path: Path) -> None:
+    path = written(tmp_path, planted())
+    kept = path.read_bytes()
+    refused = CliRunner().invoke(app, ["doctor", str(path), "--output", str(path)])
+    assert refused.exit_code == 2
+    assert "exists, and is kept" in refused.stderr
+    assert path.read_bytes() == kept
+    forced = CliRunner().invoke(app, ["doctor", str(path), "--output", str(path), "--force"])
+    assert forced.exit_code == 0, forced.output
+    assert path.read_text().startswith("# Written by slrig doctor, from rig.toml.")
+    assert read_rig(path).name == "bench"
+
+
+def test_a_rig_that_cannot_be_opened_is_exit_code_2(tmp_path: Path) -> None:
+    path = written(tmp_path, planted())
+    path.write_text(path.read_text().replace('"simulated"', '"absent"'))
+    shown = CliRunner().invoke(app, ["doctor", str(path)])
+    assert shown.exit_code == 2
+    assert "no installed package provides the head driver 'absent'" in shown.stderr
+
+
+def test_a_projector_that_is_unplugged_is_a_finding(tmp_path: Path) -> None:
+    path = written(tmp_path, planted(faults="unplug_projector_at_show = 60"))
+    with open_rig(read_rig(path)) as rig:
+        diagnosis = examine(rig, own_sequence=own_sequence(rig))
+    [told] = diagnosis.of(Severity.FAULT)
+    assert told.name == "device.failed"
+    assert "the projector is gone" in told.found
+    # What was found before that is told all the same.
+    assert any(each.name == "exposure.range" for each in diagnosis.findings)
+
+
+def test_the_displays_that_were_found_are_named_where_the_wrong_one_lights_the_scene(tmp_path: Path) -> None:
+    diagnosis = examined(written(tmp_path, DEFECTS["second display swapped"]))
+    [told] = diagnosis.of(Severity.FAULT)
+    assert "DP-2 (a projector (1280 x 800))" in told.remedy

@@ -1,0 +1,210 @@
+"""Latency and shutters of rendered rigs, whose truth is written into their rig files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from slrig.capture.flashes import CameraLatency
+from slrig.capture.sequencer import capture
+from slrig.capture.synchronisation import measure_latency
+from slrig.cli.commands import app
+from slrig.config import read_rig
+from slrig.devices import Synchronisation, Trigger
+from slrig.discovery import open_rig
+from slrig.errors import ScanEvidenceError
+from slrig.model import FloatArray, Size
+from slrig.patterns.sequence import encode, scan_patterns
+
+PLATE = """
+name = "plate"
+[[object]]
+name = "plate"
+shape = "plane"
+size_mm = [400.0, 400.0]
+rotation_deg = [6.0, -10.0, 0.0]
+albedo = 0.8
+"""
+
+RIG = """
+name = "bench"
+[head]
+driver = "simulated"
+scene = "plate.toml"
+seed = {seed}
+samples_per_axis = 1
+ambient = {ambient}
+exposure_s = {exposure_s}
+[head.projector]
+size_px = [96, 72]
+focal_px = [220.0, 220.0]
+position_mm = [90.0, 0.0, -500.0]
+target_mm = [0.0, 0.0, 0.0]
+latency_s = {stated_s}
+[head.faults]
+light_delay_s = {latency_s}
+"""
+
+CAMERA = """
+[[head.camera]]
+name = "{name}"
+size_px = [96, 240]
+focal_px = [600.0, 600.0]
+position_mm = [{x_mm}, 0.0, -500.0]
+target_mm = [0.0, 0.0, 0.0]
+saturation_s = {saturation_s}
+bit_depth = {bit_depth}
+read_noise_e = {noise_e}
+line_time_s = {line_s}
+"""
+
+PROJECTOR = Size(96, 72)
+SHUTTERS_S = (0.0, 15e-6, 60e-6)
+
+
+def written(
+    folder: Path,
+    *,
+    latency_s: float,
+    exposure_s: float,
+    line_s: float = 0.0,
+    bit_depth: int = 8,
+    seed: int = 1,
+    stated_s: float = 0.02,
+    ambient: float = 0.05,
+    twin_line_s: float | None = None,
+) -> Path:
+    """The path of a rig file: light comes `latency_s` later than the projector says it does."""
+    (folder / "plate.toml").write_text(PLATE)
+    text = RIG.format(
+        seed=seed, ambient=ambient, exposure_s=exposure_s, stated_s=stated_s, latency_s=latency_s, line_s=line_s
+    )
+    lines = [("left", -60.0, line_s), *([("right", 180.0, twin_line_s)] if twin_line_s is not None else [])]
+    for name, x_mm, line in lines:
+        text += CAMERA.format(
+            name=name, x_mm=x_mm, saturation_s=2 * exposure_s, bit_depth=bit_depth, noise_e=60.0, line_s=line
+        )
+    path = folder / "rig.toml"
+    path.write_text(text)
+    return path
+
+
+def found_on(path: Path, trigger: Trigger) -> CameraLatency:
+    with open_rig(read_rig(path)) as rig:
+        return measure_latency(rig, trigger=trigger).cameras["left"]
+
+
+def require_truth(found: CameraLatency, *, latency_s: float, line_s: float) -> None:
+    # Each show is off by up to 0.5 ms at random: the mean of 40 is not.
+    assert abs(found.latency_s - latency_s) <= 0.2e-3
+    assert found.latest_s == pytest.approx(latency_s + 0.5e-3, abs=0.3e-3)
+    assert found.jitter_s == pytest.approx(0.5e-3 / 3**0.5, rel=0.3)
+    assert found.rolling is (line_s > 0)
+    assert abs(found.line_time_s - line_s) <= (0.02 * line_s if line_s else 1e-7)
+
+
+@pytest.mark.parametrize("line_s", SHUTTERS_S)
+@pytest.mark.parametrize(
+    ("latency_s", "exposure_s", "bit_depth", "trigger"),
+    [
+        (0.012, 0.005, 12, Trigger.FREE),
+        (0.047, 0.010, 8, Trigger.SOFTWARE),
+        (0.083, 0.020, 8, Trigger.FREE),
+    ],
+)
+def test_latency_and_shutter_are_those_of_the_rig_file(
+    tmp_path: Path, latency_s: float, exposure_s: float, bit_depth: int, trigger: Trigger, line_s: float
+) -> None:
+    path = written(tmp_path, latency_s=latency_s, exposure_s=exposure_s, line_s=line_s, bit_depth=bit_depth)
+    require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
+@pytest.mark.parametrize("bit_depth", [8, 12])
+@pytest.mark.parametrize("exposure_s", [0.005, 0.010, 0.020])
+@pytest.mark.parametrize("line_s", SHUTTERS_S)
+def test_latency_and_shutter_for_every_exposure_depth_and_trigger(
+    tmp_path: Path, exposure_s: float, line_s: float, bit_depth: int, trigger: Trigger
+) -> None:
+    for seed, latency_s in enumerate((0.012, 0.047, 0.083)):
+        path = written(
+            tmp_path,
+            latency_s=latency_s,
+            exposure_s=exposure_s,
+            line_s=line_s,
+            bit_depth=bit_depth,
+            seed=seed,
+            ambient=0.2,
+        )
+        require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
+
+
+def test_an_honest_projector_has_no_latency_beyond_its_word(tmp_path: Path) -> None:
+    path = written(tmp_path, latency_s=0.0, exposure_s=0.01, stated_s=0.047)
+    require_truth(found_on(path, Trigger.FREE), latency_s=0.0, line_s=0.0)
+
+
+def test_the_command_prints_a_table_that_the_rig_file_takes(tmp_path: Path) -> None:
+    path = written(tmp_path, latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0)
+    done = CliRunner().invoke(app, ["latency", str(path), "--flashes", "20"])
+    assert done.exit_code == 0, done.output
+    assert "camera left" in done.stdout
+    assert "rolling shutter: 30." in done.stdout or "rolling shutter: 29.9" in done.stdout
+    assert "global shutter" in done.stdout.partition("camera right")[2]
+    table = done.stdout[done.stdout.index("[synchronisation]") :]
+    path.write_text(path.read_text() + table)
+    with open_rig(read_rig(path)) as rig:
+        kept = rig.synchronisation
+        assert kept is not None
+        assert kept.latency_s == pytest.approx(0.031, abs=0.5e-3)
+        assert 0 < kept.latency_error_s < 0.5e-3
+        assert kept.line_time_s == {"left": pytest.approx(3e-5, rel=0.02)}
+
+
+def test_the_command_prints_json(tmp_path: Path) -> None:
+    path = written(tmp_path, latency_s=0.012, exposure_s=0.01)
+    done = CliRunner().invoke(app, ["latency", str(path), "--json", "--trigger", "software", "--flashes", "10"])
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["synchronisation"]["latency_s"] == pytest.approx(0.012, abs=0.5e-3)
+    assert document["cameras"]["left"]["flashes_used"] >= 10
+    assert document["cameras"]["left"]["rolling"] is False
+
+
+def test_the_command_says_why_it_cannot_measure(tmp_path: Path) -> None:
+    path = written(tmp_path, latency_s=0.0, exposure_s=0.01)
+    path.write_text(path.read_text().replace("[head.faults]", "[head.faults]\nlamp_off = true"))
+    done = CliRunner().invoke(app, ["latency", str(path)])
+    assert done.exit_code == 2
+    assert "sees no flash" in done.stderr
+
+
+def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[int, str], FloatArray]:
+    """The frames of one sequence, by pattern and camera."""
+    patterns = scan_patterns(
+        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    with open_rig(read_rig(path)) as rig:
+        shots = capture(replace(rig, synchronisation=synchronisation), encode(patterns, PROJECTOR))
+        return {(shot.pattern, shot.camera): shot.image.astype(np.float64) for shot in shots}
+
+
+def test_a_scan_with_a_late_projector_is_right_once_its_latency_is_known(tmp_path: Path) -> None:
+    honest = images(written(tmp_path, latency_s=0.0, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0), None)
+    path = written(tmp_path, latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0)
+    with open_rig(read_rig(path)) as rig:
+        measured = measure_latency(rig).synchronisation
+    late = images(path, measured)
+    assert late.keys() == honest.keys()
+    for key, image in late.items():
+        # Equal but for noise.
+        assert abs(image.mean() - honest[key].mean()) < 0.1
+        assert np.abs(image - honest[key]).mean() < 2
+    with pytest.raises(ScanEvidenceError):
+        images(path, None)

@@ -1,0 +1,336 @@
+"""A rig that keeps the contract, on virtual time: every trigger there is, and a projector that plays.
+
+Drivers that break the contract are made of it by overriding what they break.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.devices import (
+    AppliedSettings,
+    CameraInfo,
+    CameraSettings,
+    ProjectorInfo,
+    Rig,
+    Shown,
+    Trigger,
+)
+from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size, Truth
+from slrig.patterns.sequence import encode
+from tests.unit.capture.fake_rig import Scene, patterns_for
+
+PROJECTOR = Size(64, 48)
+CAMERA = Size(110, 80)
+EXPOSURE_S = 1 / 60
+LATENCY_NS = 5_000_000
+ERROR_NS = 20_000
+READ_OUT_NS = 1_000_000
+BUFFERS = 4
+ALL = frozenset(Trigger)
+
+
+def sequence() -> PatternSequence:
+    return encode(patterns_for(PROJECTOR), PROJECTOR)
+
+
+class World:
+    """Time that passes when somebody waits, and the light in it. Implements `slrig.devices.Clock`."""
+
+    def __init__(self) -> None:
+        self.scene = Scene(camera=CAMERA, projector=PROJECTOR, noise_dn=0.8)
+        self.at_ns = 10**9
+        self.changes: list[tuple[int, Pixels | None]] = [(0, None)]
+        self.on_wire: list[Callable[[int], None]] = []
+        self._seen: dict[bytes, NDArray[np.float64]] = {}
+
+    def now_ns(self) -> int:
+        return self.at_ns
+
+    def wait_until(self, t_ns: int, stop: threading.Event) -> None:
+        if not stop.is_set():
+            self.at_ns = max(self.at_ns, t_ns)
+
+    def change(self, at_ns: int, profile: Pixels | None) -> None:
+        self.changes.append((at_ns, profile))
+
+    def darken(self) -> None:
+        self.changes = [change for change in self.changes if change[0] < self.at_ns]
+        self.change(self.at_ns, None)
+
+    def exposed(self, start_ns: int, exposure_s: float, gain: float) -> Pixels:
+        end_ns = start_ns + round(exposure_s * 1e9)
+        seen = np.zeros(self.scene.format.size.shape)
+        for index, (at_ns, profile) in enumerate(self.changes):
+            until_ns = self.changes[index + 1][0] if index + 1 < len(self.changes) else end_ns
+            share = (min(until_ns, end_ns) - max(at_ns, start_ns)) / (end_ns - start_ns)
+            if share > 0 and profile is not None:
+                seen += share * self._light(profile)
+        scene = self.scene
+        level = scene.albedo * (scene.ambient + scene.white * seen) * gain * exposure_s / EXPOSURE_S
+        values = 255 * np.clip(level, 0, 1) + scene.noise_dn * scene.rng.standard_normal(seen.shape)
+        whole: Pixels = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+        return whole
+
+    def _light(self, profile: Pixels) -> NDArray[np.float64]:
+        key = profile.tobytes()
+        if key not in self._seen:
+            self._seen[key] = self.scene.light(profile)
+        return self._seen[key]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One exposure of the sensor."""
+
+    number: int
+    start_ns: int
+    end_ns: int
+
+
+class ModelCamera:
+    """Implements `slrig.devices.Camera`."""
+
+    triggers = ALL
+
+    def __init__(self, world: World, name: str = "left") -> None:
+        self.world = world
+        self.name = name
+        self.applied = AppliedSettings(EXPOSURE_S, 1.0)
+        self.armed: Trigger | None = None
+        self.pending: deque[Exposure] = deque()
+        self.made = 0
+        self.next_free_ns = 0
+        self.busy_ns = 0
+        self.closed = False
+        world.on_wire.append(self.pulsed)
+
+    @property
+    def info(self) -> CameraInfo:
+        form = self.world.scene.format
+        return CameraInfo(self.name, "model", "1", form, self.triggers, (1e-4, 0.5), (1.0, 8.0))
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        self.require(unarmed=True)
+        info = self.info
+        for value, (low, high) in (
+            (settings.exposure_s, info.exposure_range_s),
+            (settings.gain, info.gain_range),
+        ):
+            if not low <= value <= high:
+                message = f"{value} is not within {low} to {high}"
+                raise UnsupportedByDeviceError(message)
+        self.applied = AppliedSettings(settings.exposure_s, settings.gain)
+        return self.applied
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        self.require(unarmed=True)
+        if count < 1 or trigger not in self.triggers:
+            message = f"{count} frames by {trigger} trigger"
+            raise UnsupportedByDeviceError(message)
+        self.pending.clear()
+        self.armed = trigger
+        self.next_free_ns = self.world.at_ns
+
+    def trigger(self) -> None:
+        self.require()
+        if self.armed is not Trigger.SOFTWARE:
+            message = "not armed for software triggers"
+            raise DeviceStateError(message)
+        self.start(self.world.at_ns + 1_000)
+
+    def pulsed(self, at_ns: int) -> None:
+        if self.armed is Trigger.HARDWARE:
+            self.start(at_ns)
+
+    def cut_off(self, at_ns: int) -> None:
+        """Pulses of the wire after an instant do not come."""
+        while self.armed is Trigger.HARDWARE and self.pending and self.pending[-1].start_ns > at_ns:
+            self.pending.pop()
+            self.made -= 1
+        self.busy_ns = min(self.busy_ns, max((e.end_ns for e in self.pending), default=at_ns))
+
+    def start(self, at_ns: int) -> None:
+        start_ns = max(at_ns, self.busy_ns)
+        self.busy_ns = start_ns + round(self.applied.exposure_s * 1e9)
+        self.pending.append(Exposure(self.made, start_ns, self.busy_ns))
+        self.made += 1
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        self.require()
+        if self.armed is None:
+            message = "not armed"
+            raise DeviceStateError(message)
+        deadline_ns = self.world.at_ns + round(timeout_s * 1e9)
+        while (exposure := self.next_exposure(deadline_ns)) is not None:
+            self.world.at_ns = max(self.world.at_ns, exposure.end_ns + READ_OUT_NS)
+            if exposure.start_ns >= after_ns:
+                return self.frame(exposure)
+        self.world.at_ns = max(self.world.at_ns, deadline_ns)
+        message = f"no frame in {timeout_s} s"
+        raise FrameTimeoutError(message)
+
+    def next_exposure(self, deadline_ns: int) -> Exposure | None:
+        if self.armed is Trigger.FREE:
+            self.run_freely()
+        if self.pending and self.pending[0].end_ns <= deadline_ns:
+            return self.pending.popleft()
+        return None
+
+    def run_freely(self) -> None:
+        """Expose as often as there was time for, keep as many as there are buffers, and begin the next one."""
+        period_ns = round(self.applied.exposure_s * 1e9) + READ_OUT_NS
+        while not self.pending or self.pending[-1].end_ns <= self.world.at_ns:
+            start_ns = self.next_free_ns
+            self.pending.append(Exposure(self.made, start_ns, start_ns + period_ns - READ_OUT_NS))
+            self.made += 1
+            self.next_free_ns += period_ns
+        while len(self.pending) > BUFFERS + 1:
+            self.pending.popleft()
+
+    def frame(self, exposure: Exposure) -> Frame:
+        image = self.world.exposed(exposure.start_ns, self.applied.exposure_s, self.applied.gain)
+        return Frame(
+            self.name,
+            image,
+            exposure.start_ns,
+            exposure.end_ns,
+            1_000,
+            exposure.number,
+            0,
+            self.applied.exposure_s,
+            self.applied.gain,
+        )
+
+    def disarm(self) -> None:
+        self.armed = None
+        self.pending.clear()
+
+    def close(self) -> None:
+        self.disarm()
+        self.closed = True
+
+    def require(self, *, unarmed: bool = False) -> None:
+        if self.closed or (unarmed and self.armed is not None):
+            message = "closed" if self.closed else "armed"
+            raise DeviceStateError(message)
+
+
+class ModelProjector:
+    """Implements `slrig.devices.Projector`."""
+
+    plays = True
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.loaded: PatternSequence | None = None
+        self.pulses: list[int] = []
+        self.closed = False
+
+    @property
+    def info(self) -> ProjectorInfo:
+        return ProjectorInfo("projector", "model", "1", PROJECTOR, self.plays, LATENCY_NS / 1e9)
+
+    def load(self, sequence: PatternSequence) -> None:
+        self.require()
+        if sequence.projector != PROJECTOR:
+            message = f"{sequence.projector} is not {PROJECTOR}"
+            raise UnsupportedByDeviceError(message)
+        self.blank()
+        self.loaded = sequence
+
+    def show(self, index: int) -> Shown:
+        profile = self.profile(index)
+        at_ns = self.world.at_ns + LATENCY_NS
+        self.world.change(at_ns, profile)
+        self.world.at_ns = at_ns + ERROR_NS
+        return Shown(index, at_ns, ERROR_NS)
+
+    def profile(self, index: int) -> Pixels:
+        self.require()
+        if self.loaded is None:
+            message = "nothing is loaded"
+            raise DeviceStateError(message)
+        if not 0 <= index < len(self.loaded):
+            message = f"no pattern {index}"
+            raise UnsupportedByDeviceError(message)
+        return self.loaded.profiles[index]
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        self.require()
+        if not self.plays:
+            message = "does not play"
+            raise UnsupportedByDeviceError(message)
+        assert exposure_s < period_s
+        self.profile(0)
+        assert self.loaded is not None
+        begin_ns = self.world.at_ns + LATENCY_NS
+        for index, profile in enumerate(self.loaded.profiles):
+            at_ns = begin_ns + round(index * period_s * 1e9)
+            self.world.change(at_ns, profile)
+            self.pulse(index, at_ns)
+        self.world.change(begin_ns + round(len(self.loaded) * period_s * 1e9), None)
+
+    def pulse(self, _index: int, at_ns: int) -> None:
+        for expose in self.world.on_wire:
+            expose(at_ns)
+
+    def stop(self) -> None:
+        for camera in self.cameras:
+            camera.cut_off(self.world.at_ns)
+        self.blank()
+
+    @property
+    def cameras(self) -> list[ModelCamera]:
+        owners = (getattr(expose, "__self__", None) for expose in self.world.on_wire)
+        return [camera for camera in owners if isinstance(camera, ModelCamera)]
+
+    def blank(self) -> None:
+        if not self.closed:
+            self.world.darken()
+
+    def close(self) -> None:
+        self.blank()
+        self.loaded, self.closed = None, True
+
+    def require(self) -> None:
+        if self.closed:
+            message = "closed"
+            raise DeviceStateError(message)
+
+
+@dataclass
+class ModelHead:
+    """Implements `slrig.devices.Head`, and `KeepsTime`."""
+
+    clock: World
+    projector: ModelProjector
+    cameras: Mapping[str, ModelCamera]
+    calibration: Calibration | None = None
+
+    def truth(self) -> Truth | None:
+        return None
+
+
+@dataclass
+class Maker:
+    """Opens a rig of these classes, each time one in a world of its own; `rigs` are those that were opened."""
+
+    camera: type[ModelCamera] = ModelCamera
+    projector: type[ModelProjector] = ModelProjector
+    calibration: Calibration | None = None
+    rigs: list[Rig] = field(default_factory=list)
+
+    def __call__(self) -> Rig:
+        world = World()
+        head = ModelHead(world, self.projector(world), {"left": self.camera(world)}, self.calibration)
+        settings = {"left": CameraSettings(EXPOSURE_S)}
+        self.rigs.append(Rig("model", head.cameras, head.projector, settings, self.calibration, head, clock=world))
+        return self.rigs[-1]

@@ -1,0 +1,82 @@
+"""`slrig conform`: its exit codes, and what it says to people and to programs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from slrig.cli.commands import app
+
+PLATE = """
+name = "plate"
+
+[[object]]
+name = "plate"
+shape = "plane"
+size_mm = [400.0, 400.0]
+rotation_deg = [6.0, -10.0, 0.0]
+albedo = 0.8
+"""
+
+
+def small_rig(folder: Path, *, faults: str = "") -> Path:
+    """A rig file of a small rendered rig before a plate."""
+    (folder / "plate.toml").write_text(PLATE)
+    rig = folder / "rig.toml"
+    rig.write_text(
+        f"""
+        name = "small"
+        [head]
+        driver = "simulated"
+        scene = "plate.toml"
+        {faults}
+        [head.projector]
+        size_px = [96, 72]
+        focal_px = [440.0, 440.0]
+        position_mm = [90.0, 0.0, -500.0]
+        target_mm = [0.0, 0.0, 0.0]
+        blur_px = 0.4
+        [[head.camera]]
+        name = "left"
+        size_px = [160, 120]
+        focal_px = [800.0, 800.0]
+        position_mm = [-60.0, 0.0, -500.0]
+        target_mm = [0.0, 0.0, 0.0]
+        saturation_s = 0.03
+        blur_px = 0.5
+        """
+    )
+    return rig
+
+
+def test_conform_scores_a_rig_that_keeps_the_contract(tmp_path: Path) -> None:
+    rig = small_rig(tmp_path)
+    shown = CliRunner().invoke(app, ["conform", str(rig)])
+    assert shown.exit_code == 0, shown.output
+    assert "100 %: " in shown.stdout
+    document = json.loads(CliRunner().invoke(app, ["conform", str(rig), "--json"]).stdout)
+    assert (document["rig"], document["conforms"], document["score"]) == ("small", True, 1.0)
+    assert document["passed"] == document["applicable"] > 25
+
+
+def test_conform_says_what_is_wrong_and_what_to_do(tmp_path: Path) -> None:
+    # Light that comes three exposures after the projector says so.
+    rig = small_rig(tmp_path, faults="faults = {light_delay_s = 0.05}")
+    shown = CliRunner().invoke(app, ["conform", str(rig)])
+    assert shown.exit_code == 1
+    assert "100 %" not in shown.stdout
+    told = " ".join(shown.stdout.split())
+    assert "(a_frame_lies_wholly_in_its_pattern)" in told
+    assert "do read returns frames whose whole exposure, all rows, lies after after_ns" in told
+    document = json.loads(CliRunner().invoke(app, ["conform", str(rig), "--json"]).stdout)
+    assert document["conforms"] is False
+
+
+def test_conform_on_a_rig_that_cannot_be_opened_is_exit_code_2(tmp_path: Path) -> None:
+    rig = small_rig(tmp_path)
+    rig.write_text(rig.read_text().replace('"simulated"', '"absent"'))
+    shown = CliRunner().invoke(app, ["conform", str(rig)])
+    assert shown.exit_code == 2
+    assert "no installed package provides the head driver 'absent'" in shown.stderr

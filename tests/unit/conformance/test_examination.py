@@ -1,0 +1,234 @@
+"""An examination: its report, its time limit, what it does with a rig that does not open, and that it ends dark."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from slrig.conformance import CHECKS, Examination, Failure, Outcome, Report, Result, run
+from slrig.conformance.check import ExpectationError, NotApplicableError, check
+from slrig.conformance.light import learn_light
+from slrig.conformance.stand import Stand
+from slrig.devices import Camera, Projector, Rig
+from slrig.errors import DeviceBusyError, DeviceGoneError
+from slrig.model import Pixels
+from tests.unit.conformance.broken_cameras import DeliversStale, Hangs
+from tests.unit.conformance.broken_projectors import StaysLit
+from tests.unit.conformance.model_rig import Maker, sequence
+
+
+def owners() -> set[threading.Thread]:
+    """The threads that own rigs under examination; other tests may have some of their own."""
+    return {thread for thread in threading.enumerate() if thread.name == "conformance"}
+
+
+@pytest.fixture
+def hanging() -> Iterator[type[Hangs]]:
+    """A camera whose reads hang until the test is over."""
+    let_go, before = threading.Event(), owners()
+    yield type("HangsForATest", (Hangs,), {"let_go": let_go})
+    let_go.set()
+    for thread in owners() - before:
+        thread.join(10)
+
+
+def test_a_device_that_never_answers_ends_the_examination_and_not_the_program(hanging: type[Hangs]) -> None:
+    report = run(Maker(hanging), sequence(), limit_s=0.3)
+    first = next(result for result in report.results if result.outcome is Outcome.FAILED)
+    after = report.results[report.results.index(first) + 1 :]
+    assert "did not return in 0.3 s" in str(first.failure)
+    assert after
+    assert {result.outcome for result in after} == {Outcome.NOT_RUN}
+    assert report.stopped is not None
+    assert "one owner" in report.stopped
+    assert all(result.reason == report.stopped for result in after)
+    assert not report.conforms
+    # What was not run counts: a rig that hangs does not have a good score for it.
+    assert report.score == pytest.approx(report.count(Outcome.PASSED) / len(CHECKS))
+
+
+def test_a_device_that_answers_after_all_is_closed(hanging: type[Hangs]) -> None:
+    maker, before = Maker(hanging), owners()
+    run(maker, sequence(), limit_s=0.3)
+    hanging.let_go.set()
+    for owner in owners() - before:
+        owner.join(10)
+        assert not owner.is_alive()
+    assert all(rig.projector.closed for rig in maker.rigs)  # type: ignore[attr-defined]
+
+
+def test_a_rig_that_does_not_open_is_not_examined() -> None:
+    def refuse() -> Rig:
+        message = "the camera is held by process 4711"
+        raise DeviceBusyError(message)
+
+    told: list[str] = []
+    with pytest.raises(DeviceBusyError, match="4711"):
+        run(refuse, sequence(), progress=lambda stage, _fraction, _detail: told.append(stage))
+    assert told == []
+
+
+def test_a_rig_that_goes_away_ends_the_examination() -> None:
+    maker = Maker()
+
+    def open_or_fail() -> Rig:
+        if len(maker.rigs) == 2:
+            message = "no camera is plugged in"
+            raise DeviceGoneError(message)
+        return maker()
+
+    report = run(open_or_fail, sequence())
+    assert report.count(Outcome.FAILED) == 1
+    assert report.count(Outcome.NOT_RUN) > 10
+    assert report.stopped is not None
+    assert "no camera is plugged in" in report.stopped
+
+
+def test_an_examination_that_is_interrupted_closes_the_rig() -> None:
+    maker, before = Maker(), owners()
+
+    def interrupt(_stage: str, fraction: float, _detail: str) -> None:
+        if fraction > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(maker, sequence(), progress=interrupt)
+    assert all(rig.projector.closed for rig in maker.rigs)  # type: ignore[attr-defined]
+    assert owners() <= before
+
+
+def test_progress_is_told_before_and_after_each_check() -> None:
+    told: list[tuple[str, float, str]] = []
+    run(Maker(), sequence(), progress=lambda *what: told.append(what))
+    assert [stage for stage, _, _ in told[::2]] == [check.title for check in CHECKS]
+    assert told[0] == (CHECKS[0].title, 0.0, "")
+    assert told[-1] == (CHECKS[-1].title, 1.0, "passed")
+
+
+def test_one_thread_owns_the_devices() -> None:
+    owners: set[int] = set()
+
+    @check(asks=())
+    def remember_the_thread(stand: Stand) -> None:
+        """Nothing."""
+        assert stand.rig.cameras
+        owners.add(threading.get_ident())
+
+    maker = Maker()
+
+    def opened() -> Rig:
+        owners.add(threading.get_ident())
+        return maker()
+
+    with Examination(opened, sequence()) as examination:
+        examination.judge(remember_the_thread)
+        examination.judge(CHECKS[1])
+    assert len(owners) == 1
+    assert threading.get_ident() not in owners
+
+
+def test_checks_share_a_rig_unless_they_want_a_fresh_one_or_the_last_one_failed() -> None:
+    maker = Maker()
+    shared = [each for each in CHECKS if not each.fresh]
+    with Examination(maker, sequence()) as examination:
+        for each in shared:
+            assert examination.judge(each).outcome is Outcome.PASSED
+        assert len(maker.rigs) == 1
+        examination.judge(next(each for each in CHECKS if each.fresh))
+        examination.judge(shared[0])
+        assert len(maker.rigs) == 3
+    broken = Maker(DeliversStale)
+    with Examination(broken, sequence()) as examination:
+        results = [examination.judge(each) for each in shared]
+    assert len(broken.rigs) == 1 + sum(result.outcome is Outcome.FAILED for result in results)
+
+
+def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
+    @check(asks=())
+    def raises(stand: Stand) -> None:
+        """A driver fails."""
+        with stand.view(*next(stand.ways())):
+            fault = "select failed"
+            raise OSError(fault)
+
+    with Examination(Maker(), sequence()) as examination:
+        result = examination.judge(raises)
+    assert result.failure == Failure(
+        "no error comes from a call that the contract allows",
+        "OSError: select failed",
+        "a driver raises the errors of slrig.errors, and no others",
+        "camera 'left', software trigger",
+    )
+
+
+def test_a_check_may_find_out_that_it_has_nothing_to_ask() -> None:
+    @check(asks=())
+    def has_nothing_to_ask(_stand: Stand) -> None:
+        """Nothing to ask."""
+        message = "it has one exposure"
+        raise NotApplicableError(message)
+
+    report = run(Maker(), sequence(), checks=(has_nothing_to_ask, CHECKS[0]))
+    assert [result.outcome for result in report.results] == [Outcome.NOT_APPLICABLE, Outcome.PASSED]
+    assert (report.applicable, report.percent, report.conforms) == (1, 100, True)
+    assert report.results[0].reason == "it has one exposure"
+
+
+def result(outcome: Outcome) -> Result:
+    return Result("check", "A check", outcome, 0.1)
+
+
+def test_a_score_is_100_only_if_nothing_failed() -> None:
+    report = Report("rig", (*(result(Outcome.PASSED) for _ in range(999)), result(Outcome.FAILED)), 1.0)
+    assert (report.percent, report.conforms) == (99, False)
+    assert Report("rig", (result(Outcome.NOT_APPLICABLE),), 1.0).conforms is False
+    assert Report("rig", (result(Outcome.PASSED), result(Outcome.NOT_APPLICABLE)), 1.0).percent == 100
+    assert Report("rig", (result(Outcome.PASSED), result(Outcome.NOT_RUN)), 1.0).percent == 50
+
+
+def test_a_report_can_be_written_as_json() -> None:
+    document = json.loads(json.dumps(run(Maker(DeliversStale, StaysLit), sequence()).document()))
+    assert document["conforms"] is False
+    assert document["passed"] < document["applicable"] == len(CHECKS)
+    failed = [each for each in document["checks"] if each["outcome"] == "failed"]
+    assert {"asked", "found", "do", "where"} == set(failed[0]["failure"])
+
+
+def test_the_checks_are_named_once_and_ask_for_members_that_there_are() -> None:
+    names = [each.name for each in CHECKS]
+    assert len(set(names)) == len(names)
+    titles = [each.title for each in CHECKS]
+    assert len(set(titles)) == len(titles)
+    for each in CHECKS:
+        for member in each.asks:
+            protocol, name = member.split(".")
+            assert protocol == "Head" or name in vars({"Camera": Camera, "Projector": Projector}[protocol]), member
+
+
+def images(*levels: float, noise_dn: float = 0.0) -> list[Pixels]:
+    """White or black frames: the left half of the image is lit."""
+    rng = np.random.default_rng(0)
+    lit = np.arange(64) < 32
+    made: list[Pixels] = []
+    for level in levels:
+        values = np.where(lit, level, 30.0) + noise_dn * rng.standard_normal((48, 64))
+        made.append(np.clip(np.rint(values), 0, 255).astype(np.uint8))
+    return made
+
+
+def test_the_level_of_light_is_that_of_the_lit_pixels_whatever_the_room_and_the_noise_are() -> None:
+    light = learn_light(images(90, 90, noise_dn=4), images(30, 30, noise_dn=4), full_scale=255)
+    assert light.lit[:, :32].mean() > 0.95
+    assert light.lit[:, 32:].mean() < 0.01
+    for level, expected in ((90, 1.0), (30, 0.0), (60, 0.5)):
+        assert light.level(images(level, noise_dn=4)[0]) == pytest.approx(expected, abs=0.05)
+
+
+def test_a_camera_that_does_not_see_the_projector_is_told_so() -> None:
+    for white, black in ((31, 30), (30, 90)):
+        with pytest.raises(ExpectationError, match="switch the lamp on"):
+            learn_light(images(white, white, noise_dn=2), images(black, black, noise_dn=2), full_scale=255)
