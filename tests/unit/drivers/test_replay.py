@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers.replay import open_head
-from slrig.bundle import write_bundle
-from slrig.devices import CameraSettings, Head, Trigger
-from slrig.errors import BundleError, ConfigError, DeviceStateError, UnsupportedByDeviceError
+from drivers.replay import ReplayClock, ReplayHead, open_head
+from slrig.bundle import read_bundle, write_bundle
+from slrig.capture.sequencer import capture
+from slrig.devices import CameraSettings, Head, Rig, Trigger
+from slrig.errors import BundleError, ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, Pattern, Shot, Size, White
 from slrig.patterns.sequence import encode
 
@@ -35,6 +37,26 @@ def head_of(
     formats = {name: CameraFormat(CAMERA, 8) for name in cameras}
     write_bundle(folder / "rec", Capture(PROJECTOR, tuple(patterns), formats, tuple(shots)))
     return open_head({"bundle": "rec"}, folder)
+
+
+class RealTime:
+    """A clock to pace a replay by, ns, that moves when it is waited for."""
+
+    def __init__(self) -> None:
+        self.now_ns = 5_000_000_000
+        self.waited_s: list[float] = []
+
+    def read_ns(self) -> int:
+        return self.now_ns
+
+    def wait(self, seconds: float) -> None:
+        self.waited_s.append(seconds)
+        self.now_ns += round(seconds * 1e9)
+
+
+def paced_head(folder: Path, shots: Sequence[Shot], speed: float, real: RealTime) -> Head:
+    head_of(folder, shots)
+    return ReplayHead(read_bundle(folder / "rec"), ReplayClock(speed, real_ns=real.read_ns, wait=real.wait))
 
 
 def values(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[int]:
@@ -75,8 +97,20 @@ def test_the_exposure_chooses_among_a_bracket(tmp_path: Path) -> None:
     assert head.cameras["eye"].info.exposure_range_s == (0.02, 0.04)
     assert values(head, [BIT]) == [90]
     assert values(head, [BIT], exposure_s=0.0401) == [180]
-    # White was recorded at one exposure only; there is no other to give.
-    assert values(head, [White()], exposure_s=0.04) == [200]
+
+
+def test_a_frame_says_the_exposure_that_it_was_recorded_with(tmp_path: Path) -> None:
+    # White was recorded at one exposure only: there is no other to give, and none is made up.
+    head = head_of(tmp_path, [*BASIC, shot(2, 180, exposure_s=0.04)])
+    camera = head.cameras["eye"]
+    camera.configure(CameraSettings(0.04))
+    head.projector.load(encode([White()], PROJECTOR))
+    camera.arm(1, Trigger.SOFTWARE)
+    after_ns = head.projector.show(0).t_visible_ns
+    camera.trigger()
+    frame = camera.read(after_ns, 1.0)
+    assert (int(frame.image[0, 0]), frame.exposure_s) == (200, 0.02)
+    assert frame.t_end_ns - frame.t_start_ns == 20_000_000
 
 
 def test_an_exposure_that_was_not_recorded_is_refused_with_those_that_were(tmp_path: Path) -> None:
@@ -157,7 +191,9 @@ def test_darkness_looks_as_it_was_recorded_and_is_not_made_up(tmp_path: Path) ->
     [
         ({}, "bundle: missing"),
         ({"bundle": 3}, "bundle: .*string"),
-        ({"bundle": "rec", "folder": "x", "speed": 2}, r"(?s)folder: unknown key.*speed: unknown key"),
+        ({"bundle": "rec", "folder": "x", "sped": 2}, r"(?s)folder: unknown key.*sped: unknown key; .*'speed'"),
+        ({"bundle": "rec", "speed": 0.01}, r"speed: expected 0, or 0.05 to 1000 times .*found 0.01"),
+        ({"bundle": "rec", "speed": -1}, "speed: expected 0, or"),
         ({"bundle": "nowhere"}, "nowhere is no scan bundle"),
     ],
 )
@@ -178,3 +214,139 @@ def test_a_recording_knows_no_truth_and_no_calibration_unless_it_has_one(tmp_pat
     head = head_of(tmp_path, BASIC)
     assert head.truth() is None
     assert head.calibration is None
+
+
+# A mean of white, black and a bit; the times of a camera that was read out slowly.
+TIMED = [shot(0, 200, time_s=0.0), shot(1, 10, time_s=0.123456789), shot(2, 90, time_s=1.25)]
+
+
+def scanned(head: Head, patterns: Sequence[Pattern], *, exposure_s: float = 0.02) -> list[Shot]:
+    settings = {name: CameraSettings(exposure_s) for name in head.cameras}
+    rig = Rig("recording", head.cameras, head.projector, settings)
+    return list(capture(rig, encode(patterns, PROJECTOR)))
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5, 1.0, 3.0])
+def test_every_scan_has_the_times_of_the_recording_at_any_speed(tmp_path: Path, speed: float) -> None:
+    real = RealTime()
+    head = paced_head(tmp_path, TIMED, speed, real)
+    for _ in range(2):
+        begun_ns = real.now_ns
+        assert [s.time_s for s in scanned(head, [White(), Black(), BIT])] == [0.0, 0.123456789, 1.25]
+        took_s = (real.now_ns - begun_ns) / 1e9
+        assert took_s == pytest.approx(1.27 / speed if speed else 0.0, abs=0.01)
+
+
+def test_a_camera_that_began_before_the_first_one_keeps_its_lead(tmp_path: Path) -> None:
+    shots = [shot(0, 200, time_s=0.0), shot(0, 150, camera="other", time_s=-0.25)]
+    head = head_of(tmp_path, shots, [White()], ["eye", "other"])
+    assert [(s.camera, s.time_s) for s in scanned(head, [White()])] == [("eye", 0.0), ("other", -0.25)]
+
+
+def test_at_speed_one_the_times_are_those_of_the_monotonic_clock(tmp_path: Path) -> None:
+    real = RealTime()
+    head = paced_head(tmp_path, TIMED, 1.0, real)
+    camera = head.cameras["eye"]
+    head.projector.load(encode([White(), Black(), BIT], PROJECTOR))
+    camera.arm(3, Trigger.SOFTWARE)
+    real.now_ns += 7_000_000_000
+    for index in range(3):
+        shown = head.projector.show(index)
+        assert shown.t_visible_ns == pytest.approx(real.now_ns, abs=2_000_000)
+        camera.trigger()
+        frame = camera.read(shown.t_visible_ns, 1.0)
+        assert frame.t_end_ns == pytest.approx(real.now_ns, abs=2_000_000)
+
+
+def test_a_scan_that_is_slower_than_the_recording_is_not_held_up_and_keeps_its_times(tmp_path: Path) -> None:
+    real = RealTime()
+    head = paced_head(tmp_path, TIMED, 2.0, real)
+    rig = Rig("recording", head.cameras, head.projector, {"eye": CameraSettings(0.02)})
+    times_s = []
+    for each in capture(rig, encode([White(), Black(), BIT], PROJECTOR)):
+        times_s.append(each.time_s)
+        real.now_ns += 10_000_000_000
+        real.waited_s.clear()
+    assert times_s == [0.0, 0.123456789, 1.25]
+    assert real.waited_s == []
+
+
+def test_a_bracket_of_one_sequence_per_exposure_keeps_its_times(tmp_path: Path) -> None:
+    patterns: list[Pattern] = [White(), Black(), BIT, White(), Black()]
+    bracket = [
+        shot(index, 10 * index + step, exposure_s=exposure_s, time_s=10.0 * step + 0.1 * index)
+        for step, exposure_s in enumerate((0.01, 0.03))
+        for index in range(len(patterns))
+    ]
+    head = head_of(tmp_path, bracket, patterns)
+    camera = head.cameras["eye"]
+    for _ in range(2):
+        seen, starts_ns = [], []
+        for exposure_s in (0.01, 0.03):
+            camera.configure(CameraSettings(exposure_s))
+            head.projector.load(encode(patterns, PROJECTOR))
+            camera.arm(len(patterns), Trigger.SOFTWARE)
+            for index in range(len(patterns)):
+                after_ns = head.projector.show(index).t_visible_ns
+                camera.trigger()
+                frame = camera.read(after_ns, 1.0)
+                seen.append((int(frame.image[0, 0]), frame.exposure_s))
+                starts_ns.append(frame.t_start_ns)
+            camera.disarm()
+        assert seen == [(int(s.image[0, 0]), s.exposure_s) for s in bracket]
+        assert [ns - starts_ns[0] for ns in starts_ns] == [round((s.time_s or 0) * 1e9) for s in bracket]
+
+
+def test_a_bracket_of_several_exposures_per_pattern_keeps_its_times(tmp_path: Path) -> None:
+    patterns: list[Pattern] = [White(), Black(), BIT, White(), Black()]
+    bracket = [
+        shot(index, 10 * index + step, exposure_s=exposure_s, time_s=index + 0.2 * step)
+        for index in range(len(patterns))
+        for step, exposure_s in enumerate((0.01, 0.03))
+    ]
+    head = head_of(tmp_path, bracket, patterns)
+    camera = head.cameras["eye"]
+    head.projector.load(encode(patterns, PROJECTOR))
+    seen, starts_ns = [], []
+    for index in range(len(patterns)):
+        for exposure_s in (0.01, 0.03):
+            camera.configure(CameraSettings(exposure_s))
+            camera.arm(1, Trigger.SOFTWARE)
+            after_ns = head.projector.show(index).t_visible_ns
+            camera.trigger()
+            frame = camera.read(after_ns, 1.0)
+            seen.append((int(frame.image[0, 0]), frame.exposure_s))
+            starts_ns.append(frame.t_start_ns)
+            camera.disarm()
+    assert seen == [(int(s.image[0, 0]), s.exposure_s) for s in bracket]
+    assert [ns - starts_ns[0] for ns in starts_ns] == [round((s.time_s or 0) * 1e9) for s in bracket]
+
+
+def test_a_paced_read_waits_for_the_end_of_the_exposure_and_no_longer_than_it_may(tmp_path: Path) -> None:
+    real = RealTime()
+    head = paced_head(tmp_path, [shot(0, 200, exposure_s=4.0)], 0.5, real)
+    camera = head.cameras["eye"]
+    camera.configure(CameraSettings(4.0))
+    head.projector.load(encode([White()], PROJECTOR))
+    camera.arm(2, Trigger.SOFTWARE)
+    after_ns = head.projector.show(0).t_visible_ns
+    camera.trigger()
+    begun_ns = real.now_ns
+    with pytest.raises(FrameTimeoutError, match="within 3"):
+        camera.read(after_ns, 3.0)
+    assert (real.now_ns - begun_ns) / 1e9 == pytest.approx(3.0)
+    assert camera.read(after_ns, 6.0).t_start_ns >= after_ns
+    assert (real.now_ns - begun_ns) / 1e9 == pytest.approx(8.0)
+
+
+def test_closing_ends_a_wait_that_another_thread_is_in(tmp_path: Path) -> None:
+    # The last frame is an hour later; nobody may have to sit through that to be let go.
+    head = head_of(tmp_path, [shot(0, 200, time_s=0.0), shot(1, 10, time_s=3600.0)])
+    head = open_head({"bundle": "rec", "speed": 1}, tmp_path)
+    head.projector.load(encode([White(), Black()], PROJECTOR))
+    head.projector.show(0)
+    waiting = threading.Thread(target=head.projector.show, args=(1,), daemon=True)
+    waiting.start()
+    head.cameras["eye"].close()
+    waiting.join(10)
+    assert not waiting.is_alive()

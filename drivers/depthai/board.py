@@ -1,0 +1,379 @@
+"""An OAK device, opened once per process however many of its cameras are: one pipeline, frames paired on the host.
+
+A pipeline cannot be changed once it runs, so it starts when the first camera is used, with every camera that has been
+opened by then. A thread takes what it delivers, checks it, and hands each camera its frames: reading one camera keeps
+the partners of its frames for the others.
+"""
+
+from __future__ import annotations
+
+import atexit
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+from drivers.depthai.feed import Feed
+from drivers.depthai.library import library, nanoseconds
+from drivers.depthai.messages import delivery_of, fault_of, kind_of
+from drivers.depthai.options import Stream
+from drivers.depthai.presence import available
+from drivers.depthai.sensors import Sensor, sensors_of
+from slrig.errors import (
+    CalibrationError,
+    ConfigError,
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    UnsupportedByDeviceError,
+)
+
+STAMP_ERR_NS = {"USB": 600_000, "network": 1_500_000}
+"""How well the library knows when a device's clock ticks: three times the standard deviations that Luxonis states
+(200 µs by USB, 500 µs by Ethernet; docs.luxonis.com, Device, host clock syncing)."""
+
+_QUEUED_MESSAGES = 16
+_LISTEN = timedelta(milliseconds=200)
+_CLOSE_S = 10.0
+_MOST_CLOCK_OFFSET_NS = 5_000_000
+
+_BOARDS: dict[str, Board] = {}
+_BOARDS_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A camera that uses a board: what it is to deliver, and where its frames go. `start` : its first settings."""
+
+    stream: Stream
+    start: Callable[[Any], None]
+    feed: Feed
+
+
+class Board:
+    """An open device. Made by `board_of`; its cameras `join` and `leave`, the last one closes it.
+
+    Raises
+    ------
+    DeviceBusyError, DeviceGoneError, DeviceError
+        It cannot be opened.
+    """
+
+    def __init__(self, info: Any, vendor: Any) -> None:
+        self._vendor = vendor
+        self.device_id: str = info.deviceId or info.name
+        self.address: str = info.name
+        _require_one_clock(vendor)
+        with _told(self.device_id, vendor):
+            self._device = vendor.Device(info)
+        try:
+            with _told(self.device_id, vendor):
+                # A device that comes back by itself comes back with other settings: gone is gone.
+                self._device.setMaxReconnectionAttempts(0)
+                self.model: str = self._device.getProductName() or self._device.getDeviceName() or "OAK"
+                self.sensors: Mapping[str, Sensor] = sensors_of(self._device.getConnectedCameraFeatures(), vendor)
+                self._pipeline = vendor.Pipeline(self._device)
+                self._pipeline.setStopOnDeviceLoss(True)
+            by_network = info.protocol == vendor.XLinkProtocol.X_LINK_TCP_IP
+            self.err_ns = STAMP_ERR_NS["network" if by_network else "USB"]
+        except BaseException:
+            with suppress(Exception):
+                self._device.close()
+            raise
+        self._lock = threading.Lock()
+        self._links: dict[str, Link] = {}
+        self._running: Mapping[str, Link] | None = None
+        self._controls: dict[str, Any] = {}
+        self._users: set[str] = set()
+        self._closing = threading.Event()
+        self._gone: str | None = None
+        self._refusal: str | None = None
+
+    def factory_calibration(self) -> Any:
+        """The library's handler of what was measured in the factory. Raises CalibrationError where there is none."""
+        with _told(self.device_id, self._vendor):
+            try:
+                return self._device.readCalibration2()
+            except self._vendor.XLinkError:
+                raise
+            except RuntimeError as cause:
+                message = (
+                    f"OAK device '{self.device_id}' stores no calibration of its own ({cause}); calibrate the rig with "
+                    "a board instead"
+                )
+                raise CalibrationError(message) from cause
+
+    def join(self, link: Link) -> Feed:
+        """Use one camera; return where its frames come.
+
+        Raises
+        ------
+        DeviceBusyError
+            The camera is in use already, or the device streams without it.
+        ConfigError
+            It is to run otherwise than the device's other cameras.
+        DeviceGoneError
+            The device was unplugged.
+        """
+        stream = link.stream
+        with self._lock:
+            self._require_there()
+            if stream.socket in self._users:
+                message = (
+                    f"camera {stream.socket} of OAK device '{self.device_id}' is open already; close it first, or name "
+                    "another socket"
+                )
+                raise DeviceBusyError(message)
+            for other in self._links.values():
+                for key, asked, has in (
+                    ("fps", stream.fps, other.stream.fps),
+                    ("external_trigger", stream.external_trigger, other.stream.external_trigger),
+                ):
+                    if stream.socket != other.stream.socket and asked != has:
+                        message = (
+                            f"camera {stream.socket} of OAK device '{self.device_id}': {key} is {asked}, that of its "
+                            f"camera {other.stream.socket} is {has}; one device exposes its cameras together: write "
+                            "the same for all of them"
+                        )
+                        raise ConfigError(message)
+            if self._running is None:
+                self._links[stream.socket] = link
+            elif stream.socket not in self._running or self._running[stream.socket].stream != stream:
+                message = (
+                    f"OAK device '{self.device_id}' is streaming from {', '.join(sorted(self._running))} already, and "
+                    f"{stream.socket} cannot be added or changed now; open all its cameras before the first is used"
+                )
+                raise DeviceBusyError(message)
+            self._users.add(stream.socket)
+            return self._links[stream.socket].feed
+
+    def leave(self, socket: str) -> None:
+        """Stop using one camera; close the device after the last one. Works after an unplug."""
+        with self._lock:
+            self._users.discard(socket)
+            if self._running is None:
+                self._links.pop(socket, None)
+        self.close_unless_used()
+
+    def close_unless_used(self) -> None:
+        """Close the device if no camera uses it. Works after an unplug."""
+        with _BOARDS_LOCK, self._lock:
+            if not self._users:
+                self._close()
+
+    def close(self) -> None:
+        """Close the device, whoever uses it. Idempotent; works after an unplug."""
+        with _BOARDS_LOCK, self._lock:
+            self._close()
+
+    def start(self) -> None:
+        """Start streaming from every camera that has joined. Idempotent.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            The device refuses the streams.
+        DeviceGoneError
+            It was unplugged.
+        """
+        with self._lock:
+            self._require_there()
+            if self._running is not None:
+                return
+            if self._refusal is None:
+                try:
+                    queue = self._built()
+                    self._pipeline.start()
+                except Exception as cause:  # noqa: BLE001 - it raises errors of many kinds, its own and Python's
+                    self._refused(cause)
+            if self._refusal is not None:
+                raise UnsupportedByDeviceError(self._refusal)
+            self._running = dict(self._links)
+            threading.Thread(target=self._listen, args=(queue,), name=f"oak-{self.device_id}", daemon=True).start()
+            self._darken()
+
+    def _refused(self, cause: Exception) -> None:
+        """Remember why the device does not stream: what was laid out half cannot be laid out again."""
+        if self._device.isClosed():
+            self._end(f"OAK device '{self.device_id}' is gone ({cause}); plug it in and open it again")
+            self._require_there()
+        streams = ", ".join(f"{link.stream.size} from {socket}" for socket, link in self._links.items())
+        self._refusal = (
+            f"OAK device '{self.device_id}': asked for {streams}, the device refuses: {cause}; ask for another size_px "
+            "or fps, and open it again"
+        )
+
+    def send(self, socket: str, control: Any) -> None:
+        """Send a camera its settings. Raises DeviceGoneError."""
+        with self._lock:
+            self._require_there()
+            try:
+                self._controls[socket].send(control)
+            except (RuntimeError, self._vendor.MessageQueue.QueueException) as cause:
+                self._end(f"OAK device '{self.device_id}' is gone ({cause}); plug it in and open it again")
+                self._require_there()
+
+    def _built(self) -> Any:
+        """Lay out the pipeline; return the queue that it fills."""
+        vendor, pipeline = self._vendor, self._pipeline
+        outputs = {}
+        for socket, link in self._links.items():
+            stream = link.stream
+            camera = pipeline.create(vendor.node.Camera).build(
+                getattr(vendor.CameraBoardSocket, socket), sensorFps=stream.fps
+            )
+            link.start(camera.initialControl)
+            outputs[socket] = camera.requestOutput(
+                (stream.size.width_px, stream.size.height_px),
+                kind_of(stream, vendor),
+                resizeMode=vendor.ImgResizeMode.CROP,
+                fps=stream.fps,
+                enableUndistortion=False,
+            )
+            self._controls[socket] = camera.inputControl.createInputQueue()
+        if len(outputs) == 1:
+            return next(iter(outputs.values())).createOutputQueue(maxSize=_QUEUED_MESSAGES, blocking=False)
+        sync = pipeline.create(vendor.node.Sync)
+        sync.setRunOnHost(True)
+        sync.setSyncThreshold(timedelta(microseconds=min(link.stream.period_ns for link in self._links.values()) / 2e3))
+        for socket, output in outputs.items():
+            output.link(sync.inputs[socket])
+        return sync.out.createOutputQueue(maxSize=_QUEUED_MESSAGES, blocking=False)
+
+    def _darken(self) -> None:
+        """Switch the device's own light off: a dot pattern over ours would spoil every frame."""
+        with _told(self.device_id, self._vendor):
+            if not self._device.getIrDrivers():
+                return
+            obeyed = [self._device.setIrLaserDotProjectorIntensity(0.0), self._device.setIrFloodLightIntensity(0.0)]
+        if not any(obeyed):
+            message = (
+                f"OAK device '{self.device_id}' does not switch its infrared light off, which would lie over the "
+                "patterns; unplug it, plug it in again, and update depthai"
+            )
+            raise DeviceError(message)
+
+    def _listen(self, queue: Any) -> None:
+        """Take what the pipeline delivers until it ends: the body of the board's thread."""
+        try:
+            while not self._closing.is_set():
+                message = queue.get(_LISTEN)
+                received_ns = time.monotonic_ns()
+                if message is not None:
+                    self._hand_out(message, received_ns)
+                elif not self._pipeline.isRunning():
+                    break
+            reason = "the pipeline has ended"
+        except Exception as cause:  # noqa: BLE001 - whatever ends this thread, readers must learn of it
+            reason = str(cause)
+        self._end(
+            f"OAK device '{self.device_id}' was closed; open it again"
+            if self._closing.is_set()
+            else f"OAK device '{self.device_id}' is gone ({reason}); plug it in and open it again"
+        )
+
+    def _hand_out(self, message: Any, received_ns: int) -> None:
+        for socket, link in (self._running or {}).items():
+            frame = message[socket] if isinstance(message, self._vendor.MessageGroup) else message
+            fault = fault_of(frame, link.stream, received_ns, self.err_ns, self._vendor)
+            if fault is not None:
+                link.feed.damaged(fault)
+            else:
+                link.feed.put(delivery_of(frame, received_ns, self._vendor))
+
+    def _end(self, reason: str) -> None:
+        self._gone = self._gone or reason
+        for link in (self._running or self._links).values():
+            link.feed.end(self._gone)
+
+    def _require_there(self) -> None:
+        if self._gone is not None:
+            raise DeviceGoneError(self._gone)
+
+    def _close(self) -> None:
+        _BOARDS.pop(self.device_id, None)
+        if self._closing.is_set():
+            return
+        self._closing.set()
+        # The library may wait for a device that does not answer any more; its owner must not.
+        closing = threading.Thread(target=self._shut_down, name=f"oak-{self.device_id}-closing", daemon=True)
+        try:
+            closing.start()
+        except RuntimeError:
+            # The interpreter is ending, and starts no thread any more.
+            self._shut_down()
+        else:
+            closing.join(_CLOSE_S)
+
+    def _shut_down(self) -> None:
+        with suppress(Exception):
+            self._pipeline.stop()
+        with suppress(Exception):
+            # Destroyed before its threads have ended, a pipeline waits for them with the interpreter's lock held.
+            self._pipeline.wait()
+        with suppress(Exception):
+            self._device.close()
+
+
+@contextmanager
+def _told(device_id: str, vendor: Any) -> Iterator[None]:
+    """Say what the library's errors mean."""
+    try:
+        yield
+    except RuntimeError as cause:
+        text = str(cause)
+        if "ALREADY_IN_USE" in text or "already in use" in text:
+            message = f"OAK device '{device_id}' is held by another program ({text}); close that program"
+            raise DeviceBusyError(message) from cause
+        if isinstance(cause, vendor.XLinkError) or "NOT_FOUND" in text or "No available devices" in text:
+            message = f"OAK device '{device_id}' is gone ({text}); plug it in and open it again"
+            raise DeviceGoneError(message) from cause
+        message = f"OAK device '{device_id}' fails: {text}; unplug it, plug it in, and try again"
+        raise DeviceError(message) from cause
+
+
+def _require_one_clock(vendor: Any) -> None:
+    """Make sure that the library's time stamps count in CLOCK_MONOTONIC."""
+    offset_ns = nanoseconds(vendor.Clock.now()) - time.monotonic_ns()
+    if abs(offset_ns) > _MOST_CLOCK_OFFSET_NS:
+        message = (
+            f"the clock of depthai {vendor.__version__} is {offset_ns / 1e6:.0f} ms off CLOCK_MONOTONIC, in which "
+            "frames are timed; report it, and use depthai 3.12"
+        )
+        raise DeviceError(message)
+
+
+def board_of(device: str) -> Board:
+    """The board of a device, opened now unless this process has it open.
+
+    Raises
+    ------
+    LibraryMissingError
+        The library is not installed.
+    DeviceBusyError, DeviceGoneError, DeviceError
+        The device cannot be opened.
+    """
+    vendor = library()
+    with _BOARDS_LOCK:
+        for known in _BOARDS.values():
+            if device in (known.device_id, known.address):
+                return known
+        opened = Board(available(device, vendor), vendor)
+        _BOARDS[opened.device_id] = opened
+        return opened
+
+
+@atexit.register
+def close_boards() -> None:
+    """Close whatever a program left open: the library's threads would keep it from ending."""
+    for board in tuple(_BOARDS.values()):
+        board.close()
+
+
+def held_devices() -> frozenset[str]:
+    """The ids of the devices that this process holds."""
+    with _BOARDS_LOCK:
+        return frozenset(_BOARDS)

@@ -1,0 +1,338 @@
+"""An OAK camera: fixed settings that are read back from its frames, and frames that began after an instant.
+
+The sensor runs by itself, so `read` waits for a frame whose exposure began late enough; with the option
+`external_trigger` an edge on FSIN starts every exposure. Every frame tells the exposure, the sensitivity and the lens
+position that it was taken with: one that was taken otherwise than asked, because a setting takes a few frames to reach
+the sensor, is passed over.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from drivers.depthai.board import Board, Link, board_of
+from drivers.depthai.feed import KEPT_FRAMES, Feed
+from drivers.depthai.library import library
+from drivers.depthai.messages import Delivery, brightness
+from drivers.depthai.options import OakOptions, Stream, options_of
+from drivers.depthai.sensors import Sensor
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
+from slrig.errors import CalibrationError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import CameraFormat, Frame, Size
+
+LEAST_EXPOSURE_S = 100e-6
+LONGEST_SHARE = 0.95
+"""The longest exposure as a share of the frame period: the rest is the sensor's."""
+
+ISO_OF_GAIN_1 = 100
+MOST_GAIN = 16.0
+"""ISO 1600, the end of the range that the library calls usual."""
+
+USUAL_EXPOSURE_S = 1 / 60
+
+_SAME = 0.01
+_SETTLE_S = 2.0
+
+
+class OakCamera:
+    """Implements `slrig.devices.Camera` on one camera of an OAK device.
+
+    Parameters
+    ----------
+    name
+        As the rig file calls it.
+    options
+        Checked already.
+
+    Raises
+    ------
+    LibraryMissingError, DeviceBusyError, DeviceGoneError, DeviceError
+        See `board_of`.
+    ConfigError
+        The device's other cameras run otherwise.
+    UnsupportedByDeviceError
+        The device has no such camera, or the camera cannot do what an option asks.
+    """
+
+    def __init__(self, name: str, options: OakOptions) -> None:
+        self._name = name
+        self._vendor = library()
+        self._board: Board = board_of(options.device)
+        try:
+            self._sensor = self._chosen(options)
+            self._stream = self._planned(options)
+            self._info = self._declared()
+            low_s, high_s = self._info.exposure_range_s
+            self._asked = (round(min(max(USUAL_EXPOSURE_S, low_s), high_s) * 1e6), ISO_OF_GAIN_1)
+            self._feed: Feed = self._board.join(Link(self._stream, self._prepare, Feed()))
+        except BaseException:
+            self._board.close_unless_used()
+            raise
+        self._armed: Trigger | None = None
+        self._armed_ns = 0
+        self._closed = False
+
+    @property
+    def info(self) -> CameraInfo:
+        """See `Camera`. Gain 1 is ISO 100."""
+        return self._info
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`. Waits until a frame comes that was taken so; with an external trigger, where no frame comes
+        before the first edge, each frame is held against what was asked.
+
+        Raises
+        ------
+        FrameTimeoutError
+            The camera delivers no frame.
+        """
+        self._require_open()
+        if self._armed is not None:
+            message = f"camera '{self._name}' is armed; disarm it before changing its settings"
+            raise DeviceStateError(message)
+        for what, asked, (least, most) in (
+            ("exposure_s", settings.exposure_s, self._info.exposure_range_s),
+            ("gain", settings.gain, self._info.gain_range),
+        ):
+            if not least * (1 - 1e-9) <= asked <= most * (1 + 1e-9):
+                why = f" at {self._stream.fps:g} frames per second" if what == "exposure_s" else ""
+                message = f"camera '{self._name}': asked for {what} {asked:g}, it takes {least:g} to {most:g}{why}"
+                raise UnsupportedByDeviceError(message)
+        self._board.start()
+        self._asked = (round(settings.exposure_s * 1e6), round(settings.gain * ISO_OF_GAIN_1))
+        control = self._vendor.CameraControl()
+        control.setManualExposure(*self._asked)
+        self._feed.begin()
+        self._board.send(self._stream.socket, control)
+        if self._stream.external_trigger:
+            return AppliedSettings(self._asked[0] / 1e6, self._asked[1] / ISO_OF_GAIN_1)
+        until_ns = time.monotonic_ns() + round((_SETTLE_S + 8 / self._stream.fps) * 1e9)
+        last: Delivery | None = None
+        while (delivery := self._feed.take(until_ns)) is not None:
+            if self._as_asked(delivery):
+                return AppliedSettings(delivery.exposure_us / 1e6, delivery.iso / ISO_OF_GAIN_1)
+            last = delivery
+            if delivery.received_ns > until_ns:
+                break
+        raise self._not_settled(last)
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`. Frames beyond `count` can be had."""
+        self._require_open()
+        if self._armed is not None:
+            message = f"camera '{self._name}' is armed already; disarm it first"
+            raise DeviceStateError(message)
+        if count < 1 or trigger not in self._info.triggers:
+            raise UnsupportedByDeviceError(self._no_trigger(count, trigger))
+        self._board.start()
+        # Edges that come while nobody reads must not be lost; a camera that runs by itself has newer frames.
+        self._feed.begin(max(KEPT_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else KEPT_FRAMES)
+        self._armed_ns = time.monotonic_ns()
+        self._armed = trigger
+
+    def trigger(self) -> None:
+        """See `Camera`. An OAK takes no software trigger."""
+        self._require_armed()
+        message = f"camera '{self._name}' is armed for {self._armed} triggers, and takes none by software; read it"
+        raise DeviceStateError(message)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`. A frame may have begun earlier than it says by the error of its time stamp: that is allowed
+        for.
+        """
+        self._require_armed()
+        until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        stale = otherwise = 0
+        while (delivery := self._feed.take(until_ns)) is not None:
+            if delivery.t_start_ns - self._board.err_ns < after_ns or delivery.t_start_ns < self._armed_ns:
+                stale += 1
+            elif not self._as_asked(delivery):
+                otherwise += 1
+                self._feed.lose()
+            else:
+                return self._frame(delivery)
+            # Frames that keep coming must not keep this from ending.
+            if time.monotonic_ns() > until_ns:
+                break
+        lost, why = self._feed.lost
+        damage = f", the last damaged one: {why}" if why else ""
+        message = (
+            f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s; passed over: "
+            f"{stale} that began earlier, {otherwise} taken otherwise than asked; lost since it was armed: {lost}"
+            f"{damage}; check {'the trigger wire' if self._armed is Trigger.HARDWARE else 'cable and USB port'}"
+        )
+        raise FrameTimeoutError(message)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        self._armed = None
+
+    def close(self) -> None:
+        """See `Camera`. The device is closed with the last of its cameras."""
+        self._armed = None
+        if not self._closed:
+            self._closed = True
+            self._board.leave(self._stream.socket)
+
+    def _chosen(self, options: OakOptions) -> Sensor:
+        """The sensor at the socket, if it can do what is asked."""
+        board = self._board
+        sensor = board.sensors.get(options.socket)
+        if sensor is None:
+            has = ", ".join(f"{s.socket} ({s.name}, {s.size})" for s in board.sensors.values()) or "none"
+            message = (
+                f"camera '{self._name}': asked for {options.socket} of OAK device '{board.device_id}', which has: {has}"
+            )
+            raise UnsupportedByDeviceError(message)
+        if options.external_trigger and not sensor.snapshot:
+            message = (
+                f"camera '{self._name}': asked for external_trigger, and its sensor {sensor.name} follows FSIN only at "
+                "its own steady frame rate, not at any time; leave external_trigger out, or use a camera with OV9282, "
+                "OV9782 or AR0234"
+            )
+            raise UnsupportedByDeviceError(message)
+        if options.focus is not None and not sensor.autofocus:
+            message = (
+                f"camera '{self._name}': asked for focus {options.focus}, and {options.socket} ({sensor.name}) has a "
+                "fixed lens; leave focus out"
+            )
+            raise UnsupportedByDeviceError(message)
+        return sensor
+
+    def _planned(self, options: OakOptions) -> Stream:
+        sensor = self._sensor
+        size = sensor.size if options.size_px is None else Size(*options.size_px)
+        if size.width_px > sensor.size.width_px or size.height_px > sensor.size.height_px:
+            message = f"camera '{self._name}': asked for {size}, its sensor {sensor.name} has {sensor.size}"
+            raise UnsupportedByDeviceError(message)
+        focus = options.focus
+        if sensor.autofocus and focus is None:
+            with suppress(CalibrationError):
+                handler = self._board.factory_calibration()
+                focus = handler.getLensPosition(getattr(self._vendor.CameraBoardSocket, sensor.socket))
+            if not focus:
+                message = (
+                    f"camera '{self._name}': {options.socket} ({sensor.name}) has autofocus, which would move during a "
+                    "scan, and stores no lens position; write focus = 0 … 255 into its table"
+                )
+                raise UnsupportedByDeviceError(message)
+        return Stream(
+            socket=options.socket,
+            size=size,
+            fps=options.fps,
+            colour=sensor.colour,
+            focus=focus,
+            colour_temperature_k=options.colour_temperature_k,
+            external_trigger=options.external_trigger,
+        )
+
+    def _declared(self) -> CameraInfo:
+        trigger = Trigger.HARDWARE if self._stream.external_trigger else Trigger.FREE
+        return CameraInfo(
+            name=self._name,
+            model=f"{self._board.model} {self._sensor.name}",
+            serial=f"{self._board.device_id}-{self._stream.socket}",
+            format=CameraFormat(self._stream.size, 8),
+            triggers=frozenset({trigger}),
+            exposure_range_s=(LEAST_EXPOSURE_S, LONGEST_SHARE / self._stream.fps),
+            gain_range=(1.0, MOST_GAIN),
+        )
+
+    def _prepare(self, control: Any) -> None:
+        """Write what the camera starts with: nothing automatic, nothing that bends grey levels, no light of its own."""
+        vendor, stream = self._vendor, self._stream
+        control.setManualExposure(*self._asked)
+        control.setSharpness(0)
+        control.setLumaDenoise(0)
+        control.setStrobeDisable()
+        if stream.colour:
+            control.setChromaDenoise(0)
+            control.setManualWhiteBalance(stream.colour_temperature_k)
+        if stream.focus is not None:
+            control.setAutoFocusMode(vendor.CameraControl.AutoFocusMode.OFF)
+            control.setManualFocus(stream.focus)
+        if stream.external_trigger:
+            control.setFrameSyncMode(vendor.CameraControl.FrameSyncMode.INPUT)
+            control.setExternalTrigger(1, 0)
+
+    def _as_asked(self, delivery: Delivery) -> bool:
+        exposure_us, iso = self._asked
+        return (
+            abs(delivery.exposure_us - exposure_us) <= max(_SAME * exposure_us, 1)
+            and abs(delivery.iso - iso) <= max(_SAME * iso, 1)
+            and (self._stream.focus is None or abs(delivery.lens_position - self._stream.focus) <= 1)
+        )
+
+    def _frame(self, delivery: Delivery) -> Frame:
+        # The last row was read out by the time the frame was here.
+        skew_ns = min(self._sensor.longest_skew_ns(self._stream.fps), delivery.received_ns - delivery.t_end_ns)
+        skew_ns = max(skew_ns, 0)
+        return Frame(
+            camera=self._name,
+            image=brightness(delivery.message, self._stream),
+            t_start_ns=delivery.t_start_ns,
+            t_end_ns=delivery.t_end_ns + skew_ns,
+            t_err_ns=self._board.err_ns,
+            sequence_number=delivery.number,
+            dropped_count=self._feed.lost[0],
+            exposure_s=delivery.exposure_us / 1e6,
+            gain=delivery.iso / ISO_OF_GAIN_1,
+            shutter_skew_s=skew_ns / 1e9,
+        )
+
+    def _not_settled(self, last: Delivery | None) -> Exception:
+        exposure_us, iso = self._asked
+        focus = "" if self._stream.focus is None else f", focus {self._stream.focus}"
+        asked = f"exposure {exposure_us} µs, ISO {iso}{focus}"
+        if last is None:
+            lost, why = self._feed.lost
+            message = (
+                f"camera '{self._name}' delivers no frame after {asked} was asked for ({lost} lost"
+                f"{f', the last one: {why}' if why else ''}); check cable and USB port, or lower fps or size_px"
+            )
+            return FrameTimeoutError(message)
+        got_focus = "" if self._stream.focus is None else f", focus {last.lens_position}"
+        message = (
+            f"camera '{self._name}': asked for {asked}, the driver gives exposure {last.exposure_us} µs, ISO {last.iso}"
+            f"{got_focus}; ask for that, or lower fps for a longer exposure"
+        )
+        return UnsupportedByDeviceError(message)
+
+    def _no_trigger(self, count: int, trigger: Trigger) -> str:
+        offered = ", ".join(sorted(self._info.triggers))
+        message = (
+            f"camera '{self._name}': asked for {count} frames by {trigger} trigger, it gives 1 or more by: {offered}"
+        )
+        if trigger is Trigger.HARDWARE and self._sensor.snapshot:
+            return f"{message}; write external_trigger = true into its table"
+        if trigger is Trigger.HARDWARE:
+            return f"{message}; its sensor {self._sensor.name} follows FSIN only at its own steady frame rate"
+        return message
+
+    def _require_open(self) -> None:
+        if self._closed:
+            message = f"camera '{self._name}' is closed; open the rig again"
+            raise DeviceStateError(message)
+
+    def _require_armed(self) -> None:
+        self._require_open()
+        if self._armed is None:
+            message = f"camera '{self._name}' is not armed; call arm first"
+            raise DeviceStateError(message)
+
+
+def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:  # noqa: ARG001 - every driver's form
+    """Open one camera of an OAK device, from its `[[camera]]` table (without `name`, `driver` and settings).
+
+    Raises
+    ------
+    ConfigError
+        The options have faults, all of them in one message.
+    LibraryMissingError, DeviceBusyError, DeviceGoneError, UnsupportedByDeviceError, DeviceError
+        See `OakCamera`.
+    """
+    return OakCamera(name, options_of(name, options))

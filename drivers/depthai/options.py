@@ -1,0 +1,71 @@
+"""What a rig file says about an OAK camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.errors import ConfigError
+from slrig.model import Size
+
+USUAL_FPS = 20.0
+
+Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F", "CAM_G", "CAM_H"]
+PixelExtent = Annotated[int, Field(ge=16, le=16384)]
+
+
+class OakOptions(Strict):
+    """The driver's keys in a `[[camera]]` table.
+
+    device : the device's id, as `slrig devices` shows it; its address or USB port will do, too. Several tables may
+    name one device: it is opened once, and its cameras are paired frame by frame.
+    socket : which camera of it. On an OAK-D, CAM_A is the colour camera, CAM_B the left and CAM_C the right mono one.
+    size_px : width and height of the frames; the sensor's own where absent.
+    fps : how many frames the sensor makes per second; the longest exposure follows from it. One for all of a device.
+    focus : lens position, 0 to 255, of a camera with autofocus (which is switched off); where absent, the position at
+    which the camera was calibrated in the factory.
+    colour_temperature_k : white balance of a colour camera, fixed.
+    external_trigger : a rising edge on the pin FSIN starts each exposure. One for all of a device.
+    """
+
+    device: Annotated[str, Field(min_length=1)]
+    socket: Socket
+    size_px: Annotated[tuple[PixelExtent, PixelExtent], Field(strict=False)] | None = None
+    fps: Annotated[float, Field(ge=1, le=240)] = USUAL_FPS
+    focus: Annotated[int, Field(ge=0, le=255)] | None = None
+    colour_temperature_k: Annotated[int, Field(ge=1000, le=12000)] = 5000
+    external_trigger: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """What one camera of a device is to deliver: options, with what the device told filled in.
+
+    focus : None for a camera without autofocus. colour : the frames are the luminance of NV12, else GRAY8.
+    """
+
+    socket: str
+    size: Size
+    fps: float
+    colour: bool
+    focus: int | None
+    colour_temperature_k: int
+    external_trigger: bool
+
+    @property
+    def period_ns(self) -> int:
+        """From one frame to the next, ns."""
+        return round(1e9 / self.fps)
+
+
+def options_of(name: str, options: Mapping[str, object]) -> OakOptions:
+    """Return a camera's options, checked. Raises ConfigError with every fault."""
+    try:
+        return OakOptions.model_validate(dict(options))
+    except ValidationError as cause:
+        message = f"the [[camera]] table '{name}' is wrong:\n{explain(cause, options, keys_of(OakOptions))}"
+        raise ConfigError(message) from cause

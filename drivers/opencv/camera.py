@@ -1,0 +1,378 @@
+"""A camera through OpenCV that never gives a stale frame: see the package's docstring for what that takes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from drivers.opencv.controls import Controls, code_of, negotiate, size_of
+from drivers.opencv.feeds import DeviceFeed, FilmFeed, LiveFeed, Taken, opened
+from drivers.opencv.options import Kind, Source
+from drivers.opencv.pixels import Picture, decoded_picture, raw_picture
+from drivers.opencv.reader import Reader
+from drivers.opencv.timing import Arrivals
+from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, prepare
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Trigger
+from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import Frame
+
+_Feed = DeviceFeed | LiveFeed | FilmFeed
+_Open = tuple[_Feed, Picture, Controls | None]
+
+_SAME = 0.01
+_PATIENCE_S = 2.0
+_SILENCE_S = 5.0
+_FIRST_FRAMES = 10
+_USUAL_PERIOD_S = 1 / 30
+
+
+@dataclass(slots=True)
+class _PassedOver:
+    """Frames that came and were not given, by cause."""
+
+    stale: int = 0
+    untimed: int = 0
+    corrupt: int = 0
+    last_fault: str = ""
+
+    def __str__(self) -> str:
+        told = f"{self.stale} stale, {self.corrupt} damaged"
+        if self.untimed:
+            told += f", {self.untimed} that had lain in a queue for nobody knows how long"
+        return f"{told} (the last: {self.last_fault})" if self.last_fault else told
+
+
+class OpenCvCamera:
+    """Implements `slrig.devices.Camera` on a `cv2.VideoCapture`.
+
+    A live source is read from opening to `close`, a camera and a film from `arm` to `disarm`. Exposure and gain can be
+    set where the kernel's interface is used (Linux); of any other source they are what the rig file says.
+
+    Raises
+    ------
+    DeviceGoneError, DeviceBusyError, UnsupportedByDeviceError, DeviceError
+        See `drivers.opencv.open_camera`.
+    """
+
+    def __init__(self, name: str, source: Source) -> None:
+        self._name = name
+        self._source = source
+        self._closed = threading.Event()
+        self._armed = False
+        self._armed_ns = 0
+        self._lost_before = 0
+        self._corrupt = 0
+        self._exposure_s = source.options.source_exposure_s or 0.0
+        opening = {Kind.DEVICE: self._open_device, Kind.LIVE: self._open_live, Kind.FILM: self._open_film}
+        self._feed, self._picture, self._controls = opening[source.kind]()
+        self._reader = Reader(self._feed, f"slrig-opencv-{name}")
+        exposures_s, gains = (self._exposure_s, self._exposure_s), (1.0, 1.0)
+        self._applied = AppliedSettings(self._exposure_s, 1.0)
+        if self._controls is not None:
+            exposures_s, gains = self._controls.exposure_range_s, self._controls.gain_range
+            self._applied = self._controls.read_back()
+        self._info = CameraInfo(
+            name=name,
+            model=f"OpenCV {cv2.__version__}, {cv2.videoio_registry.getBackendName(source.backend)}",
+            serial=source.label,
+            format=self._picture.format,
+            triggers=frozenset({Trigger.FREE}),
+            exposure_range_s=exposures_s,
+            gain_range=gains,
+        )
+        if source.kind is Kind.LIVE:
+            self._reader.start()
+
+    @property
+    def info(self) -> CameraInfo:
+        """See `Camera`."""
+        return self._info
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`. A source that OpenCV has no control over takes what its table says, within 1 %."""
+        self._require_open()
+        if self._armed:
+            message = f"camera '{self._name}' is armed; disarm it before changing its settings"
+            raise DeviceStateError(message)
+        for what, asked, (least, most), unit in (
+            ("an exposure", settings.exposure_s, self._info.exposure_range_s, " s"),
+            ("gain", settings.gain, self._info.gain_range, ""),
+        ):
+            if least * (1 - _SAME) <= asked <= most * (1 + _SAME):
+                continue
+            has = f"the source gives {least:.6g}{unit} and OpenCV no control over it"
+            if least < most:
+                has = f"the device takes {least:.6g} to {most:.6g}{unit}"
+            message = f"camera '{self._name}': asked for {what} of {asked:.6g}{unit}, {has}; write such a value"
+            raise UnsupportedByDeviceError(message)
+        if self._controls is not None:
+            self._require_idle()
+            self._applied = self._controls.apply(settings)
+        return self._applied
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`. More than `count` frames can be had. Returns when a camera's settings have taken effect.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            Another trigger than FREE; time stamps of another clock.
+        DeviceGoneError, FrameTimeoutError
+            No frames come.
+        """
+        self._require_open()
+        if self._armed:
+            message = f"camera '{self._name}' is armed already; disarm it first"
+            raise DeviceStateError(message)
+        if count < 1 or trigger is not Trigger.FREE:
+            message = (
+                f"camera '{self._name}': asked for {count} frames by {trigger} trigger, OpenCV gives 1 or more of a "
+                "camera that runs free"
+            )
+            raise UnsupportedByDeviceError(message)
+        self._armed_ns = time.monotonic_ns()
+        self._lost_before = self._corrupt = 0
+        if self._source.kind is Kind.LIVE:
+            self._reader.forget()
+            self._require_alive()
+        else:
+            self._require_idle()
+            self._start()
+        self._armed = True
+
+    def trigger(self) -> None:
+        """See `Camera`. A camera that runs free has no software trigger."""
+        self._require_armed()
+        message = f"camera '{self._name}' runs free: there is nothing to trigger; read a frame"
+        raise DeviceStateError(message)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`. The exposure began after `after_ns` at the earliest, and after `arm`."""
+        self._require_armed()
+        until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        after_ns = max(after_ns, self._armed_ns)
+        passed = _PassedOver()
+        while True:
+            taken = self._reader.next(until_ns)
+            self._require_armed()
+            if taken is None:
+                raise FrameTimeoutError(self._nothing_came(after_ns, timeout_s, passed))
+            frame = self._judged(taken, after_ns, passed)
+            if frame is not None:
+                return frame
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        self._armed = False
+        if self._source.kind is not Kind.LIVE and not self._closed.is_set():
+            self._halt()
+
+    def close(self) -> None:
+        """See `Camera`. From another thread, it ends a `read` that waits."""
+        self._armed = False
+        if not self._closed.is_set():
+            self._closed.set()
+            self._reader.close()
+
+    def _judged(self, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
+        exposed = taken.exposed
+        if exposed is None:
+            passed.untimed += 1
+            return None
+        if exposed.earliest_ns < after_ns:
+            passed.stale += 1
+            return None
+        try:
+            image = self._picture.grey(taken.data)
+        except CorruptFrameError as fault:
+            passed.corrupt += 1
+            passed.last_fault = str(fault)
+            self._corrupt += 1
+            return None
+        start_ns, end_ns, error_ns = exposed.centred(round(self._applied.exposure_s * 1e9))
+        return Frame(
+            camera=self._name,
+            image=image,
+            t_start_ns=start_ns,
+            t_end_ns=end_ns,
+            t_err_ns=error_ns,
+            sequence_number=taken.number,
+            dropped_count=taken.lost - self._lost_before + self._corrupt,
+            exposure_s=self._applied.exposure_s,
+            gain=self._applied.gain,
+        )
+
+    def _nothing_came(self, after_ns: int, timeout_s: float, passed: _PassedOver) -> str:
+        advice = "wait longer, or check its cable or network"
+        arrivals = None if isinstance(self._feed, FilmFeed) else self._feed.arrivals
+        if arrivals is not None:
+            rate_hz = self._source.options.frame_rate_hz
+            advice = (
+                f"a frame counts once the reader has waited for it, half a period of frame_rate_hz = {rate_hz:g} at "
+                f"least ({arrivals.queued} came since it last did): if the source sends more frames than that, write "
+                "so; if this machine is too slow for them, let it send fewer or smaller ones"
+            )
+        return (
+            f"camera '{self._name}': no frame that was exposed wholly after {after_ns} ns came in {timeout_s:g} s; "
+            f"passed over: {passed}; {advice}"
+        )
+
+    def _start(self) -> None:
+        """Start a camera or a film; of a camera, pass over the frames that may be exposed as before."""
+        feed = self._feed
+        if isinstance(feed, DeviceFeed):
+            feed.exposure_ns = round(self._applied.exposure_s * 1e9)
+        elif isinstance(feed, FilmFeed):
+            feed.rewind()
+        self._reader.start()
+        if not isinstance(feed, DeviceFeed):
+            return
+        try:
+            self._settle(feed)
+        except BaseException:
+            self._halt()
+            raise
+
+    def _halt(self) -> None:
+        if self._reader.stop() and isinstance(self._feed, DeviceFeed):
+            self._feed.rest()
+
+    def _settle(self, feed: DeviceFeed) -> None:
+        wanted, seen = self._source.options.settle_frames, 0
+        slowest_ns = max(feed.period_ns, feed.exposure_ns)
+        until_ns = self._armed_ns + 4 * wanted * slowest_ns + round(_PATIENCE_S * 1e9)
+        while seen <= wanted:
+            taken = self._reader.next(until_ns)
+            if taken is None:
+                message = (
+                    f"camera '{self._name}': {seen} of the first {wanted + 1} frames came in time; check its cable and "
+                    "bandwidth (dmesg | tail)"
+                )
+                raise FrameTimeoutError(message)
+            if taken.exposed is not None and taken.exposed.earliest_ns >= self._armed_ns:
+                seen += 1
+                self._lost_before = taken.lost
+        # A camera may be slower than it says.
+        if feed.arrivals is None:
+            feed.period_ns = max(feed.period_ns, round(float(np.median(np.diff(feed.stamps_ns)))))
+        now = None if self._controls is None else self._controls.read_back()
+        if now is not None and now != self._applied:
+            message = (
+                f"camera '{self._name}': set to exposure {self._applied.exposure_s:.6g} s and gain "
+                f"{self._applied.gain:.6g}, and once it streamed, it used {now.exposure_s:.6g} s and {now.gain:.6g}: "
+                "something else sets it; close other programs, or use a camera that obeys"
+            )
+            raise UnsupportedByDeviceError(message)
+
+    def _open_device(self) -> _Open:
+        source = self._source
+        capture = opened(source)
+        try:
+            negotiate(capture, source.options, source.label)
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+            code: str | None = code_of(capture)
+            if code not in LAYOUTS:
+                code = None
+                capture.set(cv2.CAP_PROP_CONVERT_RGB, 1)
+            else:
+                prepare(LAYOUTS[code])
+            rate_hz = capture.get(cv2.CAP_PROP_FPS)
+            period_ns = round(1e9 / rate_hz if rate_hz > 0 else _USUAL_PERIOD_S * 1e9)
+            arrivals = None if source.options.delay_s is None else self._arrivals()
+            feed = DeviceFeed(capture, source.label, period_ns, arrivals)
+            self._exposure_s = self._exposure_s or period_ns / 1e9
+            controls = Controls(capture, source.options, source.label, fixed_s=self._exposure_s)
+            picture = raw_picture(code, size_of(capture), source.options.bit_depth)
+        except BaseException:
+            capture.release()
+            raise
+        return feed, picture, controls
+
+    def _open_live(self) -> _Open:
+        source, options = self._source, self._source.options
+        streamed = source.backend == cv2.CAP_FFMPEG
+        silence_s = _SILENCE_S + self._exposure_s + (options.delay_s or 0)
+        parameters = {
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: round(_SILENCE_S * 1e3),
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC: round(silence_s * 1e3),
+            # Several threads decode several frames at once, and give each of them later.
+            cv2.CAP_PROP_N_THREADS: 1,
+        }
+        capture = opened(source, [each for pair in parameters.items() for each in pair] if streamed else ())
+        try:
+            code = None
+            if streamed and code_of(capture) == "MJPG" and capture.set(cv2.CAP_PROP_FORMAT, -1):
+                code = "MJPG"
+            elif not streamed:
+                negotiate(capture, options, source.label)
+            feed = LiveFeed(capture, source.label, self._arrivals())
+            picture = self._first_picture(feed, code)
+        except BaseException:
+            capture.release()
+            raise
+        return feed, picture, None
+
+    def _open_film(self) -> _Open:
+        source = self._source
+        feed = LiveFeed(opened(source), source.label, Arrivals(exposure_ns=0, delay_ns=0, period_ns=0))
+        try:
+            picture = self._first_picture(feed, None)
+        finally:
+            feed.release()
+        return FilmFeed(lambda: opened(source), source), picture, None
+
+    def _arrivals(self) -> Arrivals:
+        options = self._source.options
+        return Arrivals(
+            exposure_ns=round(self._exposure_s * 1e9),
+            delay_ns=round((options.delay_s or 0) * 1e9),
+            period_ns=round(1e9 / (options.frame_rate_hz or 1 / _USUAL_PERIOD_S)),
+        )
+
+    def _first_picture(self, feed: LiveFeed, code: str | None) -> Picture:
+        """What the frames are, from the first one that is whole."""
+        fault: CorruptFrameError | None = None
+        for _ in range(_FIRST_FRAMES):
+            data, _when = feed.grabbed()
+            try:
+                bit_depth = self._source.options.bit_depth
+                if code is None:
+                    picture = decoded_picture(data, bit_depth)
+                else:
+                    picture = raw_picture(code, size_of(feed.capture), bit_depth)
+                picture.grey(data)
+            except CorruptFrameError as error:
+                fault = error
+                continue
+            asked = self._source.options.size
+            if asked is not None and picture.format.size != asked:
+                message = f"{feed.label}: asked for {asked}, the source gives {picture.format.size}; leave size_px out"
+                raise UnsupportedByDeviceError(message)
+            return picture
+        message = f"{feed.label}: none of the first {_FIRST_FRAMES} frames was whole: {fault}; check what it sends"
+        raise DeviceError(message)
+
+    def _require_idle(self) -> None:
+        if not self._reader.stop():
+            message = f"camera '{self._name}': OpenCV has not come back from waiting for a frame; open it again"
+            raise DeviceGoneError(message)
+
+    def _require_alive(self) -> None:
+        fault = self._reader.fault
+        if fault is not None:
+            raise fault
+
+    def _require_open(self) -> None:
+        if self._closed.is_set():
+            message = f"camera '{self._name}' is closed; open the rig again"
+            raise DeviceStateError(message)
+
+    def _require_armed(self) -> None:
+        self._require_open()
+        if not self._armed:
+            message = f"camera '{self._name}' is not armed; call arm first"
+            raise DeviceStateError(message)

@@ -1,0 +1,175 @@
+"""Setting a V4L2 camera through OpenCV, and reading back what it took: `set` returns True whatever happened.
+
+Facts, from OpenCV's cap_v4l.cpp (4.x, 5.0) and from measurements on a kernel's camera: a pixel format that the device
+does not have leaves the one before; a value out of range is clamped; CAP_PROP_MODE 0 makes the numbers of controls the
+kernel's own (1 is manual exposure, exposure counts 100 µs), whatever the environment says; a control that the device
+does not have reads as -1. On other systems the numbers mean other things, and none can be verified.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+
+from drivers.opencv.options import OpenCvOptions
+from slrig.devices import AppliedSettings, CameraSettings
+from slrig.errors import UnsupportedByDeviceError
+from slrig.model import Size
+
+EXPOSURE_UNIT_S = 1e-4
+_ABSENT = -1.0
+_MANUAL = 1
+_LEAST_UNITS, _MOST_UNITS = 1, 600_000
+_TOLERANCE = 0.01
+
+
+def code_of(capture: cv2.VideoCapture) -> str:
+    """The four characters of the pixel format in use."""
+    return int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=False).decode("latin-1")
+
+
+def size_of(capture: cv2.VideoCapture) -> Size:
+    """The extent in use. Raises UnsupportedByDeviceError where OpenCV tells none."""
+    width, height = (int(capture.get(number)) for number in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width < 1 or height < 1:
+        message = f"OpenCV tells an extent of {width} x {height}; write size_px and fourcc into the rig file"
+        raise UnsupportedByDeviceError(message)
+    return Size(width, height)
+
+
+def negotiate(capture: cv2.VideoCapture, options: OpenCvOptions, label: str) -> None:
+    """Set pixel format, extent and rate, as far as they are asked for.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The device takes another one.
+    """
+    capture.set(cv2.CAP_PROP_MODE, 0)
+    if options.fourcc is not None:
+        asked = options.fourcc.ljust(4)
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*asked))
+        got = code_of(capture)
+        if got != asked:
+            message = (
+                f"{label}: asked for pixel format {asked.strip()}, the driver gives {got.strip()}; choose one of "
+                "`v4l2-ctl --list-formats-ext`"
+            )
+            raise UnsupportedByDeviceError(message)
+    if options.size is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, options.size.width_px)
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, options.size.height_px)
+        found = size_of(capture)
+        if found != options.size:
+            message = (
+                f"{label}: asked for {options.size}, the driver gives {found}; choose one of "
+                "`v4l2-ctl --list-formats-ext`, or leave size_px out"
+            )
+            raise UnsupportedByDeviceError(message)
+    if options.frame_rate_hz is not None:
+        capture.set(cv2.CAP_PROP_FPS, options.frame_rate_hz)
+        rate_hz = capture.get(cv2.CAP_PROP_FPS)
+        # OpenCV rounds to whole frames per second.
+        if abs(rate_hz - options.frame_rate_hz) > max(_TOLERANCE * options.frame_rate_hz, 0.5):
+            message = (
+                f"{label}: asked for {options.frame_rate_hz:g} frames per second, the driver gives {rate_hz:g}; choose "
+                "one of `v4l2-ctl --list-formats-ext`, or leave frame_rate_hz out"
+            )
+            raise UnsupportedByDeviceError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The numbers that a control takes."""
+
+    least: float
+    most: float
+
+
+class Controls:
+    """The controls of an open camera. Made once it streams with its format; switches every automatic off.
+
+    `exposure_s` of a device that cannot be set is `fixed_s`. Gain 1 is the least that the device can do, and each of
+    its numbers above that counts as 1 more: V4L2 does not say what they mean.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        An automatic cannot be switched off, or there is no focus control where one is asked for.
+    """
+
+    def __init__(self, capture: cv2.VideoCapture, options: OpenCvOptions, label: str, *, fixed_s: float) -> None:
+        self._capture = capture
+        self._label = label
+        self._fixed_s = fixed_s
+        self._off(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL, "automatic exposure")
+        self._exposure = self._range(cv2.CAP_PROP_EXPOSURE, _LEAST_UNITS, _MOST_UNITS)
+        self._gain = self._range(cv2.CAP_PROP_GAIN, -(2.0**30), 2.0**30)
+        self._off(cv2.CAP_PROP_AUTOFOCUS, 0, "autofocus")
+        if options.focus is not None:
+            self._put(cv2.CAP_PROP_FOCUS, options.focus, "focus", within=0.5)
+        self._off(cv2.CAP_PROP_AUTO_WB, 0, "automatic white balance")
+
+    @property
+    def exposure_range_s(self) -> tuple[float, float]:
+        """Shortest and longest exposure."""
+        if self._exposure is None:
+            return (self._fixed_s, self._fixed_s)
+        return (self._exposure.least * EXPOSURE_UNIT_S, self._exposure.most * EXPOSURE_UNIT_S)
+
+    @property
+    def gain_range(self) -> tuple[float, float]:
+        """Least and most gain."""
+        return (1.0, 1.0) if self._gain is None else (1.0, 1.0 + self._gain.most - self._gain.least)
+
+    def apply(self, settings: CameraSettings) -> AppliedSettings:
+        """Set exposure and gain, and read them back. Raises UnsupportedByDeviceError where they come out otherwise."""
+        if self._exposure is not None:
+            units = max(round(settings.exposure_s / EXPOSURE_UNIT_S), 1)
+            self._put(cv2.CAP_PROP_EXPOSURE, units, "exposure in units of 100 µs", within=_TOLERANCE * units)
+        if self._gain is not None:
+            units = round(self._gain.least + settings.gain - 1)
+            self._put(cv2.CAP_PROP_GAIN, units, "gain in its own units", within=_TOLERANCE * settings.gain)
+        return self.read_back()
+
+    def read_back(self) -> AppliedSettings:
+        """What the device says it uses."""
+        exposure_s, gain = self._fixed_s, 1.0
+        if self._exposure is not None:
+            exposure_s = self._capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_S
+        if self._gain is not None:
+            gain = 1.0 + self._capture.get(cv2.CAP_PROP_GAIN) - self._gain.least
+        return AppliedSettings(exposure_s, gain)
+
+    def _range(self, number: int, least: float, most: float) -> Range | None:
+        """Find the ends of a control's range, which OpenCV does not tell: the kernel clamps. Leaves it as it was."""
+        before = self._capture.get(number)
+        if before == _ABSENT:
+            return None
+        ends = []
+        for far in (least, most):
+            self._capture.set(number, far)
+            ends.append(self._capture.get(number))
+        self._capture.set(number, before)
+        return Range(min(ends), max(ends))
+
+    def _off(self, number: int, manual: int, what: str) -> None:
+        if self._capture.get(number) == _ABSENT:
+            return
+        self._capture.set(number, manual)
+        got = self._capture.get(number)
+        if got != manual:
+            message = (
+                f"{self._label}: {what} cannot be switched off: asked for {manual}, the driver gives {got:g}; use the "
+                "driver v4l2, or another camera"
+            )
+            raise UnsupportedByDeviceError(message)
+
+    def _put(self, number: int, value: float, what: str, *, within: float) -> None:
+        self._capture.set(number, value)
+        got = self._capture.get(number)
+        if abs(got - value) > within:
+            found = "has no such control" if got == _ABSENT else f"gives {got:g}"
+            message = f"{self._label}: asked for {what} {value:g}, the driver {found}; write another value"
+            raise UnsupportedByDeviceError(message)

@@ -1,0 +1,185 @@
+"""What a rig file says of a source, and which kind of source that is."""
+
+from __future__ import annotations
+
+import re
+import stat
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import urlsplit, urlunsplit
+
+import cv2
+from pydantic import Field, ValidationError, field_validator
+
+from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.errors import ConfigError
+from slrig.model import Size
+
+Extent = Annotated[int, Field(ge=1, le=65_536)]
+_NUMBERED = re.compile(r"%0?\d*d")
+
+
+class Kind(StrEnum):
+    """What a source is to the driver."""
+
+    DEVICE = "device"
+    """A camera of the kernel's, with controls: read from `arm` to `disarm`, timed by stamps, or else by arrival."""
+    LIVE = "live"
+    """A stream: read from opening to `close`, timed by arrival."""
+    FILM = "film"
+    """A recording: begun anew by `arm`, timed by itself."""
+
+
+class OpenCvOptions(Strict):
+    """The keys of a `[[camera]]` table with `driver = "opencv"` (beside name, exposure_s and gain).
+
+    device : an index, a device's path, a URL, a file, or a numbered series ("frames/%03d.png").
+    backend : OpenCV's name of it (v4l2, ffmpeg, gstreamer, …); else v4l2 for cameras on Linux, ffmpeg for URLs and
+        films, images for a series, and for anything else what OpenCV finds.
+    size_px : [width, height]; fourcc : the pixel format's four characters; frame_rate_hz : of a camera, what it is set
+        to; of a live source, what it sends at most; of a film, the rate in place of its own.
+    bit_depth : how many low bits of a 16-bit sample the sensor fills; else all that the format has.
+    source_exposure_s : the exposure (at most) of a source that OpenCV cannot set; unused where it can.
+    delay_s : of a source without time stamps, the longest time from the end of an exposure to the frame's arrival, all
+        buffers between them included; given for a camera with time stamps, they are not trusted.
+    settle_frames : of a camera, frames discarded after it starts, until its settings have taken effect.
+    focus : value of a camera's focus control; autofocus is off in any case.
+    """
+
+    device: Annotated[int, Field(ge=0, le=255)] | Annotated[str, Field(min_length=1)]
+    backend: str = "auto"
+    size_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
+    fourcc: Annotated[str, Field(pattern=r"^[\x20-\x7e]{3,4}$")] | None = None
+    frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)] | None = None
+    bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
+    source_exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
+    delay_s: Annotated[float, Field(ge=0, le=60)] | None = None
+    settle_frames: Annotated[int, Field(ge=1, le=1000)] = 5
+    focus: float | None = None
+
+    @field_validator("backend")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        known = sorted(_backends())
+        if name not in {"auto", *known}:
+            message = f"expected auto or one of {', '.join(known)}, found '{name}'; this OpenCV has no other"
+            raise ValueError(message)
+        return name
+
+    @property
+    def size(self) -> Size | None:
+        """The frame's extent, if one is asked for."""
+        return None if self.size_px is None else Size(*self.size_px)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A checked source: what is opened, with which of OpenCV's back ends, and how the times of its frames are known.
+
+    `label` names it in messages, without the password that a URL may carry.
+    """
+
+    kind: Kind
+    target: int | str
+    backend: int
+    label: str
+    options: OpenCvOptions
+
+
+class _LiveOptions(OpenCvOptions):
+    source_exposure_s: Annotated[float, Field(gt=0, le=60)]
+    delay_s: Annotated[float, Field(ge=0, le=60)]
+    frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)]
+
+
+class _UnstampedOptions(OpenCvOptions):
+    delay_s: Annotated[float, Field(ge=0, le=60)]
+    frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)]
+
+
+class _FilmOptions(OpenCvOptions):
+    source_exposure_s: Annotated[float, Field(gt=0, le=60)]
+    delay_s: None = None
+
+
+class _SeriesOptions(_FilmOptions):
+    frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)]
+
+
+_NEEDED: Mapping[type[OpenCvOptions], str] = {
+    OpenCvOptions: "",
+    _LiveOptions: "\n(No time stamps come from this source. To know when a frame was exposed, its driver needs the "
+    "longest exposure (source_exposure_s), the longest delay (delay_s) and the most frames per second "
+    "(frame_rate_hz).)",
+    _UnstampedOptions: "\n(With delay_s, time stamps are not used. To know when a frame was exposed, the driver then "
+    "needs the most frames per second, too: frame_rate_hz.)",
+    _FilmOptions: "\n(Of a film, its driver needs to know how long each frame was exposed: source_exposure_s.)",
+    _SeriesOptions: "\n(Of a series of images, its driver needs to know how long each was exposed, source_exposure_s, "
+    "and how many were taken per second, frame_rate_hz.)",
+}
+
+
+def checked(name: str, options: Mapping[str, object], folder: Path) -> Source:
+    """Return the source that a camera's options mean. Raises ConfigError with all their faults."""
+    device = options.get("device")
+    model: type[OpenCvOptions] = OpenCvOptions
+    kind, usual, target = Kind.LIVE, cv2.CAP_ANY, device
+    if isinstance(device, str) and "://" in device:
+        kind, model, usual = Kind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
+    elif isinstance(device, str) and device and not device.startswith("/dev/"):
+        target = str(folder / device)
+        kind, model, usual = _file(name, folder / device)
+    elif sys.platform == "linux" and options.get("backend", "auto") in {"auto", "v4l2"}:
+        kind, usual = Kind.DEVICE, cv2.CAP_V4L2
+        if "delay_s" in options:
+            model = _UnstampedOptions
+    elif device is not None:
+        model = _LiveOptions
+    try:
+        plain = model.model_validate(dict(options))
+    except ValidationError as error:
+        faults = explain(error, options, keys_of(OpenCvOptions))
+        message = f"the table of camera '{name}' is wrong:\n{faults}{_NEEDED[model]}"
+        raise ConfigError(message) from error
+    backend = {**_backends(), "auto": usual}[plain.backend]
+    return Source(
+        kind, target if isinstance(target, int) else str(target), backend, _label(plain.device, target), plain
+    )
+
+
+def _backends() -> dict[str, int]:
+    found = cv2.videoio_registry.getBackends()
+    named = {cv2.videoio_registry.getBackendName(number).lower(): number for number in found}
+    return {**named, "images": cv2.CAP_IMAGES}
+
+
+def _label(device: int | str, target: object) -> str:
+    if isinstance(device, int):
+        return f"/dev/video{device}" if sys.platform == "linux" else f"camera {device}"
+    return _without_password(device) if "://" in device else str(target)
+
+
+def _file(name: str, path: Path) -> tuple[Kind, type[OpenCvOptions], int]:
+    if _NUMBERED.search(path.name):
+        return Kind.FILM, _SeriesOptions, cv2.CAP_IMAGES
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        message = f"camera '{name}': device = \"{path}\": expected a file, found: {error.strerror}; correct the path"
+        raise ConfigError(message) from error
+    if stat.S_ISREG(mode):
+        return Kind.FILM, _FilmOptions, cv2.CAP_FFMPEG
+    if stat.S_ISFIFO(mode):
+        return Kind.LIVE, _LiveOptions, cv2.CAP_FFMPEG
+    message = f"camera '{name}': device = \"{path}\": expected a film or a pipe, found something else; name a file"
+    raise ConfigError(message)
+
+
+def _without_password(url: str) -> str:
+    parts = urlsplit(url)
+    host = parts.netloc.rpartition("@")[2]
+    return urlunsplit(parts._replace(netloc=host, query=""))

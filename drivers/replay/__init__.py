@@ -1,0 +1,113 @@
+"""A recorded scan bundle as a rig: showing a pattern makes the cameras deliver the frames that were taken of it.
+
+A scan of it finds the times, exposures and images of the recording again, at any speed: see `ReplayClock`. Each scan
+begins the recording anew; a bracket (one sequence per exposure) goes on in it from one sequence to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import Field, ValidationError, field_validator
+
+from drivers.replay.camera import ReplayCamera, Stage
+from drivers.replay.clock import ReplayClock
+from drivers.replay.projector import ReplayProjector
+from slrig.bundle import Bundle, read_bundle
+from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.devices import Camera, Head, Projector
+from slrig.errors import BundleError, ConfigError
+from slrig.model import Calibration, Truth
+
+__all__ = ["ReplayCamera", "ReplayClock", "ReplayHead", "ReplayOptions", "ReplayProjector", "open_head"]
+
+_SPEEDS = (0.05, 1000.0)
+
+
+class ReplayOptions(Strict):
+    """The `[head]` table of a replayed rig.
+
+    bundle : the folder, from the rig file's own.
+    speed : 1 takes as long as the recording did, 2 half of that; 0, or none, goes as fast as the machine can.
+    """
+
+    bundle: str = Field(min_length=1)
+    speed: float = 0.0
+
+    @field_validator("speed")
+    @classmethod
+    def _possible(cls, speed: float) -> float:
+        least, most = _SPEEDS
+        if speed != 0 and not least <= speed <= most:
+            message = f"expected 0, or {least:g} to {most:g} times the recording's own speed, found {speed:g}"
+            raise ValueError(message)
+        return speed
+
+
+class ReplayHead:
+    """Implements `slrig.devices.Head` on a recorded bundle.
+
+    `clock` says how fast, by default without a pace; all time stamps count in it.
+    """
+
+    def __init__(self, bundle: Bundle, clock: ReplayClock | None = None) -> None:
+        self.clock = clock = ReplayClock() if clock is None else clock
+        stage = Stage()
+        self._calibration = bundle.calibration
+        self._cameras = {name: ReplayCamera(name, bundle, clock, stage) for name in bundle.capture.cameras}
+        self._projector = ReplayProjector(bundle, self._cameras, clock, stage)
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """See `Head`."""
+        return self._cameras
+
+    @property
+    def projector(self) -> Projector:
+        """See `Head`."""
+        return self._projector
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """See `Head`: the calibration that lies in the bundle."""
+        return self._calibration
+
+    def truth(self) -> Truth | None:
+        """See `Head`. A recording knows its frames only."""
+        return None
+
+
+def open_head(options: Mapping[str, object], folder: Path) -> Head:
+    """Open a recorded bundle as a rig, from a rig file's `[head]` table (without its `driver`).
+
+    Parameters
+    ----------
+    options
+        `ReplayOptions`.
+    folder
+        The rig file's own: the bundle's path counts from there.
+
+    Raises
+    ------
+    ConfigError
+        The options have faults, all of them in one message, or there is no bundle.
+    BundleError
+        The bundle is damaged.
+    CalibrationError
+        Its calibration is.
+    """
+    try:
+        table = ReplayOptions.model_validate(dict(options))
+    except ValidationError as error:
+        message = f"the [head] table of a replayed rig is wrong:\n{explain(error, options, keys_of(ReplayOptions))}"
+        raise ConfigError(message) from error
+    path = folder / table.bundle
+    if not (path / "bundle.json").is_file():
+        message = f'[head] bundle = "{table.bundle}": {path} is no scan bundle (it has no bundle.json); name its folder'
+        raise ConfigError(message)
+    bundle = read_bundle(path)
+    if not bundle.capture.shots:
+        message = f"{path / 'bundle.json'}: the recording has no frames; there is nothing to replay"
+        raise BundleError(message)
+    return ReplayHead(bundle, ReplayClock(table.speed))

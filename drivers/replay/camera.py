@@ -1,0 +1,186 @@
+"""A camera of a recording: it delivers the frames that were taken of the pattern that is shown."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from drivers.replay.clock import ReplayClock
+from slrig.bundle import Bundle
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings
+from slrig.devices import Trigger as TriggerKind
+from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import Black, Frame, Pattern, Shot
+
+_SAME_EXPOSURE = 0.01
+
+
+@dataclass(slots=True)
+class Stage:
+    """What lies before the cameras: the pattern shown, and the how-manieth showing of it in the sequence."""
+
+    shown: tuple[Pattern, int] | None = None
+
+
+class ReplayCamera:
+    """Implements `slrig.devices.Camera` on one camera's recorded frames."""
+
+    def __init__(self, name: str, bundle: Bundle, clock: ReplayClock, stage: Stage) -> None:
+        capture = bundle.capture
+        self._recorded: dict[Pattern, list[Shot]] = defaultdict(list)
+        for shot in capture.shots:
+            if shot.camera == name:
+                self._recorded[capture.patterns[shot.pattern]].append(shot)
+        exposures = sorted({shot.exposure_s for shot in capture.shots if shot.camera == name and shot.exposure_s})
+        self._exposures_s = exposures
+        self._info = CameraInfo(
+            name=name,
+            model="recorded camera",
+            serial=f"{bundle.folder.name}-{name}",
+            format=capture.cameras[name],
+            triggers=frozenset({TriggerKind.SOFTWARE}),
+            # A recording that does not tell its exposure agrees with every one.
+            exposure_range_s=(exposures[0], exposures[-1]) if exposures else (1e-6, 3600.0),
+            gain_range=(1.0, 1.0),
+        )
+        self._applied = AppliedSettings(exposures[0] if exposures else 0.01, 1.0)
+        self._clock = clock
+        self._stage = stage
+        self._pending: deque[Frame] = deque()
+        self._armed = False
+        self._closed = False
+        self._number = 0
+        self._busy_ns = 0
+
+    @property
+    def info(self) -> CameraInfo:
+        """See `Camera`."""
+        return self._info
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`. Takes an exposure that was recorded, within 1 %, and gain 1."""
+        self._require_open()
+        if self._armed:
+            message = f"camera '{self._info.name}' is armed; disarm it before changing its settings"
+            raise DeviceStateError(message)
+        nearest_s = min(self._exposures_s, key=lambda have: abs(have - settings.exposure_s), default=None)
+        low_s, high_s = self._info.exposure_range_s
+        if nearest_s is None:
+            fits, had = low_s <= settings.exposure_s <= high_s, f"{low_s:g} to {high_s:g} s"
+        else:
+            fits = abs(nearest_s - settings.exposure_s) <= _SAME_EXPOSURE * nearest_s
+            had = ", ".join(f"{exposure_s:.6g} s" for exposure_s in self._exposures_s)
+        if not fits:
+            message = (
+                f"camera '{self._info.name}': asked for an exposure of {settings.exposure_s:.6g} s, the recording was "
+                f"made with {had}; write that as exposure_s into the rig file, or leave exposure_s out"
+            )
+            raise UnsupportedByDeviceError(message)
+        if abs(settings.gain - 1) > _SAME_EXPOSURE:
+            message = (
+                f"camera '{self._info.name}': asked for gain {settings.gain:g}, a recording cannot be amplified; use 1"
+            )
+            raise UnsupportedByDeviceError(message)
+        self._applied = AppliedSettings(nearest_s if nearest_s is not None else settings.exposure_s, 1.0)
+        return self._applied
+
+    def arm(self, count: int, trigger: TriggerKind) -> None:
+        """See `Camera`. Frames beyond `count` can be had: a caller may take one again."""
+        self._require_open()
+        if self._armed:
+            message = f"camera '{self._info.name}' is armed already; disarm it first"
+            raise DeviceStateError(message)
+        if count < 1 or trigger is not TriggerKind.SOFTWARE:
+            message = (
+                f"camera '{self._info.name}': asked for {count} frames by {trigger} trigger, a recording gives 1 or "
+                "more by software trigger"
+            )
+            raise UnsupportedByDeviceError(message)
+        self._armed = True
+
+    def trigger(self) -> None:
+        """See `Camera`. Takes the recorded frame of what is shown now; in the dark, that of the black pattern."""
+        self._require_armed()
+        shot = self._shot()
+        exposure_s = self._applied.exposure_s if shot.exposure_s is None else shot.exposure_s
+        start_ns = max(self._clock.now_ns(), self._busy_ns, self._clock.recorded_ns(shot.time_s))
+        end_ns = start_ns + round(exposure_s * 1e9)
+        self._busy_ns = end_ns
+        self._clock.hold(end_ns)
+        self._pending.append(
+            Frame(
+                camera=self._info.name,
+                image=shot.image,
+                t_start_ns=start_ns,
+                t_end_ns=end_ns,
+                t_err_ns=0,
+                sequence_number=self._number,
+                dropped_count=0,
+                exposure_s=exposure_s,
+                gain=self._applied.gain,
+            )
+        )
+        self._number += 1
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`. A frame that was not triggered will never come: without a pace nothing is waited for."""
+        self._require_armed()
+        while self._pending:
+            frame = self._pending[0]
+            if frame.t_start_ns >= after_ns:
+                if not self._clock.reached(frame.t_end_ns, timeout_s):
+                    break
+                self._require_armed()
+                return self._pending.popleft()
+            self._pending.popleft()
+        self._clock.idle(timeout_s)
+        message = (
+            f"camera '{self._info.name}': no frame that began after {after_ns} ns was triggered and exposed within "
+            f"{timeout_s} s; trigger after show"
+        )
+        raise FrameTimeoutError(message)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        self._armed = False
+        self._pending.clear()
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self.disarm()
+        self._recorded.clear()
+        self._closed = True
+        self._clock.release()
+
+    def frames_of(self, pattern: Pattern) -> Sequence[Shot]:
+        """Return the recorded frames of a pattern at the exposure in use; at any exposure where there is none such."""
+        shots = self._recorded.get(pattern, [])
+        in_use_s = self._applied.exposure_s
+        alike = [
+            s for s in shots if s.exposure_s is not None and abs(s.exposure_s - in_use_s) <= _SAME_EXPOSURE * in_use_s
+        ]
+        return alike or shots
+
+    def _shot(self) -> Shot:
+        pattern, showing = self._stage.shown if self._stage.shown is not None else (Black(), 0)
+        shots = self.frames_of(pattern)
+        if not shots:
+            message = (
+                f"camera '{self._info.name}': triggered while the projector is dark, and the recording has no black "
+                "frame; show a pattern first"
+            )
+            raise DeviceStateError(message)
+        # A pattern that is shown more often than it was recorded looks as it did the last time.
+        return shots[min(showing, len(shots) - 1)]
+
+    def _require_open(self) -> None:
+        if self._closed:
+            message = f"camera '{self._info.name}' is closed; open the rig again"
+            raise DeviceStateError(message)
+
+    def _require_armed(self) -> None:
+        self._require_open()
+        if not self._armed:
+            message = f"camera '{self._info.name}' is not armed; call arm first"
+            raise DeviceStateError(message)

@@ -1,0 +1,135 @@
+"""The projector of a recording: it shows what was recorded, and says what was not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivers.replay.camera import ReplayCamera, Stage
+from drivers.replay.clock import ReplayClock
+from slrig.bundle import Bundle
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, White
+
+
+class ReplayProjector:
+    """Implements `slrig.devices.Projector` on the patterns of a recording."""
+
+    def __init__(self, bundle: Bundle, cameras: Mapping[str, ReplayCamera], clock: ReplayClock, stage: Stage) -> None:
+        self._info = ProjectorInfo(
+            name="projector",
+            model="recorded projector",
+            serial=bundle.folder.name,
+            size=bundle.capture.projector,
+            plays=False,
+            latency_s=0.0,
+        )
+        self._recorded = tuple(dict.fromkeys(bundle.capture.patterns))
+        self._cameras = cameras
+        self._clock = clock
+        self._stage = stage
+        self._loaded: tuple[Pattern, ...] | None = None
+        self._closed = False
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return self._info
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. Refuses a pattern of which a camera has no frame."""
+        self._require_open()
+        if sequence.projector != self._info.size:
+            message = (
+                f"the recording was made with a projector of {self._info.size}, the sequence is for "
+                f"{sequence.projector}; encode it for {self._info.size}"
+            )
+            raise UnsupportedByDeviceError(message)
+        for pattern in sequence.patterns:
+            lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
+            if lacking:
+                recorded = "; ".join(dict.fromkeys(map(_family, self._recorded)))
+                message = (
+                    f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
+                    f"{', '.join(lacking)}; it has {recorded}. Ask for what was recorded: gray_cell_px, "
+                    "line_shift_period_px and their like, in the request or in the rig file's [scan]"
+                )
+                raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._clock.rewind()
+        self._loaded = sequence.patterns
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`."""
+        self._require_open()
+        if self._loaded is None:
+            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
+            raise DeviceStateError(message)
+        if not 0 <= index < len(self._loaded):
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._loaded) - 1}"
+            raise UnsupportedByDeviceError(message)
+        pattern = self._loaded[index]
+        showing = self._loaded[:index].count(pattern)
+        self._stage.shown = (pattern, showing)
+        times_s = [
+            shots[min(showing, len(shots) - 1)].time_s
+            for shots in (camera.frames_of(pattern) for camera in self._cameras.values())
+        ]
+        first_s = min((time_s for time_s in times_s if time_s is not None), default=0.0)
+        return Shown(index, self._clock.change_light(first_s), 0)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. A recording does not play."""
+        self._require_open()
+        message = (
+            f"asked to play {exposure_s} s patterns every {period_s} s, a recording has no trigger wire; show each "
+            "pattern and trigger the cameras by software"
+        )
+        raise UnsupportedByDeviceError(message)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`."""
+        self._stage.shown = None
+        self._clock.change_light()
+
+    def close(self) -> None:
+        """See `Projector`."""
+        self._clock.release()
+        self.blank()
+        self._loaded = None
+        self._closed = True
+
+    def _require_open(self) -> None:
+        if self._closed:
+            message = "the projector is closed; open the rig again"
+            raise DeviceStateError(message)
+
+
+def _member(pattern: Pattern) -> str:
+    """Which pattern of its family."""
+    match pattern:
+        case Gray():
+            return f"bit {pattern.bit} of {_family(pattern)}"
+        case LineShift():
+            return f"shift {pattern.shift} of {_family(pattern)}"
+        case _:
+            return _family(pattern)
+
+
+def _family(pattern: Pattern) -> str:
+    """What a pattern is one of, in the words of a request."""
+    match pattern:
+        case White() | Black():
+            return pattern.kind
+        case Gray():
+            inverse = ", inverted" if pattern.inverted else ""
+            offset = f", offset {pattern.offset_px} px" if pattern.offset_px else ""
+            return (
+                f"a {pattern.axis} Gray code of {pattern.bits} bits with cells of {pattern.cell_px} px{offset}{inverse}"
+            )
+        case LineShift():
+            return f"{pattern.axis} lines of {pattern.line_width_px} px, period {pattern.period_px} px"

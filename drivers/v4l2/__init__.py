@@ -1,0 +1,60 @@
+"""Cameras through the kernel's video interface (V4L2): webcams, USB3 cameras with a kernel driver, capture cards.
+
+Linux only. Free-running: V4L2 has no software trigger. Needs no library beyond Python's own and OpenCV.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from slrig.devices import Camera, FoundDevice
+from slrig.errors import UnsupportedByDeviceError
+
+
+def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
+    """Open a camera from a rig file's `[[camera]]` table (without driver, name, exposure_s and gain).
+
+    Parameters
+    ----------
+    name
+        The rig's name for it.
+    options
+        `drivers.v4l2.options.V4L2Options`.
+    folder
+        The rig file's own; unused, a device is not a file of the rig.
+
+    Raises
+    ------
+    ConfigError
+        The options have faults, all of them in one message.
+    DeviceGoneError
+        The camera is not plugged in.
+    DeviceBusyError
+        Another program streams from it.
+    UnsupportedByDeviceError
+        It cannot do what the options ask, or this is not Linux.
+    DeviceError
+        It may not be opened, or failed.
+    """
+    if sys.platform != "linux":
+        message = f"camera '{name}': asked for V4L2 on {sys.platform}, which only Linux has; use the driver 'opencv'"
+        raise UnsupportedByDeviceError(message)
+    from drivers.v4l2.camera import V4L2Camera
+    from drivers.v4l2.options import checked
+
+    del folder
+    return V4L2Camera(name, checked(name, options))
+
+
+def find_devices() -> tuple[FoundDevice, ...]:
+    """Return the cameras that are plugged in, each under a name that stays the same and that no other has."""
+    if sys.platform != "linux":
+        return ()
+    from drivers.v4l2.finding import found_devices, nodes
+
+    return found_devices(nodes())
+
+
+__all__ = ["find_devices", "open_camera"]

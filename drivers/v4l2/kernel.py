@@ -1,0 +1,330 @@
+"""What the kernel's video interface (V4L2) exchanges: structures, request numbers, flags.
+
+Facts: `include/uapi/linux/videodev2.h` and `v4l2-controls.h`, and the kernel's documentation "Video for Linux API".
+Names are the kernel's, without the prefix. Structures are laid out by `ctypes` for the machine that runs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
+
+CAPTURE = 1
+"""Buffer type: a camera's frames, one plane."""
+MMAP = 1
+"""Buffer memory: the driver's own, mapped."""
+FIELD_ANY = 0
+FIELD_NONE = 1
+
+CAP_VIDEO_CAPTURE = 0x1
+CAP_VIDEO_CAPTURE_MPLANE = 0x1000
+CAP_STREAMING = 0x0400_0000
+CAP_DEVICE_CAPS = 0x8000_0000
+CAP_TIMEPERFRAME = 0x1000
+
+BUFFER_ERROR = 0x40
+STAMP_MASK = 0xE000
+STAMP_MONOTONIC = 0x2000
+STAMP_SOURCE_MASK = 0x7_0000
+STAMP_SOURCE_START = 0x1_0000
+
+SIZES_DISCRETE = 1
+
+CONTROL_DISABLED = 0x1
+CONTROL_READ_ONLY = 0x4
+CONTROL_INACTIVE = 0x10
+CONTROL_WRITE_ONLY = 0x40
+CONTROL_NEXT = 0x8000_0000
+
+
+class Capability(ctypes.Structure):
+    """`v4l2_capability`: who the device is and what it can do."""
+
+    _fields_ = (
+        ("driver", ctypes.c_char * 16),
+        ("card", ctypes.c_char * 32),
+        ("bus_info", ctypes.c_char * 32),
+        ("version", ctypes.c_uint32),
+        ("capabilities", ctypes.c_uint32),
+        ("device_caps", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 3),
+    )
+
+
+class FormatDescription(ctypes.Structure):
+    """`v4l2_fmtdesc`: one pixel format that the device offers."""
+
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("description", ctypes.c_char * 32),
+        ("pixelformat", ctypes.c_uint32),
+        ("mbus_code", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 3),
+    )
+
+
+class PixelFormat(ctypes.Structure):
+    """`v4l2_pix_format`: size, pixel format and layout of a frame."""
+
+    _fields_ = (
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("pixelformat", ctypes.c_uint32),
+        ("field", ctypes.c_uint32),
+        ("bytesperline", ctypes.c_uint32),
+        ("sizeimage", ctypes.c_uint32),
+        ("colorspace", ctypes.c_uint32),
+        ("priv", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("ycbcr_enc", ctypes.c_uint32),
+        ("quantization", ctypes.c_uint32),
+        ("xfer_func", ctypes.c_uint32),
+    )
+
+
+class _FormatUnion(ctypes.Union):
+    # The window of an overlay holds pointers, so the kernel's union is aligned as a pointer is.
+    _fields_ = (("pix", PixelFormat), ("raw", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
+
+
+class Format(ctypes.Structure):
+    """`v4l2_format`."""
+
+    _fields_ = (("type", ctypes.c_uint32), ("fmt", _FormatUnion))
+
+
+class _SizeSteps(ctypes.Structure):
+    _fields_ = tuple(
+        (name, ctypes.c_uint32)
+        for name in ("min_width", "max_width", "step_width", "min_height", "max_height", "step_height")
+    )
+
+
+class _SizeDiscrete(ctypes.Structure):
+    _fields_ = (("width", ctypes.c_uint32), ("height", ctypes.c_uint32))
+
+
+class _SizeUnion(ctypes.Union):
+    _fields_ = (("discrete", _SizeDiscrete), ("stepwise", _SizeSteps))
+
+
+class FrameSize(ctypes.Structure):
+    """`v4l2_frmsizeenum`: one size, or a range of sizes, of a pixel format."""
+
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("pixel_format", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("size", _SizeUnion),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
+
+
+class Fraction(ctypes.Structure):
+    """`v4l2_fract`."""
+
+    _fields_ = (("numerator", ctypes.c_uint32), ("denominator", ctypes.c_uint32))
+
+
+class CaptureParameters(ctypes.Structure):
+    """`v4l2_captureparm`: the time per frame."""
+
+    _fields_ = (
+        ("capability", ctypes.c_uint32),
+        ("capturemode", ctypes.c_uint32),
+        ("timeperframe", Fraction),
+        ("extendedmode", ctypes.c_uint32),
+        ("readbuffers", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 4),
+    )
+
+
+class _ParametersUnion(ctypes.Union):
+    _fields_ = (("capture", CaptureParameters), ("raw", ctypes.c_uint8 * 200))
+
+
+class StreamParameters(ctypes.Structure):
+    """`v4l2_streamparm`."""
+
+    _fields_ = (("type", ctypes.c_uint32), ("parm", _ParametersUnion))
+
+
+class BufferRequest(ctypes.Structure):
+    """`v4l2_requestbuffers`."""
+
+    _fields_ = (
+        ("count", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("memory", ctypes.c_uint32),
+        ("capabilities", ctypes.c_uint32),
+        ("flags", ctypes.c_uint8),
+        ("reserved", ctypes.c_uint8 * 3),
+    )
+
+
+class TimeValue(ctypes.Structure):
+    """`timeval`; on 32-bit machines the kernel tells by the request number which of its two forms is meant."""
+
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_usec", ctypes.c_long))
+
+
+class _BufferMemory(ctypes.Union):
+    _fields_ = (
+        ("offset", ctypes.c_uint32),
+        ("userptr", ctypes.c_ulong),
+        ("planes", ctypes.c_void_p),
+        ("fd", ctypes.c_int32),
+    )
+
+
+class Buffer(ctypes.Structure):
+    """`v4l2_buffer`: one frame's place in memory, its time stamp, sequence number and flags."""
+
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("bytesused", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("field", ctypes.c_uint32),
+        ("timestamp", TimeValue),
+        ("timecode", ctypes.c_uint32 * 4),
+        ("sequence", ctypes.c_uint32),
+        ("memory", ctypes.c_uint32),
+        ("m", _BufferMemory),
+        ("length", ctypes.c_uint32),
+        ("reserved2", ctypes.c_uint32),
+        ("request_fd", ctypes.c_int32),
+    )
+
+
+class ControlDescription(ctypes.Structure):
+    """`v4l2_queryctrl`: a control's name, kind and range."""
+
+    _fields_ = (
+        ("id", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("name", ctypes.c_char * 32),
+        ("minimum", ctypes.c_int32),
+        ("maximum", ctypes.c_int32),
+        ("step", ctypes.c_int32),
+        ("default_value", ctypes.c_int32),
+        ("flags", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
+
+
+class ControlValue(ctypes.Structure):
+    """`v4l2_control`."""
+
+    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
+
+
+def _request(direction: int, number: int, kind: type[ctypes.Structure] | type[ctypes.c_int]) -> int:
+    # asm-generic/ioctl.h: two bits of direction, fourteen of size, eight of type ('V'), eight of number.
+    return direction << 30 | ctypes.sizeof(kind) << 16 | ord("V") << 8 | number
+
+
+_WRITE, _READ, _BOTH = 1, 2, 3
+
+QUERYCAP = _request(_READ, 0, Capability)
+ENUM_FMT = _request(_BOTH, 2, FormatDescription)
+G_FMT = _request(_BOTH, 4, Format)
+S_FMT = _request(_BOTH, 5, Format)
+REQBUFS = _request(_BOTH, 8, BufferRequest)
+QUERYBUF = _request(_BOTH, 9, Buffer)
+QBUF = _request(_BOTH, 15, Buffer)
+DQBUF = _request(_BOTH, 17, Buffer)
+STREAMON = _request(_WRITE, 18, ctypes.c_int)
+STREAMOFF = _request(_WRITE, 19, ctypes.c_int)
+G_PARM = _request(_BOTH, 21, StreamParameters)
+S_PARM = _request(_BOTH, 22, StreamParameters)
+G_CTRL = _request(_BOTH, 27, ControlValue)
+S_CTRL = _request(_BOTH, 28, ControlValue)
+QUERYCTRL = _request(_BOTH, 36, ControlDescription)
+ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
+
+GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT, errno.EIO})
+"""What the kernel answers when the device is not there any more; EIO: its stream has died."""
+REFUSED = frozenset({errno.EINVAL, errno.ERANGE, errno.ENOTTY, errno.EOPNOTSUPP})
+"""What the kernel answers to a request that the device cannot do."""
+
+
+def open_node(node: Path) -> int:
+    """Open a device node without blocking. Raises OSError."""
+    return os.open(node, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+
+
+def ask(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
+    """Send a request; the answer is written into `argument`. Raises OSError."""
+    while True:
+        try:
+            fcntl.ioctl(handle, request, argument)
+        except InterruptedError:
+            continue
+        return
+
+
+def text_of(code: int) -> str:
+    """A pixel format's four characters.
+
+    >>> text_of(0x59455247)
+    'GREY'
+    """
+    return (code & 0x7FFF_FFFF).to_bytes(4, "little").decode("ascii", "replace")
+
+
+def code_of(text: str) -> int:
+    """A pixel format's number; short names are filled up with blanks, as the kernel does.
+
+    >>> text_of(code_of("Y16"))
+    'Y16 '
+    """
+    return int.from_bytes(text.ljust(4).encode("ascii"), "little")
+
+
+def fault(node: Path, doing: str, error: OSError) -> DeviceError:
+    """Return what the kernel's refusal means, in words that tell what to do."""
+    number = error.errno or 0
+    cause = f"{node}: {doing}: {os.strerror(number)}"
+    if number in GONE:
+        return DeviceGoneError(f"{cause}; the camera is gone or its stream has died: plug it in again, and reopen it")
+    if number == errno.EBUSY:
+        holders = holders_of(node)
+        by = f" by {', '.join(holders)}" if holders else ""
+        return DeviceBusyError(f"{cause}; it is held{by}: close that program (fuser -v {node} lists who has it open)")
+    if number in (errno.EACCES, errno.EPERM):
+        return DeviceError(
+            f"{cause}; you may not open it: add yourself to its group (sudo usermod -aG video $USER), and log in again"
+        )
+    if number == errno.ENOSPC:
+        return UnsupportedByDeviceError(
+            f"{cause}; the USB bus has not enough bandwidth left for this stream beside the others: plug the cameras "
+            "into different USB controllers (lsusb -t), or ask for a smaller size_px, a lower frame_rate_hz, or "
+            'pixel_format = "MJPG"'
+        )
+    if number in REFUSED:
+        return UnsupportedByDeviceError(f"{cause}; the device cannot do that")
+    return DeviceError(f"{cause}; look for the kernel's own words with: dmesg | tail")
+
+
+def holders_of(node: Path) -> tuple[str, ...]:
+    """The other programs that have a node open, as far as we may see: "name (process id)"."""
+    found = []
+    target = os.path.realpath(node)
+    for process in Path("/proc").glob("[0-9]*"):
+        # Processes end while we look, and those of other users are closed to us.
+        with suppress(OSError):
+            if int(process.name) == os.getpid():
+                continue
+            if any(os.path.realpath(link) == target for link in (process / "fd").iterdir()):
+                name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
+                found.append(f"{name} ({process.name})")
+    return tuple(found)

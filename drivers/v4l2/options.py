@@ -1,0 +1,70 @@
+"""What a rig file says of a V4L2 camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field, ValidationError, field_validator
+
+from drivers.v4l2.formats import LAYOUTS
+from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.errors import ConfigError
+from slrig.model import Size
+
+Extent = Annotated[int, Field(ge=1, le=65_536)]
+
+
+class V4L2Options(Strict):
+    """The keys of a `[[camera]]` table with `driver = "v4l2"` (beside name, exposure_s and gain).
+
+    device : what `slrig devices` lists, or a path (`/dev/video0`, `/dev/v4l/by-path/…`).
+    pixel_format : four characters as `v4l2-ctl --list-formats` writes them; else the best that the device offers
+        (`formats.PREFERRED`). size_px : [width, height]; else the largest. frame_rate_hz : else as the device is set.
+    bit_depth : how many low bits of a 16-bit sample the sensor fills (Y16 and 16-bit Bayer only); else all of them.
+    limited_luma : True where the camera sends luma as 16 to 235 (YUV formats): it is spread to 0 to 255.
+    buffers : frames that the kernel may hold; a frame waits there for at most so many frame periods.
+    settle_frames : frames discarded after the stream starts, until the settings have taken effect.
+    gain_unity : the value of the gain control at which the sensor's gain is 1, where gain grows in proportion to it.
+    focus : value of the focus control; autofocus is off in any case.
+    controls : further controls by the name that `v4l2-ctl --list-ctrls` gives them.
+    readout_s : from the first row's end of exposure to the last one's arrival; else a frame period, the most it can be.
+    stamp_delay_s : how much later than it says the camera stamps its frames, where that was measured.
+    """
+
+    device: Annotated[str, Field(min_length=1)]
+    pixel_format: Annotated[str, Field(min_length=3, max_length=4)] | None = None
+    size_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
+    frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)] | None = None
+    bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
+    limited_luma: bool = False
+    buffers: Annotated[int, Field(ge=2, le=32)] = 4
+    settle_frames: Annotated[int, Field(ge=1, le=1000)] = 5
+    gain_unity: Annotated[int, Field(ge=1)] | None = None
+    focus: int | None = None
+    controls: dict[str, int] = Field(default_factory=dict)
+    readout_s: Annotated[float, Field(ge=0, le=60)] | None = None
+    stamp_delay_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+
+    @field_validator("pixel_format")
+    @classmethod
+    def _known(cls, text: str | None) -> str | None:
+        if text is not None and text.ljust(4) not in LAYOUTS:
+            known = ", ".join(sorted(code.strip() for code in LAYOUTS))
+            message = f"expected a pixel format that can be read ({known}), found '{text}'; choose one of them"
+            raise ValueError(message)
+        return text
+
+    @property
+    def size(self) -> Size | None:
+        """The frame's extent, if one is asked for."""
+        return None if self.size_px is None else Size(*self.size_px)
+
+
+def checked(name: str, options: Mapping[str, object]) -> V4L2Options:
+    """Return a camera's options. Raises ConfigError with all their faults."""
+    try:
+        return V4L2Options.model_validate(dict(options))
+    except ValidationError as error:
+        message = f"the table of camera '{name}' is wrong:\n{explain(error, options, keys_of(V4L2Options))}"
+        raise ConfigError(message) from error

@@ -1,0 +1,272 @@
+"""When an exposure began: arithmetic on intervals, against truths that the tests make up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.genicam.timing import (
+    DRIFT,
+    Arrival,
+    FrameNumbers,
+    Interval,
+    StartClock,
+    TriggeredStarts,
+    UntriggeredStarts,
+)
+
+MS = 1_000_000
+EXPOSURE, ANSWER, TRANSFER = 10 * MS, 50 * MS, 20 * MS
+ANYWHERE = Interval(0, EXPOSURE)
+AT_START = Interval(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("ids", "numbers"),
+    [
+        ([1, 2, 3], [0, 1, 2]),
+        ([65400, 65401, 65535, 1, 2], [0, 1, 135, 136, 137]),
+        ([65534, 2], [0, 3]),
+        ([65535, 0, 1], [0, 1, 2]),
+        ([5, 5, 6], [0, None, 1]),
+        ([5, 4, 6], [0, None, 1]),
+        ([1, 65530, 2], [0, None, 1]),
+        ([0, 1, 2], [0, 1, 2]),
+        ([65534, 65535, 65536, 65537], [0, 1, 2, 3]),
+        ([1 << 40, (1 << 40) + 3, (1 << 40) + 1], [0, 3, None]),
+    ],
+)
+def test_frame_ids_are_unwrapped(ids: list[int], numbers: list[int | None]) -> None:
+    counter = FrameNumbers()
+    assert [counter.next(block_id) for block_id in ids] == numbers
+    assert counter.made == 1 + max(number for number in numbers if number is not None)
+
+
+def test_all_ids_of_a_long_session_are_told_apart() -> None:
+    counter = FrameNumbers()
+    ids = [1 + index % 65535 for index in range(200_000)]
+    assert [counter.next(block_id) for block_id in ids] == list(range(200_000))
+
+
+class Host:
+    """Looks at a camera's clock that is `ahead_ns` before the host's and runs faster by `drift`."""
+
+    def __init__(self, ahead_ns: int = 7_000_000_000_123, drift: float = 0.0) -> None:
+        self.ahead_ns = ahead_ns
+        self.drift = drift
+
+    def stamp(self, now_ns: int) -> int:
+        return now_ns + self.ahead_ns + round(self.drift * now_ns)
+
+    def look(self, begun_ns: int, *, out_ns: int, back_ns: int) -> tuple[int, int, int]:
+        return begun_ns, self.stamp(begun_ns + out_ns), begun_ns + out_ns + back_ns
+
+
+def test_a_latched_clock_is_as_good_as_its_quickest_look() -> None:
+    host = Host()
+    clock = StartClock(AT_START)
+    looks = [
+        host.look(0, out_ns=3 * MS, back_ns=9 * MS),
+        host.look(20 * MS, out_ns=100_000, back_ns=200_000),
+        host.look(40 * MS, out_ns=8 * MS, back_ns=1 * MS),
+    ]
+    assert clock.latch(looks)
+    assert clock.tied
+    start = clock.start(host.stamp(30 * MS))
+    assert start.least_ns <= 30 * MS <= start.most_ns
+    assert start.most_ns - start.least_ns <= 300_000 + 4 * round(DRIFT * 20 * MS)
+
+
+@pytest.mark.parametrize(
+    "looks",
+    [
+        [(0, 0, 10), (100, 0, 110)],
+        [(0, 5, 10), (100, 5, 110), (200, 5, 210)],
+        # A clock in other units, which runs a thousand times slower.
+        [(0, 0, 1 * MS), (100 * MS, 100_000, 101 * MS)],
+        [(0, 5, 10)],
+    ],
+)
+def test_a_clock_that_stands_is_not_used(looks: list[tuple[int, int, int]]) -> None:
+    clock = StartClock(ANYWHERE)
+    assert not clock.latch(looks)
+    assert not clock.tied
+
+
+def test_a_stamp_somewhere_within_the_exposure_leaves_its_length_open() -> None:
+    host = Host()
+    for lag_ns in (0, EXPOSURE // 2, EXPOSURE):
+        clock = StartClock(ANYWHERE)
+        assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
+        start = clock.start(host.stamp(100 * MS + lag_ns))
+        assert start.least_ns <= 100 * MS <= start.most_ns
+
+
+@pytest.mark.parametrize("drift", [-5e-5, 5e-5])
+def test_a_drifting_clock_stays_within_what_is_said(drift: float) -> None:
+    host = Host(drift=drift)
+    clock = StartClock(AT_START)
+    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
+    for seconds in (1, 10, 100):
+        start = clock.start(host.stamp(seconds * 1000 * MS))
+        assert start.least_ns <= seconds * 1000 * MS <= start.most_ns
+        assert start.most_ns - start.least_ns <= 2 * DRIFT * seconds * 1e9 + 300_000
+
+
+@pytest.mark.parametrize("latched", [True, False])
+@pytest.mark.parametrize("stamped", [True, False])
+def test_starts_that_nobody_asked_for_hold_the_truth(latched: bool, stamped: bool) -> None:
+    rng = np.random.default_rng(5)
+    host = Host(drift=4e-5)
+    clock = StartClock(ANYWHERE)
+    if latched:
+        assert clock.latch([host.look(index * MS, out_ns=90_000, back_ns=40_000) for index in range(5)])
+    starts = UntriggeredStarts(EXPOSURE, TRANSFER, clock)
+    for number in range(500):
+        truth_ns = (number + 1) * 33 * MS
+        late_ns = int(rng.integers(MS, TRANSFER))
+        stamp_ns = host.stamp(truth_ns + EXPOSURE // 3) if stamped else None
+        start = starts.start(Arrival(number, stamp_ns, truth_ns + EXPOSURE + late_ns))
+        assert start is not None
+        assert start.least_ns <= truth_ns <= start.most_ns
+        # A latched clock needs no trust in the network.
+        assert start.most_ns - start.least_ns <= (EXPOSURE + 5 * MS if latched and stamped else TRANSFER)
+
+
+def test_a_frame_that_lay_in_the_camera_is_dated_by_the_clock() -> None:
+    host = Host()
+    clock = StartClock(AT_START)
+    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
+    starts = UntriggeredStarts(EXPOSURE, TRANSFER, clock)
+    start = starts.start(Arrival(0, host.stamp(100 * MS), 100 * MS + EXPOSURE + 900 * MS))
+    assert start is not None
+    assert start.least_ns <= 100 * MS <= start.most_ns < 101 * MS
+
+
+def test_a_stamp_later_than_its_arrival_is_not_believed() -> None:
+    host = Host()
+    clock = StartClock(AT_START)
+    assert clock.latch([host.look(index * MS, out_ns=50_000, back_ns=50_000) for index in range(5)])
+    starts = UntriggeredStarts(EXPOSURE, TRANSFER, clock)
+    assert starts.start(Arrival(0, host.stamp(500 * MS), 400 * MS)) is None
+
+
+def triggered(*begun_ms: int) -> TriggeredStarts:
+    starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
+    for begun in begun_ms:
+        starts.triggered(begun * MS, (begun + 1) * MS)
+    return starts
+
+
+def test_a_frame_answers_its_trigger() -> None:
+    starts = triggered(100)
+    assert starts.start(Arrival(0, None, 115 * MS)) == Interval(100 * MS, 105 * MS)
+    assert starts.owed_ns(116 * MS) <= 0
+
+
+def test_a_frame_that_nothing_asked_for_is_nobodys() -> None:
+    assert triggered().start(Arrival(0, None, 115 * MS)) is None
+    # Answered already: a second frame of one trigger.
+    starts = triggered(100)
+    assert starts.start(Arrival(0, None, 115 * MS)) is not None
+    assert starts.start(Arrival(1, None, 117 * MS)) is None
+    # The exposure would have begun before the trigger.
+    assert triggered(100).start(Arrival(0, None, 105 * MS)) is None
+    # Much longer ago than an answer takes.
+    assert triggered(100).start(Arrival(0, None, 400 * MS)) is None
+
+
+def test_a_lost_frame_has_answered_a_trigger() -> None:
+    starts = triggered(100)
+    assert starts.start(Arrival(0, None, 115 * MS)) is not None
+    for begun in (120, 130):
+        starts.triggered(begun * MS, (begun + 1) * MS)
+    # Number 1 never came.
+    assert starts.start(Arrival(2, None, 145 * MS)) == Interval(130 * MS, 135 * MS)
+
+
+def test_where_several_triggers_fit_the_earliest_is_taken() -> None:
+    assert triggered(100, 110).start(Arrival(0, None, 125 * MS)) == Interval(100 * MS, 115 * MS)
+
+
+def test_a_trigger_that_was_ignored_is_given_up() -> None:
+    starts = triggered(100, 400)
+    assert starts.owed_ns(430 * MS) > 0
+    assert starts.start(Arrival(0, None, 415 * MS)) == Interval(400 * MS, 405 * MS)
+
+
+def test_a_trigger_that_was_ignored_makes_the_next_frame_doubtful_and_no_other() -> None:
+    starts = triggered(100, 200)
+    # It may be the answer to the first, very late.
+    assert starts.start(Arrival(0, None, 215 * MS)) == Interval(100 * MS, 205 * MS)
+    # In that case, that to the second has to come. It does not.
+    assert starts.owed_ns(230 * MS) > 0
+    starts.triggered(300 * MS, 301 * MS)
+    assert starts.start(Arrival(1, None, 315 * MS)) == Interval(300 * MS, 305 * MS)
+    assert starts.owed_ns(316 * MS) <= 0
+
+
+def test_the_answer_to_a_trigger_does_not_pass_for_that_to_the_next() -> None:
+    starts = triggered(100, 200)
+    # The first exposure began very late, after the second trigger; the second one followed at once.
+    assert starts.start(Arrival(0, None, 215 * MS)) == Interval(100 * MS, 205 * MS)
+    assert starts.owed_ns(216 * MS) > 0
+    assert starts.start(Arrival(1, None, 226 * MS)) == Interval(200 * MS, 216 * MS)
+    assert starts.owed_ns(227 * MS) <= 0
+
+
+def test_a_trigger_that_may_have_been_sent_twice_is_two() -> None:
+    starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
+    starts.triggered(100 * MS, 106 * MS, times=2)
+    assert starts.start(Arrival(0, None, 117 * MS)) is not None
+    starts.triggered(120 * MS, 121 * MS)
+    # The second frame of the first trigger, or that of the second one: it may be as old as the first.
+    start = starts.start(Arrival(1, None, 135 * MS))
+    assert start is not None
+    assert start.least_ns == 100 * MS
+
+
+def test_the_clock_tells_a_very_late_frame_from_that_of_the_next_trigger() -> None:
+    host = Host()
+    starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
+    for number in range(3):
+        begun_ns = 100 * number * MS
+        starts.triggered(begun_ns, begun_ns + MS)
+        arrival = Arrival(number, host.stamp(begun_ns + MS), begun_ns + 12 * MS)
+        assert starts.start(arrival) is not None
+    starts.triggered(300 * MS, 301 * MS)
+    starts.triggered(400 * MS, 401 * MS)
+    # The frame of the trigger at 300 ms, which lay somewhere for 120 ms.
+    late = starts.start(Arrival(3, host.stamp(301 * MS), 431 * MS))
+    assert late is not None
+    assert late.least_ns <= 301 * MS <= late.most_ns < 400 * MS
+    starts.triggered(500 * MS, 501 * MS)
+    start = starts.start(Arrival(5, host.stamp(501 * MS), 512 * MS))
+    assert start is not None
+    assert start.least_ns >= 500 * MS
+
+
+def test_starts_that_were_asked_for_hold_the_truth_and_are_never_too_early() -> None:
+    """A camera that ignores, loses and delays: whatever is said of a frame's start is so."""
+    rng = np.random.default_rng(11)
+    host = Host(drift=-3e-5)
+    starts = TriggeredStarts(EXPOSURE, ANSWER, StartClock(ANYWHERE))
+    now_ns, made, said = 0, 0, 0
+    for _ in range(3000):
+        now_ns += int(rng.integers(MS, 30 * MS))
+        starts.triggered(now_ns, now_ns + MS)
+        if rng.random() < 0.05:
+            now_ns += EXPOSURE + ANSWER
+            continue
+        truth_ns = now_ns + int(rng.integers(0, 3 * MS))
+        arrived_ns = truth_ns + EXPOSURE + int(rng.integers(0, 30 * MS))
+        now_ns = arrived_ns
+        number, made = made, made + 1
+        if rng.random() < 0.1:
+            now_ns += ANSWER
+            continue
+        start = starts.start(Arrival(number, host.stamp(truth_ns + EXPOSURE // 2), arrived_ns))
+        if start is not None:
+            said += 1
+            assert start.least_ns <= truth_ns <= start.most_ns
+    assert said > 0.95 * 0.85 * 3000

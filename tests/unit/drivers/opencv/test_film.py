@@ -1,0 +1,157 @@
+"""A film and a series of images: frames at the times that they tell, from `arm` on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.opencv import open_camera
+from drivers.opencv.camera import OpenCvCamera
+from drivers.opencv.feeds import FilmFeed
+from slrig.capture.evidence import Evidence
+from slrig.capture.sequencer import capture
+from slrig.devices import CameraSettings, Rig, Shown, Trigger
+from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import Pixels
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.v4l2_bench import sequence, staged
+
+RATE_HZ = 100.0
+EXPOSURE_S = 0.008
+OPTIONS: dict[str, object] = {"device": "film.avi", "source_exposure_s": EXPOSURE_S}
+
+
+def write_film(path: Path, images: list[Pixels]) -> None:
+    """Write a film without loss."""
+    rows, columns = images[0].shape
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), RATE_HZ, (columns, rows), False)
+    assert film.isOpened()
+    for image in images:
+        film.write(image)
+    film.release()
+
+
+def ramp(count: int) -> list[Pixels]:
+    return [np.full((24, 32), 5 * index, np.uint8) for index in range(count)]
+
+
+def opened(folder: Path, **options: object) -> OpenCvCamera:
+    camera = open_camera("eye", {**OPTIONS, **options}, folder)
+    assert isinstance(camera, OpenCvCamera)
+    return camera
+
+
+def test_frames_come_in_order_at_the_films_times(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.avi", ramp(10))
+    camera = opened(tmp_path)
+    camera.arm(10, Trigger.FREE)
+    frames = []
+    for _ in range(10):
+        frames.append(camera.read(0, 5))
+        # No sooner than a camera could have given it.
+        assert frames[-1].t_end_ns <= time.monotonic_ns()
+    assert [int(frame.image[0, 0]) for frame in frames] == [5 * index for index in range(10)]
+    starts_ns = [frame.t_start_ns for frame in frames]
+    assert np.diff(starts_ns) == pytest.approx(np.full(9, 1e9 / RATE_HZ), abs=1)
+    assert {(frame.t_end_ns - frame.t_start_ns, frame.t_err_ns) for frame in frames} == {(8_000_000, 0)}
+    with pytest.raises(FrameTimeoutError, match="the film is over after 10 frames; arm"):
+        camera.read(0, 5)
+    camera.close()
+
+
+def test_arming_begins_the_film_anew(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.avi", ramp(10))
+    camera = opened(tmp_path)
+    for _ in range(2):
+        camera.arm(1, Trigger.FREE)
+        armed_ns = time.monotonic_ns()
+        first, second = camera.read(0, 5), camera.read(0, 5)
+        assert (int(first.image[0, 0]), int(second.image[0, 0])) == (0, 5)
+        assert abs(first.t_start_ns - armed_ns) < 1e9
+        with pytest.raises(DeviceStateError, match="runs free"):
+            camera.trigger()
+        camera.disarm()
+    camera.close()
+    camera.close()
+
+
+def test_frames_that_began_too_early_are_passed_over(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.avi", ramp(20))
+    camera = opened(tmp_path)
+    camera.arm(1, Trigger.FREE)
+    first = camera.read(0, 5)
+    later = camera.read(first.t_start_ns + 80_500_000, 5)
+    assert int(later.image[0, 0]) == 5 * 9
+    camera.close()
+
+
+def test_a_rate_that_is_given_takes_the_place_of_the_films(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.avi", ramp(4))
+    camera = opened(tmp_path, frame_rate_hz=40.0)
+    camera.arm(1, Trigger.FREE)
+    first, second = camera.read(0, 5), camera.read(0, 5)
+    assert second.t_start_ns - first.t_start_ns == 25_000_000
+    camera.close()
+
+
+def test_a_series_of_deep_images_keeps_its_depth(tmp_path: Path) -> None:
+    for index in range(3):
+        cv2.imwrite(str(tmp_path / f"{index:03d}.png"), np.full((24, 32), 1000 * index, np.uint16))
+    camera = opened(tmp_path, device="%03d.png", frame_rate_hz=200.0, bit_depth=12)
+    assert camera.info.format.bit_depth == 12
+    camera.arm(1, Trigger.FREE)
+    assert [int(camera.read(0, 5).image[0, 0]) for _ in range(3)] == [0, 1000, 2000]
+    camera.close()
+
+
+def test_a_film_takes_the_exposure_it_was_made_with(tmp_path: Path) -> None:
+    write_film(tmp_path / "film.avi", ramp(2))
+    camera = opened(tmp_path)
+    assert camera.configure(CameraSettings(EXPOSURE_S)).exposure_s == EXPOSURE_S
+    with pytest.raises(UnsupportedByDeviceError, match="no control"):
+        camera.configure(CameraSettings(1 / 60))
+    camera.close()
+
+
+class FollowingProjector(StagedProjector):
+    """Shows each pattern when the film does: `slot_s` each, from the film's beginning."""
+
+    def __init__(self, light: Stage, camera: OpenCvCamera, slot_s: float) -> None:
+        super().__init__(light)
+        self._camera = camera
+        self._slot_s = slot_s
+
+    def show(self, index: int) -> Shown:
+        feed = self._camera._feed
+        assert isinstance(feed, FilmFeed)
+        # The light changes while a slot's first frame is exposed.
+        at_ns = feed.begun_ns + round((index * self._slot_s + 0.5 / RATE_HZ) * 1e9)
+        while (left_ns := at_ns - time.monotonic_ns()) > 0:
+            threading.Event().wait(left_ns / 1e9)
+        return Shown(index, at_ns, 0)
+
+
+def test_a_film_of_a_sequence_pairs_with_a_projector_that_follows_it(tmp_path: Path) -> None:
+    light, shown, per_slot = staged(noise_dn=1.0), sequence(), 12
+    # Each slot begins with a frame in which the pattern before is still seen: a scan must not take it.
+    images: list[Pixels] = []
+    for index in range(len(shown)):
+        begun_ns = light.show(shown.profiles[index])
+        late_ns = begun_ns - 4_000_000
+        images.append(light.exposed(late_ns, late_ns + 8_000_000))
+        images += [light.exposed(begun_ns, begun_ns + 8_000_000) for _ in range(per_slot - 1)]
+    write_film(tmp_path / "film.avi", images)
+    camera = opened(tmp_path)
+    projector = FollowingProjector(light, camera, per_slot / RATE_HZ)
+    settings = {"eye": CameraSettings(EXPOSURE_S)}
+    rig = Rig("film", {"eye": camera}, projector, settings)
+    evidence = Evidence(shown.patterns, {"eye": camera.info.format})
+    with rig:
+        shots = list(capture(rig, shown, evidence=evidence))
+    assert [shot.pattern for shot in shots] == list(range(len(shown)))
+    assert evidence.summary().verified == len(shown)

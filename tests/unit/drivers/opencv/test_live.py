@@ -1,0 +1,233 @@
+"""A network camera on loopback, and a pipe: what was in a queue is never given for what was just seen."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.opencv import open_camera
+from drivers.opencv.camera import OpenCvCamera
+from drivers.opencv.feeds import LiveFeed
+from slrig.devices import Camera, CameraSettings, Trigger
+from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from tests.contract.opencv_bench import NetworkCamera, Served
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.v4l2_bench import sequence, staged
+
+LONG_S = 20.0
+WHITE, BLACK = sequence().profiles[:2]
+
+
+@contextmanager
+def before(light: Stage, *, network: NetworkCamera | None = None, **options: Any) -> Iterator[OpenCvCamera]:
+    """A camera that looks at a stage over the network."""
+    with Served(network or NetworkCamera(light)) as served:
+        camera = open_camera("eye", {**served.camera.options(served.url), **options}, Path())
+        assert isinstance(camera, OpenCvCamera)
+        try:
+            yield camera
+        finally:
+            camera.close()
+
+
+def read_on(camera: Camera, timeout_s: float = LONG_S) -> None:
+    """Read until it fails."""
+    while True:
+        camera.read(time.monotonic_ns(), timeout_s)
+
+
+def test_a_source_declares_what_its_table_says() -> None:
+    with before(staged()) as camera:
+        info = camera.info
+        assert (info.exposure_range_s, info.gain_range) == ((0.01, 0.01), (1.0, 1.0))
+        assert info.triggers == {Trigger.FREE}
+        assert str(info.format.size) == "80 x 60"
+        assert camera.configure(CameraSettings(0.01005)).exposure_s == 0.01
+        with pytest.raises(UnsupportedByDeviceError, match=r"asked for an exposure of 0.02 s, the source gives 0.01 s"):
+            camera.configure(CameraSettings(0.02))
+        with pytest.raises(UnsupportedByDeviceError, match="asked for gain of 2, the source gives 1 and OpenCV no"):
+            camera.configure(CameraSettings(0.01, 2.0))
+
+
+def test_a_frame_was_exposed_within_its_stated_error() -> None:
+    light = staged()
+    with before(light) as camera:
+        camera.arm(1, Trigger.FREE)
+        changed_ns = light.show(WHITE)
+        frame = camera.read(changed_ns, LONG_S)
+        assert frame.t_start_ns - frame.t_err_ns >= changed_ns
+        assert frame.t_end_ns - frame.t_start_ns == 10_000_000
+        # From the delay that is promised, and one frame's time of waiting.
+        assert 0.015 <= frame.t_err_ns / 1e9 < 0.1
+        assert frame.t_end_ns - frame.t_err_ns < time.monotonic_ns()
+
+
+def test_frames_that_piled_up_while_the_reader_was_held_up_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    light = staged()
+    network = NetworkCamera(light)
+    with before(light, network=network) as camera:
+        camera.arm(1, Trigger.FREE)
+        light.show(WHITE)
+        took = camera.read(time.monotonic_ns(), LONG_S).sequence_number
+        assert isinstance(camera._feed, LiveFeed)
+        grabbed, held, go_on = camera._feed.grabbed, threading.Event(), threading.Event()
+
+        def held_up() -> object:
+            if not held.is_set():
+                held.set()
+                assert go_on.wait(LONG_S)
+            return grabbed()
+
+        monkeypatch.setattr(camera._feed, "grabbed", held_up)
+        assert held.wait(LONG_S)
+        # White frames lie in the sockets when black is shown and the reader comes back.
+        assert network.sends(25)
+        black_ns = light.show(BLACK)
+        go_on.set()
+        frame = camera.read(black_ns, LONG_S)
+        assert frame.sequence_number - took > 20
+        assert np.abs(frame.image.astype(int) - light.expected(BLACK)).max() <= 4
+
+
+def test_a_source_that_is_faster_than_told_gives_no_frame_and_says_why() -> None:
+    with before(staged(), frame_rate_hz=5.0) as camera:
+        camera.arm(1, Trigger.FREE)
+        with pytest.raises(FrameTimeoutError, match=r"half a period of frame_rate_hz = 5 .*sends more frames"):
+            camera.read(0, 0.3)
+
+
+def test_cut_frames_are_passed_over_and_counted() -> None:
+    light = staged()
+    with before(light, network=NetworkCamera(light, cut=0.5)) as camera:
+        camera.arm(1, Trigger.FREE)
+        light.show(WHITE)
+        frames = [camera.read(time.monotonic_ns(), LONG_S) for _ in range(12)]
+        assert frames[-1].dropped_count > 0
+        assert all(frame.image.mean() > 30 for frame in frames[2:])
+        camera.disarm()
+        camera.arm(1, Trigger.FREE)
+        assert camera.read(0, LONG_S).dropped_count <= 6
+
+
+def test_a_source_that_ends_is_gone_and_stays_so() -> None:
+    network = NetworkCamera(staged())
+    with before(network.stage, network=network) as camera:
+        camera.arm(1, Trigger.FREE)
+        camera.read(0, LONG_S)
+        network.gone.set()
+        for _ in range(2):
+            with pytest.raises(DeviceGoneError, match=r"127.0.0.1:\d+/video gives no more frames"):
+                read_on(camera)
+        camera.disarm()
+        with pytest.raises(DeviceGoneError):
+            camera.arm(1, Trigger.FREE)
+        camera.close()
+
+
+def test_nobody_there_is_told_without_the_password() -> None:
+    network = NetworkCamera(staged())
+    with Served(network) as served:
+        url = served.url
+    options = network.options(url.replace("127.0.0.1", "admin:secret@127.0.0.1"))
+    with pytest.raises(DeviceGoneError, match=r"nobody answers at http://127.0.0.1:\d+/video,") as told:
+        open_camera("eye", options, Path())
+    assert "secret" not in str(told.value)
+
+
+def test_something_else_than_video_is_told() -> None:
+    with Served(NetworkCamera(staged())) as served, pytest.raises(DeviceGoneError, match="no video"):
+        open_camera("eye", served.camera.options(f"{served.url}/else"), Path())
+
+
+def test_another_extent_than_asked_for_is_refused() -> None:
+    with (
+        pytest.raises(UnsupportedByDeviceError, match="asked for 64 x 48, the source gives 80 x 60"),
+        before(staged(), size_px=[64, 48]),
+    ):
+        pass
+
+
+def test_closing_ends_a_read_that_waits() -> None:
+    with before(staged()) as camera:
+        camera.arm(1, Trigger.FREE)
+        ended = threading.Event()
+
+        def wait() -> None:
+            with pytest.raises(DeviceStateError, match="closed"):
+                camera.read(time.monotonic_ns() + 10**12, 60)
+            ended.set()
+
+        thread = threading.Thread(target=wait, daemon=True)
+        thread.start()
+        camera.close()
+        assert ended.wait(LONG_S)
+        thread.join(LONG_S)
+
+
+def test_a_pipe_that_falls_silent_can_be_closed(tmp_path: Path) -> None:
+    # Nothing wakes who reads a pipe in which nothing comes: the reader is left behind, and lets the pipe go later.
+    path = tmp_path / "video.mjpeg"
+    os.mkfifo(path)
+    light, network = staged(), NetworkCamera(staged())
+    silent = threading.Event()
+
+    def write() -> None:
+        with path.open("wb", buffering=0) as pipe:
+            for number, part in enumerate(network.parts()):
+                pipe.write(part)
+                if number == 20:
+                    break
+            silent.wait(LONG_S)
+
+    thread = threading.Thread(target=write, daemon=True)
+    thread.start()
+    camera = open_camera("eye", network.options("video.mjpeg"), tmp_path)
+    camera.arm(1, Trigger.FREE)
+    light.show(WHITE)
+    with pytest.raises(FrameTimeoutError):
+        read_on(camera, 0.3)
+    begun_s = time.monotonic()
+    camera.close()
+    assert time.monotonic() - begun_s < 10
+    silent.set()
+    thread.join(LONG_S)
+
+
+def test_a_pipe_that_nobody_writes_to_does_not_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.opencv.feeds.OPEN_LIMIT_S", 0.2)
+    os.mkfifo(tmp_path / "video.mjpeg")
+    with pytest.raises(DeviceGoneError, match=r"video.mjpeg did not open within 0.2 s"):
+        open_camera("eye", NetworkCamera(staged()).options("video.mjpeg"), tmp_path)
+    # Lets the attempt that was given up come to its end.
+    os.close(os.open(tmp_path / "video.mjpeg", os.O_WRONLY))
+
+
+def test_no_camera_at_all_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGoneError, match="/dev/video250 is not there: plug"):
+        open_camera("eye", {"device": 250}, tmp_path)
+    with pytest.raises(UnsupportedByDeviceError, match="/dev/null gives no frames"):
+        open_camera("eye", {"device": "/dev/null"}, tmp_path)
+    (tmp_path / "film.avi").write_text("no film")
+    with pytest.raises(DeviceError, match=r"film.avi: OpenCV cannot open it"):
+        open_camera("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
+
+
+def test_the_projector_is_followed_frame_by_frame() -> None:
+    light = staged()
+    with before(light) as camera:
+        projector = StagedProjector(light)
+        projector.load(sequence())
+        camera.arm(1, Trigger.FREE)
+        for turn in range(20):
+            shown = projector.show(turn % 2)
+            frame = camera.read(shown.t_visible_ns + shown.t_err_ns, LONG_S)
+            wanted = light.expected(sequence().profiles[turn % 2])
+            assert np.abs(frame.image.astype(int) - wanted).max() <= 6, turn

@@ -1,0 +1,91 @@
+"""What OpenCV hands over, as grey images; what is damaged is refused."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.opencv.pixels import Picture, decoded_picture, raw_picture
+from drivers.v4l2.formats import CorruptFrameError
+from slrig.model import CameraFormat, Size
+
+SIZE = Size(16, 8)
+RAMP = np.arange(128, dtype=np.uint8).reshape(SIZE.shape)
+
+
+def test_raw_grey_of_any_depth_keeps_its_values() -> None:
+    assert np.array_equal(raw_picture("GREY", SIZE, None).grey(RAMP), RAMP)
+    deep = RAMP.astype(np.uint16) * 31
+    for code, bit_depth in (("Y12 ", 12), ("Y16 ", 16)):
+        picture = raw_picture(code, SIZE, None)
+        assert picture.format == CameraFormat(SIZE, bit_depth)
+        assert np.array_equal(picture.grey(deep), deep)
+    assert raw_picture("Y16 ", SIZE, 12).format.bit_depth == 12
+    assert raw_picture("GREY", SIZE, 12).format.bit_depth == 8
+
+
+def test_mosaics_come_in_one_row_of_bytes() -> None:
+    # As measured: OpenCV gives every format that it does not know as 1 x N bytes.
+    assert np.array_equal(raw_picture("RGGB", SIZE, None).grey(np.full((1, 128), 77, np.uint8)), np.full((8, 16), 77))
+    ten = np.full(128, 500, "<u2").view(np.uint8).reshape(1, -1)
+    picture = raw_picture("RG10", SIZE, None)
+    assert picture.format.bit_depth == 10
+    assert np.array_equal(picture.grey(ten), np.full((8, 16), 500))
+
+
+def test_luma_is_taken_from_two_channels() -> None:
+    yuyv = np.dstack([RAMP, np.full(SIZE.shape, 128, np.uint8)])
+    assert np.array_equal(raw_picture("YUYV", SIZE, None).grey(yuyv), RAMP)
+
+
+def test_decoded_colour_becomes_grey_without_loss() -> None:
+    picture = decoded_picture(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR), None)
+    assert picture == Picture(None, CameraFormat(SIZE, 8))
+    assert np.array_equal(picture.grey(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR)), RAMP)
+    deep = decoded_picture(RAMP.astype(np.uint16) * 8, 10)
+    assert deep.format.bit_depth == 10
+    with pytest.raises(CorruptFrameError, match="float"):
+        decoded_picture(RAMP.astype(np.float64), None)
+
+
+def jpeg() -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
+    encoded, data = cv2.imencode(".jpg", RAMP, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    assert encoded
+    return np.asarray(data, dtype=np.uint8).reshape(-1)
+
+
+def test_a_jpeg_is_whole_or_refused() -> None:
+    data = jpeg()
+    picture = raw_picture("MJPG", SIZE, None)
+    padded = np.concatenate([data, np.zeros(40, np.uint8)])
+    for whole in (data.reshape(1, -1), padded):
+        assert np.abs(picture.grey(whole).astype(int) - RAMP).max() <= 2
+    middle = len(data) // 2
+    for damaged in (data[:middle], np.delete(data, np.s_[-40:-20]), data[2:], data[:0]):
+        with pytest.raises(CorruptFrameError, match="JPEG"):
+            picture.grey(damaged)
+    with pytest.raises(CorruptFrameError, match="16 x 8, expected 16 x 16"):
+        raw_picture("MJPG", Size(16, 16), None).grey(data)
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.zeros((8, 15), np.uint8), "15 x 8, the camera's frames are 16 x 8"),
+        (np.zeros((8, 16), np.uint16), "uint16"),
+    ],
+)
+def test_frames_of_another_kind_are_refused(image: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], words: str) -> None:
+    with pytest.raises(CorruptFrameError, match=words):
+        Picture(None, CameraFormat(SIZE, 8)).grey(image)
+
+
+def test_samples_beyond_the_depth_are_refused() -> None:
+    with pytest.raises(CorruptFrameError, match="up to 4096, 12 bits end at 4095"):
+        Picture(None, CameraFormat(SIZE, 12)).grey(np.full((8, 16), 4096, np.uint16))
+
+
+def test_too_few_bytes_are_refused() -> None:
+    with pytest.raises(CorruptFrameError, match="bytes"):
+        raw_picture("RG10", SIZE, None).grey(np.zeros((1, 200), np.uint8))

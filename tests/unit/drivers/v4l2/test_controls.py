@@ -1,0 +1,116 @@
+"""Controls: the order in which devices take them, and what gain and exposure mean in their numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from drivers.v4l2 import controls as ctl
+from drivers.v4l2.controls import Control, GainScale
+from drivers.v4l2.options import V4L2Options, checked
+from slrig.errors import ConfigError, UnsupportedByDeviceError
+
+NODE = Path("/dev/video7")
+GAIN = Control(ctl.GAIN, "gain", 16, 255, 1, 0)
+
+
+def webcam() -> dict[int, Control]:
+    known = (
+        Control(ctl.AUTO_WHITE_BALANCE, "white_balance_automatic", 0, 1, 1, 0),
+        Control(ctl.AUTOGAIN, "gain_automatic", 0, 1, 1, 0),
+        GAIN,
+        Control(ctl.POWER_LINE_FREQUENCY, "power_line_frequency", 0, 2, 1, 0),
+        Control(ctl.EXPOSURE_AUTO, "auto_exposure", 0, 3, 1, 0),
+        Control(ctl.EXPOSURE_ABSOLUTE, "exposure_time_absolute", 3, 2047, 1, 0),
+        Control(ctl.EXPOSURE_AUTO_PRIORITY, "exposure_dynamic_framerate", 0, 1, 1, 0),
+        Control(ctl.FOCUS_ABSOLUTE, "focus_absolute", 0, 250, 5, 0),
+        Control(ctl.FOCUS_AUTO, "focus_automatic_continuous", 0, 1, 1, 0),
+        Control(0x00980910, "gamma", 72, 500, 1, 0),
+    )
+    return {control.number: control for control in known}
+
+
+def options(**more: object) -> V4L2Options:
+    return checked("left", {"device": "/dev/video7", **more})
+
+
+def names(steps: tuple[tuple[Control, int], ...]) -> list[tuple[str, int]]:
+    return [(control.name, value) for control, value in steps]
+
+
+def test_automatics_are_off_before_what_they_govern_is_set() -> None:
+    asked = options(focus=30, controls={"gamma": 100})
+    assert names(ctl.in_order(webcam(), asked, exposure_units=167, gain_units=16, node=NODE)) == [
+        ("auto_exposure", 1),
+        ("exposure_dynamic_framerate", 0),
+        ("exposure_time_absolute", 167),
+        ("gain_automatic", 0),
+        ("gain", 16),
+        ("focus_automatic_continuous", 0),
+        ("focus_absolute", 30),
+        ("white_balance_automatic", 0),
+        ("power_line_frequency", 0),
+        ("gamma", 100),
+    ]
+
+
+def test_a_device_without_controls_needs_none() -> None:
+    assert ctl.in_order({}, options(), exposure_units=None, gain_units=None, node=NODE) == ()
+    filtering = {ctl.POWER_LINE_FREQUENCY: Control(ctl.POWER_LINE_FREQUENCY, "power_line_frequency", 1, 2, 1, 0)}
+    assert ctl.in_order(filtering, options(), exposure_units=None, gain_units=None, node=NODE) == ()
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"focus": 900}, "asked focus_absolute = 900, the device takes 0 to 250"),
+        ({"controls": {"gama": 100}}, "control 'gama', the device has: .*gamma"),
+        ({"controls": {"gamma": 3}}, "asked gamma = 3, the device takes 72 to 500"),
+    ],
+)
+def test_what_a_device_cannot_take_is_refused(more: dict[str, object], words: str) -> None:
+    with pytest.raises(UnsupportedByDeviceError, match=words):
+        ctl.in_order(webcam(), options(**more), exposure_units=None, gain_units=None, node=NODE)
+    with pytest.raises(UnsupportedByDeviceError, match="'focus'"):
+        ctl.in_order({}, options(focus=3), exposure_units=None, gain_units=None, node=NODE)
+
+
+@pytest.mark.parametrize(("asked", "units"), [(16.7, 17), (0, 3), (9999, 2047), (3.4, 3)])
+def test_a_value_goes_to_the_devices_grid(asked: float, units: int) -> None:
+    assert webcam()[ctl.EXPOSURE_ABSOLUTE].nearest(asked) == units
+    assert webcam()[ctl.FOCUS_ABSOLUTE].nearest(13) == 15
+
+
+def test_exposure_is_in_units_of_100_microseconds() -> None:
+    assert ctl.exposure_range_s(webcam()[ctl.EXPOSURE_ABSOLUTE]) == pytest.approx((0.0003, 0.2047))
+    assert ctl.exposure_range_s(Control(0, "exposure", 0, 100, 5, 0)) == pytest.approx((0.0005, 0.01))
+
+
+def test_gain_without_unity_counts_from_the_least() -> None:
+    scale = GainScale(GAIN, None)
+    assert scale.range == (1.0, 240.0)
+    assert [scale.units(gain) for gain in (1.0, 3.0, 240.0)] == [16, 18, 255]
+    assert scale.gain(18) == 3.0
+
+
+def test_gain_with_unity_is_a_ratio() -> None:
+    scale = GainScale(GAIN, 16)
+    assert scale.range == pytest.approx((1.0, 255 / 16))
+    assert [scale.units(gain) for gain in (1.0, 2.0, 2.03)] == [16, 32, 32]
+    from_zero = GainScale(Control(ctl.GAIN, "gain", 0, 255, 1, 0), 32)
+    assert from_zero.range == pytest.approx((1 / 32, 255 / 32))
+
+
+def test_a_device_without_gain_has_gain_1() -> None:
+    scale = GainScale(None, 16)
+    assert (scale.range, scale.units(1.0), scale.gain(77)) == ((1.0, 1.0), None, 1.0)
+
+
+def test_all_faults_of_a_table_come_in_one_message() -> None:
+    with pytest.raises(ConfigError) as caught:
+        checked("left", {"pixel_format": "H264", "size_px": [640], "fokus": 3, "frame_rate_hz": -1})
+    message = str(caught.value)
+    assert "camera 'left'" in message
+    for words in ("device: missing", "'H264'", "size_px", "did you mean 'focus'?", "frame_rate_hz"):
+        assert words in message

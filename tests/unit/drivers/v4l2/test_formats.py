@@ -1,0 +1,121 @@
+"""Pixel formats: known bytes give known samples, and what is missing is found missing."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.v4l2.formats import LAYOUTS, PREFERRED, CorruptFrameError, Layout, Packing, grey_image, least_stride_bytes
+from slrig.model import Pixels, Size
+from tests.contract.v4l2_sensor import BIT_DEPTHS, encoded
+
+SIZE = Size(13, 6)
+
+
+def ramp(bit_depth: int, size: Size = SIZE) -> Pixels:
+    values = np.linspace(0, 2**bit_depth - 1, size.width_px * size.height_px).reshape(size.shape)
+    return np.rint(values).astype(np.uint8 if bit_depth <= 8 else np.uint16)
+
+
+@pytest.mark.parametrize("padding_bytes", [0, 7])
+@pytest.mark.parametrize("code", [code for code in BIT_DEPTHS if code not in ("MJPG", "RG10")])
+def test_samples_come_back_as_they_were_sent(code: str, padding_bytes: int) -> None:
+    layout, size = LAYOUTS[code], Size(12, 6)
+    sent = ramp(BIT_DEPTHS[code], size)
+    stride = least_stride_bytes(layout, size) + padding_bytes
+    data = np.frombuffer(encoded(sent, code, stride), np.uint8)
+    image = grey_image(data, layout, size, stride_bytes=stride)
+    np.testing.assert_array_equal(image, sent)
+    assert image.dtype == sent.dtype
+    assert image.flags.owndata or image.base is not data
+    # The last row may come without its padding, and not with less.
+    assert grey_image(data[: len(data) - padding_bytes], layout, size, stride_bytes=stride).shape == size.shape
+    with pytest.raises(CorruptFrameError, match="of"):
+        grey_image(data[: len(data) - padding_bytes - 1], layout, size, stride_bytes=stride)
+
+
+@pytest.mark.parametrize(
+    ("code", "row", "samples"),
+    [
+        # By the kernel's documentation of V4L2_PIX_FMT_Y10P: the low bits are in the fifth byte.
+        ("Y10P", [0xFF, 0x00, 0x80, 0x01, 0b11_10_01_00], [0x3FC, 0x001, 0x202, 0x007]),
+        # And of V4L2_PIX_FMT_SRGGB12P.
+        ("Y12P", [0xFF, 0x01, 0xA5], [0xFF5, 0x01A]),
+        ("Y12 ", [0x34, 0x02, 0xFF, 0x0F], [0x234, 0xFFF]),
+        ("UYVY", [128, 10, 128, 20], [10, 20]),
+        ("YVYU", [10, 128, 20, 128], [10, 20]),
+        ("VYUY", [128, 10, 128, 20], [10, 20]),
+    ],
+)
+def test_known_bytes_give_known_samples(code: str, row: list[int], samples: list[int]) -> None:
+    size = Size(len(samples), 1)
+    image = grey_image(np.array(row, np.uint8), LAYOUTS[code], size, stride_bytes=len(row))
+    assert image.tolist() == [samples]
+
+
+@pytest.mark.parametrize("bit_depth", [8, 12, 16])
+@pytest.mark.parametrize("bayer", ["BGGR", "GBRG", "GRBG", "RGGB"])
+def test_a_mosaic_under_one_colour_has_that_colours_brightness(bayer: str, bit_depth: int) -> None:
+    size, full = Size(16, 12), 2**bit_depth - 1
+    packing = Packing.BYTES if bit_depth == 8 else Packing.WORDS
+    for colour, weight in {"R": 0.299, "G": 0.587, "B": 0.114}.items():
+        mosaic = np.zeros(size.shape, "<u2" if bit_depth > 8 else np.uint8)
+        for (y, x), name in zip(itertools.product((0, 1), (0, 1)), bayer, strict=True):
+            if name == colour:
+                mosaic[y::2, x::2] = full
+        data = np.frombuffer(mosaic.tobytes(), np.uint8)
+        layout = Layout(bit_depth, packing, bayer)
+        image = grey_image(data, layout, size, stride_bytes=least_stride_bytes(layout, size))
+        np.testing.assert_allclose(image[2:-2, 2:-2], weight * full, atol=2 + 0.002 * full)
+
+
+def test_the_kernels_names_of_mosaics_are_not_confused() -> None:
+    # SGRBG10 and SGRBG12 have the odd names BA10 and BA12, SBGGR8 is BA81 and SBGGR16 is BYR2.
+    assert [LAYOUTS[code].bayer for code in ("BA81", "BA10", "BA12", "BYR2", "RG10", "GB12")] == [
+        *("BGGR", "GRBG", "GRBG", "BGGR", "RGGB", "GBRG")
+    ]
+
+
+def test_every_format_that_can_be_read_has_its_rank() -> None:
+    assert sorted(PREFERRED) == sorted(LAYOUTS)
+    assert PREFERRED.index("GREY") < PREFERRED.index("YUYV") < PREFERRED.index("MJPG")
+
+
+def test_limited_luma_is_spread() -> None:
+    row = np.array([16, 128, 235, 128, 0, 128, 255, 128], np.uint8)
+    image = grey_image(row, LAYOUTS["YUYV"], Size(4, 1), stride_bytes=8, limited_luma=True)
+    assert image.tolist() == [[0, 255, 0, 255]]
+    grey = grey_image(row[:4].copy(), LAYOUTS["GREY"], Size(4, 1), stride_bytes=4, limited_luma=True)
+    assert grey.tolist() == [[16, 128, 235, 128]]
+
+
+def scene(size: Size, seed: int = 0) -> Pixels:
+    noise = np.random.default_rng(seed).integers(0, 255, size.shape).astype(np.uint8)
+    return np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0), dtype=np.uint8)
+
+
+def test_a_jpeg_is_decoded() -> None:
+    size = Size(64, 48)
+    data = np.frombuffer(encoded(scene(size), "MJPG", 0), np.uint8)
+    image = grey_image(data, LAYOUTS["MJPG"], size, stride_bytes=0)
+    assert np.abs(image.astype(int) - scene(size)).max() < 12
+
+
+@pytest.mark.parametrize("kept", [0, 3, 200, -2, -200])
+def test_a_jpeg_that_was_cut_is_corrupt(kept: int) -> None:
+    size = Size(64, 48)
+    data = np.frombuffer(encoded(scene(size), "MJPG", 0)[:kept], np.uint8)
+    with pytest.raises(CorruptFrameError):
+        grey_image(data, LAYOUTS["MJPG"], size, stride_bytes=0)
+
+
+def test_a_jpeg_of_another_size_or_none_at_all_is_corrupt() -> None:
+    size = Size(64, 48)
+    other = np.frombuffer(encoded(scene(Size(64, 40)), "MJPG", 0), np.uint8)
+    with pytest.raises(CorruptFrameError, match="64 x 40"):
+        grey_image(other, LAYOUTS["MJPG"], size, stride_bytes=0)
+    with pytest.raises(CorruptFrameError, match="begin"):
+        grey_image(np.full(3000, 7, np.uint8), LAYOUTS["MJPG"], size, stride_bytes=0)
