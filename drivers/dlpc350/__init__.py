@@ -1,0 +1,87 @@
+"""Light engines with TI's controller DLPC350 over USB: the LightCrafter 4500, and boards with the same controller.
+
+Linux only: the engine is a HID device (0451:6401), and is spoken to through /dev/hidraw*. Needs no library.
+
+What it shows. The engine's mirrors are an array of 912 columns and 1140 rows, each on or off: that is the size that is
+declared, and no picture is ever scaled to it. Patterns come from the engine's own flash, where 24 of them lie as the
+bit planes of one picture (`drivers.dlpc350.flash`): TI's program puts the pictures there, this driver writes them and
+keeps the list. It knows what the flash holds from that list alone: the engine does not give its pictures back. It does
+give their number, and the name (tag) of what was flashed; both are compared. That each frame shows its pattern is
+proven by the frames, as in every scan. The video input (HDMI) is not used: which picture of it is in the engine's
+buffer when cannot be known from here.
+
+The mirrors stand on their corners. Column c of row r lies at x = c + ½·(r mod 2), y = r/2, in units of a mirror's
+diagonal (10.8 µm). So a column's edge zigzags by half a column from row to row, and its centre lies at c + ¼: the same
+for every column. A calibration for 912 x 1140 pixels takes all this in: its fy is twice its fx, and its cx moves by ¼.
+
+The engine is told things in the order stop, set, validate, start. `play` shows the loaded sequence once, with a pulse
+on TRIG_OUT_1 per pattern. `show` plays a sequence of one pattern, which the engine ends by itself after `hold_s`:
+whatever becomes of this program, the light goes off then. Dark means: sequence stopped and every LED switched off.
+
+Untested on metal. All of it was tested against a peer that speaks the protocol below a kernel's hidraw node; what the
+peer knows is what TI's documents and TI's own sources say, as each module's docstring cites. To be watched on the first
+day: the sense of the LED current (`led_current_inverted`), light between a stop and a start, the polarity of the
+trigger output, and how long a picture takes from the flash to the mirrors (`image_load_s`; `slrig latency` measures).
+
+The DLPC900 (LightCrafter 6500, 9000) frames its commands alike, but has other pattern tables: `drivers.dlpc350.link`
+would serve it, the rest would not. The DLPC347x speak I²C.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from slrig.devices import FoundDevice, Projector
+from slrig.errors import UnsupportedByDeviceError
+
+
+def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
+    """Open a light engine from a rig file's `[projector]` table (without its `driver`). It is dark afterwards.
+
+    Parameters
+    ----------
+    options
+        `drivers.dlpc350.options.EngineOptions`.
+    folder
+        The rig file's own: the path of the flashed pictures' list counts from there.
+
+    Raises
+    ------
+    ConfigError
+        The options have faults, all of them in one message, or the list of the flashed pictures has.
+    DeviceGoneError
+        The engine is not plugged in.
+    DeviceBusyError
+        Another program holds it.
+    UnsupportedByDeviceError
+        Its flash does not hold what the list says, it does not take a setting, or this is not Linux.
+    DeviceError
+        It may not be opened, or failed.
+    """
+    if sys.platform != "linux":
+        message = f"asked for a light engine on {sys.platform}; this driver needs Linux' /dev/hidraw"
+        raise UnsupportedByDeviceError(message)
+    from drivers.dlpc350.finding import engines, resolved
+    from drivers.dlpc350.flash import read_flash
+    from drivers.dlpc350.link import open_link
+    from drivers.dlpc350.options import checked
+    from drivers.dlpc350.projector import LightEngine
+
+    table = checked(options)
+    flash = read_flash(folder / table.patterns)
+    node = resolved(table.device, engines())
+    return LightEngine(open_link(node.path), table, flash, serial=node.name)
+
+
+def find_devices() -> tuple[FoundDevice, ...]:
+    """Return the light engines that are plugged in. None of them is opened."""
+    if sys.platform != "linux":
+        return ()
+    from drivers.dlpc350.finding import engines, found_devices
+
+    return found_devices(engines())
+
+
+__all__ = ["find_devices", "open_projector"]

@@ -1,0 +1,244 @@
+"""What lies in the engine's flash, as a list says, and the pictures that a person puts there.
+
+The engine's flash is written by TI's program (LightCrafter 4500 GUI, "Firmware": add pictures, build, upload), not by
+this driver: a write that fails may leave an engine that does not start. The list is `images.json`, beside the pictures:
+
+    {"format": "slrig-dlpc350-images", "version": 1, "tag": "slrig-1a2b3c4d",
+     "images": [{"flash_index": 0, "file": "slrig-1a2b3c4d-0.bmp", "sha256": "…", "planes": ["white", …]}]}
+
+`flash_index` is the picture's place in the flash, `tag` the firmware tag given to TI's program (null: none was). What a
+plane shows is read from the picture itself; `planes` says it in words, and how many of the 24 are in use.
+
+A pattern and its inverse are one plane: the pattern table can invert. White, black, 8 Gray bits with their inverses and
+8 lines are 17 planes, one picture. The pictures are filled in the order of play, and a later one holds again what a
+sequence comes back to (white): so each is needed once, and two of them, 48 planes, are loaded before a sequence starts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from drivers.dlpc350.planes import PLANES, Plane, keys_of_plane, picture_of, plane_of, planes_in, words
+from drivers.dlpc350.timing import MOST_IMAGES
+from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
+from slrig.model import PatternSequence
+
+LIST = "images.json"
+TO_FLASH = "to_flash"
+_MOST_BYTES = 1_000_000
+
+
+class _Image(Strict):
+    flash_index: Annotated[int, Field(ge=0, lt=256)]
+    file: Annotated[str, Field(min_length=1)]
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    planes: Annotated[list[str], Field(min_length=1, max_length=PLANES)]
+
+
+class _List(Strict):
+    format: Literal["slrig-dlpc350-images"]
+    version: Literal[1]
+    tag: Annotated[str, Field(min_length=1, max_length=31)] | None = None
+    images: Annotated[list[_Image], Field(max_length=MOST_IMAGES)]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a pattern lies: the picture's index in the flash, the plane's number, and whether it is to be inverted."""
+
+    image: int
+    plane: int
+    inverted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One picture of the flash. numbers : by the key of a plane, its number; content : the BMP file."""
+
+    flash_index: int
+    content: bytes
+    numbers: Mapping[bytes, int]
+    planes: tuple[str, ...]
+
+    def place(self, keys: tuple[bytes, bytes]) -> Place | None:
+        """Return where a plane or its inverse, told by their keys, lies here, if it does."""
+        for inverted, key in enumerate(keys):
+            if key in self.numbers:
+                return Place(self.flash_index, self.numbers[key], bool(inverted))
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Flash:
+    """Everything that the list says of the flash. folder : where it lies, or would; tag : the firmware's, if known."""
+
+    folder: Path
+    tag: str | None = None
+    pictures: tuple[Picture, ...] = ()
+
+    def places(self, sequence: PatternSequence) -> tuple[Place, ...]:
+        """Return where each pattern lies, with as few changes of picture as possible.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            The flash lacks patterns. The pictures that hold them have been written, and the message says what to do.
+        StorageError
+            They could not be written.
+        """
+        found = [self._candidates(plane_of(sequence, index)) for index in range(len(sequence))]
+        missing = [index for index, candidates in enumerate(found) if not candidates]
+        if missing:
+            raise self._lacking(sequence, missing)
+        chosen: list[Place] = []
+        for index, candidates in enumerate(found):
+            # Stay with the picture that is in the buffer; change to the one that lasts longest.
+            image = chosen[-1].image if chosen else -1
+            if image not in candidates:
+                image = max(candidates, key=lambda image: _lasts(found[index:], image))
+            chosen.append(candidates[image])
+        return tuple(chosen)
+
+    def _candidates(self, plane: Plane) -> dict[int, Place]:
+        keys = keys_of_plane(plane)
+        places = (picture.place(keys) for picture in self.pictures)
+        return {place.image: place for place in places if place is not None}
+
+    def _lacking(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
+        written = write_pictures(self.folder / TO_FLASH, sequence, self.pictures)
+        named = ", ".join(words(sequence.patterns[index]) for index in missing[:3])
+        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        return UnsupportedByDeviceError(
+            f"the engine's flash, as {self.folder / LIST} lists it, lacks {len(missing)} of {len(sequence)} patterns "
+            f"({named}{more}); the pictures to put there are in {written.folder} now: add them to the firmware with "
+            "TI's LightCrafter 4500 program, in the order of their numbers, with the firmware tag "
+            f'"{written.tag}", upload it, and let patterns in the [projector] table of the rig file name that folder'
+        )
+
+
+def _lasts(found: Sequence[Mapping[int, Place]], image: int) -> int:
+    """How many patterns in a row lie in a picture."""
+    return next((count for count, candidates in enumerate(found) if image not in candidates), len(found))
+
+
+def read_flash(folder: Path) -> Flash:
+    """Return what the list in a folder says; an empty flash where there is no list yet.
+
+    Raises
+    ------
+    ConfigError
+        The list has faults, or a picture is not the one that it names.
+    """
+    path = folder / LIST
+    if not path.exists():
+        return Flash(folder)
+    data = read_json(read_text(path, _MOST_BYTES, ConfigError), path, ConfigError)
+    try:
+        listed = _List.model_validate(data)
+    except ValidationError as error:
+        message = f"{path}: the list of the flashed pictures is wrong:\n{explain(error, data, keys_of(_List))}"
+        raise ConfigError(message) from error
+    indices = [image.flash_index for image in listed.images]
+    if len(set(indices)) != len(indices):
+        message = f"{path}: expected each flash_index once, found {indices}; correct the list"
+        raise ConfigError(message)
+    return Flash(folder, listed.tag, tuple(_read(folder, image) for image in listed.images))
+
+
+def _read(folder: Path, image: _Image) -> Picture:
+    path = folder / image.file
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        message = f"{path}: {LIST} names this picture, found: {error.strerror}; copy it there"
+        raise ConfigError(message) from error
+    if hashlib.sha256(content).hexdigest() != image.sha256:
+        message = (
+            f"{path}: this is not the picture that {LIST} lists (SHA-256 differs): what lies in the flash cannot be "
+            "told; copy the folder again, or write and flash new pictures"
+        )
+        raise ConfigError(message)
+    return _picture(image.flash_index, content, tuple(image.planes), str(path))
+
+
+def _picture(flash_index: int, content: bytes, planes: tuple[str, ...], name: str) -> Picture:
+    numbers: dict[bytes, int] = {}
+    for number, plane in enumerate(planes_in(content, name)[: len(planes)]):
+        numbers.setdefault(keys_of_plane(plane)[0], number)
+    return Picture(flash_index, content, numbers, planes)
+
+
+def write_pictures(folder: Path, sequence: PatternSequence, others: Sequence[Picture] = ()) -> Flash:
+    """Write pictures that hold every pattern of a sequence, and the list of them, for TI's program.
+
+    Parameters
+    ----------
+    folder
+        Made if need be; a list that is there is replaced.
+    sequence
+        For 912 x 1140 mirrors.
+    others
+        Pictures that are to stay in the flash: they keep their places, the new ones come after them.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        A pattern has shades of grey, or there are too many pictures.
+    StorageError
+        The files could not be written.
+    """
+    first = max((picture.flash_index for picture in others), default=-1) + 1
+    made = [
+        _picture(first + number, picture_of([plane for plane, _ in group]), tuple(word for _, word in group), "made")
+        for number, group in enumerate(_grouped(sequence))
+    ]
+    pictures = (*others, *made)
+    if len(pictures) > MOST_IMAGES:
+        message = (
+            f"asked for {len(made)} pictures beside the {len(others)} in the flash, it takes {MOST_IMAGES}; begin "
+            "anew: let patterns in the rig file name an empty folder"
+        )
+        raise UnsupportedByDeviceError(message)
+    together = hashlib.sha256(b"".join(picture.content for picture in pictures)).hexdigest()
+    tag = f"slrig-{together[:8]}"
+    entries = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for picture in pictures:
+            file = f"{tag}-{picture.flash_index}.bmp"
+            (folder / file).write_bytes(picture.content)
+            digest = hashlib.sha256(picture.content).hexdigest()
+            entries.append(
+                {"flash_index": picture.flash_index, "file": file, "sha256": digest, "planes": list(picture.planes)}
+            )
+        listed = {"format": "slrig-dlpc350-images", "version": 1, "tag": tag, "images": entries}
+        (folder / LIST).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        message = f"{folder}: asked to write pictures for the engine's flash, found: {error.strerror}; make room there"
+        raise StorageError(message) from error
+    return Flash(folder, tag, pictures)
+
+
+def _grouped(sequence: PatternSequence) -> list[list[tuple[Plane, str]]]:
+    """Planes picture by picture: each holds all patterns from its first to its last one in the order of play."""
+    groups: list[list[tuple[Plane, str]]] = [[]]
+    held: set[bytes] = set()
+    for index, pattern in enumerate(sequence.patterns):
+        plane = plane_of(sequence, index)
+        keys = keys_of_plane(plane)
+        if not held.isdisjoint(keys):
+            continue
+        if len(groups[-1]) == PLANES:
+            groups.append([])
+            held = set()
+        held.update(keys)
+        groups[-1].append((plane, words(pattern)))
+    return groups

@@ -1,0 +1,91 @@
+"""What a rig file says of a light engine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.errors import ConfigError
+
+Share = Annotated[float, Field(gt=0, le=1)]
+
+
+class Colour(IntEnum):
+    """LEDs of a pattern, as the pattern table has them: bit 0 red, 1 green, 2 blue."""
+
+    RED = 1
+    GREEN = 2
+    YELLOW = 3
+    BLUE = 4
+    MAGENTA = 5
+    CYAN = 6
+    WHITE = 7
+
+
+class EngineOptions(Strict):
+    """The keys of a `[projector]` table with `driver = "dlpc350"`.
+
+    patterns : a folder with the list of the pictures in the engine's flash (`images.json`) and these pictures, from the
+        rig file's own. There need not be one yet: `load` writes the pictures that it lacks into `to_flash` there.
+    device : what `slrig devices` lists, or a path (`/dev/hidraw0`); else the only engine that is plugged in.
+    led : white, red, green, blue, yellow, cyan or magenta.
+    led_current : current of these LEDs, as a share of the board's most. led_current_limit : no more than this, whatever
+        led_current says. duty_limit : light is on for no more than this share of the time while a sequence is played.
+    led_current_inverted : True where 255 switches an LED off and 0 gives it the most current, with the polarity
+        register at "normal": so it was found on the LightCrafter 4500 (TI forum, thread 451589), unlike in the manual.
+    hold_s : a shown pattern goes dark after this long by itself.
+    image_load_s : from the command to start until light, at the most: the engine loads a picture from its flash.
+    light_margin_s : in a played sequence, light lasts this much longer than the exposure.
+    trigger_polarity : "high" where TRIG_OUT_1 rises as the pattern's light begins. trigger_delay_us : how much later it
+        does; -20.05 to +2.78 µs.
+    standby : put the engine into standby when it is closed; it is woken when opened, in any case.
+    """
+
+    patterns: Annotated[str, Field(min_length=1)]
+    device: Annotated[str, Field(min_length=1)] | None = None
+    led: Literal["white", "red", "green", "blue", "yellow", "cyan", "magenta"] = "white"
+    led_current: Share = 0.3
+    led_current_limit: Share = 0.5
+    led_current_inverted: bool = True
+    duty_limit: Share = 1.0
+    hold_s: Annotated[float, Field(ge=2, le=200)] = 30.0
+    image_load_s: Annotated[float, Field(ge=0, le=5)] = 0.2
+    light_margin_s: Annotated[float, Field(ge=0, le=1)] = 0.0005
+    trigger_polarity: Literal["high", "low"] = "high"
+    trigger_delay_us: Annotated[float, Field(ge=-20.05, le=2.78)] = 0.0
+    standby: bool = False
+
+    @model_validator(mode="after")
+    def _within_limits(self) -> Self:
+        if self.led_current > self.led_current_limit:
+            message = (
+                f"led_current is {self.led_current:g}, led_current_limit allows {self.led_current_limit:g}; lower the "
+                "current, or raise the limit if eyes and LEDs are safe with it"
+            )
+            raise ValueError(message)
+        return self
+
+    @property
+    def colour(self) -> Colour:
+        """The LEDs that patterns are lit with."""
+        return Colour[self.led.upper()]
+
+    @property
+    def current_byte(self) -> int:
+        """The current in 255ths of the most."""
+        return round(self.led_current * 255)
+
+
+def checked(options: Mapping[str, object]) -> EngineOptions:
+    """Return an engine's options. Raises ConfigError with all their faults."""
+    try:
+        return EngineOptions.model_validate(dict(options))
+    except ValidationError as error:
+        message = (
+            f"the [projector] table of a light engine is wrong:\n{explain(error, options, keys_of(EngineOptions))}"
+        )
+        raise ConfigError(message) from error

@@ -1,0 +1,121 @@
+"""The engine's rules of exposure and period, held before the engine is asked; each error names its rule.
+
+Source: TI's sources for the LightCrafter 4500 (DLP SDK, lcr4500.cpp: `Pattern::Exposure` and
+`CreateSendStartSequenceLut`), DLPU010 ("Pattern Display Exposure and Frame Period") and, for the time that a picture
+takes from the flash, the LightCrafter 4500 user's guide (DLPU011, "Pattern Sequence Background"): 200 ms at the worst.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from slrig.errors import UnsupportedByDeviceError
+
+MINIMUM_US = {1: 235, 2: 700, 3: 1570, 4: 1700, 5: 2000, 6: 2500, 7: 4500, 8: 8333}
+"""Shortest exposure by bit depth."""
+MAXIMUM_US = 200_000_000
+DARK_US = 230
+"""A pattern that does not last its whole period is dark for so long at least: the mirrors are cleared."""
+BUFFERS = 2
+"""Pictures of 24 bit planes that are loaded before a sequence starts; of more than that, only the first is."""
+MOST_PATTERNS = 128
+"""Entries of the pattern table (DLPU010, "Pattern Display LUT")."""
+MOST_IMAGES = 64
+"""Entries of the image table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How long each pattern is lit, and from one pattern to the next, whole microseconds."""
+
+    exposure_us: int
+    period_us: int
+
+    @property
+    def dark_between(self) -> bool:
+        """Whether the mirrors are cleared after each pattern."""
+        return self.exposure_us < self.period_us
+
+
+def lit(exposure_s: float, period_s: float, *, margin_s: float, duty_limit: float) -> Timing:
+    """How long to light patterns of which cameras take `exposure_s`, one per period.
+
+    Parameters
+    ----------
+    margin_s
+        Light beyond the exposure: it covers what a camera takes from the pulse to its first row.
+    duty_limit
+        How much of the time light may be on.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The engine does not have this timing, or the duty limit forbids it.
+    """
+    period_us = round(period_s * 1e6)
+    wanted_us = max(round((exposure_s + margin_s) * 1e6), MINIMUM_US[1])
+    if exposure_s <= 0 or wanted_us > period_us:
+        message = (
+            f"asked for {exposure_s:.6f} s of light every {period_s:.6f} s: with {margin_s:.6f} s for the cameras to "
+            f"start, light takes {wanted_us} µs, the period is {period_us} µs; lengthen the period"
+        )
+        raise UnsupportedByDeviceError(message)
+    # What the dark between does not fit into is lit to its end.
+    timing = Timing(wanted_us if wanted_us <= period_us - DARK_US else period_us, period_us)
+    check_timing(timing)
+    duty = timing.exposure_us / timing.period_us
+    if duty > duty_limit:
+        message = (
+            f"asked for {timing.exposure_us} µs of light every {timing.period_us} µs: light is on for {duty:.0%} of "
+            f"the time, duty_limit of the rig file allows {duty_limit:.0%}; lengthen the period, or shorten exposure_s"
+        )
+        raise UnsupportedByDeviceError(message)
+    return timing
+
+
+def check_timing(timing: Timing, *, bit_depth: int = 1) -> None:
+    """Raise UnsupportedByDeviceError if the engine does not have this timing; the message names the rule."""
+    exposure_us, period_us = timing.exposure_us, timing.period_us
+    asked = f"asked for an exposure of {exposure_us} µs and a period of {period_us} µs"
+    least_us = MINIMUM_US[bit_depth]
+    if exposure_us < least_us:
+        message = f"{asked}: the shortest exposure of a {bit_depth}-bit pattern is {least_us} µs; lengthen exposure_s"
+        raise UnsupportedByDeviceError(message)
+    if max(exposure_us, period_us) > MAXIMUM_US:
+        message = f"{asked}: the longest is {MAXIMUM_US} µs ({MAXIMUM_US / 1e6:g} s); shorten exposure_s"
+        raise UnsupportedByDeviceError(message)
+    if exposure_us > period_us or 0 < period_us - exposure_us < DARK_US:
+        message = (
+            f"{asked}: the exposure equals the period, or is shorter by {DARK_US} µs at least, the time that clearing "
+            f"the mirrors takes; here it is {period_us - exposure_us} µs shorter; lengthen the period"
+        )
+        raise UnsupportedByDeviceError(message)
+
+
+def check_loading(counts: Sequence[int], period_us: int, image_load_s: float) -> None:
+    """Check that each picture is there when its first pattern is due.
+
+    Parameters
+    ----------
+    counts
+        How many patterns are shown of each picture before the next one takes its place.
+    image_load_s
+        How long a picture takes from the flash.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        A picture would come too late; the message names the rule.
+    """
+    if len(counts) <= BUFFERS:
+        return
+    least = min(counts[:-1])
+    if least * period_us < image_load_s * 1e6:
+        message = (
+            f"the sequence needs {len(counts)} pictures from the engine's flash, one after the other: only {BUFFERS} "
+            f"are loaded beforehand, and each further one must come while the one before it is shown, which takes "
+            f"{image_load_s:g} s (image_load_s); {least} patterns every {period_us} µs take "
+            f"{least * period_us / 1e6:g} s; lengthen the period to {image_load_s / least:.4f} s, or scan one axis only"
+        )
+        raise UnsupportedByDeviceError(message)

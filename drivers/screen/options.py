@@ -1,0 +1,63 @@
+"""What a rig file says of a screen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.errors import ConfigError
+from slrig.model import Size
+
+Extent = Annotated[int, Field(ge=1, le=65_535)]
+Seconds = Annotated[float, Field(ge=0, le=5)]
+
+UNMEASURED_S = 0.05
+"""How late the light of a display is that nobody has measured, ± as much: none of the usual projectors is later."""
+
+
+class ScreenOptions(Strict):
+    """The keys of a `[projector]` table with `driver = "screen"`.
+
+    output : the connector, as `slrig devices` and `xrandr` name it ("HDMI-1", "DP-2").
+    backend : "x11" presents through X itself and is told when each picture was flipped; "sdl" presents through SDL
+        (extra `screen`), everywhere; "auto" is x11 where there is an X server with the Present extension.
+    native_px : [width, height] of the projector's own raster (its data sheet's "native resolution"), where its EDID
+        prefers another size, or none.
+    monitor : the display that must be at that connector, as `slrig devices` calls it; else any is taken.
+    latency_s : from the signal of a picture's last row to its light: the display's own delay, as measured. Until then
+        it is taken to be `UNMEASURED_S`, ± as much. latency_error_s : ± what it varies; half a refresh if absent.
+    trust_compositor : True to show through a compositor, which may scale, tint or delay what it is given.
+    check_pixels : whether one picture of each sequence is read back from the frame buffer and compared.
+    dark_after_s : for how long the output is kept black after the process that had opened it ended, however it did.
+    display : the X server, as in DISPLAY; that of the environment if absent.
+    """
+
+    output: Annotated[str, Field(min_length=1, max_length=100)]
+    backend: Literal["auto", "sdl", "x11"] = "auto"
+    native_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
+    monitor: Annotated[str, Field(min_length=1)] | None = None
+    latency_s: Seconds | None = None
+    latency_error_s: Seconds | None = None
+    trust_compositor: bool = False
+    check_pixels: bool = True
+    dark_after_s: Annotated[float, Field(ge=0, le=86_400)] = 600.0
+    display: Annotated[str, Field(min_length=1)] | None = None
+
+    @property
+    def native(self) -> Size | None:
+        """The projector's own raster, if it is told."""
+        return None if self.native_px is None else Size(*self.native_px)
+
+
+def checked(options: Mapping[str, object]) -> ScreenOptions:
+    """Return a screen's options. Raises ConfigError with all their faults."""
+    try:
+        return ScreenOptions.model_validate(dict(options))
+    except ValidationError as error:
+        message = (
+            f"the [projector] table of driver 'screen' is wrong:\n{explain(error, options, keys_of(ScreenOptions))}"
+        )
+        raise ConfigError(message) from error

@@ -1,0 +1,188 @@
+"""The projector on a screen output, as the rest of slrig sees it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TypeVar
+
+from drivers.screen.options import UNMEASURED_S, ScreenOptions
+from drivers.screen.stage import Stage, opened
+from drivers.screen.timing import Presented, whole_light
+from drivers.screen.working import OwnThread
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
+from slrig.model import PatternSequence
+
+Result = TypeVar("Result")
+
+_OPENS_IN_S = 30.0
+_LOADS_IN_S = 60.0
+_SHOWS_IN_S = 5.0
+_DARKENS_IN_S = 2.0
+_USUAL_WAIT = 2.0
+"""Refreshes from show to the end of a picture's scan-out: half a one to wait, one or one and a half to be shown."""
+
+
+class ScreenProjector:
+    """Implements `slrig.devices.Projector` on one output of this computer.
+
+    A thread of its own does whatever is done with the window; `blank` and `close` work from any other, and where that
+    thread hangs in a graphics driver, another process makes the output black.
+
+    Raises
+    ------
+    UnsupportedByDeviceError, DeviceGoneError, DeviceBusyError, DeviceError, LibraryMissingError
+        As `drivers.screen.stage.opened`.
+    """
+
+    def __init__(self, options: ScreenOptions) -> None:
+        self._options = options
+        self._thread = OwnThread(f"output {options.output}")
+        try:
+            self._stage: Stage = self._thread.do(lambda: opened(options), timeout_s=_OPENS_IN_S)
+        except BaseException:
+            self._thread.end(timeout_s=0)
+            raise
+        stage = self._stage
+        self.refresh_s = stage.refresh_s
+        measured = options.latency_s is not None
+        self._latency_s = options.latency_s if options.latency_s is not None else UNMEASURED_S
+        usual_error_s = self.refresh_s / 2 if measured else UNMEASURED_S
+        self._latency_error_s = usual_error_s if options.latency_error_s is None else options.latency_error_s
+        self._info = ProjectorInfo(
+            name=options.output,
+            model=stage.model,
+            serial=stage.serial,
+            size=stage.size,
+            plays=False,
+            latency_s=self._latency_s + self._latency_error_s + _USUAL_WAIT * self.refresh_s,
+            refresh_s=self.refresh_s,
+        )
+        self._sequence: PatternSequence | None = None
+        self._unchecked = False
+        self._closed = threading.Event()
+        self._darkened = threading.Event()
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return self._info
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. Looks at the output again, which may have been changed since it was opened."""
+        self._require_open()
+        self._sequence = None
+        if sequence.projector != self._info.size:
+            message = (
+                f"output {self._info.name} shows {self._info.size} pixels, the sequence was made for "
+                f"{sequence.projector}: it would be scaled; encode it for {self._info.size}"
+            )
+            raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._or_dark(lambda: self._thread.do(lambda: self._stage.load(sequence), timeout_s=_LOADS_IN_S))
+        self._sequence = sequence
+        self._unchecked = self._options.check_pixels
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`. Dark, if it fails."""
+        self._require_open()
+        sequence = self._sequence
+        if sequence is None:
+            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
+            raise DeviceStateError(message)
+        if not 0 <= index < len(sequence):
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(sequence) - 1}"
+            raise UnsupportedByDeviceError(message)
+        return self._or_dark(lambda: self._shown(sequence, index))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. A screen has no trigger wire."""
+        self._require_open()
+        message = (
+            f"asked to play {exposure_s} s patterns every {period_s} s, a screen output has no trigger wire; show each "
+            "pattern, and trigger the cameras by software"
+        )
+        raise UnsupportedByDeviceError(message)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`. From any thread.
+
+        Raises
+        ------
+        DeviceError
+            The window does not go black, and nobody is there to cover it.
+        """
+        if self._closed.is_set():
+            return
+        self._darkened.set()
+        try:
+            presented = self._thread.do(lambda: self._stage.show(None), timeout_s=_DARKENS_IN_S)
+        except DeviceError:
+            if not self._stage.cover():
+                raise
+        else:
+            # The picture before is there until the dark one is scanned out.
+            t_visible_ns, t_err_ns = self._light(presented)
+            self._wait_until(t_visible_ns + t_err_ns)
+
+    def close(self) -> None:
+        """See `Projector`. From any thread. The output stays black, `dark_after_s` beyond this process's end."""
+        if self._closed.is_set():
+            return
+        self._darkened.set()
+        self._closed.set()
+        self._sequence = None
+        # Whatever state it is in: what cannot be done any more is not needed.
+        with suppress(DeviceError):
+            self._thread.do(lambda: self._stage.show(None), timeout_s=_DARKENS_IN_S)
+        self._stage.cover()
+        with suppress(DeviceError):
+            self._thread.do(self._stage.close, timeout_s=_DARKENS_IN_S)
+        self._thread.end(timeout_s=_DARKENS_IN_S)
+
+    def _shown(self, sequence: PatternSequence, index: int) -> Shown:
+        self._darkened.clear()
+        presented = self._thread.do(lambda: self._stage.show(index), timeout_s=_SHOWS_IN_S)
+        t_visible_ns, t_err_ns = self._light(presented)
+        if self._unchecked and not self._darkened.is_set():
+            self._thread.do(lambda: self._stage.compare(sequence.image(index)), timeout_s=_SHOWS_IN_S)
+            self._unchecked = False
+        self._wait_until(t_visible_ns + t_err_ns)
+        if self._darkened.is_set():
+            message = f"pattern {index} was darkened from outside before its light was there; show it again"
+            raise DeviceStateError(message)
+        return Shown(index, t_visible_ns, t_err_ns)
+
+    def _light(self, presented: Presented) -> tuple[int, int]:
+        return whole_light(
+            presented,
+            refresh_s=self.refresh_s,
+            latency_s=self._latency_s,
+            latency_error_s=self._latency_error_s,
+        )
+
+    def _wait_until(self, t_ns: int) -> None:
+        """Wait, unless the projector is closed meanwhile."""
+        while (left_ns := t_ns - time.monotonic_ns()) > 0:
+            if self._closed.wait(left_ns / 1e9):
+                return
+
+    def _or_dark(self, attempt: Callable[[], Result]) -> Result:
+        try:
+            return attempt()
+        except BaseException:
+            with suppress(DeviceError):
+                self.blank()
+            raise
+
+    def _require_open(self) -> None:
+        if self._closed.is_set():
+            message = f"the projector on output {self._options.output} is closed; open the rig again"
+            raise DeviceStateError(message)

@@ -1,0 +1,292 @@
+"""Pictures shown through SDL 2, which runs everywhere and tells no flip times.
+
+SDL's present call returns when a picture is queued, up to `timing.QUEUED` refreshes before it is seen; each picture is
+presented twice, so that the first one is through when the second one returns, and the rest is stated as error.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import time
+import warnings
+from contextlib import suppress
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.screen.options import ScreenOptions
+from drivers.screen.requests import coloured
+from drivers.screen.station import Station
+from drivers.screen.timing import Presented, queued
+from slrig.errors import DeviceError, LibraryMissingError, UnsupportedByDeviceError
+from slrig.model import PatternSequence, Pixels, Size
+
+_HINTS = (
+    # Signals belong to the service.
+    (b"SDL_NO_SIGNAL_HANDLERS", b"1"),
+    (b"SDL_VIDEO_MINIMIZE_ON_FOCUS_LOSS", b"0"),
+    (b"SDL_RENDER_SCALE_QUALITY", b"0"),
+    (b"SDL_VIDEO_X11_NET_WM_BYPASS_COMPOSITOR", b"1"),
+)
+_SETTLES_IN_S = 2.0
+_LOOKS_EVERY_S = 0.02
+_CENTRED = 0x2FFF0000
+_OPAQUE = np.uint32(0xFF000000)
+
+
+class SdlSurface:
+    """Shows patterns in a window of SDL's, exactly over a station's own. The station's thread uses it."""
+
+    def __init__(self, station: Station) -> None:
+        sdl = _started((b"SDL_VIDEODRIVER", b"x11"), (b"SDL_X11_FORCE_OVERRIDE_REDIRECT", b"1"))
+        picture = station.picture
+        self._canvas = _Canvas(sdl, (picture.x, picture.y), picture.size, sdl.SDL_WINDOW_BORDERLESS)
+        self._refresh_s = station.refresh_s
+        self.window = self._canvas.x11_window()
+        station.watch(self.window)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """Take the patterns of a sequence."""
+        self._canvas.sequence = sequence
+
+    def show(self, index: int | None) -> Presented:
+        """Show a pattern of the sequence, None the dark, and return when that may have happened."""
+        return self._canvas.show(index, self._refresh_s)
+
+    def close(self) -> None:
+        """Let the window go."""
+        self._canvas.close()
+
+
+class SdlWindow:
+    """A display that SDL knows, where there is no X server to ask. One thread uses it. Implements `Stage`."""
+
+    def __init__(self, canvas: _Canvas, name: str, refresh_s: float) -> None:
+        self._canvas = canvas
+        self.size = canvas.size
+        self.refresh_s = refresh_s
+        self.model = f"display {name}, {self.size} at {1 / refresh_s:.0f} Hz, through SDL ({canvas.driver})"
+        self.serial = name
+        self.show(None)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """Take the patterns of a sequence."""
+        self._canvas.sequence = sequence
+
+    def show(self, index: int | None) -> Presented:
+        """Show a pattern of the sequence, None the dark."""
+        return self._canvas.show(index, self.refresh_s)
+
+    def compare(self, levels: Pixels) -> None:
+        """Nobody may read what a Wayland compositor shows."""
+
+    def cover(self) -> bool:
+        """There is nobody to ask but this window's own thread."""
+        return False
+
+    def close(self) -> None:
+        """Go dark, and let the window go: what is behind it is seen again."""
+        with suppress(DeviceError):
+            self.show(None)
+        self._canvas.close()
+
+
+def fullscreen(options: ScreenOptions) -> SdlWindow:
+    """Fill the display of the name `options.output`. Raises UnsupportedByDeviceError, LibraryMissingError."""
+    sdl = _started()
+    try:
+        index, (name, size, rate_hz) = _chosen(displays(sdl), options)
+        centre = _CENTRED | index
+        canvas = _Canvas(sdl, (centre, centre), size, sdl.SDL_WINDOW_FULLSCREEN_DESKTOP | sdl.SDL_WINDOW_BORDERLESS)
+    except BaseException:
+        _stopped(sdl)
+        raise
+    return SdlWindow(canvas, name, 1 / rate_hz)
+
+
+def _chosen(found: list[tuple[str, Size, int]], options: ScreenOptions) -> tuple[int, tuple[str, Size, int]]:
+    matching = [index for index, (name, _, _) in enumerate(found) if name == options.output]
+    if len(matching) != 1:
+        there = "; ".join(f"'{name}' ({size} at {rate_hz} Hz)" for name, size, rate_hz in found) or "none"
+        count = f"{len(matching)} displays are" if matching else "no display is"
+        message = f"output {options.output}: {count} of that name; there are: {there}; write one of these names"
+        raise UnsupportedByDeviceError(message)
+    name, size, rate_hz = found[matching[0]]
+    if options.native is not None and options.native != size:
+        message = (
+            f"output {name} shows {size}, the projector's own raster is {options.native} (native_px): set the display "
+            "to that size, with a scale of 100 %"
+        )
+        raise UnsupportedByDeviceError(message)
+    if rate_hz < 1:
+        message = f"output {name} does not tell its refresh rate; set one in the system's display settings"
+        raise UnsupportedByDeviceError(message)
+    return matching[0], found[matching[0]]
+
+
+def displays(sdl: Any) -> list[tuple[str, Size, int]]:
+    """The displays that SDL knows: name, extent, refresh rate in Hz (0: unknown)."""
+    found = []
+    for index in range(sdl.SDL_GetNumVideoDisplays()):
+        mode = sdl.SDL_DisplayMode()
+        if sdl.SDL_GetCurrentDisplayMode(index, ctypes.byref(mode)) == 0:
+            name = (sdl.SDL_GetDisplayName(index) or b"").decode("utf-8", "replace")
+            found.append((name, Size(max(mode.w, 1), max(mode.h, 1)), int(mode.refresh_rate)))
+    return found
+
+
+def listed() -> list[tuple[str, Size, int]]:
+    """As `displays`, for a look. Raises LibraryMissingError, DeviceError."""
+    sdl = _started()
+    try:
+        return displays(sdl)
+    finally:
+        _stopped(sdl)
+
+
+class _Canvas:
+    """A window of SDL's with a renderer and one texture of exactly its size, black at first."""
+
+    def __init__(self, sdl: Any, place: tuple[int, int], size: Size, flags: int) -> None:
+        self._sdl = sdl
+        self.size = size
+        self.sequence: PatternSequence | None = None
+        self.driver = (sdl.SDL_GetCurrentVideoDriver() or b"").decode()
+        self._renderer = self._texture = None
+        width_px, height_px = size.width_px, size.height_px
+        self._window = sdl.SDL_CreateWindow(b"slrig", *place, width_px, height_px, flags | sdl.SDL_WINDOW_SHOWN)
+        try:
+            self._made(self._window, "window")
+            sdl.SDL_ShowCursor(0)
+            self._renderer = sdl.SDL_CreateRenderer(self._window, -1, sdl.SDL_RENDERER_PRESENTVSYNC)
+            if not self._renderer:
+                self._renderer = sdl.SDL_CreateRenderer(self._window, -1, 0)
+            self._made(self._renderer, "renderer")
+            self._require_size()
+            self._texture = sdl.SDL_CreateTexture(
+                self._renderer, sdl.SDL_PIXELFORMAT_ARGB8888, sdl.SDL_TEXTUREACCESS_STREAMING, width_px, height_px
+            )
+            self._made(self._texture, "texture")
+            sdl.SDL_SetTextureBlendMode(self._texture, sdl.SDL_BLENDMODE_NONE)
+        except BaseException:
+            self._destroy()
+            raise
+
+    def show(self, index: int | None, refresh_s: float) -> Presented:
+        """Show a pattern of the sequence, None the dark."""
+        sdl = self._sdl
+        if index is None or self.sequence is None:
+            words: NDArray[np.uint32] = np.full(self.size.shape, _OPAQUE, np.uint32)
+        else:
+            words = np.ascontiguousarray(coloured(self.sequence.image(index)) | _OPAQUE)
+        sdl.SDL_PumpEvents()
+        self._done(sdl.SDL_UpdateTexture(self._texture, None, words.ctypes.data, words.strides[0]), "take a picture")
+        asked_ns = time.monotonic_ns()
+        for _ in range(2):
+            self._done(sdl.SDL_RenderCopy(self._renderer, self._texture, None, None), "draw")
+            sdl.SDL_RenderPresent(self._renderer)
+        return queued(asked_ns, time.monotonic_ns(), refresh_s)
+
+    def x11_window(self) -> int:
+        """The X server's number for the window."""
+        info = self._sdl.SDL_SysWMinfo()
+        self._sdl.SDL_VERSION(info.version)
+        self._made(self._sdl.SDL_GetWindowWMInfo(self._window, ctypes.byref(info)), "window of X")
+        _outlive_the_server(info.info.x11.display)
+        return int(info.info.x11.window)
+
+    def close(self) -> None:
+        """Let everything go."""
+        self._destroy()
+        _stopped(self._sdl)
+
+    def _require_size(self) -> None:
+        """Wait until the window has its extent: a window system may take its time to give it."""
+        until_s = time.monotonic() + _SETTLES_IN_S
+        while True:
+            self._sdl.SDL_PumpEvents()
+            width_px, height_px = ctypes.c_int(), ctypes.c_int()
+            self._sdl.SDL_GetRendererOutputSize(self._renderer, ctypes.byref(width_px), ctypes.byref(height_px))
+            if (width_px.value, height_px.value) == (self.size.width_px, self.size.height_px):
+                return
+            if time.monotonic() > until_s:
+                message = (
+                    f"asked SDL for a window of {self.size} pixels, it gives {width_px.value} x {height_px.value}: the "
+                    "desktop scales; set the projector's scale to 100 %"
+                )
+                raise UnsupportedByDeviceError(message)
+            time.sleep(_LOOKS_EVERY_S)
+
+    def _destroy(self) -> None:
+        sdl = self._sdl
+        for destroy, thing in (
+            (sdl.SDL_DestroyTexture, self._texture),
+            (sdl.SDL_DestroyRenderer, self._renderer),
+            (sdl.SDL_DestroyWindow, self._window),
+        ):
+            if thing:
+                destroy(thing)
+        self._window = self._renderer = self._texture = None
+
+    def _made(self, thing: object, name: str) -> None:
+        if not thing:
+            self._fail(f"make a {name}")
+
+    def _done(self, code: int, what: str) -> None:
+        if code:
+            self._fail(what)
+
+    def _fail(self, what: str) -> None:
+        message = (
+            f"SDL cannot {what}: {(self._sdl.SDL_GetError() or b'').decode('utf-8', 'replace')}; update the graphics "
+            'driver, or take backend = "x11"'
+        )
+        raise DeviceError(message)
+
+
+def _started(*hints: tuple[bytes, bytes]) -> Any:
+    sdl = _library()
+    for name, value in (*_HINTS, *hints):
+        sdl.SDL_SetHint(name, value)
+    if sdl.SDL_InitSubSystem(sdl.SDL_INIT_VIDEO):
+        message = (
+            f"SDL finds no display: {(sdl.SDL_GetError() or b'').decode('utf-8', 'replace')}; start slrig within the "
+            "graphical session, or set DISPLAY or WAYLAND_DISPLAY as they are there"
+        )
+        raise DeviceError(message)
+    return sdl
+
+
+def _stopped(sdl: Any) -> None:
+    sdl.SDL_QuitSubSystem(sdl.SDL_INIT_VIDEO)
+
+
+@cache
+def _library() -> Any:
+    try:
+        with warnings.catch_warnings():
+            # It tells of the library that it found by a warning.
+            warnings.simplefilter("ignore")
+            return importlib.import_module("sdl2")
+    except ImportError as cause:
+        install = "pip install 'slrig[screen]'"
+        message = f"backend sdl of the driver 'screen' needs PySDL2, which cannot be imported ({cause}): {install}"
+        raise LibraryMissingError(message, install=install) from cause
+
+
+def _outlive_the_server(display: int) -> None:
+    """Keep Xlib from ending the whole process when the server ends (libX11 1.7 and later) or refuses a request."""
+    with suppress(OSError, AttributeError):
+        xlib = ctypes.CDLL("libX11.so.6")
+        xlib.XSetIOErrorExitHandler.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p]
+        xlib.XSetIOErrorExitHandler.restype = None
+        xlib.XSetIOErrorExitHandler(display, _GOES_ON, None)
+        xlib.XSetErrorHandler.argtypes, xlib.XSetErrorHandler.restype = [ctypes.c_void_p], ctypes.c_void_p
+        xlib.XSetErrorHandler(_PASSES_OVER)
+
+
+_GOES_ON = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _data: None)
+_PASSES_OVER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(lambda _display, _error: 0)

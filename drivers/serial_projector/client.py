@@ -1,0 +1,306 @@
+"""A box as the host knows it: a session, its verbs as methods, and its clock. Safe between threads."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+from drivers.serial_projector.clock import DeviceClock
+from drivers.serial_projector.frames import Event, Mode, Refused
+from drivers.serial_projector.link import Link, RefusedError, Reply, SilentError
+from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
+
+PROTOCOL = 1
+_PINGS = 8
+_FAREWELL_S = 0.6
+_AGAIN_S = 0.1
+_MANY = 10**6
+
+_Values = TypeVar("_Values", "Box", "Status")
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the host asks a box to keep to, as HELLO says it."""
+
+    watchdog_ms: int
+    on_ms: int
+    duty: int
+    bright: int
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """What a box says of itself in HELLO: the fields of the protocol, under their names there."""
+
+    sltp: int
+    model: str
+    fw: str
+    w: int
+    h: int
+    max: int
+    boot: str
+    watchdog_ms: int
+    on_ms: int
+    duty: int
+    bright: int
+    light_us: int
+    error_us: int
+    gap_us: int
+    hold_us: int
+    least_us: int
+
+    @property
+    def light_s(self) -> float:
+        """The longest time from a command to its light."""
+        return self.light_us / 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a box does now."""
+
+    state: str
+    loaded: int
+    first: int
+    index: int
+    frames: int
+    shows: int
+    fault: int
+    t_us: int
+
+
+class Client:
+    """A session with one box.
+
+    Raises
+    ------
+    DeviceBusyError
+        Another host is in a session with it.
+    UnsupportedByDeviceError
+        It cannot keep to the limits.
+    DeviceError
+        Nothing that speaks SLTP/1 answers.
+    DeviceGoneError
+        The port is gone.
+    """
+
+    def __init__(self, link: Link, limits: Limits, *, label: str, open_s: float) -> None:
+        self._link = link
+        self._limits = limits
+        self._label = label
+        self._open_s = open_s
+        self._lock = threading.RLock()
+        self._clock = DeviceClock()
+        self._abandoned = threading.Event()
+        self._box = self._greeted()
+
+    @property
+    def box(self) -> Box:
+        """What the box said of itself when it was last greeted."""
+        return self._box
+
+    @property
+    def link(self) -> Link:
+        """What the session runs over."""
+        return self._link
+
+    def greet(self) -> Box:
+        """Begin the session again, after the box restarted: it is dark, and holds nothing. Raises as opening does."""
+        with self._lock:
+            self._clock = DeviceClock()
+            self._box = self._greeted()
+            return self._box
+
+    def ping(self) -> tuple[str, int]:
+        """What the box does, and the fault that it went dark for (0: none)."""
+        with self._lock:
+            return self._pinged(self._link.ask("PING"))
+
+    def beat(self) -> None:
+        """Tell the box that its host lives, unless a command is under way, which tells it, too. Tried once."""
+        if self._abandoned.is_set() or not self._lock.acquire(blocking=False):
+            return
+        try:
+            with suppress(SilentError, RefusedError):
+                self._pinged(self._link.ask("PING", tries=1))
+        finally:
+            self._lock.release()
+
+    def load(self, count: int, crc32: int) -> None:
+        """Have the box take a run of its patterns."""
+        self._ask("LOAD", count, f"{crc32:08X}")
+        self._abandoned.clear()
+
+    def show(self, index: int) -> tuple[int, int]:
+        """Light a pattern; return (t_visible_ns, t_err_ns), CLOCK_MONOTONIC."""
+        with self._lock:
+            reply = self._ask("SHOW", index, takes_s=self._box.light_s)
+            return self._lit(reply, index)
+
+    def sequence(self, first: int, count: int, exposure_us: int, period_us: int, mode: Mode) -> None:
+        """Begin a sequence. Its events are collected from now on."""
+        with self._lock:
+            self._link.events.clear()
+            self._ask("SEQ", first, count, exposure_us, period_us, int(mode), takes_s=self._box.light_s)
+
+    def trigger(self, index: int) -> tuple[int, int]:
+        """Light the next pattern of a sequence that waits for it, which is `index`; return as `show` does."""
+        with self._lock:
+            return self._lit(self._ask("TRIG", takes_s=self._box.light_s), index)
+
+    def stop(self) -> int:
+        """End a sequence, dark; return how many of its patterns were lit."""
+        return _whole(self._ask("STOP"), 0)
+
+    def blank(self) -> None:
+        """Go dark."""
+        self._ask("BLANK")
+
+    def status(self) -> Status:
+        """What the box does now."""
+        return _keyed(Status, self._ask("STATUS").words)
+
+    def frames(self) -> tuple[tuple[int, int, int], ...]:
+        """(index, t_visible_ns, t_err_ns) of the patterns of the last sequence, as far as their events came in."""
+        with self._lock:
+            found = []
+            for event in self._link.events:
+                match event:
+                    case Event("FRAME", (index, t_us)) if index.isdigit() and t_us.isdigit():
+                        t_ns, error_ns = self._clock.host_ns(int(t_us))
+                        found.append((int(index), t_ns, error_ns + self._box.error_us * 1000))
+            return tuple(found)
+
+    def abandon(self) -> None:
+        """Leave the box to its watchdog: it hears nothing of this host any more but commands, until `load`."""
+        self._abandoned.set()
+
+    def close(self) -> None:
+        """Go dark, end the session, let the port go; from any thread, in any state. Idempotent; never raises."""
+        self._link.closing.set()
+        self._abandoned.set()
+        with self._lock:
+            with suppress(SlrigError):
+                for verb in ("BLANK", "BYE"):
+                    self._link.ask(verb, deadline_s=_FAREWELL_S, while_closing=True)
+            self._link.port.close()
+
+    def _ask(self, verb: str, *numbers: int | str, takes_s: float = 0.0) -> Reply:
+        with self._lock:
+            return self._link.ask(verb, *numbers, takes_s=takes_s)
+
+    def _pinged(self, reply: Reply) -> tuple[str, int]:
+        self._clock.note(_whole(reply, 0), reply.sent_ns, reply.received_ns)
+        return reply.words[1] if len(reply.words) > 1 else "", _whole(reply, 2)
+
+    def _lit(self, reply: Reply, index: int) -> tuple[int, int]:
+        if _whole(reply, 0) != index:
+            message = (
+                f"asked the trigger box on {self._label} for pattern {index}, found {reply.words}; its firmware errs"
+            )
+            raise DeviceError(message)
+        t_us = _whole(reply, 1)
+        self._clock.note(t_us, reply.sent_ns, reply.received_ns)
+        t_ns, error_ns = self._clock.host_ns(t_us)
+        return t_ns, error_ns + self._box.error_us * 1000
+
+    def _greeted(self) -> Box:
+        """Say HELLO until the box has started; many boards restart when their port is opened."""
+        until_s = time.monotonic() + self._open_s
+        while True:
+            left_s = until_s - time.monotonic()
+            try:
+                box = self._checked(self._said_hello(max(left_s, self._link.reply_s)))
+                for _ in range(_PINGS):
+                    self._pinged(self._link.ask("PING"))
+            except RefusedError as refusal:
+                if refusal.code == Refused.RANGE:
+                    raise UnsupportedByDeviceError(self._beyond(refusal)) from refusal
+                if refusal.code not in {Refused.BUSY, Refused.SESSION}:
+                    raise
+                # Another host's session may be about to end; and a box that restarts just now has forgotten ours.
+                if left_s > 0 and not self._link.closing.wait(_AGAIN_S):
+                    continue
+                raise DeviceBusyError(self._held(" ".join(refusal.words))) from refusal
+            return box
+
+    def _said_hello(self, deadline_s: float) -> Box:
+        limits = self._limits
+        asked = (PROTOCOL, limits.watchdog_ms, limits.on_ms, limits.duty, limits.bright)
+        try:
+            reply = self._link.ask("HELLO", *asked, tries=_MANY, deadline_s=deadline_s)
+        except SilentError as silence:
+            if self._link.tally.others:
+                raise DeviceBusyError(self._held("somebody else's answers came in")) from silence
+            raise DeviceError(self._unspoken(silence)) from silence
+        return _keyed(Box, reply.words)
+
+    def _checked(self, box: Box) -> Box:
+        """What the box says of itself. Raises DeviceError, UnsupportedByDeviceError."""
+        beyond = [
+            f"{field.name} {getattr(box, field.name)} instead of {getattr(self._limits, field.name)}"
+            for field in fields(Limits)
+            if getattr(box, field.name) > getattr(self._limits, field.name)
+        ]
+        if min(box.w, box.h, box.watchdog_ms, box.on_ms) < 1:
+            message = f"the trigger box on {self._label} describes itself as {box}; its firmware errs"
+            raise DeviceError(message)
+        if box.sltp != PROTOCOL or beyond:
+            message = (
+                f"the trigger box on {self._label} ({box.model} {box.fw}) speaks SLTP/{box.sltp} and grants "
+                f"{', '.join(beyond) or 'what was asked'}; flash firmware of SLTP/{PROTOCOL} that keeps to them"
+            )
+            raise UnsupportedByDeviceError(message)
+        return box
+
+    def _held(self, by: str) -> str:
+        return (
+            f"the trigger box on {self._label} is in a session with another host ({by}); end that one, or wait for its "
+            "watchdog if it has died"
+        )
+
+    def _beyond(self, refusal: RefusedError) -> str:
+        return (
+            f"the trigger box on {self._label} does not grant {self._limits}: {' '.join(refusal.words)}; a box that "
+            "cannot dim takes brightness 1 only, else see watchdog_s, max_on_s and max_duty"
+        )
+
+    def _unspoken(self, silence: SilentError) -> str:
+        return (
+            f"nothing on {self._label} answered as a trigger box that speaks SLTP/{PROTOCOL}: {silence}. Is it the "
+            "right port (slrig devices), and is the firmware on the box?"
+        )
+
+
+def _whole(reply: Reply, index: int) -> int:
+    """Word `index` of an answer as a number. Raises DeviceError."""
+    try:
+        return int(reply.words[index])
+    except (IndexError, ValueError) as error:
+        message = f"the trigger box answered {' '.join(reply.words)!r}, expected a number at {index}; its firmware errs"
+        raise DeviceError(message) from error
+
+
+def _keyed(model: type[_Values], words: tuple[str, ...]) -> _Values:
+    """Make a value of `key=value` words; keys that newer firmware adds are passed over. Raises DeviceError."""
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    values: dict[str, Any] = {}
+    faults = []
+    for field in fields(model):
+        text = given.get(field.name)
+        if text is None:
+            faults.append(f"no {field.name}")
+        elif field.type == "str":
+            values[field.name] = text
+        elif text.isdigit():
+            values[field.name] = int(text)
+        else:
+            faults.append(f"{field.name}={text}, no whole number")
+    if faults:
+        message = f"the trigger box answered {' '.join(words)!r}: {', '.join(faults)}; its firmware errs"
+        raise DeviceError(message)
+    return model(**values)

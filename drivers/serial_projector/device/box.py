@@ -1,0 +1,104 @@
+"""What the protocol core knows of a box: what it is asked for, what it says of itself, and how long it was lit.
+
+Runs unchanged in MicroPython and in CPython.
+"""
+
+# MicroPython has neither `__future__` nor `abc` or `dataclasses`: plain classes do.
+
+DUTY_WINDOW_US = 10000000
+DUTY_SLOTS = 20
+DUTY_SLACK = 20
+"""Permille of the window by which the light may overrun: no box switches without a delay."""
+
+
+class HardwareError(Exception):
+    """The light engine did not do what it was told. Raised by the methods of a `Hardware`."""
+
+
+class Hardware:
+    """What the core asks of a box. Every method may raise `HardwareError`; then the box goes dark."""
+
+    def time_us(self) -> int:
+        """Microseconds since the box started; never wraps, never goes back."""
+        raise NotImplementedError
+
+    def select(self, pattern: int) -> None:
+        """Make this pattern of the flash the current one, and return once it is. It is dark until `light`."""
+        raise NotImplementedError
+
+    def light(self) -> None:
+        """Light the current pattern, and return once it is on the scene."""
+        raise NotImplementedError
+
+    def dark(self) -> None:
+        """Put the light out, and return once it is."""
+        raise NotImplementedError
+
+    def pulse(self) -> None:
+        """Begin one trigger pulse to the cameras."""
+        raise NotImplementedError
+
+    def dim(self, permille: int) -> int:
+        """Set the brightness; return what it is now. A box that cannot dim returns 1000."""
+        raise NotImplementedError
+
+
+class Description:
+    """What a box is, as it says in HELLO, and the CRC-32 of every pattern in its flash.
+
+    light_us : longest time from a command to its light. error_us : error of its time stamps. gap_us : least time from
+    the end of an exposure to the next one. hold_us : how long a pattern of a sequence stays lit beyond its exposure.
+    least_us : shortest exposure. on_ms, duty, watchdog_ms : the most that it grants.
+    """
+
+    def __init__(
+        self,
+        model: str,
+        firmware: str,
+        width_px: int,
+        height_px: int,
+        crc32: list[int],
+        *,
+        light_us: int,
+        error_us: int,
+        gap_us: int,
+        hold_us: int,
+        least_us: int,
+        watchdog_ms: int = 10000,
+        on_ms: int = 3600000,
+        duty: int = 1000,
+    ) -> None:
+        self.model, self.firmware = model, firmware
+        self.width_px, self.height_px = width_px, height_px
+        self.crc32 = b"".join([value.to_bytes(4, "big") for value in crc32])
+        self.count = len(crc32)
+        self.light_us, self.error_us = light_us, error_us
+        self.gap_us, self.hold_us, self.least_us = gap_us, hold_us, least_us
+        self.watchdog_ms, self.on_ms, self.duty = watchdog_ms, on_ms, duty
+
+
+class LightTime:
+    """How long it was lit in the last 10 s, in slots of half a second."""
+
+    def __init__(self) -> None:
+        self.slots = [0] * DUTY_SLOTS
+        self.until_us = 0
+
+    def note(self, now_us: int, lit: bool) -> None:
+        """It was lit, or dark, since the last note."""
+        slot_us = DUTY_WINDOW_US // DUTY_SLOTS
+        if now_us - self.until_us > DUTY_WINDOW_US:
+            self.slots = [slot_us if lit else 0] * DUTY_SLOTS
+            self.until_us = now_us
+        while self.until_us < now_us:
+            at = self.until_us // slot_us
+            step_us = min(now_us, (at + 1) * slot_us) - self.until_us
+            if self.until_us % slot_us == 0:
+                self.slots[at % DUTY_SLOTS] = 0
+            if lit:
+                self.slots[at % DUTY_SLOTS] += step_us
+            self.until_us += step_us
+
+    def left_us(self, duty: int) -> int:
+        """How long it may stay lit now."""
+        return min(duty + DUTY_SLACK, 1000) * (DUTY_WINDOW_US // 1000) - sum(self.slots)

@@ -1,0 +1,231 @@
+"""The pins of the reference trigger box: a Raspberry Pi Pico (RP2040) with MicroPython, and a light engine that steps.
+
+The engine keeps its patterns in a flash of its own: a pulse on STEP makes the next one current, a pulse on HOME the
+first one, and its light follows LAMP. Engines whose patterns are advanced by a trigger input and whose LED has an
+enable or dimming input are wired so.
+
+    GP2  STEP    out, engine's trigger input      GP5  CAMERA  out, cameras' trigger inputs (opto-isolated)
+    GP3  HOME    out, engine's reset input        GP6  READY   in, engine shows what it was stepped to; None: settles
+    GP4  LAMP    out, LED enable or dimming input, with a resistor of 10 kΩ to ground
+
+The resistor on LAMP is what keeps it dark while the box starts, restarts or has no firmware: a pin is an input then.
+A watchdog timer restarts the box when this program stands still for a second. This program does not listen to Ctrl-C:
+to change its files, start the box with SERVICE (GP15) on ground, and it ends at once.
+"""
+
+# MicroPython has no `__future__`, its modules have no types, and the words of `asm_pio` are no names of this module.
+# ruff: noqa: F821, ANN001, ANN202
+# mypy: disable-error-code="name-defined, no-untyped-def, no-untyped-call, untyped-decorator, type-arg"
+# mypy: disable-error-code="call-overload, redundant-expr, import-not-found"
+
+try:
+    from drivers.serial_projector.device.box import Description, Hardware, HardwareError
+    from drivers.serial_projector.device.protocol import Device
+except ImportError:
+    # On a box the files lie side by side.
+    from box import Description, Hardware, HardwareError  # type: ignore[no-redef]
+    from protocol import Device  # type: ignore[no-redef]
+
+MODEL, FIRMWARE = "slrig-pico", "1.0.0"
+WIDTH_PX, HEIGHT_PX = 912, 1140
+
+STEP_PIN, HOME_PIN, LAMP_PIN, CAMERA_PIN, READY_PIN, SERVICE_PIN = 2, 3, 4, 5, 6, 15
+
+STEP_US = 50
+"""Length of a pulse on STEP or HOME, and of the pause after it."""
+
+SETTLE_US = 500
+"""From the last step to a pattern that stands still, where there is no READY."""
+
+READY_US = 20000
+"""Longest wait for READY."""
+
+LAMP_US = 20
+"""From LAMP to light."""
+
+PULSE_US = 100
+"""Length of the cameras' trigger pulse."""
+
+HOLD_US = 500
+"""How long a pattern of a sequence stays lit beyond its exposure: longer than this program is ever late."""
+
+LEAST_US = 200
+ERROR_US = 50
+DIM_HZ = 100000
+RESTART_MS = 1000
+MOST_DUTY, MOST_ON_MS = 1000, 3600000
+TIDY_AFTER = 64
+
+
+def described(patterns: dict) -> Description:
+    """What HELLO says, from the patterns.json that was written with the engine's images."""
+    fits = patterns.get("size_px") == [WIDTH_PX, HEIGHT_PX]
+    crc32 = [int(each, 16) for each in patterns["crc32"]] if fits else []
+    return Description(
+        MODEL,
+        FIRMWARE,
+        WIDTH_PX,
+        HEIGHT_PX,
+        crc32,
+        light_us=2 * STEP_US * (len(crc32) + 1) + max(SETTLE_US, READY_US) + LAMP_US,
+        error_us=ERROR_US,
+        gap_us=HOLD_US + 2 * STEP_US + SETTLE_US + 1000,
+        hold_us=HOLD_US,
+        least_us=LEAST_US,
+        duty=MOST_DUTY,
+        on_ms=MOST_ON_MS,
+    )
+
+
+class Board(Hardware):
+    """The pins. machine, rp2, time : MicroPython's modules."""
+
+    def __init__(self, machine, rp2, time) -> None:
+        self._time = time
+        self._lamp = machine.PWM(machine.Pin(LAMP_PIN), freq=DIM_HZ, duty_u16=0)
+        self._step = machine.Pin(STEP_PIN, machine.Pin.OUT, value=0)
+        self._home = machine.Pin(HOME_PIN, machine.Pin.OUT, value=0)
+        self._ready = None if READY_PIN is None else machine.Pin(READY_PIN, machine.Pin.IN, machine.Pin.PULL_DOWN)
+        self._camera = _pulses(machine, rp2)
+        self._level = 65535
+        self._position = -1
+        self._ticks = time.ticks_us()
+        self._us = 0
+
+    def time_us(self) -> int:
+        """See `Hardware`. The board's own counter wraps after 18 minutes."""
+        ticks = self._time.ticks_us()
+        self._us += self._time.ticks_diff(ticks, self._ticks)
+        self._ticks = ticks
+        return self._us
+
+    def select(self, pattern: int) -> None:
+        """See `Hardware`."""
+        if self._position < 0 or pattern < self._position:
+            self._send(self._home)
+            self._position = 0
+        while self._position < pattern:
+            self._send(self._step)
+            self._position += 1
+        if self._ready is None:
+            self._time.sleep_us(SETTLE_US)
+            return
+        begun_us = self.time_us()
+        while not self._ready.value():
+            if self.time_us() - begun_us > READY_US:
+                # Where it stands is unknown: home first, next time.
+                self._position = -1
+                raise HardwareError("the engine is not READY")
+
+    def light(self) -> None:
+        """See `Hardware`."""
+        self._lamp.duty_u16(self._level)
+        self._time.sleep_us(LAMP_US)
+
+    def dark(self) -> None:
+        """See `Hardware`."""
+        self._lamp.duty_u16(0)
+        self._time.sleep_us(LAMP_US)
+
+    def pulse(self) -> None:
+        """See `Hardware`. The state machine ends it, so nobody waits."""
+        self._camera.put(PULSE_US)
+
+    def dim(self, permille: int) -> int:
+        """See `Hardware`."""
+        self._level = 65535 * permille // 1000
+        return permille
+
+    def _send(self, pin) -> None:
+        pin.value(1)
+        self._time.sleep_us(STEP_US)
+        pin.value(0)
+        self._time.sleep_us(STEP_US)
+
+
+def _pulses(machine, rp2):
+    """A state machine that makes one pulse, of so many µs as it is given."""
+
+    @rp2.asm_pio(set_init=rp2.PIO.OUT_LOW)
+    def program() -> None:
+        pull(block)
+        mov(x, osr)
+        set(pins, 1)
+        label("on")
+        jmp(x_dec, "on")
+        set(pins, 0)
+
+    camera = rp2.StateMachine(0, program, freq=1000000, set_base=machine.Pin(CAMERA_PIN))
+    camera.active(1)
+    return camera
+
+
+class UsbPort:
+    """The board's USB serial port. select, sys : MicroPython's modules."""
+
+    def __init__(self, select, sys) -> None:
+        self._in, self._out = sys.stdin.buffer, sys.stdout.buffer
+        self._poll = select.poll()
+        self._poll.register(sys.stdin, select.POLLIN)
+
+    def read(self) -> bytes:
+        """What came in; does not wait."""
+        data = b""
+        while len(data) < 64 and self._poll.poll(0):
+            data += self._in.read(1)
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send it."""
+        self._out.write(data)
+
+
+def serve(device: Device, port: UsbPort, alive, tidy) -> None:
+    """Run a box for ever. alive : feeds the watchdog timer. tidy : collects garbage, where that disturbs least."""
+    sent = 0
+    while True:
+        alive()
+        data = port.read()
+        out = device.feed(data) if data else device.poll()
+        if out:
+            port.write(out)
+            sent += 1
+            # Memory is tidied by choice, in the dark: of itself it would happen in the middle of an exposure.
+            if sent >= TIDY_AFTER and device.wait_us() < 0:
+                tidy()
+                sent = 0
+
+
+def run() -> None:
+    """Be a trigger box. Called on the board only."""
+    # ruff: noqa: I001 - what only the board has
+    import gc
+    import json
+    import machine
+    import micropython
+    import os
+    import rp2
+    import select
+    import sys
+    import time
+
+    if not machine.Pin(SERVICE_PIN, machine.Pin.IN, machine.Pin.PULL_UP).value():
+        return
+    # Bytes from the host are never a keyboard interrupt.
+    micropython.kbd_intr(-1)
+    board = Board(machine, rp2, time)
+    try:
+        with open("patterns.json") as file:  # noqa: PTH123 - MicroPython has no pathlib
+            patterns = json.load(file)
+    except (OSError, ValueError):
+        patterns = {}
+    device = Device(board, described(patterns), int.from_bytes(os.urandom(4), "big"))
+    watchdog = machine.WDT(timeout=RESTART_MS)
+    try:
+        serve(device, UsbPort(select, sys), watchdog.feed, gc.collect)
+    finally:
+        board.dark()
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,339 @@
+"""SLTP/1 as a trigger box speaks it: bytes in, bytes out, and a `Hardware` between them and the light.
+
+Pure: no pin, no port, no clock of its own. Runs unchanged in MicroPython (1.20 or newer) and in CPython. What the
+verbs, fields and codes mean is in the docstring of `drivers.serial_projector`.
+"""
+
+# MicroPython has no `__future__`.
+
+import binascii
+
+try:
+    from drivers.serial_projector.device import wire
+    from drivers.serial_projector.device.box import Description, Hardware, HardwareError, LightTime
+except ImportError:
+    # On a box the files lie side by side.
+    import wire  # type: ignore[import-not-found, no-redef]
+    from box import Description, Hardware, HardwareError, LightTime  # type: ignore[import-not-found, no-redef]
+
+LEAST_WATCHDOG_MS = 50
+_UNDER_LIGHT = ("lit", "playing", "waiting")
+
+
+class Refusal(Exception):  # noqa: N818 - an answer, not a failure of the box
+    """The answer to a command that is not obeyed."""
+
+    def __init__(self, code: int, words: str) -> None:
+        super().__init__(words)
+        self.code, self.words = code, words
+
+
+class Device:
+    """A box. Give it every byte that comes in (`feed`), let it look at its clock as often as possible (`poll`), and
+    send what both return.
+    """
+
+    def __init__(self, hardware: Hardware, description: Description, boot_id: int) -> None:
+        self._hardware, self._about, self._boot = hardware, description, boot_id
+        self._buffer = b""
+        self._out: list[bytes] = []
+        self._session = ""
+        self._open = False
+        self._number = -1
+        self._reply = b""
+        self._heard_us = 0
+        self._watchdog_us, self._on_us, self._duty = LEAST_WATCHDOG_MS * 1000, 0, 0
+        self._first = self._count = 0
+        self._state = "idle"
+        self._fault = 0
+        self._light_time = LightTime()
+        self._lit = False
+        self._lit_us = 0
+        self._owes_dark = False
+        self._index = -1
+        self._shows = 0
+        self._sequence = (0, 0, 0, 0)
+        self._next_us = self._off_us = 0
+        self._frames = 0
+        self._dark()
+
+    def feed(self, data: bytes) -> bytes:
+        """Take what came from the host; return what is to be sent."""
+        self._look()
+        self._buffer += data
+        while True:
+            end = self._buffer.find(b"\n")
+            if end < 0:
+                break
+            line, self._buffer = self._buffer[:end], self._buffer[end + 1 :]
+            if line:
+                self._out.append(self._answer(line))
+        if len(self._buffer) > wire.MOST_LINE_BYTES:
+            self._buffer = b""
+        return self._sent()
+
+    def poll(self) -> bytes:
+        """Do what is due by now; return what is to be sent."""
+        self._look()
+        return self._sent()
+
+    def wait_us(self) -> int:
+        """How long until `poll` has something to do, at the latest; -1 if only a command can change that."""
+        now_us = self._hardware.time_us()
+        due = []
+        if self._owes_dark:
+            due.append(now_us + 1000)
+        if self._lit:
+            due.append(self._lit_us + self._on_us)
+            if self._duty < 1000:
+                due.append(now_us + max(self._light_time.left_us(self._duty), 1))
+        if self._state in _UNDER_LIGHT:
+            due.append(self._heard_us + self._watchdog_us)
+        if self._state == "playing" or (self._state == "waiting" and self._lit):
+            due.append(self._off_us if self._lit else self._next_us)
+        return max(min(due) - now_us, 0) if due else -1
+
+    def _sent(self) -> bytes:
+        out, self._out = self._out, []
+        return b"".join(out)
+
+    def _event(self, text: str) -> None:
+        self._out.append(wire.framed("! " + text))
+
+    # What happens by itself.
+
+    def _look(self) -> None:
+        now_us = self._hardware.time_us()
+        self._light_time.note(now_us, self._lit)
+        if self._owes_dark:
+            self._dark()
+        if self._state in _UNDER_LIGHT and now_us - self._heard_us > self._watchdog_us:
+            self._trip(wire.WATCHDOG)
+        elif self._lit and now_us - self._lit_us > self._on_us:
+            self._trip(wire.ON_TIME)
+        elif self._lit and self._light_used_up():
+            self._trip(wire.DUTY)
+        elif self._state in ("playing", "waiting"):
+            try:
+                self._go_on(now_us)
+            except HardwareError:
+                self._trip(wire.LIGHT)
+
+    def _go_on(self, now_us: int) -> None:
+        """A sequence's next step, if it is due."""
+        first, count, _, period_us = self._sequence
+        if self._lit and now_us >= self._off_us:
+            self._dark()
+            if self._frames == count:
+                self._state = "ready"
+                self._event(f"DONE {count}")
+                return
+            self._hardware.select(self._first + first + self._frames)
+            self._next_us = max(self._next_us + period_us, self._hardware.time_us())
+        elif not self._lit and self._state == "playing" and now_us >= self._next_us:
+            self._light_frame()
+
+    def _light_frame(self) -> int:
+        """Light the selected pattern of a sequence, and tell the cameras."""
+        first, _, exposure_us, _ = self._sequence
+        t_us = self._light()
+        self._hardware.pulse()
+        self._off_us = self._hardware.time_us() + exposure_us + self._about.hold_us
+        self._index = first + self._frames
+        self._frames += 1
+        self._event(f"FRAME {self._index} {t_us}")
+        return t_us
+
+    def _light(self) -> int:
+        self._hardware.light()
+        now_us = self._hardware.time_us()
+        self._light_time.note(now_us, False)
+        self._lit, self._lit_us = True, now_us
+        self._shows += 1
+        return now_us
+
+    def _dark(self) -> None:
+        self._owes_dark = True
+        try:
+            self._hardware.dark()
+        except HardwareError:
+            # Tried again at every look, until it obeys.
+            if self._fault != wire.LIGHT:
+                self._fault = wire.LIGHT
+                self._event(f"FAULT {wire.LIGHT}")
+            return
+        self._owes_dark = False
+        self._light_time.note(self._hardware.time_us(), self._lit)
+        self._lit = False
+
+    def _trip(self, code: int) -> None:
+        self._dark()
+        self._state = "ready" if self._count else "idle"
+        self._fault = code
+        self._event(f"FAULT {code}")
+
+    # What the host asks for.
+
+    def _answer(self, line: bytes) -> bytes:
+        text = wire.unframed(line)
+        words = text.split(" ") if text is not None else []
+        if len(words) < 3 or len(words[0]) != 4 or not words[1].isdigit() or int(words[1]) >= wire.NUMBERS:
+            return wire.framed(f"? ERR {wire.FRAMING} bad frame")
+        session, number, verb = words[0], int(words[1]), words[2]
+        now_us = self._hardware.time_us()
+        if session == self._session:
+            # The host lives, even if this is not news.
+            self._heard_us = now_us
+            ahead = (number - self._number) % wire.NUMBERS
+            if ahead == 0:
+                return self._reply
+            if ahead >= wire.NUMBERS // 2:
+                return wire.framed(f"{session} {number} ERR {wire.STATE} number {number} after {self._number}")
+        if session != self._session or not self._open:
+            silent_us = now_us - self._heard_us
+            if self._open and silent_us <= self._watchdog_us:
+                return wire.framed(f"{session} {number} ERR {wire.BUSY} held by {self._session}")
+            if verb != "HELLO":
+                return wire.framed(f"{session} {number} ERR {wire.SESSION} say HELLO")
+            self._session, self._open, self._heard_us = session, False, now_us
+        self._number = number
+        try:
+            done = self._act(verb, words[3:])
+            answer = f"{session} {number} OK {done}" if done else f"{session} {number} OK"
+        except Refusal as refusal:
+            answer = f"{session} {number} ERR {refusal.code} {refusal.words}"
+        except HardwareError as error:
+            self._trip(wire.LIGHT)
+            answer = f"{session} {number} ERR {wire.HARDWARE} {error}"
+        self._reply = wire.framed(answer)
+        return self._reply
+
+    def _act(self, verb: str, words: list[str]) -> str:
+        wanted = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5}.get(verb, 0)
+        if verb not in ("HELLO", "PING", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"):
+            raise Refusal(wire.VERB, verb)
+        try:
+            numbers = [int(word, 16) if (verb, at) == ("LOAD", 1) else int(word) for at, word in enumerate(words)]
+        except ValueError:
+            numbers = []
+        if len(numbers) != len(words) or len(words) != wanted or (numbers and min(numbers) < 0):
+            raise Refusal(wire.RANGE, f"{verb} takes {wanted} numbers")
+        answer: str = getattr(self, "_" + verb.lower())(*numbers)
+        return answer
+
+    def _hello(self, version: int, watchdog_ms: int, on_ms: int, duty: int, bright: int) -> str:
+        about = self._about
+        self._darken("idle")
+        self._open = False
+        if version != wire.VERSION:
+            raise Refusal(wire.RANGE, f"speaks SLTP/{wire.VERSION}")
+        if watchdog_ms < LEAST_WATCHDOG_MS or on_ms < 1 or not 1 <= duty <= 1000 or not 1 <= bright <= 1000:
+            raise Refusal(wire.RANGE, "limits")
+        granted = self._hardware.dim(bright)
+        if granted > bright:
+            raise Refusal(wire.RANGE, f"bright {granted}")
+        watchdog_ms, on_ms, duty = min(watchdog_ms, about.watchdog_ms), min(on_ms, about.on_ms), min(duty, about.duty)
+        self._watchdog_us, self._on_us, self._duty = watchdog_ms * 1000, on_ms * 1000, duty
+        self._open = True
+        return (
+            f"sltp={wire.VERSION} model={about.model} fw={about.firmware} w={about.width_px} h={about.height_px} "
+            f"max={about.count} boot={self._boot:08X} watchdog_ms={watchdog_ms} on_ms={on_ms} duty={duty} "
+            f"bright={granted} light_us={about.light_us} error_us={about.error_us} gap_us={about.gap_us} "
+            f"hold_us={about.hold_us} least_us={about.least_us}"
+        )
+
+    def _ping(self) -> str:
+        return f"{self._hardware.time_us()} {self._state} {self._fault}"
+
+    def _load(self, count: int, crc32: int) -> str:
+        self._darken("idle")
+        about = self._about
+        if not 1 <= count <= about.count:
+            raise Refusal(wire.RANGE, f"{count} of {about.count}")
+        for first in range(about.count - count + 1):
+            if binascii.crc32(about.crc32[4 * first : 4 * (first + count)]) == crc32:
+                self._first, self._count, self._state = first, count, "ready"
+                return f"{count} {first}"
+        raise Refusal(wire.PATTERNS, f"{about.count} {binascii.crc32(about.crc32):08X}")
+
+    def _show(self, index: int) -> str:
+        self._require_light(index)
+        self._index = index
+        self._dark()
+        self._state = "ready"
+        self._hardware.select(self._first + index)
+        t_us = self._light()
+        self._state = "lit"
+        return f"{index} {t_us}"
+
+    def _seq(self, first: int, count: int, exposure_us: int, period_us: int, mode: int) -> str:
+        about = self._about
+        self._require_light(first)
+        if not 1 <= count <= self._count - first or mode not in (wire.FREE, wire.STEP):
+            raise Refusal(wire.RANGE, f"{count} patterns from {first}, mode {mode}")
+        if not about.least_us <= exposure_us <= self._on_us - about.hold_us or period_us < exposure_us + about.gap_us:
+            raise Refusal(wire.RANGE, f"exposure {exposure_us} period {period_us}")
+        if mode == wire.FREE and (exposure_us + about.hold_us) * 1000 > self._duty * period_us:
+            raise Refusal(wire.LIMIT, f"duty {self._duty}")
+        self._darken("ready")
+        self._hardware.select(self._first + first)
+        self._sequence, self._frames = (first, count, exposure_us, period_us), 0
+        self._next_us = self._hardware.time_us() + about.gap_us
+        self._state = "playing" if mode == wire.FREE else "waiting"
+        return f"{self._next_us}"
+
+    def _trig(self) -> str:
+        self._require_no_fault()
+        if self._state != "waiting" or self._lit:
+            raise Refusal(wire.STATE, "nothing waits" if self._state != "waiting" else "still lit")
+        self._require_duty()
+        t_us = self._light_frame()
+        return f"{self._index} {t_us}"
+
+    def _stop(self) -> str:
+        self._darken("ready" if self._count else "idle")
+        return f"{self._frames}"
+
+    def _blank(self) -> str:
+        self._darken("ready" if self._count else "idle")
+        return ""
+
+    def _bye(self) -> str:
+        self._darken("idle")
+        self._open = False
+        return ""
+
+    def _status(self) -> str:
+        return (
+            f"state={self._state} loaded={self._count} first={self._first} index={self._index} frames={self._frames} "
+            f"shows={self._shows} fault={self._fault} t_us={self._hardware.time_us()}"
+        )
+
+    def _require_light(self, index: int) -> None:
+        self._require_no_fault()
+        if not self._count or self._state in ("playing", "waiting"):
+            raise Refusal(wire.STATE, self._state)
+        if not 0 <= index < self._count:
+            raise Refusal(wire.RANGE, f"{index} of {self._count}")
+        self._require_duty()
+
+    def _require_no_fault(self) -> None:
+        if self._fault:
+            raise Refusal(wire.FAULT, f"{self._fault}")
+
+    def _require_duty(self) -> None:
+        if self._light_used_up():
+            raise Refusal(wire.LIMIT, f"duty {self._duty}")
+
+    def _light_used_up(self) -> bool:
+        return self._duty < 1000 and self._light_time.left_us(self._duty) <= 0
+
+    def _darken(self, state: str) -> None:
+        """End whatever goes on, by the host's wish: that also acknowledges a fault."""
+        self._state = state
+        if state == "idle":
+            self._first = self._count = 0
+        self._fault = 0
+        self._dark()
+        if self._owes_dark:
+            raise HardwareError("the light does not go out")

@@ -1,0 +1,43 @@
+"""The host's sign of life to a box: while it comes, the box's watchdog keeps the light."""
+
+from __future__ import annotations
+
+import threading
+
+from drivers.serial_projector.client import Client
+from slrig.errors import DeviceError, DeviceGoneError
+
+BEATS_PER_WATCHDOG = 5
+"""So many that a few lost ones, or a busy host, do not put the light out."""
+
+
+class KeepAlive:
+    """A thread that beats until it is stopped or the port is gone, except while the box is abandoned.
+
+    It says that the process lives, not that its owner thread does: a pattern that a stuck owner leaves lit is put out
+    by the box after `max_on_s`.
+    """
+
+    def __init__(self, client: Client, *, watchdog_s: float) -> None:
+        self._client = client
+        self._period_s = watchdog_s / BEATS_PER_WATCHDOG
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="serial projector", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End it. Idempotent; from any thread."""
+        self._stop.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._period_s):
+            try:
+                self._client.beat()
+            except DeviceGoneError:
+                # The owner's next command finds out, and says so.
+                return
+            except DeviceError:
+                # What the box answers is the owner's business; that it heard this is enough.
+                continue

@@ -1,0 +1,150 @@
+"""One command, one answer, over a line that loses and damages bytes: sent again until it is answered, obeyed once.
+
+A command that is sent again keeps its number, and the box answers a number that it has obeyed already with what it
+answered then. So an answer that is lost costs time, and never shows a pattern twice.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+
+from drivers.serial_projector.frames import NUMBERS, Answer, Event, Refused, Splitter, Unread, framed, parsed
+from drivers.serial_projector.port import SLICE_S, Port
+from slrig.errors import DeviceError, DeviceStateError
+
+MOST_TRIES = 12
+_EVENTS = 4096
+
+
+class RefusedError(DeviceError):
+    """The box answered, and does not obey. `code` is one of `Refused` (or a number that newer firmware knows)."""
+
+    def __init__(self, verb: str, code: int, words: tuple[str, ...]) -> None:
+        self.verb, self.code, self.words = verb, code, words
+        name = Refused(code).name.lower() if code in set(Refused) else "unknown"
+        super().__init__(f"the trigger box refused {verb}: error {code} ({name}) {' '.join(words)}".rstrip())
+
+
+class SilentError(DeviceError):
+    """No answer came, however often the command was sent: the box may have obeyed, or never heard of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What the box answered. It obeyed at some instant between `sent_ns` and `received_ns` (CLOCK_MONOTONIC)."""
+
+    words: tuple[str, ...]
+    sent_ns: int
+    received_ns: int
+
+
+@dataclass(slots=True)
+class Tally:
+    """What the line did: commands, sent again, damaged lines that came in, answers to somebody else."""
+
+    commands: int = 0
+    again: int = 0
+    damaged: int = 0
+    others: int = 0
+
+
+@dataclass(slots=True)
+class Link:
+    """Commands to one box. One thread at a time uses it; `closing` ends a wait from another one.
+
+    reply_s : how long an answer may take, beyond what the command itself takes. deadline_s : after which a command is
+    not sent again.
+    """
+
+    port: Port
+    reply_s: float
+    deadline_s: float
+    # So many that two hosts hardly share one; never the number of a session before.
+    session: str = field(default_factory=lambda: secrets.token_hex(2).upper())
+    closing: threading.Event = field(default_factory=threading.Event)
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=_EVENTS))
+    tally: Tally = field(default_factory=Tally)
+    _number: int = 0
+    _splitter: Splitter = field(default_factory=Splitter)
+    _waiting: deque[bytes] = field(default_factory=deque)
+
+    def ask(
+        self,
+        verb: str,
+        *numbers: int | str,
+        takes_s: float = 0.0,
+        tries: int = MOST_TRIES,
+        deadline_s: float | None = None,
+        while_closing: bool = False,
+    ) -> Reply:
+        """Send a command until it is answered; return the answer.
+
+        Parameters
+        ----------
+        takes_s
+            How long the box may be busy with it.
+        while_closing
+            Ask although `closing` is set.
+
+        Raises
+        ------
+        RefusedError
+            The box does not obey.
+        SilentError
+            No answer.
+        DeviceGoneError
+            The port is gone.
+        DeviceStateError
+            `closing` was set meanwhile.
+        """
+        self._number = (self._number + 1) % NUMBERS
+        line = framed(" ".join(map(str, (self.session, self._number, verb, *numbers))))
+        begun_s = time.monotonic()
+        until_s = begun_s + (self.deadline_s if deadline_s is None else deadline_s)
+        self.tally.commands += 1
+        first_ns = time.monotonic_ns()
+        sent = 0
+        while sent < tries and (sent == 0 or time.monotonic() < until_s):
+            self.port.write(line)
+            self.tally.again += sent > 0
+            sent += 1
+            answer = self._answer(time.monotonic() + self.reply_s + takes_s, while_closing)
+            if answer is not None:
+                if answer.code is not None:
+                    raise RefusedError(verb, answer.code, answer.words)
+                return Reply(answer.words, first_ns, time.monotonic_ns())
+        message = (
+            f"asked the trigger box for {verb} {sent} times in {time.monotonic() - begun_s:.2f} s, found no answer "
+            f"({self.tally.damaged} damaged lines so far); check its cable, its power and the baud rate"
+        )
+        raise SilentError(message)
+
+    def _answer(self, until_s: float, while_closing: bool) -> Answer | None:
+        """The answer to the command that was sent last; None when it is time to send it again."""
+        while True:
+            while self._waiting:
+                raw = self._waiting.popleft()
+                match parsed(raw):
+                    case Answer() as answer if answer.session != self.session:
+                        self.tally.others += 1
+                    case Answer() as answer if answer.number == self._number:
+                        return answer
+                    case Event() as event:
+                        self.events.append(event)
+                    case Unread():
+                        return None
+                    case None:
+                        self.tally.damaged += 1
+                        # That may have been it: a little longer, for what else is under way.
+                        until_s = min(until_s, time.monotonic() + SLICE_S)
+            if self.closing.is_set() and not while_closing:
+                message = "the projector was closed while it waited for the trigger box; open the rig again"
+                raise DeviceStateError(message)
+            left_s = until_s - time.monotonic()
+            if left_s <= 0:
+                return None
+            self._waiting.extend(self._splitter.lines(self.port.read(min(left_s, SLICE_S))))

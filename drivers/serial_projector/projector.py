@@ -1,0 +1,297 @@
+"""A trigger box as a projector: patterns in its flash, light by command, darkness whenever anything is in doubt."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from drivers.serial_projector.client import Client, Limits
+from drivers.serial_projector.frames import Fault, Mode, Refused
+from drivers.serial_projector.keeping import KeepAlive
+from drivers.serial_projector.link import Link, RefusedError
+from drivers.serial_projector.options import SerialProjectorOptions
+from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
+from drivers.serial_projector.port import Port
+from slrig.devices import ProjectorInfo, Shown, SystemClock
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
+from slrig.model import PatternSequence, Size
+
+_FAULTS = {
+    Fault.WATCHDOG: "it heard nothing from this host for watchdog_s: the host was too busy or the cable is bad; raise "
+    "watchdog_s in the rig file, or give the host less to do",
+    Fault.ON_TIME: "a pattern was lit for max_on_s without another one being asked for; raise max_on_s in the rig file "
+    "if the light may be on for longer",
+    Fault.DUTY: "there was light for max_duty of 10 s; raise max_duty in the rig file if it may, or wait between scans",
+    Fault.LIGHT: "its light engine failed; see to its cables and power",
+}
+_Value = TypeVar("_Value")
+
+
+class SerialProjector:
+    """Implements `slrig.devices.Projector` on a box that speaks SLTP/1.
+
+    The box's watchdog is fed by a thread of the driver's own. When a command fails and the box does not confirm that
+    it is dark, that thread falls silent, and the watchdog puts the light out.
+
+    Parameters
+    ----------
+    port
+        Open; the projector closes it.
+    options
+        Checked.
+    export_folder
+        Where the images of a sequence go that the box does not hold; None: nowhere.
+    """
+
+    def __init__(self, port: Port, options: SerialProjectorOptions, *, export_folder: Path | None) -> None:
+        self._options = options
+        self._export_folder = export_folder
+        limits = Limits(
+            watchdog_ms=round(options.watchdog_s * 1000),
+            on_ms=round(options.max_on_s * 1000),
+            duty=round(options.max_duty * 1000),
+            bright=round(options.brightness * 1000),
+        )
+        link = Link(port, options.reply_s, options.deadline_s)
+        try:
+            self._client = Client(link, limits, label=options.port, open_s=options.open_s)
+        except BaseException:
+            port.close()
+            raise
+        box = self._client.box
+        self._size = Size(box.w, box.h)
+        self._info = ProjectorInfo("projector", f"{box.model} {box.fw}", options.port, self._size, True, box.light_s)
+        self._boot = box.boot
+        self._loaded: tuple[int, int] | None = None
+        self._lit: str | None = None
+        self._closed = threading.Event()
+        self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000)
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return self._info
+
+    @property
+    def client(self) -> Client:
+        """The session with the box, for what `Projector` has no word for."""
+        return self._client
+
+    @property
+    def played(self) -> tuple[Shown, ...]:
+        """When each pattern of the last `play` became visible, as far as the box's events came through."""
+        return tuple(Shown(*frame) for frame in self._client.frames())
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. The box must hold these patterns, one after another: their checksums are compared.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            It holds others, or the sequence is for another size, or too long.
+        """
+        self._require_open()
+        self._loaded = None
+        self.blank()
+        if sequence.projector != self._size:
+            message = (
+                f"the trigger box projects {self._size}, the sequence was made for {sequence.projector}; encode it for "
+                f"{self._size}"
+            )
+            raise UnsupportedByDeviceError(message)
+        count, most = len(sequence), self._client.box.max
+        each = crc32_of_each(sequence)
+        if count > most:
+            found = f"the trigger box holds {most} patterns, the sequence has {count}"
+            raise UnsupportedByDeviceError(self._to_be_flashed(sequence, found))
+        wanted = (count, crc32_of_all(each))
+        try:
+            self._sent(lambda: self._client.load(*wanted))
+        except UnsupportedByDeviceError as error:
+            found = f"asked for {count} patterns with CRC-32 {wanted[1]:08X}, the trigger box holds others ({error})"
+            raise UnsupportedByDeviceError(self._to_be_flashed(sequence, found)) from error
+        self._loaded = wanted
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`. The instant is the box's own stamp; its error comes from the exchanges with its clock."""
+        loaded = self._require_loaded(f"show pattern {index}")
+        if not 0 <= index < loaded[0]:
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {loaded[0] - 1}"
+            raise UnsupportedByDeviceError(message)
+        with self._dark_if_it_fails():
+            t_visible_ns, t_err_ns = self._sent(lambda: self._client.show(index))
+            self._lit = f"pattern {index} was lit"
+            SystemClock().wait_until(t_visible_ns + t_err_ns, self._closed)
+        return Shown(index, t_visible_ns, t_err_ns)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. Returns when the box has begun; a play that ends by itself ends dark."""
+        count, _ = self._require_loaded("play")
+        exposure_us, period_us = round(exposure_s * 1e6), round(period_s * 1e6)
+        self._check_timing(exposure_us, period_us)
+        with self._dark_if_it_fails():
+            # A box that restarted since is found here: below, it could have begun to play before it did.
+            self._sent(self._client.ping)
+            self._lit = "a sequence played"
+            self._sent(lambda: self._client.sequence(0, count, exposure_us, period_us, Mode.FREE))
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self._darken(self._client.stop)
+
+    def blank(self) -> None:
+        """See `Projector`. Raises DeviceError where the box does not confirm it; its watchdog goes on to see to it."""
+        self._darken(self._client.blank)
+
+    def close(self) -> None:
+        """See `Projector`."""
+        self._closed.set()
+        self._client.close()
+        self._keeping.stop()
+        self._loaded = self._lit = None
+
+    def _darken(self, command: Callable[[], object]) -> None:
+        if self._closed.is_set():
+            return
+        try:
+            self._sent(command)
+        except BaseException as error:
+            self._abandon()
+            if self._closed.is_set() and isinstance(error, DeviceStateError):
+                # By another thread, meanwhile: dark.
+                return
+            raise
+        finally:
+            self._lit = None
+
+    @contextmanager
+    def _dark_if_it_fails(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._lit = None
+            try:
+                self._client.blank()
+            except Exception:  # noqa: BLE001 - the error that led here is the one to tell
+                self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        """Leave the box to its watchdog until a sequence is loaded again."""
+        self._loaded = None
+        self._client.abandon()
+
+    def _sent(self, command: Callable[[], _Value]) -> _Value:
+        """Send a command; to a box that restarted in the dark, once more after it was greeted and loaded again."""
+        try:
+            return self._obeyed(command)
+        except _RestartedError:
+            # Told below, if it does not go better.
+            pass
+        try:
+            self._meet_again()
+            return self._obeyed(command)
+        except _RestartedError as error:
+            message = f"the trigger box on {self._options.port} restarts again and again; see to its power supply"
+            raise DeviceGoneError(message) from error
+
+    def _obeyed(self, command: Callable[[], _Value]) -> _Value:
+        """Send a command; what the box refuses becomes an error of slrig's."""
+        try:
+            return command()
+        except RefusedError as refusal:
+            match refusal.code:
+                case Refused.SESSION:
+                    raise _RestartedError from refusal
+                case Refused.STATE:
+                    raise DeviceStateError(f"{refusal}; stop what it does first") from refusal
+                case Refused.RANGE | Refused.LIMIT | Refused.PATTERNS:
+                    raise UnsupportedByDeviceError(str(refusal)) from refusal
+                case Refused.BUSY:
+                    message = (
+                        f"another host took the trigger box on {self._options.port} over ({refusal}); end that one"
+                    )
+                    raise DeviceBusyError(message) from refusal
+                case Refused.FAULT:
+                    raise DeviceError(_went_dark(self._options.port, refusal.words)) from refusal
+                case _:
+                    raise
+
+    def _meet_again(self) -> None:
+        """Greet and load a box that does not know its session any more. Raises DeviceGoneError where it was lit."""
+        lit, self._lit = self._lit, None
+        box = self._client.greet()
+        how = "restarted" if box.boot != self._boot else "was taken over by another host"
+        boots = f"boot {self._boot}, now {box.boot}"
+        if lit is not None:
+            message = (
+                f"the trigger box on {self._options.port} {how} ({boots}) while {lit}: frames since then may be dark; "
+                "see to its power supply and cable, open the rig again, and scan again"
+            )
+            raise DeviceGoneError(message)
+        if (box.w, box.h) != (self._size.width_px, self._size.height_px):
+            message = (
+                f"the trigger box on {self._options.port} {how} ({boots}) and projects {box.w} x {box.h} instead of "
+                f"{self._size}; open the rig again"
+            )
+            raise DeviceGoneError(message)
+        self._boot = box.boot
+        if self._loaded is not None:
+            count, crc32 = self._loaded
+            self._obeyed(lambda: self._client.load(count, crc32))
+
+    def _check_timing(self, exposure_us: int, period_us: int) -> None:
+        box = self._client.box
+        lit_us = exposure_us + box.hold_us
+        asked = f"asked to play {exposure_us / 1e6:.6g} s exposures every {period_us / 1e6:.6g} s"
+        for fits, found, remedy in (
+            (exposure_us >= box.least_us, f"at least {box.least_us / 1e6:.6g} s", "expose for longer"),
+            (
+                period_us >= exposure_us + box.gap_us,
+                f"at least {box.gap_us / 1e6:.6g} s between exposures",
+                "lengthen the exposure: the period grows with it",
+            ),
+            (lit_us <= box.on_ms * 1000, f"at most {box.on_ms / 1000:.6g} s of light (max_on_s)", "raise max_on_s"),
+            (
+                lit_us * 1000 <= box.duty * period_us,
+                f"light for {lit_us / period_us:.1%} of the time, where {box.duty / 1000:.1%} are allowed (max_duty)",
+                "raise max_duty if the light may be on for so long",
+            ),
+        ):
+            if not fits:
+                message = f"{asked}, the trigger box on {self._options.port} gives {found}; {remedy}"
+                raise UnsupportedByDeviceError(message)
+
+    def _to_be_flashed(self, sequence: PatternSequence, found: str) -> str:
+        """What to do about a sequence that the box does not hold; writes its images where the rig file says so."""
+        if self._export_folder is None:
+            where = 'write export_folder = "patterns" into the rig file and scan again: its images are written there'
+        else:
+            export(sequence, self._export_folder)
+            where = f"its images and patterns.json are in {self._export_folder} now"
+        return f"{found}. Flash the sequence: {where}; put the images into the light engine, patterns.json onto the box"
+
+    def _require_open(self) -> None:
+        if self._closed.is_set():
+            message = "the projector is closed; open the rig again"
+            raise DeviceStateError(message)
+
+    def _require_loaded(self, what: str) -> tuple[int, int]:
+        self._require_open()
+        if self._loaded is None:
+            message = f"asked to {what}, no sequence is loaded; call load first"
+            raise DeviceStateError(message)
+        return self._loaded
+
+
+class _RestartedError(DeviceError):
+    """The box does not know the session any more."""
+
+
+def _went_dark(port: str, words: tuple[str, ...]) -> str:
+    known = {str(fault.value): why for fault, why in _FAULTS.items()}
+    why = known.get(words[0] if words else "", f"fault {' '.join(words)}, which is unknown here")
+    return f"the trigger box on {port} had gone dark by itself: {why}. Frames since then may be dark; scan again"

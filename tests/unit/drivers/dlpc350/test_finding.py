@@ -1,0 +1,66 @@
+"""Engines found in /sys, and the one that a rig file means."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivers import dlpc350
+from drivers.dlpc350.finding import engines, found_devices, resolved
+from slrig.errors import ConfigError, DeviceGoneError, UnsupportedByDeviceError
+
+ENGINE = "0003:00000451:00006401"
+MOUSE = "0003:0000046D:0000C077"
+
+
+def plug(sysfs: Path, number: int, *, hid: str = ENGINE, serial: str = "", port: str = "") -> None:
+    folder = sysfs / f"hidraw{number}" / "device"
+    folder.mkdir(parents=True)
+    (folder / "uevent").write_text(
+        f"DRIVER=hid-generic\nHID_ID={hid}\nHID_NAME=Texas Instruments DLPC350\nHID_PHYS={port}\nHID_UNIQ={serial}\n"
+    )
+
+
+def test_engines_are_told_from_other_devices(tmp_path: Path) -> None:
+    plug(tmp_path, 0, hid=MOUSE, serial="M")
+    plug(tmp_path, 10, serial="B")
+    plug(tmp_path, 2, serial="A")
+    (tmp_path / "hidraw3").mkdir()
+    found = engines(tmp_path)
+    assert [(node.name, str(node.path)) for node in found] == [("A", "/dev/hidraw2"), ("B", "/dev/hidraw10")]
+    (first, _) = found_devices(found)
+    assert (first.driver, first.device) == ("dlpc350", "A")
+    assert first.label == "Texas Instruments DLPC350 (/dev/hidraw2)"
+
+
+def test_a_name_never_stands_for_two(tmp_path: Path) -> None:
+    for number, port in ((0, "usb-1/input0"), (1, "usb-2/input0"), (2, ""), (3, "")):
+        plug(tmp_path, number, serial="LCR2", port=port)
+    assert [node.name for node in engines(tmp_path)] == ["usb-1/input0", "usb-2/input0", "/dev/hidraw2", "/dev/hidraw3"]
+
+
+def test_the_engine_that_is_meant(tmp_path: Path) -> None:
+    plug(tmp_path, 0, serial="A")
+    (only,) = engines(tmp_path)
+    assert resolved(None, (only,)) is resolved("A", (only,)) is resolved("/dev/hidraw0", (only,)) is only
+    with pytest.raises(DeviceGoneError, match=r'light engine "B", plugged in: A \(/dev/hidraw0\)'):
+        resolved("B", (only,))
+    plug(tmp_path, 1, serial="B")
+    with pytest.raises(ConfigError, match=r"A .*; B .*; write device"):
+        resolved(None, engines(tmp_path))
+    assert resolved("B", engines(tmp_path)).path == Path("/dev/hidraw1")
+
+
+def test_none_is_no_error_for_the_finder(tmp_path: Path) -> None:
+    assert engines(tmp_path / "none") == ()
+    with pytest.raises(DeviceGoneError, match="asked for a light engine, plugged in: none"):
+        resolved(None, ())
+
+
+def test_other_systems_have_no_hidraw(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert dlpc350.find_devices() == ()
+    with pytest.raises(UnsupportedByDeviceError, match="darwin"):
+        dlpc350.open_projector({"patterns": "p"}, tmp_path)

@@ -1,0 +1,192 @@
+"""Reports on the wire, byte by byte, and what becomes of an engine that does not answer."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from drivers.dlpc350.link import Link, open_link
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError
+from tests.contract.dlpc350_device import Cable, FakeEngine
+
+SHORT_S = 0.05
+
+
+@contextmanager
+def wired(*, answer_s: float = 5.0) -> Iterator[tuple[Link, socket.socket]]:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    link = Link(near.detach(), "light engine", answer_s=answer_s)
+    try:
+        with far:
+            yield link, far
+    finally:
+        link.close()
+
+
+@pytest.fixture
+def engine() -> FakeEngine:
+    return FakeEngine({})
+
+
+def linked(engine: FakeEngine, *, answer_s: float = 5.0) -> Link:
+    return Link(Cable(engine).host, "light engine", answer_s=answer_s)
+
+
+def test_a_command_is_framed_as_the_manual_says() -> None:
+    with wired() as (link, far):
+        far.send(bytes([0x40, 1, 0, 0]).ljust(64, b"\0"))
+        # What lay there before the link was opened would be forgotten; this came after.
+        link.write(0x1A24, b"\2")
+        sent = far.recv(100)
+        assert sent == bytes([0, 0x40, 1, 3, 0, 0x24, 0x1A, 2]).ljust(65, b"\0")
+        far.send(bytes([0xC0, 2, 1, 0, 0x42]).ljust(64, b"\0"))
+        assert link.read(0x1A0C, 1) == b"\x42"
+        assert far.recv(100) == bytes([0, 0xC0, 2, 2, 0, 0x0C, 0x1A]).ljust(65, b"\0")
+
+
+def test_what_is_longer_than_a_report_goes_on_in_the_next_one() -> None:
+    data = bytes(range(200))
+    with wired() as (link, far):
+        far.send(bytes([0x40, 1, 0, 0]).ljust(64, b"\0"))
+        link.write(0x1A34, data)
+        reports = [far.recv(100) for _ in range(4)]
+        assert all(len(report) == 65 and report[0] == 0 for report in reports)
+        together = b"".join(report[1:] for report in reports)
+        assert together[:6] == bytes([0x40, 1, 202, 0, 0x34, 0x1A])
+        assert together[6:206] == data
+        assert not any(together[206:])
+
+
+def test_a_long_answer_is_put_together() -> None:
+    data = bytes(range(100))
+    message = (bytes([0xC0, 1]) + len(data).to_bytes(2, "little") + data).ljust(128, b"\0")
+    with wired() as (link, far):
+        far.send(message[:64])
+        far.send(message[64:])
+        assert link.read(0x1A34, 100) == data
+
+
+def test_an_answer_to_an_earlier_command_is_passed_over(engine: FakeEngine) -> None:
+    engine.faults.stale_answer = True
+    engine.registers[0x1A29] = bytes(range(8))
+    link = linked(engine)
+    assert [link.read(0x1A29, 8) for _ in range(300)] == [bytes(range(8))] * 300
+    link.close()
+
+
+def test_what_another_program_left_unread_is_forgotten() -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with far:
+        far.send(bytes([0xC0, 1, 1, 0, 7]).ljust(64, b"\0"))
+        link = Link(near.detach(), "light engine", answer_s=SHORT_S)
+        with pytest.raises(DeviceError, match="did not answer"):
+            link.read(0x1A0C, 1)
+        link.close()
+
+
+def test_a_refusal_is_told(engine: FakeEngine) -> None:
+    engine.faults.refused.add(0x1A24)
+    link = linked(engine)
+    with pytest.raises(DeviceError, match="refused the command 0x1a24"):
+        link.write(0x1A24, b"\2")
+    assert link.read(0x1A0A, 1) == b"\1"
+    link.close()
+
+
+def test_a_silent_engine_is_given_up_and_may_come_back(engine: FakeEngine) -> None:
+    engine.faults.silent.add(0x1A0C)
+    link = linked(engine, answer_s=SHORT_S)
+    with pytest.raises(DeviceError, match=r"did not answer the command 0x1a0c in 0\.05 s"):
+        link.read(0x1A0C, 1)
+    engine.faults.silent.clear()
+    assert link.read(0x1A0C, 1) == b"\0"
+    link.close()
+
+
+def test_an_answer_that_is_too_short_is_refused() -> None:
+    with wired() as (link, far):
+        far.send(bytes([0xC0, 1, 1, 0, 7]).ljust(64, b"\0"))
+        with pytest.raises(DeviceError, match="asked for 8 bytes of 0x1a29, it gave 1"):
+            link.read(0x1A29, 8)
+
+
+def test_an_unplugged_engine_is_gone() -> None:
+    with wired() as (link, far):
+        far.close()
+        for _ in range(2):
+            with pytest.raises(DeviceGoneError, match="is gone"):
+                link.read(0x1A0C, 1)
+
+
+def test_more_than_the_engine_takes_is_not_sent() -> None:
+    with wired() as (link, _), pytest.raises(DeviceError, match="asked to send 507 bytes at once, it takes 506"):
+        link.write(0x1A34, bytes(507))
+
+
+def test_a_closed_link_is_closed() -> None:
+    with wired() as (link, _):
+        link.close()
+        link.close()
+        with pytest.raises(DeviceStateError):
+            link.write(0x1A24, b"\0")
+
+
+def test_a_node_that_is_not_there_is_gone(tmp_path: Path) -> None:
+    with pytest.raises(DeviceGoneError, match="No such file"):
+        open_link(tmp_path / "hidraw7")
+
+
+def test_a_node_that_is_no_engine_is_gone(tmp_path: Path) -> None:
+    path = tmp_path / "hidraw0"
+    path.write_bytes(b"")
+    with pytest.raises(DeviceGoneError, match="no hidraw node"):
+        open_link(path)
+
+
+@pytest.mark.parametrize(("vendor", "product"), [(0x0451, 0x6401), (0x046D, 0xC077)])
+def test_a_number_that_was_given_to_another_device_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vendor: int, product: int
+) -> None:
+    def answer(handle: int, request: int, into: bytearray) -> int:
+        assert request == 0x80084803
+        into[:] = (3).to_bytes(4, "little") + vendor.to_bytes(2, "little") + product.to_bytes(2, "little")
+        return handle
+
+    path = tmp_path / "hidraw0"
+    path.write_bytes(b"")
+    monkeypatch.setattr(fcntl, "ioctl", answer)
+    if product == 0x6401:
+        open_link(path).close()
+    else:
+        with pytest.raises(DeviceGoneError, match="found 046d:c077"):
+            open_link(path)
+
+
+def test_a_node_that_another_program_holds_is_busy(tmp_path: Path) -> None:
+    path = tmp_path / "hidraw0"
+    with path.open("wb") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(DeviceBusyError, match="another program holds it"):
+            open_link(path)
+
+
+@pytest.mark.parametrize(("number", "kind"), [(errno.EACCES, DeviceError), (errno.EBUSY, DeviceBusyError)])
+def test_a_node_that_may_not_be_opened_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, number: int, kind: type[DeviceError]
+) -> None:
+    def refuse(*_: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(kind) as refused:
+        open_link(Path("/dev/hidraw0"))
+    assert type(refused.value) is kind
+    if number == errno.EACCES:
+        assert 'ATTRS{idProduct}=="6401"' in str(refused.value)

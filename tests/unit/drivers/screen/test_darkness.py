@@ -1,0 +1,223 @@
+"""Dark: after opening, after every end, while nobody answers, and when the process is killed. The desktop is white."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.screen import guarding, open_projector
+from drivers.screen.projector import ScreenProjector
+from slrig.errors import DeviceError, DeviceStateError
+from slrig.model import Size
+from tests.contract.screen_bench import rig_options, sequence
+from tests.contract.screen_server import DummyServer, OutputPixels
+from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE
+
+FAR_S = 20.0
+WHITE, BLACK = 0, 1
+
+pytestmark = pytest.mark.slow
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from drivers.screen import open_projector
+from tests.contract.screen_bench import rig_options, sequence
+from tests.unit.drivers.screen.conftest import RIGHT, SIZE
+
+options = rig_options(RIGHT, SIZE, backend=sys.argv[1], dark_after_s=float(sys.argv[2]))
+projector = open_projector(options, Path())
+projector.load(sequence(SIZE))
+projector.show(int(sys.argv[3]))
+print("shown", flush=True)
+sys.stdin.readline()
+"""
+
+
+def opened(**options: object) -> ScreenProjector:
+    projector = open_projector(rig_options(RIGHT, SIZE, **options), Path())
+    assert isinstance(projector, ScreenProjector)
+    OPEN.append(projector)
+    return projector
+
+
+def lit(projector: ScreenProjector) -> ScreenProjector:
+    projector.load(sequence(SIZE))
+    projector.show(WHITE)
+    return projector
+
+
+def until(condition: Callable[[], bool], *, within_s: float = FAR_S) -> float:
+    """How long it took until the condition held."""
+    begun_s = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begun_s < within_s
+    return time.monotonic() - begun_s
+
+
+def is_white(pixels: OutputPixels) -> bool:
+    return int(pixels.grey().min()) == 255
+
+
+def is_black(pixels: OutputPixels) -> bool:
+    return not pixels.colours().any()
+
+
+def test_dark_after_opening_and_after_every_end_while_the_desktop_shines(right: OutputPixels) -> None:
+    assert is_white(right)
+    projector = opened()
+    assert is_black(right)
+    ends: list[Callable[[], None]] = [projector.blank, projector.stop, lambda: projector.load(sequence(SIZE))]
+    for end in ends:
+        lit(projector)
+        assert is_white(right)
+        end()
+        assert is_black(right)
+    lit(projector).close()
+    assert is_black(right)
+    again = lit(opened())
+    assert is_white(right)
+    again.close()
+    assert is_black(right)
+    guarding.release(None, RIGHT)
+    assert until(lambda: is_white(right)) < FAR_S
+
+
+def test_nothing_is_shown_on_the_other_output(server: DummyServer, right: OutputPixels) -> None:
+    left = OutputPixels(server.display, (0, 0), SIZE)
+    projector = lit(opened())
+    projector.show(BLACK)
+    assert is_black(right)
+    assert is_white(left)
+    projector.close()
+    assert is_white(left)
+    left.close()
+
+
+def started(backend: str, dark_after_s: float, pattern: int = WHITE) -> subprocess.Popen[str]:
+    child = subprocess.Popen(  # noqa: S603 - our own program
+        [sys.executable, "-c", PROGRAM, backend, str(dark_after_s), str(pattern)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "shown\n"
+    return child
+
+
+@pytest.mark.parametrize("backend", ["x11", "sdl"])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_dark_when_the_process_is_killed_and_never_lit_by_what_is_below(
+    right: OutputPixels, backend: str, number: int
+) -> None:
+    with started(backend, dark_after_s=1.5) as child:
+        assert is_white(right)
+        child.send_signal(number)
+        child.wait(FAR_S)
+        assert until(lambda: is_black(right), within_s=1.0) < 0.5
+    with started(backend, dark_after_s=1.0, pattern=BLACK) as child:
+        child.send_signal(number)
+        # From now on no picture has light in it until the guard has done its time: the desktop was white all along.
+        begun_s, pictures = time.monotonic(), 0
+        while is_black(right):
+            pictures += 1
+            assert time.monotonic() - begun_s < FAR_S
+        assert time.monotonic() - begun_s > 1.0
+        assert pictures > 20
+        child.wait(FAR_S)
+
+
+def test_another_process_takes_the_output_over_from_the_guard_of_one_that_was_killed(right: OutputPixels) -> None:
+    with started("x11", dark_after_s=600) as child:
+        child.kill()
+        child.wait(FAR_S)
+        until(lambda: is_black(right))
+        projector = lit(opened())
+        assert is_white(right)
+        projector.blank()
+        assert is_black(right)
+        projector.close()
+    guarding.release(None, RIGHT)
+    # The first guard has left, too: nothing else would show the desktop now.
+    assert until(lambda: is_white(right)) < FAR_S
+
+
+def test_blank_from_another_thread_interrupts_a_show(right: OutputPixels) -> None:
+    projector = opened(latency_s=1.0)
+    projector.load(sequence(SIZE))
+    failure: list[Exception] = []
+
+    def show() -> None:
+        try:
+            projector.show(WHITE)
+        except DeviceError as error:
+            failure.append(error)
+
+    showing = threading.Thread(target=show)
+    showing.start()
+    until(lambda: is_white(right))
+    darkening = threading.Thread(target=projector.blank)
+    darkening.start()
+    until(lambda: is_black(right), within_s=2.0)
+    projector.close()
+    showing.join(FAR_S)
+    darkening.join(FAR_S)
+    assert isinstance(failure[0], DeviceStateError)
+    assert is_black(right)
+
+
+def test_the_guard_covers_a_window_whose_thread_hangs(right: OutputPixels) -> None:
+    projector = lit(opened())
+    hang = threading.Event()
+    stuck = threading.Thread(target=lambda: projector._thread.do(hang.wait, timeout_s=FAR_S))
+    stuck.start()
+    outside = threading.Thread(target=projector.blank)
+    outside.start()
+    outside.join(FAR_S)
+    assert not hang.is_set()
+    assert is_black(right)
+    hang.set()
+    stuck.join(FAR_S)
+    # It answers again: patterns are above the guard again.
+    projector.show(WHITE)
+    assert is_white(right)
+    projector.close()
+    assert is_black(right)
+
+
+def test_a_guard_that_is_killed_is_replaced_when_the_rig_is_opened_again(right: OutputPixels) -> None:
+    opened().close()
+    guard = guarding._kept[(None, RIGHT)]
+    os.kill(guard._process.pid, signal.SIGKILL)
+    until(lambda: is_white(right))
+    assert not guard.cover()
+    projector = lit(opened())
+    projector.close()
+    assert is_black(right)
+    assert guarding._kept[(None, RIGHT)] is not guard
+
+
+def test_the_guard_goes_where_its_output_goes_and_ends_with_it(server: DummyServer, right: OutputPixels) -> None:
+    opened(dark_after_s=600).close()
+    assert is_black(right)
+    small = Size(100, 80)
+    places = server.arrange(**{LEFT: small, RIGHT: small})
+    moved = OutputPixels(server.display, places[RIGHT], small)
+    until(lambda: is_black(moved))
+    left = OutputPixels(server.display, places[LEFT], small)
+    until(lambda: is_white(left))
+    moved.close()
+    left.close()
+    guard = guarding._kept[(None, RIGHT)]
+    assert guard.is_alive
+    server.run("xrandr", "--output", RIGHT, "--off")
+    until(lambda: not guard.is_alive)

@@ -1,0 +1,364 @@
+"""Outputs of a real X server: those that would not show patterns as they are, and what happens while one is open."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.screen import find_devices, open_projector, power, requests
+from drivers.screen.connection import Connection
+from slrig.devices import FoundDevice, Projector
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    DeviceStateError,
+    LibraryMissingError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Size
+from tests.contract.screen_bench import let_go, rig_options, sequence
+from tests.contract.screen_server import DummyServer, OutputPixels
+from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE
+
+FAR_S = 10.0
+_NEVER = "never shown"
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("server")]
+
+
+def opened(**options: object) -> Projector:
+    projector = open_projector(rig_options(RIGHT, SIZE, **options), Path())
+    OPEN.append(projector)
+    return projector
+
+
+@contextmanager
+def showing(**options: object) -> Iterator[Projector]:
+    projector = opened(**options)
+    try:
+        projector.load(sequence(SIZE))
+        yield projector
+    finally:
+        projector.close()
+
+
+@contextmanager
+def client(server: DummyServer) -> Iterator[Connection]:
+    connection = Connection(server.display)
+    yield connection
+    connection.close()
+
+
+def awaited(condition: Callable[[], bool]) -> bool:
+    until_s = time.monotonic() + FAR_S
+    while not condition():
+        if time.monotonic() > until_s:
+            return False
+    return True
+
+
+def output_property(connection: Connection, output: str, name: str, value: str) -> None:
+    """Set a word as a property of an output, as graphics drivers do (RandR 1.3, requests 12 and 13)."""
+    resources = connection.ask(25, struct.pack("<I", connection.screen.root), extension="RANDR")
+    controllers, count = struct.unpack_from("<HH", resources, 16)
+    number = struct.unpack_from(f"<{count}I", resources, 32 + 4 * controllers)[int(output.removeprefix("DUMMY"))]
+    atom = requests.atom(connection, name)
+    body = struct.pack("<IIIBBxxI", number, atom, 4, 32, 0, 1)
+    connection.do(13, body + struct.pack("<I", requests.atom(connection, value)), extension="RANDR")
+
+
+def test_outputs_are_found() -> None:
+    assert find_devices() == (
+        FoundDevice("screen", LEFT, f"{LEFT} ({SIZE} at 120.00 Hz)"),
+        FoundDevice("screen", RIGHT, f"{RIGHT} ({SIZE} at 120.00 Hz)"),
+    )
+
+
+def test_no_session_has_no_outputs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":2047")
+    assert find_devices() == ()
+    monkeypatch.delenv("DISPLAY")
+    assert find_devices() == ()
+    with pytest.raises(UnsupportedByDeviceError, match="needs an X server"):
+        opened(backend="x11")
+    with pytest.raises(DeviceError, match="no X server answers at display ':2047'"):
+        opened(display=":2047")
+
+
+def test_a_missing_library_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lacking(name: str) -> object:
+        raise OSError(name)
+
+    from drivers.screen import connection
+
+    connection._library.cache_clear()
+    monkeypatch.setattr("ctypes.CDLL", lacking)
+    for attempt in (opened, find_devices):
+        with pytest.raises(LibraryMissingError) as caught:
+            attempt()
+        assert caught.value.install == "apt install libxcb1"
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (("--mode", "160x120-own"), "its mode is 160 x 120"),
+        (("--gamma", "1.3:1:1"), "--gamma 1:1:1 --brightness 1"),
+        (("--brightness", "0.8"), "--gamma 1:1:1 --brightness 1"),
+        (("--same-as", LEFT), f"{LEFT} shows the same part of the screen"),
+        (("--pos", "64x0"), f"{LEFT} shows the same part of the screen"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_an_output_that_is_set_otherwise_is_refused_and_mended_by_the_command_told(
+    server: DummyServer, right: OutputPixels, command: tuple[str, str], words: str
+) -> None:
+    server.mode(RIGHT, Size(160, 120))
+    # A desktop that stays as wide as it is, whatever becomes of the output.
+    server.run("xrandr", "--fb", "512x512", "--output", RIGHT, *command)
+    before = right.colours()
+    with pytest.raises(UnsupportedByDeviceError) as caught:
+        opened()
+    assert words in str(caught.value)
+    # Refused before anything was put on it.
+    assert np.array_equal(right.colours(), before)
+    for line in str(caught.value).splitlines()[1:]:
+        mending = line.split("; ")[-1].split("then: ")[-1]
+        server.run(*mending.replace("--mode 128x96", "--mode 128x96-own").split())
+    opened().close()
+
+
+def test_an_output_that_is_panned_is_refused_and_mended_by_the_command_told(tmp_path: Path) -> None:
+    # On a server of its own: some of it stays.
+    with DummyServer(tmp_path) as panning, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DISPLAY", panning.display)
+        panning.arrange(**{LEFT: SIZE, RIGHT: SIZE})
+        panning.run("xrandr", "--fb", "512x512", "--output", RIGHT, "--panning", "256x192+128+0")
+        with pytest.raises(UnsupportedByDeviceError, match="256 x 192 pixels that moves with the pointer") as caught:
+            opened()
+        panning.run(*str(caught.value).splitlines()[1].split("; ")[-1].split())
+        opened().close()
+        let_go(RIGHT)
+
+
+def test_an_output_that_is_off_or_absent_is_refused(server: DummyServer) -> None:
+    server.arrange(**{LEFT: SIZE})
+    with pytest.raises(
+        (UnsupportedByDeviceError, DeviceGoneError), match=rf"(?s){RIGHT}.*(switched off|nothing is conn)"
+    ):
+        opened()
+    with pytest.raises(DeviceGoneError, match=rf"DUMMY5: nothing is connected to it; connected are: {LEFT} \("):
+        open_projector(rig_options("DUMMY5", SIZE), Path())
+    with pytest.raises(UnsupportedByDeviceError, match=rf"HDMI-1: there is none of that name; connected are: {LEFT}"):
+        open_projector(rig_options("HDMI-1", SIZE), Path())
+
+
+def test_a_raster_that_nobody_tells_is_asked_for() -> None:
+    with pytest.raises(UnsupportedByDeviceError, match="native_px"):
+        open_projector({"output": RIGHT}, Path())
+
+
+def test_what_the_graphics_driver_does_to_levels_is_read_from_its_properties(server: DummyServer) -> None:
+    with client(server) as connection:
+        output_property(connection, RIGHT, "Broadcast RGB", "Limited 16:235")
+        with pytest.raises(UnsupportedByDeviceError, match="16 to 235"):
+            opened()
+        output_property(connection, RIGHT, "Broadcast RGB", "Full")
+    opened().close()
+
+
+def test_a_screen_of_another_depth_is_refused(tmp_path: Path) -> None:
+    with DummyServer(tmp_path, depth=16) as shallow:
+        shallow.arrange(**{LEFT: SIZE, RIGHT: SIZE})
+        with pytest.raises(UnsupportedByDeviceError, match="DefaultDepth 24"):
+            opened(display=shallow.display, backend="x11")
+
+
+def test_an_output_in_use_is_refused_with_the_process_that_holds_it(right: OutputPixels) -> None:
+    with showing() as projector:
+        projector.show(0)
+        with pytest.raises(DeviceBusyError, match=f"in use by process {os.getpid()} "):
+            opened()
+        # The one who was there first is not disturbed.
+        assert right.colours().min() == 255
+    opened().close()
+
+
+def test_a_gamma_ramp_that_comes_later_is_refused_with_the_next_sequence(server: DummyServer) -> None:
+    with showing() as projector:
+        projector.show(0)
+        server.run("xrandr", "--output", RIGHT, "--gamma", "1:1:1.4")
+        with pytest.raises(UnsupportedByDeviceError, match="gamma"):
+            projector.load(sequence(SIZE))
+        with pytest.raises(DeviceStateError, match="no sequence is loaded"):
+            projector.show(0)
+
+
+@pytest.mark.parametrize("backend", ["x11", "sdl"])
+def test_an_output_that_is_changed_is_refused_with_the_next_pattern(
+    server: DummyServer, right: OutputPixels, backend: str
+) -> None:
+    with showing(backend=backend) as projector:
+        projector.show(0)
+        server.run("xrandr", "--output", RIGHT, "--mode", server.mode(RIGHT, Size(160, 120)))
+        with pytest.raises(UnsupportedByDeviceError, match="its mode is 160 x 120"):
+            projector.show(0)
+        assert not right.colours().any()
+
+
+def test_an_output_that_is_switched_off_is_refused_with_the_next_pattern(server: DummyServer) -> None:
+    with showing() as projector:
+        server.run("xrandr", "--output", RIGHT, "--off")
+        with pytest.raises((UnsupportedByDeviceError, DeviceGoneError), match=r"switched off|nothing is connected"):
+            projector.show(0)
+
+
+@pytest.mark.parametrize("backend", ["x11", "sdl"])
+def test_a_window_that_came_above_the_patterns_goes_below_them(
+    server: DummyServer, right: OutputPixels, backend: str
+) -> None:
+    with showing(backend=backend) as projector, client(server) as connection:
+        projector.show(0)
+        requests.black_window(connection, SIZE.width_px, 0, SIZE)
+        assert not right.colours().any()
+        projector.show(0)
+        assert right.colours().min() == 255
+
+
+def test_pixels_that_are_not_the_patterns_are_found_once_per_sequence(
+    right: OutputPixels, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with showing() as projector, monkeypatch.context() as patch:
+        patch.setattr("drivers.screen.present.fill_tiled", lambda *_: None)
+        with pytest.raises(UnsupportedByDeviceError, match=r"of 12288 pixels are not the pattern's.*#ffffff was shown"):
+            projector.show(0)
+        assert not right.colours().any()
+        patch.undo()
+        projector.show(0)
+        assert right.colours().min() == 255
+
+
+def test_a_compositor_that_does_not_let_go_is_refused_unless_trusted(server: DummyServer) -> None:
+    with client(server) as connection:
+        connection.ask(0, struct.pack("<II", 0, 4), extension="Composite")
+        owner = requests.hidden_window(connection)
+        words = b"fancy effects"
+        name = requests.atom(connection, "_NET_WM_NAME")
+        connection.do(18, struct.pack("<IIIBxxxI", owner, name, 31, 8, len(words)) + words)
+        requests.take_selection(connection, requests.atom(connection, "_NET_WM_CM_S0"), owner, from_another=True)
+        connection.do(2, struct.pack("<IBxxx", connection.screen.root, 0), extension="Composite")
+        with pytest.raises(UnsupportedByDeviceError, match=r"drawn by a compositor \(fancy effects\)"), showing():
+            pytest.fail(_NEVER)
+        with showing(trust_compositor=True) as projector:
+            projector.show(0)
+
+
+def test_the_server_is_told_not_to_blank_its_displays_for_as_long(server: DummyServer) -> None:
+    def is_saving(connection: Connection) -> bool:
+        reply = connection.ask(1, struct.pack("<I", connection.screen.root), extension="MIT-SCREEN-SAVER")
+        return reply[1] == 1
+
+    with client(server) as connection:
+        server.run("xset", "s", "1", "1")
+        assert awaited(lambda: is_saving(connection))
+        with showing() as projector:
+            # It woke them, and keeps them awake for longer than the second after which they slept.
+            until_s = time.monotonic() + 1.5
+            while time.monotonic() < until_s:
+                projector.show(0)
+                assert not is_saving(connection)
+        assert awaited(lambda: is_saving(connection))
+        server.run("xset", "s", "reset", "s", "off")
+
+
+class PowerManaged:
+    """A server of which only the power of its displays is known, without a saver that can be suspended."""
+
+    def __init__(self, level: int) -> None:
+        self.level = level
+        self.enabled = True
+        self.timeout_s = 600
+
+    def has(self, extension: str) -> bool:
+        return extension == "DPMS"
+
+    def ask(self, opcode: int, body: bytes = b"", *, extension: str | None = None) -> bytes:
+        del body
+        if extension == "DPMS":
+            assert opcode == 7
+            return bytes(8) + struct.pack("<HB", self.level, self.enabled) + bytes(21)
+        assert opcode == 108
+        return bytes(8) + struct.pack("<HHBB", self.timeout_s, 600, 1, 1) + bytes(18)
+
+    def do(self, opcode: int, body: bytes = b"", *, data: int = 0, extension: str | None = None) -> None:
+        if extension == "DPMS" and opcode == 6:
+            (self.level,) = struct.unpack_from("<H", body)
+        elif extension == "DPMS":
+            self.enabled = opcode == 4
+        elif opcode == 107:
+            (self.timeout_s,) = struct.unpack_from("<h", body)
+        else:
+            assert (opcode, data) == (115, 0)
+
+
+def test_displays_that_sleep_are_woken_kept_awake_and_allowed_to_sleep_again() -> None:
+    server = PowerManaged(level=3)
+    waking = power.Waking(server)  # type: ignore[arg-type]
+    assert (server.level, server.enabled, server.timeout_s) == (0, False, 0)
+    waking.require_awake()
+    server.level = 2
+    with pytest.raises(UnsupportedByDeviceError, match=r"put to sleep \(suspended\)"):
+        waking.require_awake()
+    waking.end()
+    assert (server.enabled, server.timeout_s) == (True, 600)
+
+
+@pytest.mark.parametrize("backend", ["x11", "sdl"])
+def test_the_end_of_the_server_is_told_of_and_survived(tmp_path: Path, backend: str) -> None:
+    # In a process of its own: Xlib may end it.
+    program = f"""
+import sys
+from pathlib import Path
+from drivers.screen import open_projector
+from slrig.errors import DeviceError
+from tests.contract.screen_bench import rig_options, sequence
+from tests.unit.drivers.screen.conftest import RIGHT, SIZE
+projector = open_projector(rig_options(RIGHT, SIZE, backend="{backend}"), Path())
+projector.load(sequence(SIZE))
+projector.show(0)
+print("lit", flush=True)
+sys.stdin.readline()
+for _ in range(2):
+    try:
+        projector.show(1)
+    except DeviceError as error:
+        print(type(error).__name__, flush=True)
+projector.close()
+print("closed", flush=True)
+"""
+    with DummyServer(tmp_path) as mortal:
+        mortal.arrange(**{LEFT: SIZE, RIGHT: SIZE})
+        child = subprocess.Popen(  # noqa: S603 - our own program
+            [sys.executable, "-c", program],
+            env={**os.environ, "DISPLAY": mortal.display},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        with child:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "lit\n"
+            mortal.kill()
+            said, _ = child.communicate("go on\n", timeout=60)
+    assert said.split() == ["DeviceGoneError", "DeviceGoneError", "closed"]
+    assert child.returncode == 0

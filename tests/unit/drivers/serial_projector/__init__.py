@@ -1,0 +1,1 @@
+"""Tests of the serial projector, its protocol and its reference box."""

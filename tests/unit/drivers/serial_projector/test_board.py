@@ -1,0 +1,213 @@
+"""The pins of the reference box, on a board in memory."""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable
+
+import pytest
+
+from drivers.serial_projector.device import main
+from drivers.serial_projector.device.box import HardwareError
+from drivers.serial_projector.device.protocol import Device
+from drivers.serial_projector.frames import framed
+from tests.unit.drivers.serial_projector.fake_pico import Board as Pico
+
+FULL = 65535
+PATTERNS = {"size_px": [main.WIDTH_PX, main.HEIGHT_PX], "crc32": [f"{number:08X}" for number in range(26)]}
+
+
+@pytest.fixture
+def pico() -> Pico:
+    board = Pico()
+    board.levels[main.READY_PIN] = 1
+    return board
+
+
+@pytest.fixture
+def board(pico: Pico) -> main.Board:
+    return main.Board(pico.machine, pico.rp2, pico.time)
+
+
+def pulses(pico: Pico, pin: int) -> int:
+    return sum(what == f"{pin}=1" for _, what in pico.did)
+
+
+def test_it_starts_dark(pico: Pico, board: main.Board) -> None:
+    assert pico.levels[main.LAMP_PIN] == 0
+    assert board.time_us() == 0
+
+
+def test_a_pattern_is_reached_by_steps_from_home(pico: Pico, board: main.Board) -> None:
+    board.select(3)
+    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (1, 3)
+    board.select(5)
+    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (1, 5)
+    board.select(5)
+    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (1, 5)
+    board.select(1)
+    assert (pulses(pico, main.HOME_PIN), pulses(pico, main.STEP_PIN)) == (2, 6)
+    assert pico.levels[main.LAMP_PIN] == 0
+
+
+def test_an_engine_that_is_not_ready_is_a_failure_and_homed_next_time(pico: Pico, board: main.Board) -> None:
+    board.select(2)
+    pico.levels[main.READY_PIN] = 0
+
+    counted = board.time_us
+
+    def later_us() -> int:
+        pico.now_us += 100
+        return counted()
+
+    board.time_us = later_us  # type: ignore[method-assign]
+    with pytest.raises(HardwareError, match="READY"):
+        board.select(3)
+    pico.levels[main.READY_PIN] = 1
+    board.select(3)
+    assert pulses(pico, main.HOME_PIN) == 2
+
+
+def test_light_follows_the_lamp_and_its_brightness(pico: Pico, board: main.Board) -> None:
+    board.light()
+    assert pico.levels[main.LAMP_PIN] == FULL
+    board.dark()
+    assert pico.levels[main.LAMP_PIN] == 0
+    assert board.dim(250) == 250
+    assert pico.levels[main.LAMP_PIN] == 0
+    board.light()
+    assert pico.levels[main.LAMP_PIN] == FULL // 4
+
+
+def test_the_cameras_get_a_pulse_of_its_length(pico: Pico, board: main.Board) -> None:
+    for _ in range(2):
+        pico.did.clear()
+        board.pulse()
+        (up_us, up), (down_us, down) = pico.did
+        assert (up, down) == (f"{main.CAMERA_PIN}=1", f"{main.CAMERA_PIN}=0")
+        # The loop's last turn and the instruction that ends it.
+        assert down_us - up_us == pytest.approx(main.PULSE_US, abs=2)
+
+
+def test_its_time_never_wraps(pico: Pico, board: main.Board) -> None:
+    told = []
+    for _ in range(40):
+        pico.now_us += 200_000_000
+        told.append(board.time_us())
+    assert told == [200_000_000 * step for step in range(1, 41)]
+
+
+def test_only_patterns_of_the_engines_extent_are_offered() -> None:
+    assert main.described(PATTERNS).count == 26
+    assert main.described({"size_px": [1, 1], "crc32": ["00000000"]}).count == 0
+    assert main.described({}).count == 0
+
+
+class Ended(Exception):  # noqa: N818 - not a failure
+    """The program would run for ever."""
+
+
+class Usb:
+    """The board's serial port: what comes in, one piece per turn, then the end."""
+
+    def __init__(self, *pieces: bytes) -> None:
+        self.pieces = list(pieces)
+        self.sent = b""
+
+    def read(self) -> bytes:
+        if not self.pieces:
+            raise Ended
+        return self.pieces.pop(0)
+
+    def write(self, data: bytes) -> None:
+        self.sent += data
+
+
+def test_the_program_answers_feeds_its_watchdog_and_tidies_in_the_dark(board: main.Board) -> None:
+    alive: list[int] = []
+    tidied: list[int] = []
+    hello = framed("1A2B 1 HELLO 1 1000 5000 1000 1000")
+    pings = [framed(f"1A2B {2 + number} PING") for number in range(main.TIDY_AFTER)]
+    usb = Usb(b"", hello[:9], hello[9:], *pings, b"")
+    box = Device(board, main.described(PATTERNS), 1)
+    with pytest.raises(Ended):
+        main.serve(box, usb, lambda: alive.append(1), lambda: tidied.append(len(alive)))  # type: ignore[arg-type]
+    assert usb.sent.count(b" OK ") == 1 + main.TIDY_AFTER
+    assert len(alive) == 5 + main.TIDY_AFTER
+    assert len(tidied) == 1
+
+
+def test_the_usb_port_gives_what_is_there_and_does_not_wait() -> None:
+    waiting = bytearray(framed("1A2B 1 PING") * 10)
+    sent: list[bytes] = []
+    poll = types.SimpleNamespace(register=lambda *_: None, poll=lambda _: [1] if waiting else [])
+    select = types.SimpleNamespace(poll=lambda: poll, POLLIN=1)
+
+    def read(count: int) -> bytes:
+        data = bytes(waiting[:count])
+        del waiting[:count]
+        return data
+
+    stdin = types.SimpleNamespace(buffer=types.SimpleNamespace(read=read))
+    port = main.UsbPort(
+        select,
+        types.SimpleNamespace(
+            stdin=stdin, stdout=types.SimpleNamespace(buffer=types.SimpleNamespace(write=sent.append))
+        ),
+    )
+    taken = b""
+    while data := port.read():
+        assert len(data) <= 64
+        taken += data
+    assert taken == framed("1A2B 1 PING") * 10
+    port.write(b"x")
+    assert sent == [b"x"]
+
+
+@pytest.fixture
+def on_the_board(pico: Pico, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """Runs the program on the board until its USB port ends; returns what it did besides."""
+    done: list[str] = []
+
+    def watchdog(timeout: int) -> types.SimpleNamespace:
+        done.append(f"watchdog {timeout}")
+        return types.SimpleNamespace(feed=lambda: None)
+
+    def run(*pieces: bytes, service: int = 1) -> list[str]:
+        pico.levels[main.SERVICE_PIN] = service
+        machine = types.SimpleNamespace(
+            Pin=pico.machine.Pin,  # type: ignore[attr-defined]
+            PWM=pico.machine.PWM,  # type: ignore[attr-defined]
+            WDT=watchdog,
+        )
+        micropython = types.SimpleNamespace(kbd_intr=lambda key: done.append(f"key {key}"))
+        for name, module in (("machine", machine), ("rp2", pico.rp2), ("micropython", micropython), ("time", pico)):
+            monkeypatch.setitem(sys.modules, name, module)
+        usb = Usb(*pieces)
+        monkeypatch.setattr(main, "UsbPort", lambda _select, _sys: usb)
+        try:
+            main.run()
+        except Ended:
+            done.append("ended")
+        monkeypatch.undo()
+        done.append(usb.sent.decode())
+        return done
+
+    return run
+
+
+def test_the_program_leaves_the_light_out_however_it_ends(
+    pico: Pico, on_the_board: Callable[..., list[str]], tmp_path: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(str(tmp_path))
+    did = on_the_board(framed("1A2B 1 HELLO 1 1000 5000 1000 1000"))
+    assert did[:3] == ["key -1", f"watchdog {main.RESTART_MS}", "ended"]
+    assert "model=slrig-pico" in did[3]
+    assert "max=0" in did[3], "there is no patterns.json here"
+    assert pico.levels[main.LAMP_PIN] == 0
+
+
+def test_a_jumper_keeps_the_program_from_starting(pico: Pico, on_the_board: Callable[..., list[str]]) -> None:
+    assert on_the_board(service=0) == [""]
+    assert main.LAMP_PIN not in pico.levels

@@ -1,0 +1,171 @@
+"""The reference box in MicroPython's own interpreter does, byte for byte, what it does in CPython."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import tests.unit.drivers.serial_projector
+from drivers.serial_projector.device import box, main, protocol, wire
+from drivers.serial_projector.frames import framed
+from drivers.serial_projector.pattern_set import crc32_of_all
+from tests.unit.drivers.serial_projector import fake_pico
+from tests.unit.drivers.serial_projector.engines import FIRMWARE, micropython_package
+
+HERE = Path(tests.unit.drivers.serial_projector.__path__[0])
+CRC32 = list(range(1000, 1026))
+
+PLAY = """
+from binascii import hexlify, unhexlify
+from box import Description, Hardware, HardwareError
+from protocol import Device
+
+class Light(Hardware):
+    now_us, calls = 0, 0
+    def time_us(self):
+        return self.now_us
+    def _did(self, what):
+        self.calls += 1
+        print(self.now_us, what)
+        if self.calls % 97 == 0:
+            raise HardwareError("number %d" % self.calls)
+    def select(self, pattern):
+        self._did("select %d" % pattern)
+    def light(self):
+        self._did("light")
+        self.now_us += 20
+    def dark(self):
+        self._did("dark")
+    def pulse(self):
+        self._did("pulse")
+    def dim(self, permille):
+        return permille
+
+light = Light()
+about = Description("test", "1", 400, 300, CRC32, light_us=3000, error_us=50, gap_us=2000, hold_us=500, least_us=100)
+box = Device(light, about, 0xC0FFEE)
+for passed_us, line in LINES:
+    until_us = light.now_us + passed_us
+    while light.now_us < until_us and 0 <= box.wait_us() <= until_us - light.now_us:
+        light.now_us += max(box.wait_us(), 1)
+        out = box.poll()
+        if out:
+            print(hexlify(out).decode())
+    light.now_us = max(until_us, light.now_us)
+    print(hexlify(box.feed(unhexlify(line))).decode())
+"""
+
+PINS = """
+from fake_pico import Board as Pico
+import main
+from protocol import Device
+
+pico = Pico()
+pico.levels[main.READY_PIN] = 1
+patterns = {"size_px": [main.WIDTH_PX, main.HEIGHT_PX], "crc32": ["%08X" % number for number in CRC32]}
+box = Device(main.Board(pico.machine, pico.rp2, pico.time), main.described(patterns), 7)
+for line in LINES:
+    print(box.feed(line).decode())
+    for _ in range(300):
+        pico.now_us += 100
+        print(box.poll().decode(), end="")
+print(pico.did)
+"""
+
+
+def in_micropython(script: str, folder: Path) -> str:
+    command = ["node", str(HERE / "micropython_run.mjs"), str(micropython_package()), str(folder)]
+    done = subprocess.run(command, input=script, capture_output=True, text=True, check=False, timeout=60)  # noqa: S603
+    assert done.returncode == 0, done.stderr + done.stdout[-2000:]
+    return done.stdout
+
+
+def in_cpython(script: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    for name, module in (
+        ("box", box),
+        ("wire", wire),
+        ("protocol", protocol),
+        ("main", main),
+        ("fake_pico", fake_pico),
+    ):
+        monkeypatch.setitem(sys.modules, name, module)
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told):
+        exec(compile(script, "script", "exec"), {})  # noqa: S102 - the script above
+    return told.getvalue()
+
+
+def random_lines(seed: int, count: int) -> list[tuple[int, str]]:
+    """(µs before it, bytes) of whatever hosts may send, some of it damaged, some of it again."""
+    rng = random.Random(seed)
+    lines: list[tuple[int, str]] = []
+    number, data = 0, b""
+    for step in range(count):
+        session = "1A2B" if step % 200 < 180 else "77F0"
+        first = rng.randrange(20)
+        size = rng.randrange(1, 7)
+        text = rng.choice(
+            [
+                *(f"HELLO 1 {rng.choice([40, 500, 1000])} {rng.choice([50, 5000])} {duty} 500" for duty in (200, 1000)),
+                f"LOAD {size} 00C0FFEE",
+                f"LOAD {size} {crc32_of_all(CRC32[first : first + size]):08X}",
+                f"LOAD 26 {crc32_of_all(CRC32):08X}",
+                f"LOAD 26 {crc32_of_all(CRC32):08X}",
+                *(f"SHOW {rng.randrange(26)}" for _ in range(6)),
+                f"SEQ {rng.randrange(3)} {size} {rng.choice([50, 4000, 9000])} {rng.choice([6400, 50000])} 0",
+                f"SEQ 0 {size} 4000 10000 1",
+                *("TRIG", "TRIG", "PING", "PING", "STOP", "BLANK", "STATUS", "DANCE", "SHOW", "SHOW -1", "LOAD x y"),
+                *(["BYE"] if step % 50 == 0 else []),
+            ]
+        )
+        chance = rng.random()
+        if chance < 0.8 or not data:
+            number = (number + 1) % 10_000
+            data = framed(f"{session} {number} {text}")
+        sent = data
+        if chance > 0.95:
+            at = rng.randrange(len(data))
+            sent = data[:at] + rng.randbytes(rng.randrange(3)) + data[at + 1 :]
+        lines.append((rng.choice([10, 1_000, 5_000, 30_000, 700_000]), sent.hex()))
+    return lines
+
+
+def test_both_interpreters_play_the_same_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = ""
+    for seed in range(4):
+        script = f"CRC32 = {CRC32}\nLINES = {random_lines(seed, 500)}\n{PLAY}"
+        in_ours = in_cpython(script, monkeypatch)
+        assert in_micropython(script, FIRMWARE) == in_ours
+        told += in_ours
+    text = b"".join(bytes.fromhex(line) for line in told.splitlines() if " " not in line)
+    # All that a box may say was said.
+    for each in (b" OK ", *(b" ERR %d " % code for code in (2, 3, 4, 5, 6, 7, 8, 9, 10)), b"? ERR 1 "):
+        assert each in text, each
+    for event in (b"FRAME", b"DONE", *(b"FAULT %d*" % code for code in (1, 2, 4))):
+        assert event in text, event
+
+
+def test_the_pins_do_the_same_in_both(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for file in (*FIRMWARE.glob("*.py"), HERE / "fake_pico.py"):
+        (tmp_path / file.name).write_text(file.read_text(encoding="utf-8"), encoding="utf-8")
+    texts = [
+        "HELLO 1 1000 5000 1000 500",
+        f"LOAD 26 {crc32_of_all(CRC32):08X}",
+        "SHOW 3",
+        "SHOW 1",
+        "SEQ 2 3 4000 8000 0",
+        "STATUS",
+        "BYE",
+    ]
+    lines = [framed(f"1A2B {number} {text}") for number, text in enumerate(texts)]
+    script = f"CRC32 = {CRC32}\nLINES = {lines}\n{PINS}"
+    told = in_cpython(script, monkeypatch)
+    assert in_micropython(script, tmp_path) == told
+    assert told.count("FRAME") == 3
+    assert told.count("5=1") == 3

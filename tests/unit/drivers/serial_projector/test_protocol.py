@@ -1,0 +1,495 @@
+"""The reference core on a clock that the test moves: at most once, in one session, and dark when it must be."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import pytest
+
+from drivers.serial_projector.device.box import Description, Hardware, HardwareError, LightTime
+from drivers.serial_projector.device.protocol import Device
+from drivers.serial_projector.frames import Answer, Event, Fault, Refused, Splitter, Unread, framed, parsed
+from drivers.serial_projector.pattern_set import crc32_of_all
+
+CRC32 = [zlib.crc32(bytes([number])) for number in range(26)]
+WATCHDOG_US, ON_US = 1_000_000, 5_000_000
+HELLO = "HELLO 1 1000 5000 1000 1000"
+
+
+@dataclass
+class Light(Hardware):
+    """A light engine whose clock stands still; `did` is what it was told."""
+
+    now_us: int = 1_000
+    did: list[str] = field(default_factory=list)
+    broken: set[str] = field(default_factory=set)
+    dims: bool = True
+
+    def time_us(self) -> int:
+        return self.now_us
+
+    def select(self, pattern: int) -> None:
+        self._do("select", str(pattern))
+
+    def light(self) -> None:
+        self._do("light")
+
+    def dark(self) -> None:
+        self._do("dark")
+
+    def pulse(self) -> None:
+        self._do("pulse")
+
+    def dim(self, permille: int) -> int:
+        return permille if self.dims else 1000
+
+    def _do(self, *what: str) -> None:
+        self.did.append(" ".join(what))
+        if what[0] in self.broken:
+            message = f"{what[0]} failed"
+            raise HardwareError(message)
+
+    def is_lit(self) -> bool:
+        done = [each for each in self.did if each in {"light", "dark"}]
+        return done[-1] == "light"
+
+    @property
+    def shown(self) -> list[int]:
+        """The patterns that were lit, in order."""
+        shown = []
+        for index, each in enumerate(self.did):
+            if each == "light":
+                before = [other for other in self.did[:index] if other.startswith("select")]
+                shown.append(int(before[-1].split()[1]))
+        return shown
+
+
+class Host:
+    """Sends lines to a core, and reads what comes back."""
+
+    def __init__(self, *, crc32: list[int] | None = None, **about: int) -> None:
+        self.light = Light()
+        limits = {"light_us": 2_000, "error_us": 50, "gap_us": 3_000, "hold_us": 500, "least_us": 200, **about}
+        self.box = Device(self.light, Description("test", "1", 4, 2, crc32 or CRC32, **limits), 0xB007)
+        self.number = 0
+        self.events: list[Event] = []
+
+    def send(self, data: bytes) -> list[Answer | Unread]:
+        answers: list[Answer | Unread] = []
+        for line in Splitter().lines(self.box.feed(data)):
+            self._sort(line, answers)
+        return answers
+
+    def ask(self, text: str, *, session: str = "1A2B", number: int | None = None) -> Answer:
+        if number is None:
+            self.number = number = (self.number + 1) % 10_000
+        (answer,) = self.send(framed(f"{session} {number} {text}"))
+        assert isinstance(answer, Answer)
+        assert (answer.session, answer.number) == (session, number)
+        return answer
+
+    def ok(self, text: str, **how: str) -> tuple[str, ...]:
+        answer = self.ask(text, **how)  # type: ignore[arg-type]
+        assert answer.code is None, answer
+        return answer.words
+
+    def refused(self, text: str, **how: str) -> int | None:
+        return self.ask(text, **how).code  # type: ignore[arg-type]
+
+    def ready(self, hello: str = HELLO, count: int = 26) -> Host:
+        self.ok(hello)
+        self.ok(f"LOAD {count} {crc32_of_all(CRC32[:count]):08X}")
+        return self
+
+    def pass_us(self, us: int) -> None:
+        """Let time pass, in which the box does what it has to."""
+        until_us = self.light.now_us + us
+        while self.light.now_us < until_us and 0 <= (due_us := self.box.wait_us()) <= until_us - self.light.now_us:
+            self.light.now_us += max(due_us, 1)
+            for line in Splitter().lines(self.box.poll()):
+                self._sort(line, [])
+        self.light.now_us = max(until_us, self.light.now_us)
+        for line in Splitter().lines(self.box.poll()):
+            self._sort(line, [])
+
+    def state(self) -> str:
+        """The state, as PING tells it; a sign of life."""
+        return self.ok("PING")[1]
+
+    def _sort(self, line: bytes, answers: list[Answer | Unread]) -> None:
+        found = parsed(line)
+        assert found is not None, line
+        assert len(line) <= 240
+        if isinstance(found, Event):
+            self.events.append(found)
+        else:
+            answers.append(found)
+
+
+def test_a_box_starts_dark_and_knows_nobody() -> None:
+    host = Host()
+    assert host.light.did == ["dark"]
+    for verb in ("PING", "SHOW 0", "BLANK", "STATUS", "TRIG", "STOP", "BYE", "LOAD 1 00000000", "SEQ 0 1 200 9999 0"):
+        assert host.refused(verb) == Refused.SESSION
+
+
+def test_a_command_that_comes_again_is_answered_again_and_obeyed_once() -> None:
+    host = Host().ready()
+    answers = [host.ask("SHOW 3", number=77) for _ in range(12)]
+    assert len(set(answers)) == 1
+    assert host.light.shown == [3]
+    assert host.ask("SHOW 4", number=78).code is None
+    assert host.ask("SHOW 3", number=77).code == Refused.STATE, "an old number is not obeyed"
+    assert host.light.shown == [3, 4]
+
+
+def test_a_refusal_is_answered_again_too() -> None:
+    host = Host().ready()
+    first = host.ask("SHOW 26", number=5)
+    assert first.code == Refused.RANGE
+    host.light.now_us += 10
+    assert host.ask("SHOW 26", number=5) == first
+
+
+def test_numbers_wrap() -> None:
+    host = Host()
+    host.number = 9_996
+    host.ready()
+    for index in range(5):
+        host.ok(f"SHOW {index}")
+    assert host.light.shown == [0, 1, 2, 3, 4]
+    assert host.number == 3
+
+
+def test_damaged_and_strange_lines_are_told() -> None:
+    host = Host().ready()
+    whole = framed("1A2B 9 SHOW 1")
+    strange = ("1A2B", "1A2B 9", "1A2B nine PING", "1A2B 10000 PING", "A 9 PING")
+    for data in (whole.replace(b"1*", b"2*"), b"rubbish\n", b"\xff\xfe\n", *map(framed, strange)):
+        assert host.send(data) == [Unread()]
+    assert host.send(b"\n\r\n") in ([], [Unread()])
+    assert host.light.shown == []
+    assert host.send(whole[:5]) == []
+    (answer,) = host.send(whole[5:])
+    assert isinstance(answer, Answer)
+    assert answer.code is None
+    host.number = 9
+    assert host.refused("DANCE") == Refused.VERB
+    for words in ("SHOW", "SHOW 1 2", "SHOW x", "SHOW -1", "LOAD 26", "LOAD 26 XYZ", "SEQ 0 1 2", "HELLO 1"):
+        assert host.refused(words) == Refused.RANGE
+
+
+def test_a_flood_without_end_of_line_is_forgotten() -> None:
+    host = Host().ready()
+    host.send(b"x" * 10_000)
+    assert host.send(b"\n") == [Unread()] or host.send(b"\n") == []
+    assert host.state() == "ready"
+
+
+def test_a_second_session_waits_for_the_first_to_die_or_leave() -> None:
+    host = Host().ready()
+    host.ok("SHOW 1")
+    assert host.refused(HELLO, session="77F0") == Refused.BUSY
+    assert host.refused("BLANK", session="77F0") == Refused.BUSY
+    assert host.light.is_lit()
+    host.pass_us(WATCHDOG_US + 1)
+    assert host.refused("BLANK", session="77F0") == Refused.SESSION
+    assert host.ask(HELLO, session="77F0", number=1).code is None
+    assert host.refused("SHOW 1") == Refused.BUSY
+    assert host.ask("BYE", session="77F0", number=2).code is None
+    assert host.refused("SHOW 1") == Refused.SESSION
+    assert host.refused("PING", session="77F0") == Refused.SESSION
+    host.ready()
+
+
+def test_a_farewell_is_answered_again() -> None:
+    host = Host().ready()
+    host.ok("SHOW 1")
+    assert host.ask("BYE", number=50) == host.ask("BYE", number=50)
+    assert not host.light.is_lit()
+
+
+def test_the_watchdog_puts_the_light_out_and_the_host_must_see_it() -> None:
+    host = Host().ready()
+    host.ok("SHOW 1")
+    host.pass_us(WATCHDOG_US - 1)
+    assert host.state() == "lit"
+    host.pass_us(WATCHDOG_US)
+    assert host.light.is_lit()
+    host.pass_us(1)
+    assert not host.light.is_lit()
+    assert host.events == [Event("FAULT", (str(Fault.WATCHDOG.value),))]
+    assert host.ok("PING")[1:] == ("ready", "1")
+    for verb in ("SHOW 1", "SEQ 0 26 5000 10000 0", "TRIG"):
+        assert host.refused(verb) == Refused.FAULT
+    assert not host.light.is_lit()
+    host.ok("BLANK")
+    host.ok("SHOW 1")
+
+
+@pytest.mark.parametrize("line", [framed("77F0 1 PING"), b"rubbish\n", framed("1A2B 9").replace(b"9", b"8")])
+def test_only_its_own_host_feeds_the_watchdog(line: bytes) -> None:
+    host = Host().ready()
+    host.ok("SHOW 1")
+    for _ in range(4):
+        host.pass_us(WATCHDOG_US // 3)
+        host.send(line)
+    assert not host.light.is_lit()
+
+
+def test_a_command_sent_again_feeds_the_watchdog() -> None:
+    host = Host().ready()
+    for _ in range(8):
+        host.ask("SHOW 1", number=99)
+        host.pass_us(WATCHDOG_US // 2)
+    assert host.light.is_lit()
+
+
+def test_a_pattern_is_not_lit_for_longer_than_allowed() -> None:
+    host = Host().ready()
+    host.ok("SHOW 1")
+    for _ in range(ON_US // 500_000):
+        host.pass_us(500_000)
+        assert host.light.is_lit()
+        host.state()
+    host.pass_us(1)
+    assert not host.light.is_lit()
+    assert host.events == [Event("FAULT", (str(Fault.ON_TIME.value),))]
+    host.ok("STOP")
+    for index in range(20):
+        host.ok(f"SHOW {index}")
+        host.pass_us(500_000)
+    assert host.light.is_lit(), "another pattern begins the time anew"
+
+
+def test_light_is_rationed_by_duty() -> None:
+    host = Host().ready("HELLO 1 1000 60000 300 1000")
+    host.ok("SHOW 1")
+    begun_us = host.light.now_us
+    while not host.events:
+        host.pass_us(1_000)
+        host.state()
+    assert host.events == [Event("FAULT", (str(Fault.DUTY.value),))]
+    assert host.light.now_us - begun_us == pytest.approx(3_200_000, abs=2_000)
+    host.ok("BLANK")
+    assert host.refused("SHOW 1") == Refused.LIMIT
+    host.pass_us(6_800_000)
+    # The light is ten seconds back only in part.
+    host.ok("SHOW 1")
+    host.pass_us(700_000)
+    assert host.refused("SHOW 2") in {Refused.LIMIT, Refused.FAULT}
+    host.ok("BLANK")
+    assert host.refused("SEQ 0 26 5000 10000 0") == Refused.LIMIT, "more light than duty in the long run"
+    host.pass_us(10_000_001)
+    host.ok("SEQ 0 26 5000 20000 0")
+
+
+def test_light_time_counts_the_last_ten_seconds() -> None:
+    counted = LightTime()
+    now_us, history = 0, []
+    for step in range(4_000):
+        lit = step % 7 < 3
+        now_us += 37_003
+        counted.note(now_us, lit)
+        history.append((now_us, lit))
+        truth = sum(37_003 for at, on in history if on and at > now_us - 10_000_000)
+        # Slots are forgotten whole.
+        assert truth - 550_000 <= sum(counted.slots) <= truth + 550_000
+    counted.note(now_us + 10**9, False)
+    assert sum(counted.slots) == 0
+
+
+def test_a_sequence_runs_on_its_own_clock() -> None:
+    host = Host().ready()
+    (first_us,) = host.ok("SEQ 2 5 4000 10000 0")
+    assert not host.light.is_lit()
+    host.light.did.clear()
+    host.pass_us(100_000)
+    frames = [event.words for event in host.events if event.name == "FRAME"]
+    assert [int(index) for index, _ in frames] == [2, 3, 4, 5, 6]
+    assert [int(t_us) - int(first_us) for _, t_us in frames] == [0, 10_000, 20_000, 30_000, 40_000]
+    assert host.events[-1] == Event("DONE", ("5",))
+    done = [each.split()[0] for each in host.light.did]
+    assert done == [*["light", "pulse", "dark", "select"] * 4, "light", "pulse", "dark"]
+    assert host.state() == "ready"
+    assert host.ok("STOP") == ("5",)
+
+
+def test_a_pattern_of_a_sequence_is_lit_for_its_exposure_and_the_hold() -> None:
+    host = Host().ready()
+    host.ok("SEQ 0 1 4000 10000 0")
+    host.pass_us(3_000 + 4_499)
+    assert host.light.is_lit()
+    host.pass_us(1)
+    assert not host.light.is_lit()
+
+
+def test_a_box_that_is_late_does_not_hurry() -> None:
+    host = Host().ready()
+    host.ok("SEQ 0 3 4000 10000 0")
+    host.pass_us(3_000)
+    # The program stood still for 50 ms.
+    host.light.now_us += 50_000
+    host.pass_us(200_000)
+    times = [int(event.words[1]) for event in host.events if event.name == "FRAME"]
+    assert min(later - earlier for earlier, later in pairwise(times)) >= 9_999
+    assert len(times) == 3
+
+
+def test_a_sequence_can_be_stopped() -> None:
+    host = Host().ready()
+    host.ok("SEQ 0 26 4000 10000 0")
+    host.pass_us(35_000)
+    assert host.ok("STOP") == ("4",)
+    host.light.did.clear()
+    host.pass_us(500_000)
+    assert host.light.did == []
+    for verb in ("SHOW 1", "SEQ 0 26 4000 10000 0"):
+        host.ok("BLANK")
+        host.ok(verb)
+
+
+def test_a_sequence_waits_for_triggers() -> None:
+    host = Host().ready()
+    assert host.refused("TRIG") == Refused.STATE
+    host.ok("SEQ 4 3 4000 10000 1")
+    host.pass_us(500_000)
+    assert host.light.shown == []
+    for index in (4, 5, 6):
+        shown = host.ok("TRIG")
+        assert shown == (str(index), str(host.light.now_us))
+        assert host.refused("TRIG") == Refused.STATE, "it is lit"
+        host.pass_us(4_500)
+        assert not host.light.is_lit()
+    assert host.events[-1] == Event("DONE", ("3",))
+    assert host.refused("TRIG") == Refused.STATE
+    assert host.light.shown == [4, 5, 6]
+    assert host.light.did.count("pulse") == 3
+
+
+def test_the_watchdog_ends_a_sequence() -> None:
+    host = Host().ready()
+    host.ok("SEQ 0 26 40000 100000 0")
+    host.pass_us(WATCHDOG_US + 1)
+    assert host.events[-1] == Event("FAULT", ("1",))
+    shown = len(host.light.shown)
+    host.pass_us(2_000_000)
+    assert len(host.light.shown) == shown <= 11
+    assert not host.light.is_lit()
+
+
+@pytest.mark.parametrize("busy", ["SEQ 0 26 4000 10000 0", "SEQ 0 26 4000 10000 1"])
+def test_nothing_else_is_shown_while_a_sequence_goes_on(busy: str) -> None:
+    host = Host().ready()
+    host.ok(busy)
+    assert host.refused("SHOW 1") == Refused.STATE
+    assert host.refused("SEQ 0 1 4000 10000 0") == Refused.STATE
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "0 27 4000 10000 0",
+        "1 26 4000 10000 0",
+        "26 1 4000 10000 0",
+        "0 0 4000 10000 0",
+        "0 1 4000 10000 2",
+        "0 1 199 10000 0",
+        "0 1 5000000 9000000 0",
+        "0 1 4000 6999 0",
+    ],
+)
+def test_a_sequence_out_of_range_is_refused(words: str) -> None:
+    host = Host().ready()
+    assert host.refused(f"SEQ {words}") == Refused.RANGE
+    assert host.state() == "ready"
+
+
+def test_any_run_of_the_flash_can_be_loaded_and_nothing_else() -> None:
+    host = Host().ready()
+    assert host.ok(f"LOAD 3 {crc32_of_all(CRC32[7:10]):08X}") == ("3", "7")
+    host.ok("SHOW 2")
+    assert host.light.shown == [9]
+    assert host.refused("SHOW 3") == Refused.RANGE
+    assert host.refused(f"LOAD 2 {crc32_of_all([CRC32[0], CRC32[2]]):08X}") == Refused.PATTERNS
+    assert not host.light.is_lit()
+    assert host.refused("SHOW 0") == Refused.STATE, "what does not fit leaves nothing loaded"
+    for count in (0, 27):
+        assert host.refused(f"LOAD {count} 00000000") == Refused.RANGE
+
+
+@pytest.mark.parametrize("dark", ["BLANK", "STOP", "BYE", "LOAD 27 00000000", HELLO, "HELLO 2 1000 5000 1000 1000"])
+def test_every_verb_that_is_dark_is(dark: str) -> None:
+    for begin in ("SHOW 1", "SEQ 0 26 4000 10000 0"):
+        host = Host().ready()
+        host.ok(begin)
+        host.pass_us(4_000)
+        assert host.light.is_lit()
+        host.ask(dark)
+        assert not host.light.is_lit()
+        host.pass_us(500_000)
+        assert not host.light.is_lit()
+
+
+def test_limits_are_granted_in_part_and_never_exceeded() -> None:
+    host = Host(watchdog_ms=800, on_ms=2_000, duty=400)
+    words = dict(word.split("=") for word in host.ok("HELLO 1 5000 60000 1000 250"))
+    assert [words[key] for key in ("watchdog_ms", "on_ms", "duty", "bright")] == ["800", "2000", "400", "250"]
+    for limits in ("49 5000 1000 1000", "1000 0 1000 1000", "1000 5000 0 1000", "1000 5000 1001 1000"):
+        assert host.refused(f"HELLO 1 {limits}") == Refused.RANGE
+    assert host.refused("PING") == Refused.SESSION, "a HELLO that is refused leaves no session"
+    host.light.dims = False
+    assert host.refused("HELLO 1 1000 5000 1000 999") == Refused.RANGE
+    host.ok(HELLO)
+
+
+@pytest.mark.parametrize("broken", ["select", "light", "pulse"])
+def test_an_engine_that_fails_is_dark_and_says_so(broken: str) -> None:
+    host = Host().ready()
+    host.light.broken = {broken}
+    if broken != "pulse":
+        assert host.refused("SHOW 1") == Refused.HARDWARE
+        assert not host.light.is_lit()
+        assert host.refused("SHOW 1") == Refused.FAULT
+        host.ok("BLANK")
+    host.light.broken = set()
+    host.ok("SEQ 0 26 4000 10000 0")
+    host.light.broken = {broken}
+    host.pass_us(200_000)
+    assert host.events[-1] == Event("FAULT", (str(Fault.LIGHT.value),))
+    assert host.light.did[-1] == "dark"
+    assert host.state() == "ready"
+
+
+def test_a_light_that_does_not_go_out_is_told_to_again_and_again() -> None:
+    host = Host().ready()
+    host.ok("SHOW 1")
+    host.light.broken = {"dark"}
+    assert host.refused("BLANK") == Refused.HARDWARE
+    tried = host.light.did.count("dark")
+    host.pass_us(50_000)
+    assert host.light.did.count("dark") > tried + 20
+    host.light.broken = set()
+    host.pass_us(2_000)
+    tried = host.light.did.count("dark")
+    host.pass_us(50_000)
+    assert host.light.did.count("dark") == tried
+    assert host.ok("PING")[2] == str(Fault.LIGHT.value)
+
+
+def test_status_tells_everything() -> None:
+    host = Host().ready()
+    host.ok("SHOW 5")
+    words = dict(word.split("=") for word in host.ok("STATUS"))
+    assert words == {
+        "state": "lit",
+        "loaded": "26",
+        "first": "0",
+        "index": "5",
+        "frames": "0",
+        "shows": "1",
+        "fault": "0",
+        "t_us": "1000",
+    }
