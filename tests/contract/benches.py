@@ -12,6 +12,7 @@ from slrig.bundle import write_bundle
 from slrig.capture.sequencer import capture
 from slrig.model import Capture, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract import depthai_bench, dlpc350_bench, genicam_bench, opencv_bench, serial_bench, v4l2_bench
 from tests.contract.suite import Bench, rig_of
 
 PROJECTOR = Size(96, 72)
@@ -69,7 +70,7 @@ def simulated(folder: Path, *, realtime: bool = False, **head: object) -> Bench:
     return Bench(partial(device.open_head, options, folder), sequence())
 
 
-def replayed(folder: Path) -> Bench:
+def replayed(folder: Path, **options: object) -> Bench:
     """A recording, made here on the rendered rig, with the times and exposures of its frames."""
     bench = simulated(folder)
     with bench.head() as head:
@@ -77,11 +78,20 @@ def replayed(folder: Path) -> Bench:
         formats = {name: camera.info.format for name, camera in head.cameras.items()}
         recorded = Capture(PROJECTOR, bench.sequence.patterns, formats, shots)
         write_bundle(folder / "recording", recorded, head.calibration)
-    return Bench(partial(replay.open_head, {"bundle": "recording"}, folder), bench.sequence)
+    return Bench(partial(replay.open_head, {"bundle": "recording", **options}, folder), bench.sequence)
 
 
 BENCHES: dict[str, Callable[[Path], Bench]] = {
     "simulated": simulated,
     "simulated in real time": partial(simulated, realtime=True),
     "replay": replayed,
+    "replay in real time, 50 times as fast": partial(replayed, speed=50),
+    "v4l2 (umockdev)": v4l2_bench.bench,
+    "opencv (stream)": opencv_bench.stream_bench,
+    "opencv (file)": opencv_bench.file_bench,
+    "opencv (umockdev)": opencv_bench.device_bench,
+    "genicam (GigE Vision on loopback)": genicam_bench.bench,
+    "depthai (host-only)": depthai_bench.bench,
+    "dlpc350": dlpc350_bench.bench,
+    "serial projector": serial_bench.bench,
 }

@@ -1,0 +1,81 @@
+"""The OAK driver before a stage: a mono pair of one device, with the library's own messages, queues and Sync.
+
+The library must be installed, no device need be plugged in; what stands below the driver is in
+`tests.unit.drivers.depthai.fake_oak`. Without the library the bench skips, on CI it fails.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drivers.depthai import open_camera
+from slrig.devices import Camera, Projector
+from slrig.model import Calibration, PatternSequence, Size, Truth
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.suite import Bench
+from tests.unit.capture.fake_rig import PROJECTOR, Scene
+
+FPS = 60.0
+SOCKETS = {"left": "CAM_B", "right": "CAM_C"}
+
+
+@dataclass
+class OakHead:
+    """Implements `slrig.devices.Head`: cameras of one device, and a projector on the same stage."""
+
+    oak: Any
+    stage: Stage
+    options: Mapping[str, Mapping[str, object]]
+    cameras: Mapping[str, Camera] = field(init=False)
+    projector: Projector = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.projector = StagedProjector(self.stage)
+        with self.oak.connected():
+            self.cameras = {name: open_camera(name, options, Path()) for name, options in self.options.items()}
+
+    @property
+    def calibration(self) -> Calibration | None:
+        return None
+
+    def truth(self) -> Truth | None:
+        return None
+
+    def close(self) -> None:
+        self.projector.close()
+        for camera in self.cameras.values():
+            camera.close()
+
+
+def sequence(projector: Size = PROJECTOR) -> PatternSequence:
+    patterns = scan_patterns(
+        projector, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return encode(patterns, projector)
+
+
+def oak_head(stage: Stage, *, fps: float = FPS, options: Mapping[str, object] | None = None, **oak: Any) -> OakHead:
+    """A mono pair before a stage; `oak` are the fields of `FakeOak`, `options` more of the driver's."""
+    from tests.unit.drivers.depthai.fake_oak import DEVICE, FakeOak
+
+    tables = {
+        name: {"device": DEVICE, "socket": socket, "fps": fps, **(options or {})} for name, socket in SOCKETS.items()
+    }
+    return OakHead(FakeOak(stage, **oak), stage, tables)
+
+
+def bench(folder: Path, **oak: Any) -> Bench:  # noqa: ARG001 - every bench takes a folder
+    """The pair as an instrument for the contract suite. Skips where the library is missing; fails there on CI."""
+    importlib.import_module("tests.unit.drivers.depthai.fake_oak")
+    seeds = iter(range(1_000))
+
+    def open_head() -> OakHead:
+        scene = Scene(noise_dn=0.8, seed=next(seeds))
+        return oak_head(Stage(scene, latency_s=0.002, jitter_s=0.003), **oak)
+
+    return Bench(open_head, sequence())

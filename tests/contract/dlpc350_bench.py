@@ -1,0 +1,378 @@
+"""The light engine's driver before a camera on its trigger wire: a bench for the contract suite.
+
+Here the engine is at the other end of a pair of sockets. In the guest it is a HID device of the kernel, and the driver
+opens its hidraw node: `python -m tests.contract.dlpc350_bench FILE` runs the contract suite and the checks below on it,
+and writes what came of each to FILE, as JSON; `tests/contract/test_dlpc350_guest.py` asserts on that.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers import dlpc350
+from drivers.dlpc350.finding import engines
+from drivers.dlpc350.flash import Flash, read_flash, write_pictures
+from drivers.dlpc350.link import Link
+from drivers.dlpc350.options import checked
+from drivers.dlpc350.planes import MIRRORS
+from drivers.dlpc350.projector import LightEngine
+from slrig.capture.evidence import Evidence
+from slrig.capture.sequencer import capture
+from slrig.conformance import run
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Projector, Trigger
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceGoneError,
+    DeviceStateError,
+    FrameTimeoutError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Calibration, Frame, PatternSequence, Size, Truth
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.dlpc350_device import Cable, FakeEngine, UhidEngine
+from tests.contract.stage import Stage
+from tests.contract.suite import Bench, rig_of
+from tests.unit.capture.fake_rig import Scene
+
+PICTURES = "pictures"
+LOAD_S = 0.03
+"""What the fake engine takes for a picture, and what its rig file says at the most."""
+_WIRE_NS = 20_000
+_ERR_NS = 1_000
+_EXPOSURES_S = (1e-4, 0.5)
+_GAINS = (1.0, 8.0)
+
+
+def sequence(*, rows: bool = False) -> PatternSequence:
+    """White, black, Gray code with inverses, shifted lines, and white and black again."""
+    patterns = scan_patterns(
+        MIRRORS, line_shift=True, period_px=16, line_width_px=2, gray_cell_px=None, gray_offset_px=0, rows=rows
+    )
+    return encode(patterns, MIRRORS)
+
+
+def scene() -> Scene:
+    """A camera that sees most of the mirrors' columns, and of their rows a band."""
+    return Scene(
+        camera=Size(640, 100),
+        projector=MIRRORS,
+        columns_per_px=1.4,
+        rows_per_px=10.0,
+        blur_px=0.8,
+        noise_dn=0.5,
+        white=0.5,
+    )
+
+
+class WiredCamera:
+    """Implements `slrig.devices.Camera` on a stage: triggered by software, or by `pulse`."""
+
+    def __init__(self, name: str, stage: Stage) -> None:
+        self._stage = stage
+        self._settings = CameraSettings(1 / 60)
+        self._armed: Trigger | None = None
+        self._closed = False
+        self._exposures: deque[tuple[int, int, int]] = deque()
+        self._made = 0
+        self._left = 0
+        self._busy_until_ns = 0
+        self._dropped = 0
+        self._changed = threading.Condition()
+        self.info = CameraInfo(
+            name,
+            "camera on a stage",
+            "stage",
+            stage.format,
+            frozenset({Trigger.SOFTWARE, Trigger.HARDWARE}),
+            _EXPOSURES_S,
+            _GAINS,
+        )
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`."""
+        self._require(self._armed is None, "configure: the camera is armed; disarm it")
+        for what, asked, (least, most) in (
+            ("exposure", settings.exposure_s, _EXPOSURES_S),
+            ("gain", settings.gain, _GAINS),
+        ):
+            if not least <= asked <= most:
+                message = f"asked for {what} {asked:g}, the camera has {least:g} to {most:g}; choose one of these"
+                raise UnsupportedByDeviceError(message)
+        self._settings = settings
+        return AppliedSettings(settings.exposure_s, settings.gain)
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`."""
+        self._require(self._armed is None, "arm: the camera is armed; disarm it")
+        if count < 1 or trigger not in self.info.triggers:
+            message = f"asked for {count} frames by {trigger}, the camera makes one or more by software or hardware"
+            raise UnsupportedByDeviceError(message)
+        with self._changed:
+            self._exposures.clear()
+            self._left, self._dropped, self._armed = count, 0, trigger
+
+    def trigger(self) -> None:
+        """See `Camera`."""
+        self._require(self._armed is Trigger.SOFTWARE, "trigger: the camera is not armed for it; arm it")
+        self._expose(time.monotonic_ns())
+
+    def pulse(self, t_ns: int) -> None:
+        """Take an edge on the wire."""
+        if self._armed is Trigger.HARDWARE:
+            self._expose(t_ns + _WIRE_NS)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`."""
+        self._require(self._armed is not None, "read: the camera is not armed; arm it")
+        until = time.monotonic() + timeout_s
+        with self._changed:
+            while (left_s := until - time.monotonic()) > 0:
+                while self._exposures and self._exposures[0][1] < after_ns:
+                    self._exposures.popleft()
+                if self._exposures and (ready_s := (self._exposures[0][2] - time.monotonic_ns()) / 1e9) <= 0:
+                    return self._frame(*self._exposures.popleft())
+                self._changed.wait(min(left_s, ready_s) if self._exposures else left_s)
+        message = f"no frame in {timeout_s} s; check the trigger"
+        raise FrameTimeoutError(message)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        with self._changed:
+            self._armed = None
+            self._exposures.clear()
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self.disarm()
+        self._closed = True
+
+    def _expose(self, t_ns: int) -> None:
+        end_ns = t_ns + round(self._settings.exposure_s * 1e9)
+        with self._changed:
+            if self._left == 0 or t_ns < self._busy_until_ns:
+                self._dropped += 1
+                return
+            self._left -= 1
+            self._busy_until_ns = end_ns
+            self._exposures.append((self._made, t_ns, end_ns))
+            self._made += 1
+            self._changed.notify_all()
+
+    def _frame(self, number: int, start_ns: int, end_ns: int) -> Frame:
+        settings = self._settings
+        image = self._stage.exposed(start_ns, end_ns, gain=settings.gain)
+        return Frame(
+            self.info.name,
+            image,
+            start_ns,
+            end_ns,
+            _ERR_NS,
+            number,
+            self._dropped,
+            settings.exposure_s,
+            settings.gain,
+        )
+
+    def _require(self, condition: bool, message: str) -> None:
+        if self._closed:
+            message = "the camera is closed; open the rig again"
+        if self._closed or not condition:
+            raise DeviceStateError(message)
+
+
+class EngineHead:
+    """Implements `slrig.devices.Head`: a light engine, and a camera on its wire."""
+
+    def __init__(self, projector: Projector, camera: Camera) -> None:
+        self._projector = projector
+        self._camera = camera
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """See `Head`."""
+        return {self._camera.info.name: self._camera}
+
+    @property
+    def projector(self) -> Projector:
+        """See `Head`."""
+        return self._projector
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """See `Head`. None: nothing is measured here."""
+        return None
+
+    def truth(self) -> Truth | None:
+        """See `Head`."""
+        return None
+
+
+class Table:
+    """A stage, and a fake engine that lights it, with the pictures of a sequence in its flash; used by one head."""
+
+    def __init__(self, folder: Path, shown: PatternSequence, **engine: float | str | bool) -> None:
+        self.folder = folder
+        self.stage = Stage(scene())
+        self.flash: Flash = write_pictures(folder / PICTURES, shown)
+        self._camera: WiredCamera | None = None
+        pictures = {picture.flash_index: picture.content for picture in self.flash.pictures}
+        options = {"tag": self.flash.tag, "load_s": LOAD_S, **engine}
+        self.engine = FakeEngine(pictures, light=self.stage.show, pulse=self._pulse, **options)  # type: ignore[arg-type]
+
+    def options(self, **more: object) -> dict[str, object]:
+        """The engine's table in a rig file."""
+        return {"patterns": PICTURES, "image_load_s": 1.5 * LOAD_S, "light_margin_s": 0.002, **more}
+
+    def head(self, projector: Projector) -> EngineHead:
+        """The projector and a new camera."""
+        self._camera = WiredCamera("left", self.stage)
+        return EngineHead(projector, self._camera)
+
+    def connected(self, **more: object) -> EngineHead:
+        """The driver at the other end of a new cable."""
+        flash = read_flash(self.folder / PICTURES)
+        link = Link(Cable(self.engine).host, "light engine")
+        return self.head(LightEngine(link, checked(self.options(**more)), flash, serial="LC4500-1"))
+
+    def opened(self, **more: object) -> EngineHead:
+        """The driver as a rig opens it, on whatever engine the kernel has."""
+        return self.head(dlpc350.open_projector(self.options(**more), self.folder))
+
+    def _pulse(self, t_ns: int) -> None:
+        if self._camera is not None:
+            self._camera.pulse(t_ns)
+
+
+def bench(folder: Path) -> Bench:
+    """The contract suite's bench."""
+    shown = sequence()
+    table = Table(folder, shown)
+    return Bench(table.connected, shown)
+
+
+Notes = dict[str, float | int | str]
+
+
+def both_axes_are_scanned_by_wire(table: Table, notes: Notes) -> None:
+    """Capture two pictures' worth of patterns in one play, every frame proven."""
+    shown = sequence(rows=True)
+    rig = rig_of(table.opened())
+    evidence = Evidence(shown.patterns, {name: camera.info.format for name, camera in rig.cameras.items()})
+    begun = time.monotonic()
+    with rig:
+        shots = list(capture(rig, shown, evidence=evidence))
+    notes |= {"patterns": len(shown), "pictures": len(table.flash.pictures), "s": round(time.monotonic() - begun, 2)}
+    summary = evidence.summary()
+    assert (len(shots), summary.shot_again) == (len(shown), 0), summary
+    assert table.engine.lit is None
+
+
+def it_is_found_by_its_serial_number(table: Table, notes: Notes) -> None:
+    """Find it without opening it, and open it by the name found."""
+    (device,) = dlpc350.find_devices()
+    notes["label"] = device.label
+    assert (device.driver, device.device) == ("dlpc350", "LC4500-1")
+    table.opened(device=device.device).projector.close()
+
+
+def an_engine_that_another_program_holds_is_busy(table: Table, notes: Notes) -> None:
+    """Hold it as another program does, and as this driver does."""
+    path = engines()[0].path
+    other = os.open(path, os.O_RDWR)
+    try:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(DeviceBusyError, match="another program holds it") as busy:
+            table.opened()
+        notes["says"] = str(busy.value)
+    finally:
+        os.close(other)
+    with rig_of(table.opened()), pytest.raises(DeviceBusyError):
+        table.opened()
+
+
+def showing_takes_what_it_says(table: Table, notes: Notes) -> None:
+    """Time `show`, and see that light is there when it says."""
+    head = table.opened()
+    with rig_of(head):
+        head.projector.load(sequence())
+        took = []
+        for index in range(10):
+            begun = time.monotonic()
+            shown = head.projector.show(index % 2)
+            took.append(time.monotonic() - begun)
+            assert shown.t_visible_ns + shown.t_err_ns <= time.monotonic_ns()
+            lit = table.engine.lit
+            assert lit is not None
+            assert lit[0, 0] == (255 if index % 2 == 0 else 0)
+        notes["median_show_ms"] = round(float(np.median(took)) * 1e3, 1)
+        notes["declared_latency_ms"] = round(head.projector.info.latency_s * 1e3, 1)
+
+
+def an_engine_that_is_unplugged_is_gone(table: Table, notes: Notes) -> None:
+    """Unplug it while it shows: gone, closed without error, and found no more. It is the last check."""
+    head = table.opened()
+    head.projector.load(sequence())
+    head.projector.show(0)
+    device.unplug() if (device := _PLUGGED.pop(id(table), None)) is not None else None
+    with pytest.raises(DeviceGoneError) as gone:
+        head.projector.show(1)
+    notes["says"] = str(gone.value)
+    head.projector.close()
+    head.projector.close()
+    assert dlpc350.find_devices() == ()
+    with pytest.raises(DeviceGoneError, match="plugged in: none"):
+        table.opened()
+
+
+_PLUGGED: dict[int, UhidEngine] = {}
+CHECKS: tuple[Callable[[Table, Notes], None], ...] = (
+    both_axes_are_scanned_by_wire,
+    it_is_found_by_its_serial_number,
+    an_engine_that_another_program_holds_is_busy,
+    showing_takes_what_it_says,
+    an_engine_that_is_unplugged_is_gone,
+)
+
+
+def _wait_until_found() -> None:
+    """The kernel makes the node in its own time."""
+    until, pause = time.monotonic() + 30.0, threading.Event()
+    while not dlpc350.find_devices() and time.monotonic() < until:
+        pause.wait(0.05)
+
+
+def main(target: Path) -> None:
+    """Run the contract suite and the checks on the kernel's node, and write what came of each."""
+    table = Table(target.parent, sequence(rows=True))
+    _PLUGGED[id(table)] = UhidEngine(table.engine)
+    _wait_until_found()
+    bench = Bench(table.opened, sequence())
+    told: dict[str, object] = {"contract": run(bench.open_rig, bench.sequence).document()}
+    target.write_text(json.dumps(told, indent=1))
+    for check in CHECKS:
+        notes: Notes = {}
+        fault: str | None = None
+        begun = time.monotonic()
+        try:
+            check(table, notes)
+        # Whatever it is (pytest's failures are no Exception), the other checks have their turn.
+        except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001
+            fault = "".join(traceback.format_exception(error))
+        told[check.__name__] = {"fault": fault, "seconds": round(time.monotonic() - begun, 2), "notes": notes}
+        target.write_text(json.dumps(told, indent=1))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,396 @@
+"""A DLPC350 at the other end of the wire: what the controller does with reports, as TI's documents say, and strictly.
+
+It is as unhelpful as the documents allow: it wakes up in video mode with every LED on; a stop leaves the last pattern
+lit; settings are refused while a sequence runs, and a start before the tables were validated; light comes only when the
+picture was loaded, although the status says at once that the sequence runs. Its light goes to whoever asks
+(`Stage.show`), its trigger output too.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from slrig.model import Pixels
+
+REPORT = 64
+WHITE: Pixels = np.full((1, 1), 255, np.uint8)
+
+_SETTINGS = {
+    0x0B01: 3,
+    0x1008: 1,
+    0x1009: 1,
+    0x1A05: 1,
+    0x1A1D: 3,
+    0x1A22: 1,
+    0x1A23: 1,
+    0x1A29: 8,
+    0x1A30: 1,
+    0x1A31: 4,
+}
+"""Registers by command, with their lengths; written only while no sequence runs."""
+_AT_ANY_TIME = {0x0200: 1, 0x1A07: 1, 0x1A1B: 1, 0x1A32: 1, 0x1A33: 1}
+_INVALIDATES = {0x1A1B, 0x1A1D, 0x1A22, 0x1A23, 0x1A29, 0x1A30, 0x1A31, 0x1A34}
+
+
+@dataclass
+class Faults:
+    """What goes wrong. silent, refused : commands that are not answered, or refused; bent : registers that read back
+    otherwise than they were set; busy_checks : how often a check of the tables is said to be still under way.
+    """
+
+    silent: set[int] = field(default_factory=set)
+    refused: set[int] = field(default_factory=set)
+    bent: Mapping[int, bytes] = field(default_factory=dict)
+    busy_checks: int = 2
+    never_runs: bool = False
+    stale_answer: bool = False
+
+
+class FakeEngine:
+    """A controller with pictures in its flash.
+
+    Parameters
+    ----------
+    pictures
+        BMP files by their place in the flash.
+    light, pulse
+        Told of every change of light (None: dark), and of every edge of the trigger output (ns).
+    load_s
+        How long a picture takes from the flash.
+    """
+
+    def __init__(
+        self,
+        pictures: Mapping[int, bytes],
+        *,
+        light: Callable[[Pixels | None], object] = lambda _: None,
+        pulse: Callable[[int], None] = lambda _: None,
+        tag: str = "",
+        load_s: float = 0.0,
+        standby: bool = False,
+    ) -> None:
+        self.faults = Faults()
+        self.commands: list[tuple[int, bytes]] = []
+        self.shown: list[Pixels | None] = []
+        self.tag = tag
+        self.registers: dict[int, bytes] = {
+            **{command: bytes(length) for command, length in (_SETTINGS | _AT_ANY_TIME).items()},
+            0x0200: bytes([standby]),
+            0x0B01: bytes([0x97, 0x78, 0x7D]),
+            0x1008: b"\1",
+            0x1A07: b"\x08",
+        }
+        self._planes = {index: _planes(picture) for index, picture in pictures.items()}
+        self._light, self._pulse, self._load_s = light, pulse, load_s
+        self._mailboxes = {1: bytearray(64), 2: bytearray(128 * 3)}
+        self._mirrors: Pixels | None = WHITE
+        self._lit: Pixels | None = None
+        self._validated: int | None = None
+        self._hardware = 1
+        self._busy = 0
+        self._pending: tuple[bytearray, int] | None = None
+        self._halt: threading.Event | None = None
+        self._sequencer: threading.Thread | None = None
+        self._lock = threading.RLock()
+        self._relight()
+
+    @property
+    def running(self) -> bool:
+        """Whether a sequence is under way."""
+        return self._halt is not None
+
+    @property
+    def lit(self) -> Pixels | None:
+        """What is on the scene; None: nothing."""
+        return self._lit
+
+    def unplug(self) -> None:
+        """Without power, there is no light."""
+        self._stop()
+        self._mirrors = None
+        self._relight()
+
+    def take(self, report: bytes) -> bytes | None:
+        """Take one report of the host, and return the answer that it makes, if it completes a message."""
+        if self._pending is None:
+            self._pending = bytearray(), 4 + int.from_bytes(report[2:4], "little")
+        message, length = self._pending
+        message += report
+        if len(message) < length:
+            return None
+        self._pending = None
+        flags, sequence = message[0], message[1]
+        command = int.from_bytes(message[4:6], "little")
+        data = bytes(message[6:length])
+        with self._lock:
+            self.commands.append((command, data)) if not flags & 0x80 else None
+            if command in self.faults.silent:
+                return None
+            answer = None if command in self.faults.refused else self._done(command, data, read=bool(flags & 0x80))
+        if not flags & 0x40:
+            return None
+        head = bytes([flags | (0x20 if answer is None else 0), sequence]) + len(answer or b"").to_bytes(2, "little")
+        return (head + (answer or b"")).ljust(REPORT, b"\0")
+
+    def _done(self, command: int, data: bytes, *, read: bool) -> bytes | None:
+        """The answer to a command; None: refused."""
+        if self.registers[0x0200] == b"\1" and command not in {0x0200, 0x1A0A}:
+            return None
+        return self._told(command) if read else self._set(command, data)
+
+    def _told(self, command: int) -> bytes | None:
+        match command:
+            case 0x1A0A:
+                return bytes([self._hardware])
+            case 0x1A0C:
+                return bytes([2 if self.running and not self.faults.never_runs else 0])
+            case 0x1A1A:
+                self._busy = max(self._busy - 1, 0)
+                return b"\x80" if self._busy else bytes([self._validated or 0])
+            case 0x1A24:
+                return bytes([2 if self.running else 0])
+            case 0x1A42:
+                return bytes([len(self._planes)])
+            case 0x1AFF:
+                return self.tag.encode().ljust(32, b"\0")
+        return self.faults.bent.get(command, self.registers.get(command))
+
+    def _set(self, command: int, data: bytes) -> bytes | None:
+        if command == 0x1A24:
+            return self._started(data)
+        if self.running and (command in _SETTINGS or command in {0x1A1A, 0x1A34}):
+            return None
+        if command in _INVALIDATES:
+            self._validated = None
+        if command == 0x1A1A:
+            self._validated, self._busy = self._validation(), self.faults.busy_checks
+        elif command == 0x1A34:
+            box = self._mailboxes.get(self.registers[0x1A33][0])
+            start = self.registers[0x1A32][0]
+            if box is None or start + len(data) > len(box):
+                return None
+            box[start : start + len(data)] = data
+        elif len(data) == (_SETTINGS | _AT_ANY_TIME).get(command):
+            self.registers[command] = data
+            self._relight()
+        else:
+            return None
+        return b""
+
+    def _started(self, data: bytes) -> bytes | None:
+        if data == b"\0":
+            self._stop()
+        elif data == b"\2" and self._validated == 0 and self.registers[0x1A1B] == b"\1" and not self.running:
+            self._halt = threading.Event()
+            self._sequencer = threading.Thread(target=self._run, args=(self._halt,), daemon=True)
+            self._sequencer.start()
+        else:
+            return None
+        return b""
+
+    def _entries(self) -> list[int]:
+        count = self.registers[0x1A31][0] + 1
+        table = self._mailboxes[2]
+        return [int.from_bytes(table[3 * i : 3 * i + 3], "little") for i in range(count)]
+
+    def _images(self) -> list[int]:
+        images = list(self._mailboxes[1][: self.registers[0x1A31][3] + 1])
+        # Two are taken the other way round.
+        return images[::-1] if len(images) == 2 else images
+
+    def _validation(self) -> int:
+        exposure_us, period_us = struct.unpack("<II", self.registers[0x1A29])
+        entries, images = self._entries(), self._images()
+        found = 0
+        if not 235 <= exposure_us <= period_us <= 200_000_000:
+            found |= 1
+        swaps = sum(entry >> 18 & 1 for entry in entries)
+        known = all(entry >> 2 & 0x3F < 24 and entry >> 8 & 0xF == 1 and entry & 3 in (0, 3) for entry in entries)
+        flashed = all(image in self._planes for image in images)
+        if not (known and flashed and swaps == len(images) and entries[0] >> 18 & 1):
+            found |= 2
+        if exposure_us != period_us and not all(entry >> 17 & 1 for entry in entries):
+            found |= 8
+        if 0 < period_us - exposure_us < 230:
+            found |= 16
+        return found
+
+    def _run(self, halt: threading.Event) -> None:
+        entries, images = self._entries(), self._images()
+        exposure_us, period_us = struct.unpack("<II", self.registers[0x1A29])
+        swaps = -1
+        # Two pictures are loaded beforehand, of more than two only the first one.
+        loaded_ns = time.monotonic_ns() + round(self._load_s * 1e9 * min(len(images), 2))
+        if halt.wait(self._load_s):
+            return
+        for entry in entries:
+            if entry >> 18 & 1:
+                swaps += 1
+                if len(images) > 2 and swaps > 0:
+                    if time.monotonic_ns() < loaded_ns:
+                        self._hardware |= 8
+                        swaps -= 1
+                    loaded_ns = time.monotonic_ns() + round(self._load_s * 1e9)
+            if not self._step(halt, self._planes[images[swaps]], entry, exposure_us / 1e6):
+                return
+            if entry >> 17 & 1 and not self._change(halt, None):
+                return
+            if halt.wait((period_us - exposure_us) / 1e6):
+                return
+        with self._lock:
+            if self._halt is halt:
+                self._halt = None
+
+    def _step(self, halt: threading.Event, planes: tuple[Pixels, ...], entry: int, exposure_s: float) -> bool:
+        plane = planes[entry >> 2 & 0x3F]
+        shown = 255 - plane if entry >> 16 & 1 else plane
+        if not self._change(halt, shown if entry >> 12 & 7 else None):
+            return False
+        self._pulse(time.monotonic_ns())
+        return not halt.wait(exposure_s)
+
+    def _change(self, halt: threading.Event, mirrors: Pixels | None) -> bool:
+        with self._lock:
+            if halt.is_set():
+                return False
+            self._mirrors = mirrors
+            self._relight()
+        return True
+
+    def _stop(self) -> None:
+        halt, self._halt = self._halt, None
+        if halt is not None:
+            halt.set()
+
+    def _relight(self) -> None:
+        """Light is what the mirrors send of the LEDs that are on."""
+        awake = self.registers[0x0200] == b"\0"
+        on = self.registers[0x1A07][0] & 0xF and any(value != 255 for value in self.registers[0x0B01])
+        lit = self._mirrors if awake and on else None
+        if lit is not self._lit:
+            self._lit = lit
+            self.shown.append(lit)
+            self._light(lit)
+
+
+def _planes(picture: bytes) -> tuple[Pixels, ...]:
+    """The 24 planes of a BMP file: green's bits, red's, blue's, each from the least significant one."""
+    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    if pixels is None or pixels.shape != (1140, 912, 3):
+        message = "a picture of the flash is none of 912 x 1140 pixels"
+        raise ValueError(message)
+    blue, green, red = (np.asarray(channel) for channel in cv2.split(pixels))
+    return tuple(_profile(channel >> np.uint8(bit) & np.uint8(1)) for channel in (green, red, blue) for bit in range(8))
+
+
+def _profile(plane: Pixels) -> Pixels:
+    """A plane as the one row or column that it repeats; whole where it does not."""
+    values = (plane > 0).astype(np.uint8) * np.uint8(255)
+    if (values == values[0, 0]).all():
+        return values[:1, :1]
+    if (values == values[:1]).all():
+        return values[:1]
+    return values[:, :1] if (values == values[:, :1]).all() else values
+
+
+class Cable:
+    """An engine on a pair of sockets that keep reports apart, as a hidraw node does. `host` is the driver's end."""
+
+    def __init__(self, engine: FakeEngine) -> None:
+        self.engine = engine
+        near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.host = near.detach()
+        self._serving = threading.Thread(target=self._serve, daemon=True)
+        self._serving.start()
+
+    def unplug(self) -> None:
+        """Pull it out."""
+        self.engine.unplug()
+        with suppress(OSError):
+            self._far.shutdown(socket.SHUT_RDWR)
+        self._serving.join(5)
+
+    def _serve(self) -> None:
+        with self._far:
+            while report := _received(self._far):
+                answer = self.engine.take(_without_number(report))
+                if answer is not None:
+                    with suppress(OSError):
+                        if self.engine.faults.stale_answer:
+                            self._far.send(bytes([answer[0], (answer[1] - 1) % 256]) + answer[2:])
+                        self._far.send(answer)
+
+
+def _received(far: socket.socket) -> bytes:
+    try:
+        return far.recv(REPORT + 1)
+    except OSError:
+        return b""
+
+
+def _without_number(report: bytes) -> bytes:
+    """The host writes a zero, as the report's number, before each."""
+    if len(report) != REPORT + 1 or report[0] != 0:
+        message = f"expected a zero and {REPORT} bytes, found {len(report)} bytes beginning with {report[:1].hex()}"
+        raise ValueError(message)
+    return report[1:]
+
+
+class UhidEngine:
+    """An engine as a HID device of the kernel (`/dev/uhid`, include/uapi/linux/uhid.h): it has a real hidraw node."""
+
+    _DESTROY, _OUTPUT, _CREATE, _INPUT = 1, 6, 11, 12
+    _DESCRIPTOR = bytes.fromhex("0600ff 0901 a101 0901 1500 26ff00 7508 9540 8102 0902 9540 9102 c0".replace(" ", ""))
+
+    def __init__(
+        self, engine: FakeEngine, *, serial: str = "LC4500-1", port: str = "usb-0000:00:14.0-2/input0"
+    ) -> None:
+        self.engine = engine
+        self._handle = os.open("/dev/uhid", os.O_RDWR | os.O_CLOEXEC)
+        create = struct.pack(
+            "<I128s64s64sHHIIII4096s",
+            self._CREATE,
+            b"Texas Instruments DLPC350",
+            port.encode(),
+            serial.encode(),
+            len(self._DESCRIPTOR),
+            3,
+            0x0451,
+            0x6401,
+            0x100,
+            0,
+            self._DESCRIPTOR,
+        )
+        os.write(self._handle, create)
+        self._gone = threading.Event()
+        self._serving = threading.Thread(target=self._serve, daemon=True)
+        self._serving.start()
+
+    def unplug(self) -> None:
+        """Pull it out."""
+        if not self._gone.is_set():
+            self._gone.set()
+            self.engine.unplug()
+            os.write(self._handle, struct.pack("<I", self._DESTROY))
+            os.close(self._handle)
+
+    def _serve(self) -> None:
+        with suppress(OSError):
+            while not self._gone.is_set():
+                event = os.read(self._handle, 4380)
+                if struct.unpack_from("<I", event)[0] != self._OUTPUT:
+                    continue
+                size = struct.unpack_from("<H", event, 4 + 4096)[0]
+                answer = self.engine.take(_without_number(event[4 : 4 + size]))
+                if answer is not None:
+                    os.write(self._handle, struct.pack("<IH", self._INPUT, len(answer)) + answer.ljust(4096, b"\0"))

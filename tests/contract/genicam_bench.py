@@ -1,0 +1,224 @@
+"""The GenICam driver on a GigE Vision camera over loopback, before a staged projector."""
+
+from __future__ import annotations
+
+import atexit
+import fcntl
+import importlib
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.genicam import open_camera
+from slrig.devices import Camera, Projector
+from slrig.model import Calibration, PatternSequence, Pixels, Size, Truth
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.genicam_peer import ANSWERED, ASKED, BEGIN, DELAY, END, INTERFACE, PIXEL_FORMATS, read_exactly
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.suite import Bench
+from tests.unit.capture.fake_rig import Scene
+
+CAMERA, PROJECTOR = Size(120, 90), Size(64, 48)
+ROOT = Path(__file__).resolve().parents[2]
+_LONG_S = 20.0
+
+
+def why_not() -> str:
+    """Why the fake camera cannot run here; "" if it can."""
+    try:
+        importlib.import_module("gi").require_version("Aravis", "0.8")
+    except (ImportError, ValueError) as missing:
+        return (
+            f"needs Aravis ({missing}): apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev gcc "
+            "pkg-config python3-dev, then pip install 'PyGObject<3.51'"
+        )
+    return ""
+
+
+def require_aravis() -> None:
+    """Skip where Aravis is not installed; fail instead where CI=true, which has to install it."""
+    if reason := why_not():
+        if os.environ.get("CI") == "true":
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+
+@dataclass(frozen=True)
+class Fate:
+    """What becomes of a frame: exposed so much late, then held in the camera, and a share of its packets lost."""
+
+    delay_s: float = 0.0
+    lost: float = 0.0
+    held_s: float = 0.0
+
+
+class FakeGigE:
+    """A fake GigE Vision camera in a process of its own, that sees a stage. Only one runs at a time: it has one port.
+
+    Parameters
+    ----------
+    stage
+        What it sees.
+    kind
+        "stock": as Aravis makes it; "sfnc": in the names of SFNC 2, with a trigger line and more pixel formats.
+    fate
+        Asked once per frame.
+    packed
+        Makes the bytes of an image, by the name of the pixel format; as they are in memory where absent.
+    """
+
+    _running: FakeGigE | None = None
+
+    def __init__(
+        self,
+        stage: Stage,
+        *,
+        kind: str = "stock",
+        fate: Callable[[], Fate] = Fate,
+        packed: Mapping[str, Callable[[Pixels], bytes]] | None = None,
+    ) -> None:
+        self.stage = stage
+        self.fate = fate
+        self.exposures: list[tuple[int, int]] = []
+        self._kind = kind
+        self._packed = packed or {}
+        self._process: subprocess.Popen[str] | None = None
+        self._lock: IO[str] | None = None
+        self._never = threading.Event()
+
+    def start(self) -> None:
+        """Run, if it does not yet; a camera that another test left running ends."""
+        if self._process is not None and self._process.poll() is None:
+            return
+        if FakeGigE._running is not None:
+            FakeGigE._running.stop()
+        # Other test runs on this machine wait for the port here.
+        self._lock = (Path(tempfile.gettempdir()) / "slrig-test-gige.lock").open("w", encoding="ascii")
+        fcntl.flock(self._lock, fcntl.LOCK_EX)
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", "tests.contract.genicam_peer", str(theirs.fileno()), self._kind]
+        self._process = subprocess.Popen(  # noqa: S603 - our own module
+            command, stdin=subprocess.PIPE, pass_fds=(theirs.fileno(),), cwd=ROOT, text=True
+        )
+        theirs.close()
+        ours.settimeout(_LONG_S)
+        assert len(read_exactly(ours, ASKED.size)) == ASKED.size, "the fake GigE Vision camera did not start"
+        ours.settimeout(None)
+        self._thread = threading.Thread(target=self._serve, args=(ours,), daemon=True)
+        self._thread.start()
+        FakeGigE._running = self
+        atexit.register(self.stop)
+
+    def pulse(self) -> None:
+        """A pulse on the trigger line (sfnc)."""
+        assert self._process is not None
+        assert self._process.stdin is not None
+        self._process.stdin.write("pulse\n")
+        self._process.stdin.flush()
+
+    def stop(self) -> None:
+        """Pull the plug. Idempotent."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        process.kill()
+        process.wait(_LONG_S)
+        if process.stdin is not None:
+            process.stdin.close()
+        self._thread.join(_LONG_S)
+        if self._lock is not None:
+            self._lock.close()
+        FakeGigE._running = None
+        atexit.unregister(self.stop)
+
+    def _serve(self, peer: socket.socket) -> None:
+        fate = Fate()
+        names = {code: name for name, code in PIXEL_FORMATS.items()}
+        with peer:
+            while len(asked := read_exactly(peer, ASKED.size)) == ASKED.size:
+                kind, start_ns, end_ns, gain, pixel_format, width_px, height_px = ASKED.unpack(asked)
+                if kind == BEGIN:
+                    fate = self.fate()
+                    answer = DELAY.pack(fate.delay_s)
+                else:
+                    assert kind == END
+                    self.exposures.append((start_ns, end_ns))
+                    if fate.held_s:
+                        self._never.wait(fate.held_s)
+                    seen = self.stage.exposed(start_ns, end_ns, gain=float(gain))[:height_px, :width_px]
+                    packed = self._packed.get(names[pixel_format], _as_it_is)
+                    data = packed(seen)
+                    answer = ANSWERED.pack(fate.lost, len(data)) + data
+                try:
+                    peer.sendall(answer)
+                except OSError:
+                    return
+
+
+def _as_it_is(image: NDArray[np.unsignedinteger]) -> bytes:
+    return image.tobytes()
+
+
+def table(**options: object) -> dict[str, object]:
+    """The `[[camera]]` table of the fake camera."""
+    region = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
+    return {"device": INTERFACE, "region": region, **options}
+
+
+class GigEHead:
+    """Implements `slrig.devices.Head`: the driver's camera, and a staged projector."""
+
+    def __init__(self, peer: FakeGigE, options: Mapping[str, object]) -> None:
+        peer.start()
+        self._projector = StagedProjector(peer.stage)
+        self._cameras = {"left": open_camera("left", options, Path())}
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """See `Head`."""
+        return self._cameras
+
+    @property
+    def projector(self) -> Projector:
+        """See `Head`."""
+        return self._projector
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """See `Head`."""
+        return None
+
+    def truth(self) -> Truth | None:
+        """See `Head`."""
+        return None
+
+
+def scene(**options: int | float) -> Scene:
+    """What the fake camera looks at."""
+    return Scene(camera=CAMERA, projector=PROJECTOR, columns_per_px=0.5, rows_per_px=0.5, white=0.4, **options)  # type: ignore[arg-type]
+
+
+def sequence() -> PatternSequence:
+    patterns = scan_patterns(
+        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return encode(patterns, PROJECTOR)
+
+
+def bench(folder: Path) -> Bench:
+    """The driver on Aravis' fake GigE Vision camera, as it comes."""
+    del folder
+    require_aravis()
+    peer = FakeGigE(Stage(scene(noise_dn=0.5), latency_s=0.002, jitter_s=0.002))
+    return Bench(lambda: GigEHead(peer, table()), sequence())

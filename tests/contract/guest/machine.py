@@ -1,0 +1,186 @@
+"""A virtual machine that runs one command on a kernel with drivers of our choice, and brings back what it wrote.
+
+QEMU emulates the processor (no /dev/kvm is needed) and boots Debian's kernel on the host's own files, read-only, with a
+layer in memory above them: the command finds the same Python, the same packages and the same checkout as the host.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.contract.guest.initrd import FAULT, HOST_TAG, SHARE, SHARE_TAG, Module, initrd
+from tests.contract.guest.kernel import GuestUnavailableError, fetch_kernel
+
+__all__ = ["FILES", "Finished", "GuestError", "GuestUnavailableError", "Module", "require_guest", "run_in_guest"]
+
+QEMU = "qemu-system-x86_64"
+FILES = f"{SHARE}/files"
+"""The folder, as the guest sees it, whose files come back."""
+
+# Mitigations cost an emulated processor time and protect nobody; its clock is the host's, whatever the kernel fears.
+_KERNEL_ARGUMENTS = "console=ttyS0 quiet loglevel=4 panic=-1 mitigations=off nokaslr tsc=reliable random.trust_cpu=on"
+_CHECKOUT = Path(__file__).resolve().parents[3]
+
+
+class GuestError(Exception):
+    """The guest did not come up, or did not finish in time. The message holds the end of its console and output."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """A command that ended in the guest.
+
+    output : its standard output and error. files : a folder with what it wrote to `FILES`. total_s : with the boot.
+    """
+
+    exit_code: int
+    output: str
+    files: Path
+    total_s: float
+
+
+def run_in_guest(
+    command: Sequence[str],
+    *,
+    folder: Path,
+    modules: Sequence[Module] = (),
+    devices: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+    timeout_s: float = 300.0,
+    memory_mib: int = 1536,
+    cores: int = 2,
+) -> Finished:
+    """Boot, run one command in the checkout, power off.
+
+    Parameters
+    ----------
+    command
+        Program and arguments, as they would be run here. It runs as root, sees /dev and /sys of the guest, has a
+        loopback interface only, and may write anywhere: all but the files in `FILES` is forgotten.
+    folder
+        An empty folder for this run.
+    modules
+        Kernel modules to load before; what they depend on is found.
+    devices
+        QEMU's `-device` arguments ("virtio-gpu-pci").
+    environment
+        Added to PATH and to the few variables that the guest is given.
+    timeout_s
+        The whole run's. The machine is killed then, and with this process in any case.
+
+    Raises
+    ------
+    GuestUnavailableError
+        QEMU or Debian's kernel cannot be had here.
+    GuestError
+        The guest did not come up, or did not finish in time.
+    """
+    qemu, kernel = _qemu(), fetch_kernel()
+    archive, console, share = folder / "initrd", folder / "console", folder / "share"
+    (share / "files").mkdir(parents=True)
+    archive.write_bytes(initrd(kernel, modules))
+    (share / "command").write_text(_script(command, environment or {}))
+    arguments = [
+        # A guard below this process: the machine ends even if this process is killed.
+        *("timeout", "--kill-after=5", f"{timeout_s + 10:.0f}"),
+        *(qemu, "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot", "-nic", "none"),
+        *("-machine", "q35", "-accel", "tcg,thread=multi", "-cpu", "max,la57=off"),
+        *("-smp", str(cores), "-m", str(memory_mib), "-serial", f"file:{console}"),
+        *("-kernel", str(kernel.image), "-initrd", str(archive), "-append", _KERNEL_ARGUMENTS),
+        *("-virtfs", f"local,path=/,mount_tag={HOST_TAG},security_model=none,readonly=on,multidevs=remap"),
+        *("-virtfs", f"local,path={_escaped(share)},mount_tag={SHARE_TAG},security_model=none"),
+        *("-device", "virtio-rng-pci"),
+        *(word for device in devices for word in ("-device", device)),
+    ]
+    begun = time.monotonic()
+    said, timed_out = _run(arguments, timeout_s)
+    total_s = time.monotonic() - begun
+    output = _text(share / "output")
+    exit_code = share / "exit_code"
+    fault = next((line for line in _text(console).splitlines() if FAULT in line), None)
+    if timed_out or fault is not None or not exit_code.is_file():
+        how = f"did not finish in {timeout_s:.0f} s" if timed_out else fault or "went down before its command ended"
+        message = (
+            f"the guest {how} (it ran {total_s:.0f} s)\nQEMU: {said.strip()[-500:]}\n"
+            f"console: {_text(console)[-2000:]}\noutput: {output[-3000:]}"
+        )
+        raise GuestError(message)
+    return Finished(int(exit_code.read_text()), output, share / "files", total_s)
+
+
+def machine_needs() -> None:
+    """Raise GuestUnavailableError if the guest cannot be run here."""
+    _qemu()
+    fetch_kernel()
+
+
+def require_guest(needs: Callable[[], None] = machine_needs) -> None:
+    """Skip the test where the guest is not to be had; but fail it in CI (CI=true) if that is our doing.
+
+    It is where QEMU is not installed. Where apt cannot fetch the kernel, CI skips as well, and says why.
+    """
+    try:
+        needs()
+    except GuestUnavailableError as error:
+        if error.fixable and os.environ.get("CI") == "true":
+            pytest.fail(f"no guest, and CI must have one: {error}")
+        pytest.skip(f"no guest: {error}")
+
+
+def _qemu() -> str:
+    found = shutil.which(QEMU)
+    if found is None:
+        message = f"{QEMU} is not installed; run: apt-get install --no-install-recommends qemu-system-x86"
+        raise GuestUnavailableError(message, fixable=True)
+    return found
+
+
+def _script(command: Sequence[str], environment: Mapping[str, str]) -> str:
+    variables = {
+        "HOME": "/root",
+        "LANG": "C.UTF-8",
+        "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', os.defpath)}",
+        "PYTHONUNBUFFERED": "1",
+        **environment,
+    }
+    given = " ".join(shlex.quote(f"{name}={value}") for name, value in variables.items())
+    return f"cd {shlex.quote(str(_CHECKOUT))} && exec env -i {given} {shlex.join(command)}\n"
+
+
+def _run(arguments: Sequence[str], timeout_s: float) -> tuple[str, bool]:
+    """What the machine's program said, and whether it had to be killed."""
+    machine = subprocess.Popen(  # noqa: S603 - our own words
+        arguments, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        return machine.communicate(timeout=timeout_s)[0], False
+    except subprocess.TimeoutExpired:
+        return _killed(machine), True
+    except BaseException:
+        _killed(machine)
+        raise
+
+
+def _killed(machine: subprocess.Popen[str]) -> str:
+    # The guard passes the signal on, waits for QEMU, and kills it if it lingers.
+    machine.terminate()
+    return machine.communicate(timeout=30)[0]
+
+
+def _escaped(path: Path) -> str:
+    """A path as QEMU's options want it."""
+    return str(path).replace(",", ",,")
+
+
+def _text(path: Path) -> str:
+    return path.read_text(errors="replace") if path.is_file() else ""

@@ -1,0 +1,272 @@
+"""The kernel's virtual video device `vivid`, from its far side: controls that inject faults, and a video output whose
+picture its capture node sees.
+
+Each instance has a capture node, and those that we ask for an output node too. With "Loop Video" on, every frame that
+the capture node delivers is a copy of what the output shows at that instant (kernel documentation, "The Virtual Video
+Test Driver (vivid)"; both nodes must agree on format and timing; Linux 6.11 put another control in its place). So the
+output node is a projector with a flip time, and the capture node a camera before it, with the kernel's own buffers,
+time stamps and errors in between.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import mmap
+import os
+import select
+from collections.abc import Mapping
+from contextlib import suppress
+from enum import IntEnum
+from pathlib import Path
+
+from tests.contract.guest.machine import Module
+
+LOOPED, BARE = 6, 3
+
+
+class Control(IntEnum):
+    """Ids of vivid's own controls. TIMESTAMP_SOURCE: 0 end of frame, 1 start of exposure. OSD_TEXT: 2 none."""
+
+    TEST_PATTERN = 0x00F0F000
+    OSD_TEXT = 0x00F0F001
+    TIMESTAMP_SOURCE = 0x00F0F018
+    DROPPED_PERCENT = 0x00F0F040
+    DISCONNECT = 0x00F0F041
+    BUFFER_ERROR = 0x00F0F042
+    FATAL_ERROR = 0x00F0F046
+
+
+def modules() -> tuple[Module, ...]:
+    """Instances with one capture node each: `LOOPED` with an output beside it (HDMI), `BARE` as plain webcams."""
+    count = LOOPED + BARE
+
+    def each(looped: str, bare: str) -> str:
+        return ",".join([looped] * LOOPED + [bare] * BARE)
+
+    options = {
+        "n_devs": str(count),
+        "node_types": each("0x101", "0x1"),
+        "num_inputs": each("1", "1"),
+        "input_types": each("0x3", "0x0"),
+        "num_outputs": each("1", "0"),
+        "output_types": each("0x1", "0x0"),
+    }
+    return (Module("vivid", " ".join(f"{name}={value}" for name, value in options.items())),)
+
+
+def nodes() -> Mapping[str, Path]:
+    """The device file of each node by its name: 'vivid-000-vid-cap' and so on."""
+    folders = Path("/sys/class/video4linux").iterdir()
+    return {(folder / "name").read_text().strip(): Path("/dev") / folder.name for folder in folders}
+
+
+class _Control(ctypes.Structure):
+    _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
+
+
+class _Query(ctypes.Structure):
+    _fields_ = (
+        ("id", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("name", ctypes.c_char * 32),
+        ("minimum", ctypes.c_int32),
+        ("maximum", ctypes.c_int32),
+        ("step", ctypes.c_int32),
+        ("default_value", ctypes.c_int32),
+        ("flags", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
+
+
+class _Timings(ctypes.Structure):
+    """struct v4l2_dv_timings, of which extent and speed are looked at."""
+
+    _pack_ = 1
+    _layout_ = "ms"
+    _fields_ = (
+        ("type", ctypes.c_uint32),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("interlaced", ctypes.c_uint32),
+        ("polarities", ctypes.c_uint32),
+        ("pixel_clock_hz", ctypes.c_uint64),
+        ("rest", ctypes.c_uint8 * 104),
+    )
+
+
+class _ListedTimings(ctypes.Structure):
+    _fields_ = (("index", ctypes.c_uint32), ("reserved", ctypes.c_uint32 * 3), ("timings", _Timings))
+
+
+class _Format(ctypes.Structure):
+    """struct v4l2_format with its struct v4l2_pix_format, on a 64-bit machine."""
+
+    _fields_ = (
+        ("type", ctypes.c_uint64),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("pixel_format", ctypes.c_uint32),
+        ("field", ctypes.c_uint32),
+        ("bytes_per_line", ctypes.c_uint32),
+        ("image_bytes", ctypes.c_uint32),
+        ("rest", ctypes.c_uint8 * 176),
+    )
+
+
+class _Request(ctypes.Structure):
+    _fields_ = (
+        ("count", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("memory", ctypes.c_uint32),
+        ("capabilities", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+    )
+
+
+class _Buffer(ctypes.Structure):
+    """struct v4l2_buffer on a 64-bit machine."""
+
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("bytes_used", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("field", ctypes.c_uint32),
+        ("seconds", ctypes.c_int64),
+        ("microseconds", ctypes.c_int64),
+        ("timecode", ctypes.c_uint8 * 16),
+        ("sequence", ctypes.c_uint32),
+        ("memory", ctypes.c_uint32),
+        ("offset", ctypes.c_uint64),
+        ("length", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
+
+
+_READ, _WRITE = 2, 1
+_OUTPUT, _MMAP, _NO_FIELD = 2, 1, 1
+
+
+def _request(direction: int, number: int, argument: type[ctypes._SimpleCData[int]] | type[ctypes.Structure]) -> int:
+    return (direction << 30) | (ctypes.sizeof(argument) << 16) | (ord("V") << 8) | number
+
+
+_S_FMT = _request(_READ | _WRITE, 5, _Format)
+_REQBUFS = _request(_READ | _WRITE, 8, _Request)
+_QUERYBUF = _request(_READ | _WRITE, 9, _Buffer)
+_QBUF = _request(_READ | _WRITE, 15, _Buffer)
+_DQBUF = _request(_READ | _WRITE, 17, _Buffer)
+_STREAMON = _request(_WRITE, 18, ctypes.c_int)
+_S_CTRL = _request(_READ | _WRITE, 28, _Control)
+_QUERYCTRL = _request(_READ | _WRITE, 36, _Query)
+_S_DV_TIMINGS = _request(_READ | _WRITE, 87, _Timings)
+_ENUM_DV_TIMINGS = _request(_READ | _WRITE, 98, _ListedTimings)
+
+
+class Node:
+    """An open node of the device."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+
+    def close(self) -> None:
+        """Idempotent."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    def set(self, control: int, value: int = 1) -> None:
+        """Set a control; a button is pressed by any value."""
+        self._ask(_S_CTRL, _Control(control, value))
+
+    def set_named(self, name: str, value: int) -> None:
+        """Set a control that is known by name only. Raises LookupError if there is none."""
+        query = _Query(id=0x80000000)
+        while True:
+            try:
+                self._ask(_QUERYCTRL, query)
+            except OSError as error:
+                message = f"{self.path} has no control '{name}'"
+                raise LookupError(message) from error
+            if query.name.decode() == name:
+                self.set(query.id, value)
+                return
+            query.id |= 0x80000000
+
+    def set_timing(self, width_px: int, height_px: int) -> None:
+        """Choose the signal's timing: of the progressive ones of this extent the fastest. Raises LookupError."""
+        fits: list[_Timings] = []
+        listed = _ListedTimings()
+        # The list ends with an error.
+        with suppress(OSError):
+            while True:
+                self._ask(_ENUM_DV_TIMINGS, listed)
+                timings = listed.timings
+                if (timings.width, timings.height, timings.interlaced) == (width_px, height_px, 0):
+                    fits.append(_Timings.from_buffer_copy(timings))
+                listed.index += 1
+        if not fits:
+            message = f"{self.path} knows no timing of {width_px} x {height_px}"
+            raise LookupError(message)
+        self._ask(_S_DV_TIMINGS, max(fits, key=lambda timings: timings.pixel_clock_hz))
+
+    def _ask(self, request: int, argument: ctypes._SimpleCData[int] | ctypes.Structure) -> None:
+        fcntl.ioctl(self._file, request, argument)
+
+
+class Output(Node):
+    """An output node that shows one picture until it is given the next."""
+
+    def __init__(self, path: Path, pixel_format: str, width_px: int, height_px: int, *, dark: bytes) -> None:
+        super().__init__(path)
+        form = _Format(
+            type=_OUTPUT,
+            width=width_px,
+            height=height_px,
+            pixel_format=int.from_bytes(pixel_format.encode(), "little"),
+            field=_NO_FIELD,
+        )
+        self._ask(_S_FMT, form)
+        self.format = (form.pixel_format.to_bytes(4, "little").decode(), form.width, form.height, form.bytes_per_line)
+        request = _Request(count=2, type=_OUTPUT, memory=_MMAP)
+        self._ask(_REQBUFS, request)
+        if request.count != 2 or len(dark) != form.image_bytes:
+            message = f"{path}: {request.count} buffers of {form.image_bytes} bytes, format {self.format}"
+            raise RuntimeError(message)
+        self._memory: list[mmap.mmap] = []
+        for index in range(request.count):
+            buffer = _Buffer(index=index, type=_OUTPUT, memory=_MMAP)
+            self._ask(_QUERYBUF, buffer)
+            self._memory.append(mmap.mmap(self._file, buffer.length, offset=buffer.offset))
+            self._queue(index, dark)
+        self._ask(_STREAMON, ctypes.c_int(_OUTPUT))
+        self._free, _ = self._flipped()
+
+    def close(self) -> None:
+        """Idempotent. What is mapped keeps the file open, so it goes first."""
+        while self._memory:
+            self._memory.pop().close()
+        super().close()
+
+    def show(self, picture: bytes) -> int:
+        """Show a picture; return when it replaced the one before, CLOCK_MONOTONIC in ns, cut to whole microseconds."""
+        self._queue(self._free, picture)
+        self._free, at_ns = self._flipped()
+        return at_ns
+
+    def _queue(self, index: int, picture: bytes) -> None:
+        self._memory[index][: len(picture)] = picture
+        self._ask(_QBUF, _Buffer(index=index, type=_OUTPUT, memory=_MMAP, bytes_used=len(picture), field=_NO_FIELD))
+
+    def _flipped(self) -> tuple[int, int]:
+        """Wait for the picture before to come back: vivid keeps the last one for as long as there is no other."""
+        waiting = select.poll()
+        waiting.register(self._file, select.POLLOUT)
+        if not waiting.poll(5000):
+            message = f"{self.path} did not change its picture in 5 s"
+            raise TimeoutError(message)
+        buffer = _Buffer(type=_OUTPUT, memory=_MMAP)
+        self._ask(_DQBUF, buffer)
+        return buffer.index, (buffer.seconds * 1_000_000 + buffer.microseconds) * 1_000

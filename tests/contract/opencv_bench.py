@@ -1,0 +1,242 @@
+"""The OpenCV driver before staged light: a network camera on loopback, the same through a pipe, a kernel's fake device.
+
+The network camera is a sensor that runs free, and a server that sends what it saw as JPEGs (multipart/x-mixed-replace,
+as network cameras do). OpenCV and everything above it are the real ones; what is not fetched waits in the buffers of
+sockets and pipes, also as it does with a camera.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from drivers import opencv
+from slrig.devices import Camera, Projector
+from slrig.model import Calibration, Truth
+from tests.contract import v4l2_host
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.suite import Bench
+from tests.contract.v4l2_bench import CAMERA, Faked, FakeDevice, sequence, staged, why_not
+
+
+@dataclass
+class NetworkCamera:
+    """A sensor that runs free, and what its server sends of it. Times in seconds.
+
+    delay_s : frames are sent so long after their exposure at most, and `least_delay_s` at least, at a time drawn at
+    random; the server, as one that promises this, throws away what has become older. lost, cut : share of frames that
+    are not sent, or sent without their end or a part of their middle.
+    """
+
+    stage: Stage
+    period_s: float = 0.02
+    exposure_s: float = 0.01
+    delay_s: float = 0.01
+    least_delay_s: float = 0.0
+    lost: float = 0.0
+    cut: float = 0.0
+    seed: int = 0
+    gone: threading.Event = field(default_factory=threading.Event)
+    _sent: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+
+    def sends(self, count: int) -> bool:
+        """Wait until so many more frames were sent; False if they are not, for long."""
+        while self._sent.acquire(blocking=False):
+            pass
+        return all(self._sent.acquire(timeout=10) for _ in range(count))
+
+    def parts(self) -> Iterator[bytes]:
+        """What one client is sent, part by part, in time, until the camera is gone."""
+        rng = random.Random(self.seed)
+        begun_ns, number = time.monotonic_ns(), 0
+        while not self.gone.is_set():
+            age_s = (time.monotonic_ns() - begun_ns) / 1e9 - self.least_delay_s - self.exposure_s
+            number = max(number + 1, int(age_s / self.period_s))
+            start_ns = begun_ns + round(number * self.period_s * 1e9)
+            end_ns = start_ns + round(self.exposure_s * 1e9)
+            spread_s = 0.5 * (self.delay_s - self.least_delay_s)
+            due_ns = end_ns + round((self.least_delay_s + rng.random() * spread_s) * 1e9)
+            lost, cut = rng.random() < self.lost, rng.random() < self.cut
+            while (left_ns := due_ns - time.monotonic_ns()) > 0:
+                if self.gone.wait(left_ns / 1e9):
+                    return
+            encoded, data = cv2.imencode(".jpg", self.stage.exposed(start_ns, end_ns), [cv2.IMWRITE_JPEG_QUALITY, 100])
+            assert encoded
+            sent = bytes(data)
+            if cut:
+                end, again = rng.choice([(len(sent) // 2, len(sent)), (len(sent) - 300, len(sent) - 200)])
+                sent = sent[:end] + sent[again:]
+            if not lost and time.monotonic_ns() < end_ns + self.delay_s * 1e9:
+                self._sent.release()
+                yield b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(sent) + sent + b"\r\n"
+
+    def options(self, device: str) -> dict[str, object]:
+        """The driver's options for it. What is promised is written with room for a busy machine."""
+        return {
+            "device": device,
+            "source_exposure_s": self.exposure_s,
+            "delay_s": 3 * self.delay_s,
+            "frame_rate_hz": 1 / self.period_s,
+        }
+
+
+class Served:
+    """The camera as a server on loopback. A context manager."""
+
+    def __init__(self, camera: NetworkCamera) -> None:
+        self.camera = camera
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if self.path != "/video":
+                    self.send_error(404)
+                    return
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                with suppress(ConnectionError):
+                    for part in camera.parts():
+                        self.wfile.write(part)
+
+            def log_message(self, *_: Any) -> None:
+                """Say nothing."""
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=partial(self._server.serve_forever, 0.05), daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self._server.server_port}/video"
+
+    def close(self) -> None:
+        self.camera.gone.set()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(10)
+
+    def __enter__(self) -> Served:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Piped:
+    """The camera as a program that writes into a named pipe. A context manager."""
+
+    def __init__(self, camera: NetworkCamera, path: Path) -> None:
+        self.camera = camera
+        self.path = path
+        os.mkfifo(path)
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    def _write(self) -> None:
+        while not self.camera.gone.wait(0.005):
+            # Nobody may be there to read.
+            with suppress(OSError):
+                pipe = os.open(self.path, os.O_WRONLY | os.O_NONBLOCK)
+                try:
+                    for part in self.camera.parts():
+                        self._send(pipe, part)
+                finally:
+                    os.close(pipe)
+
+    def _send(self, pipe: int, part: bytes) -> None:
+        while part and not self.camera.gone.is_set():
+            if select.select([], [pipe], [], 0.05)[1]:
+                with suppress(BlockingIOError):
+                    part = part[os.write(pipe, part) :]
+
+    def close(self) -> None:
+        self.camera.gone.set()
+        self._thread.join(10)
+
+    def __enter__(self) -> Piped:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class DeviceHost(FakeDevice):
+    """The kernel's fake video device, and the OpenCV driver hosted beside it."""
+
+    def _start(self, command: list[str], environment: Mapping[str, str]) -> str:
+        own = [__spec__.name if part == v4l2_host.__name__ else part for part in command]
+        return super()._start(own, environment)
+
+
+@dataclass(frozen=True)
+class OpenCvHead:
+    """One camera through the driver, before a staged projector."""
+
+    cameras: Mapping[str, Camera]
+    projector: Projector
+    calibration: Calibration | None = None
+
+    def truth(self) -> Truth | None:
+        return None
+
+
+def stream_bench(_folder: Path) -> Bench:
+    """A network camera."""
+    light = staged(noise_dn=1.0)
+    served = Served(NetworkCamera(light))
+
+    def open_head() -> OpenCvHead:
+        camera = opencv.open_camera("eye", served.camera.options(served.url), Path())
+        return OpenCvHead({"eye": camera}, StagedProjector(light))
+
+    return Bench(open_head, sequence())
+
+
+def file_bench(folder: Path) -> Bench:
+    """A file that another program writes as it goes: a named pipe."""
+    light = staged(noise_dn=1.0)
+    Piped(NetworkCamera(light), folder / "video.mjpeg")
+
+    def open_head() -> OpenCvHead:
+        camera = opencv.open_camera("eye", NetworkCamera(light).options("video.mjpeg"), folder)
+        return OpenCvHead({"eye": camera}, StagedProjector(light))
+
+    return Bench(open_head, sequence())
+
+
+def device_bench(folder: Path, faked: Faked | None = None, **options: object) -> Bench:
+    """A camera of the kernel's, by its stamps. Skips the test where umockdev is missing."""
+    if why_not():
+        pytest.skip(why_not())
+    device = DeviceHost(folder, staged(noise_dn=1.0), faked or Faked())
+
+    def open_head() -> OpenCvHead:
+        usual = {"fourcc": "GREY", "size_px": [CAMERA.width_px, CAMERA.height_px], "frame_rate_hz": 50}
+        return OpenCvHead({"left": device.open_camera(**usual, **options)}, StagedProjector(device.stage))
+
+    return Bench(open_head, sequence())
+
+
+if __name__ == "__main__":
+    threading.Thread(target=v4l2_host._end_with_input, daemon=True).start()
+    # The host opens cameras with the driver that it finds under this name.
+    v4l2_host.__dict__["v4l2"] = opencv
+    server = v4l2_host.Host(address=sys.argv[1], authkey=v4l2_host.AUTHKEY).get_server()
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    server.serve_forever()

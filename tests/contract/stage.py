@@ -1,0 +1,157 @@
+"""Light in time, for fakes that stand below a camera driver: a projector, and what a sensor sees of it.
+
+A fake camera asks `Stage.exposed` what it saw from one instant to another. If the pattern changed in between, it saw a
+mixture of both, as a real one does: a driver that pairs frames with patterns wrongly cannot hide it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.model import CameraFormat, PatternSequence, Pixels, Size
+from tests.unit.capture.fake_rig import Scene
+
+REFERENCE_EXPOSURE_S = 0.01
+"""The exposure at which a fake camera is as bright as `Scene` says; brightness grows in proportion."""
+
+
+class Stage:
+    """What a projector showed when (CLOCK_MONOTONIC, ns), and what a camera sees of it. Safe between threads.
+
+    latency_s, jitter_s : from `show` to light: the latency, and up to so much more, at random.
+    """
+
+    def __init__(self, scene: Scene, *, latency_s: float = 0.0, jitter_s: float = 0.0, seed: int = 0) -> None:
+        self.scene = scene
+        self.latency_s = latency_s
+        self.jitter_s = jitter_s
+        self._rng = np.random.default_rng(seed)
+        self._lock = threading.Lock()
+        self._light: dict[bytes, NDArray[np.float64]] = {}
+        self._dark: Pixels = np.zeros((1, 1), np.uint8)
+        self._changes: list[tuple[int, Pixels]] = [(0, self._dark)]
+
+    @property
+    def format(self) -> CameraFormat:
+        """The sensor's."""
+        return self.scene.format
+
+    def show(self, profile: Pixels | None) -> int:
+        """Change the light to a pattern, or to the dark; return when it will have changed."""
+        with self._lock:
+            late_s = self.latency_s + self.jitter_s * float(self._rng.random())
+            at_ns = max(time.monotonic_ns() + round(late_s * 1e9), self._changes[-1][0])
+            self._changes.append((at_ns, self._dark if profile is None else profile))
+            return at_ns
+
+    def exposed(self, t_start_ns: int, t_end_ns: int, *, gain: float = 1.0) -> Pixels:
+        """What the sensor read out after an exposure, (H, W), with the scene's noise."""
+        with self._lock:
+            changes = list(self._changes)
+        exposure_s = (t_end_ns - t_start_ns) / 1e9
+        seen = np.zeros(self.format.size.shape)
+        for index, (at_ns, profile) in enumerate(changes):
+            until_ns = changes[index + 1][0] if index + 1 < len(changes) else t_end_ns
+            share = (min(until_ns, t_end_ns) - max(at_ns, t_start_ns)) / max(t_end_ns - t_start_ns, 1)
+            if share > 0:
+                seen += share * self._seen(profile)
+        with self._lock:
+            noise = self.scene.noise_dn * self._rng.standard_normal(seen.shape)
+        return self._whole(self._level(seen, exposure_s * gain) + noise)
+
+    def expected(self, profile: Pixels | None, *, exposure_s: float = REFERENCE_EXPOSURE_S) -> Pixels:
+        """What the sensor reads of a pattern without noise: the truth that a frame is compared with."""
+        return self._whole(self._level(self._seen(self._dark if profile is None else profile), exposure_s))
+
+    def _level(self, seen: NDArray[np.float64], exposure_s: float) -> NDArray[np.float64]:
+        scene = self.scene
+        light = scene.albedo * (scene.ambient + scene.white * seen) * exposure_s / REFERENCE_EXPOSURE_S
+        return np.asarray(scene.format.full_scale * np.clip(light, 0, 1))
+
+    def _whole(self, values: NDArray[np.float64]) -> Pixels:
+        form = self.format
+        kind = np.uint8 if form.bit_depth <= 8 else np.uint16
+        return np.clip(np.rint(values), 0, form.full_scale).astype(kind)
+
+    def _seen(self, profile: Pixels) -> NDArray[np.float64]:
+        key = profile.tobytes() + bytes(str(profile.shape), "ascii")
+        with self._lock:
+            found = self._light.get(key)
+        if found is None:
+            found = self.scene.light(profile)
+            with self._lock:
+                self._light[key] = found
+        return found
+
+
+class StagedProjector:
+    """Implements `slrig.devices.Projector` on a stage. It steps; it does not play."""
+
+    def __init__(self, stage: Stage, *, err_ns: int = 100_000) -> None:
+        self._stage = stage
+        self._err_ns = err_ns
+        self._loaded: PatternSequence | None = None
+        self._closed = threading.Event()
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        size = self._stage.scene.projector
+        return ProjectorInfo("projector", "staged projector", "stage", size, False, self._stage.latency_s)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`."""
+        self._require_open()
+        size: Size = self._stage.scene.projector
+        if sequence.projector != size:
+            message = f"the projector is {size}, the sequence was made for {sequence.projector}; encode it for {size}"
+            raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._loaded = sequence
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`."""
+        self._require_open()
+        if self._loaded is None:
+            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
+            raise DeviceStateError(message)
+        if not 0 <= index < len(self._loaded):
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._loaded) - 1}"
+            raise UnsupportedByDeviceError(message)
+        at_ns = self._stage.show(self._loaded.profiles[index])
+        while (left_ns := at_ns + self._err_ns - time.monotonic_ns()) > 0:
+            if self._closed.wait(left_ns / 1e9):
+                break
+        return Shown(index, at_ns, self._err_ns)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`."""
+        self._require_open()
+        message = f"asked to play {exposure_s} s patterns every {period_s} s, the staged projector has no trigger wire"
+        raise UnsupportedByDeviceError(message)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`."""
+        if not self._closed.is_set():
+            self._stage.show(None)
+
+    def close(self) -> None:
+        """See `Projector`."""
+        self.blank()
+        self._loaded = None
+        self._closed.set()
+
+    def _require_open(self) -> None:
+        if self._closed.is_set():
+            message = "the projector is closed; open the rig again"
+            raise DeviceStateError(message)

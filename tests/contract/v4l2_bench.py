@@ -1,0 +1,257 @@
+"""The V4L2 driver over a fake video device (umockdev), as a bench.
+
+Three processes: Debian's Python serves the device's requests (`v4l2_server`), another hosts the unmodified driver in
+the test bed (`v4l2_host`), and this one holds the light, the projector and the test. Needs the Debian packages
+umockdev, gir1.2-umockdev-1.0 and python3-gi.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, Self, cast
+
+import pytest
+
+from slrig.devices import Camera, FoundDevice, Projector
+from slrig.model import Calibration, PatternSequence, Size, Truth
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.suite import Bench
+from tests.contract.v4l2_host import AUTHKEY, Host
+from tests.contract.v4l2_sensor import BIT_DEPTHS, GAIN_UNITS, SensorService
+from tests.unit.capture.fake_rig import Scene
+
+ROOT = Path(__file__).resolve().parents[2]
+DEBIAN_PYTHON = Path("/usr/bin/python3")
+CAMERA = Size(80, 60)
+PROJECTOR = Size(32, 24)
+
+
+@cache
+def why_not() -> str:
+    """Why the fake device cannot stand here; "" if it can."""
+    if shutil.which("umockdev-wrapper") is None:
+        return "umockdev is not installed: apt install umockdev gir1.2-umockdev-1.0 python3-gi"
+    probe = "import gi; gi.require_version('UMockdev', '1.0'); from gi.repository import UMockdev"
+    if subprocess.run([DEBIAN_PYTHON, "-c", probe], capture_output=True, check=False).returncode:  # noqa: S603
+        return "UMockdev's bindings are not installed: apt install gir1.2-umockdev-1.0 python3-gi"
+    return ""
+
+
+def usb_camera(port: str, serial: str, *names: str) -> str:
+    """The device tree of a USB camera with these video nodes, as umockdev reads it."""
+    camera = f"/devices/pci0000:00/0000:00:14.0/usb1/1-{port}"
+    tree = f"P: {camera}\nE: SUBSYSTEM=usb\nE: DEVTYPE=usb_device\nA: idVendor=1234\\n\nA: idProduct=abcd\\n\n"
+    if serial:
+        tree += f"A: serial={serial}\\n\n"
+    for index, name in enumerate(names):
+        # "=00" makes a plain file, which can be mapped; without it, umockdev makes a terminal.
+        tree += (
+            f"\nP: {camera}/1-{port}:1.0/video4linux/{name}\nN: {name}=00\nE: DEVNAME=/dev/{name}\n"
+            f"E: SUBSYSTEM=video4linux\nA: dev=81:{name.removeprefix('video')}\\n\nA: index={index}\\n\n"
+            "A: name=Bench camera\\n\n"
+        )
+    return f"{tree}\n"
+
+
+def control(number: int, name: str, minimum: int, maximum: int, default: int, **more: int) -> dict[str, Any]:
+    ranges = {"minimum": minimum, "maximum": maximum, "step": 1, "default": default}
+    return {"id": number, "name": name, **ranges, **more}
+
+
+CONTROLS = (
+    control(0x00980900, "Brightness", -64, 64, 0),
+    control(0x0098090C, "White Balance, Automatic", 0, 1, 1),
+    control(0x00980913, "Gain", GAIN_UNITS, 8 * GAIN_UNITS, 2 * GAIN_UNITS),
+    control(0x00980918, "Power Line Frequency", 0, 2, 1),
+    # Aperture priority: the exposure is the device's own until it is told otherwise.
+    control(0x009A0901, "Auto Exposure", 0, 3, 3),
+    control(0x009A0902, "Exposure Time, Absolute", 1, 400, 156),
+    control(0x009A0903, "Exposure, Dynamic Framerate", 0, 1, 1),
+    control(0x009A090A, "Focus, Absolute", 0, 250, 0),
+    control(0x009A090C, "Focus, Automatic Continuous", 0, 1, 1),
+)
+
+
+@dataclass(frozen=True)
+class Faked:
+    """A fake camera. Times in seconds; `stamp`, `lost` and their like as in `v4l2_kernel`."""
+
+    formats: Mapping[str, list[tuple[int, int]]] = field(
+        default_factory=lambda: {"GREY": [(CAMERA.width_px, CAMERA.height_px)]}
+    )
+    rates: tuple[tuple[int, int], ...] = ((1, 50), (1, 200), (1, 400), (1, 25))
+    controls: tuple[dict[str, Any], ...] = CONTROLS
+    stamp: str = "start"
+    readout_s: float = 0.0
+    bands: int = 1
+    jitter_s: float = 0.0
+    lag_frames: int = 3
+    lost: float = 0.0
+    corrupt: float = 0.0
+    flags_corrupt: bool = True
+    noise_when_corrupt: bool = True
+    tells_rate: bool = True
+    stretches: bool = True
+    padding_bytes: int = 0
+    seed: int = 0
+    tree: str = usb_camera("2", "S123", "video0")
+    nodes: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: {"video0": {}})
+    links: Mapping[str, str] = field(default_factory=dict)
+
+    def config(self, light: Path, faults: Path) -> dict[str, Any]:
+        keys = (
+            *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lag_frames", "lost", "corrupt"),
+            *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "tree", "links"),
+        )
+        most = max(width * height for sizes in self.formats.values() for width, height in sizes)
+        usual = {"card": "Bench camera", "bus": "usb-0000:00:14.0-2", "capabilities": 0x04200001}
+        room = {"most_bytes": 2 * most + 3 * 4096}
+        return {
+            **{key: getattr(self, key) for key in keys},
+            "light": str(light),
+            "faults": str(faults),
+            "nodes": {name: {**usual, **room, **own} for name, own in self.nodes.items()},
+        }
+
+
+class FakeDevice:
+    """A fake camera that is plugged in, and the driver's host beside it. A context manager."""
+
+    def __init__(self, folder: Path, stage: Stage, faked: Faked) -> None:
+        self.stage = stage
+        self.faults = folder / "faults"
+        self.faults.mkdir(exist_ok=True)
+        # Socket paths may have 107 characters, and those of test folders have more.
+        self._short = tempfile.TemporaryDirectory(prefix="slrig-v4l2-")
+        short = Path(self._short.name)
+        self.sensor = SensorService(
+            short / "light",
+            stage,
+            readout_s=faked.readout_s,
+            bands=faked.bands,
+            noise_when_corrupt=faked.noise_when_corrupt,
+        )
+        config = folder / "device.json"
+        config.write_text(json.dumps(faked.config(short / "light", self.faults)))
+        self._processes: list[subprocess.Popen[str]] = []
+        try:
+            server = self._start([str(DEBIAN_PYTHON), "-m", "tests.contract.v4l2_server", str(config)], {})
+            address = str(short / "host")
+            self._start([sys.executable, "-m", "tests.contract.v4l2_host", address], {"UMOCKDEV_DIR": server})
+            host = cast("Any", Host(address=address, authkey=AUTHKEY))
+            host.connect()
+            self._driver = host.driver()
+        except BaseException:
+            self.close()
+            raise
+        atexit.register(self.close)
+
+    def open_camera(self, **options: object) -> Camera:
+        """Open a camera through the driver, in its host."""
+        camera: Camera = self._driver.open_camera("left", {"device": "/dev/video0", **options})
+        return camera
+
+    def found(self) -> tuple[FoundDevice, ...]:
+        """What the driver's finder finds."""
+        devices: tuple[FoundDevice, ...] = self._driver.find_devices()
+        return devices
+
+    def fault(self, name: str, on: bool = True) -> None:
+        """Begin or end a fault: unplugged, dead, busy, silent, no bandwidth."""
+        if on:
+            (self.faults / name).touch()
+        else:
+            (self.faults / name).unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Unplug, and end both processes. Idempotent."""
+        atexit.unregister(self.close)
+        for process in self._processes:
+            with suppress(OSError):
+                process.communicate(timeout=10)
+        if self._processes:
+            self._processes.clear()
+            self.sensor.close()
+            self._short.cleanup()
+
+    def _start(self, command: list[str], environment: Mapping[str, str]) -> str:
+        process = subprocess.Popen(  # noqa: S603 - our own programs
+            ["umockdev-wrapper", *command],  # noqa: S607 - found by why_not
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env={**os.environ, **environment},
+        )
+        self._processes.append(process)
+        assert process.stdout is not None
+        words = process.stdout.readline().split(maxsplit=1)
+        assert words, f"{command} ended early"
+        assert words[0] == "ready"
+        return words[1].strip() if len(words) > 1 else ""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class V4L2Head:
+    """One camera through the driver, before a staged projector."""
+
+    cameras: Mapping[str, Camera]
+    projector: Projector
+    calibration: Calibration | None = None
+
+    def truth(self) -> Truth | None:
+        return None
+
+
+def staged(code: str = "GREY", *, camera: Size = CAMERA, noise_dn: float = 0.0, latency_s: float = 0.002) -> Stage:
+    """The light before a fake camera of this pixel format."""
+    scene = Scene(
+        camera=camera,
+        bit_depth=BIT_DEPTHS[code],
+        projector=PROJECTOR,
+        first_column_px=1.0,
+        columns_per_px=0.33,
+        rows_per_px=0.33,
+        blur_px=0.7,
+        noise_dn=noise_dn,
+    )
+    return Stage(scene, latency_s=latency_s)
+
+
+def sequence() -> PatternSequence:
+    """What the staged projector shows."""
+    patterns = scan_patterns(
+        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return encode(patterns, PROJECTOR)
+
+
+def bench(folder: Path, faked: Faked | None = None, *, frame_rate_hz: float = 50, **options: object) -> Bench:
+    """The driver on a fake webcam that stamps the start of exposure. Skips the test where umockdev is missing."""
+    if why_not():
+        pytest.skip(why_not())
+    device = FakeDevice(folder, staged(noise_dn=1.0), faked or Faked())
+
+    def open_head() -> V4L2Head:
+        camera = device.open_camera(frame_rate_hz=frame_rate_hz, gain_unity=GAIN_UNITS, **options)
+        return V4L2Head({"left": camera}, StagedProjector(device.stage))
+
+    return Bench(open_head, sequence())

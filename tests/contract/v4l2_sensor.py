@@ -1,0 +1,115 @@
+"""What the fake video device's sensor sees, as the bytes that a camera would send: answers over a socket."""
+
+from __future__ import annotations
+
+import json
+import socketserver
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slrig.model import Pixels
+from tests.contract.stage import Stage
+
+BIT_DEPTHS = {"GREY": 8, "Y10 ": 10, "Y12 ": 12, "Y16 ": 16, "Y10P": 10, "YUYV": 8, "UYVY": 8, "MJPG": 8, "RG10": 10}
+GAIN_UNITS = 16
+"""The device's number for gain 1."""
+
+
+def encoded(image: Pixels, code: str, row_bytes: int) -> bytes:
+    """Return an image as a camera of this pixel format sends it; rows are padded to `row_bytes`."""
+    if code == "MJPG":
+        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        assert done
+        return bytes(data)
+    height, width = image.shape
+    match code:
+        case "GREY":
+            rows = image.astype(np.uint8)
+        case "YUYV" | "UYVY":
+            rows = np.full((height, 2 * width), 128, np.uint8)
+            rows[:, (code == "UYVY") :: 2] = image
+        case "Y10P":
+            rows = np.array([_packed(row) for row in image], np.uint8)
+        case _:
+            rows = image.astype("<u2").view(np.uint8)
+    padded = np.full((height, row_bytes), 0xEE, np.uint8)
+    padded[:, : rows.shape[1]] = rows
+    return padded.tobytes()
+
+
+def _packed(row: Pixels) -> list[int]:
+    packed: list[int] = []
+    for first in range(0, len(row), 4):
+        group = [int(sample) for sample in row[first : first + 4]]
+        packed += [sample >> 2 for sample in group]
+        packed.append(sum((sample & 3) << 2 * place for place, sample in enumerate(group)))
+    return packed
+
+
+class SensorService:
+    """Answers the fake device on a socket: each question is one exposure, each answer the bytes of one frame.
+
+    bands : a rolling shutter is so many bands of rows, exposed one after another within the read-out.
+    noise_when_corrupt : whether a corrupt frame holds random bytes; otherwise its second half is missing.
+    asked : every question so far, the truth about the frames that came.
+    """
+
+    def __init__(
+        self, path: Path, stage: Stage, *, readout_s: float = 0.0, bands: int = 1, noise_when_corrupt: bool = True
+    ) -> None:
+        self.stage = stage
+        self.readout_ns = round(readout_s * 1e9)
+        self.bands = bands
+        self.noise_when_corrupt = noise_when_corrupt
+        self.rng = np.random.default_rng(1)
+        self.asked: list[dict[str, Any]] = []
+        self._more = threading.Condition()
+        service = self
+
+        class Handler(socketserver.StreamRequestHandler):
+            def handle(self) -> None:
+                for line in self.rfile:
+                    data = service.answer(json.loads(line))
+                    self.wfile.write(b"%d\n" % len(data) + data)
+
+        class Server(socketserver.ThreadingUnixStreamServer):
+            daemon_threads = True
+            block_on_close = False
+
+        self._server = Server(str(path), Handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, name="sensor", daemon=True)
+        self._thread.start()
+
+    def answer(self, asked: dict[str, Any]) -> bytes:
+        with self._more:
+            self.asked.append(asked)
+            self._more.notify_all()
+        data = encoded(self.image(asked), asked["code"], asked["row_bytes"])
+        if not asked["corrupt"]:
+            return data
+        return self.rng.bytes(len(data)) if self.noise_when_corrupt else data[: len(data) // 2]
+
+    def wait_for_more(self, than: int) -> None:
+        """Return once more than so many frames have been taken: somebody reads."""
+        with self._more:
+            assert self._more.wait_for(lambda: len(self.asked) > than, timeout=10)
+
+    def image(self, asked: dict[str, Any]) -> Pixels:
+        start_ns, exposure_ns = asked["start_ns"], asked["exposure_ns"]
+        gain = max(asked["gain"], GAIN_UNITS) / GAIN_UNITS
+        whole = np.zeros(self.stage.format.size.shape, np.uint16)
+        rows = np.array_split(np.arange(len(whole)), self.bands)
+        for band, part in enumerate(rows):
+            late_ns = self.readout_ns * band // max(self.bands - 1, 1)
+            seen = self.stage.exposed(start_ns + late_ns, start_ns + late_ns + exposure_ns, gain=gain)
+            whole[part] = seen[part]
+        return whole.astype(np.uint8) if self.stage.format.bit_depth <= 8 else whole
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

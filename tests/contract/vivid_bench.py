@@ -1,0 +1,190 @@
+"""The drivers v4l2 and opencv before vivid's looped video, in the guest: what the projector shows, the camera delivers.
+
+The picture that the output node is given is what a small camera would see of the pattern (`Scene`), so a frame is that
+of its pattern exactly, bit by bit, or it is not.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+
+from drivers import opencv, v4l2
+from slrig.devices import Camera, Projector, ProjectorInfo, Shown
+from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.model import Calibration, PatternSequence, Pixels, Size, Truth
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.guest.vivid import Control, Node, Output, nodes
+from tests.contract.stage import Stage
+from tests.contract.suite import Bench
+from tests.unit.capture.fake_rig import Scene
+
+SIGNAL = (640, 480)
+"""The looped signal's extent, columns and rows; vivid scales from and to it by 4 at the most."""
+CAMERA = Size(160, 120)
+PROJECTOR = Size(96, 72)
+_CUT_NS = 1_000
+"""Flip times are cut to whole microseconds."""
+
+
+def sequence() -> PatternSequence:
+    """White, black, Gray code with inverses, shifted lines, and white and black again."""
+    patterns = scan_patterns(
+        PROJECTOR, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+    )
+    return encode(patterns, PROJECTOR)
+
+
+@cache
+def stage() -> Stage:
+    """What the camera sees of a pattern."""
+    return Stage(Scene(camera=CAMERA, projector=PROJECTOR))
+
+
+@cache
+def camera_node(instance: int) -> Node:
+    """A far side handle on a capture node: its signal is looped, and shows no text."""
+    node = Node(nodes()[f"vivid-{instance:03d}-vid-cap"])
+    node.set(Control.OSD_TEXT, 2)
+    output = nodes().get(f"vivid-{instance:03d}-vid-out")
+    if output is not None:
+        node.set_timing(*SIGNAL)
+        node.set_named("Loop Video", 1)
+        far = Node(output)
+        far.set_timing(*SIGNAL)
+        far.close()
+    return node
+
+
+@cache
+def output(instance: int) -> Output:
+    """The output node, showing the dark. It stays open: a signal that ends is not dark, but noise."""
+    camera_node(instance)
+    path = nodes()[f"vivid-{instance:03d}-vid-out"]
+    return Output(path, "GREY", CAMERA.width_px, CAMERA.height_px, dark=expected(None).tobytes())
+
+
+def expected(profile: Pixels | None) -> Pixels:
+    """(H, W) uint8: what the camera sees of a pattern."""
+    return stage().expected(profile)
+
+
+class LoopedProjector:
+    """Implements `slrig.devices.Projector` on vivid's output node."""
+
+    def __init__(self, output: Output) -> None:
+        self._output = output
+        self._loaded: PatternSequence | None = None
+        self._closed = False
+        self._lock = threading.Lock()
+        self.blank()
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`. It changes at the next frame of its signal."""
+        return ProjectorInfo("projector", "vivid output", str(self._output.path), PROJECTOR, False, 1 / 60)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`."""
+        self._require_open()
+        if sequence.projector != PROJECTOR:
+            message = f"the projector is {PROJECTOR}, the sequence was made for {sequence.projector}; encode it anew"
+            raise UnsupportedByDeviceError(message)
+        self.blank()
+        self._loaded = sequence
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`."""
+        self._require_open()
+        if self._loaded is None:
+            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
+            raise DeviceStateError(message)
+        if not 0 <= index < len(self._loaded):
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._loaded) - 1}"
+            raise UnsupportedByDeviceError(message)
+        with self._lock:
+            at_ns = self._output.show(expected(self._loaded.profiles[index]).tobytes())
+        return Shown(index, at_ns, _CUT_NS)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`."""
+        self._require_open()
+        message = f"asked to play {exposure_s} s patterns every {period_s} s, a video signal has no trigger wire"
+        raise UnsupportedByDeviceError(message)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`."""
+        if not self._closed:
+            with self._lock:
+                self._output.show(expected(None).tobytes())
+
+    def close(self) -> None:
+        """See `Projector`."""
+        self.blank()
+        self._loaded = None
+        self._closed = True
+
+    def _require_open(self) -> None:
+        if self._closed:
+            message = "the projector is closed; open the rig again"
+            raise DeviceStateError(message)
+
+
+class LoopedHead:
+    """Implements `slrig.devices.Head`: one camera before the looped projector."""
+
+    def __init__(self, camera: Camera, projector: Projector) -> None:
+        self._camera = camera
+        self._projector = projector
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """See `Head`."""
+        return {"left": self._camera}
+
+    @property
+    def projector(self) -> Projector:
+        """See `Head`."""
+        return self._projector
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """See `Head`. None: nothing is measured here."""
+        return None
+
+    def truth(self) -> Truth | None:
+        """See `Head`."""
+        return None
+
+
+def options(instance: int, driver: str = "v4l2", /, **more: object) -> dict[str, object]:
+    """The camera's table in a rig file."""
+    return {
+        "device": str(camera_node(instance).path),
+        "size_px": [CAMERA.width_px, CAMERA.height_px],
+        **({"pixel_format": "GREY"} if driver == "v4l2" else {"fourcc": "GREY"}),
+        **more,
+    }
+
+
+def head(folder: Path, driver: str = "v4l2") -> LoopedHead:
+    """A driver's camera before the looped projector."""
+    projector = LoopedProjector(output(0))
+    return LoopedHead(DRIVERS[driver]("left", options(0, driver), folder), projector)
+
+
+def bench(folder: Path, driver: str = "v4l2") -> Bench:
+    """The contract suite's bench; only in the guest."""
+    return Bench(lambda: head(folder, driver), sequence())
+
+
+DRIVERS: Mapping[str, Callable[[str, Mapping[str, object], Path], Camera]] = {
+    "v4l2": v4l2.open_camera,
+    "opencv": opencv.open_camera,
+}

@@ -1,0 +1,180 @@
+"""The desk: where a test decides what the faulty rig meets, holds it at a step, and reads what its projector was told.
+
+It lives in the test's own process, so its records survive whatever becomes of the service.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+WAIT_S = 60.0
+"""How long a test waits for what must come; a pass never waits for it to run out."""
+
+ANY = -1
+"""A number that stands for every number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of a device. `number` : of the pattern shown or the frame read; 0 for all other steps."""
+
+    device: str
+    name: str
+    number: int = ANY
+
+    def __str__(self) -> str:
+        return f"{self.device} {self.name}" + (f" {self.number}" if self.number > 0 else "")
+
+    def meets(self, device: str, name: str, number: int) -> bool:
+        """Whether a device is at this step."""
+        return (self.device, self.name) == (device, name) and self.number in {ANY, number}
+
+
+@dataclass(slots=True)
+class Hold:
+    """A step at which the rig waits. `reached` : it does; `go` : it need not any more."""
+
+    step: Step
+    reached: threading.Event = field(default_factory=threading.Event)
+    go: threading.Event = field(default_factory=threading.Event)
+
+    def until_reached(self) -> None:
+        """Return when the rig is there."""
+        assert self.reached.wait(WAIT_S), f"the rig did not come to {self.step}"
+
+
+class Desk:
+    """Answers the driver. A context manager."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="desk-")
+        self.path = Path(self._folder.name, "desk")
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._changed = threading.Condition()
+        self._faults: dict[Step, str] = {}
+        self._unplugged: set[str] = set()
+        self._holds: list[Hold] = []
+        self.steps: list[tuple[str, str, int]] = []
+        self.light: list[tuple[str, bool]] = []
+
+    def __enter__(self) -> Self:
+        self._listener.bind(str(self.path))
+        self._listener.listen()
+        threading.Thread(target=self._accept, name="desk", daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.lift()
+        self._listener.close()
+        self._folder.cleanup()
+
+    def fault(self, step: Step, what: str) -> None:
+        """Have a step fail, each time, until `lift`. A device that is unplugged cannot be opened until then, either."""
+        with self._changed:
+            self._faults[step] = what
+
+    def lift(self) -> None:
+        """Put everything right, and let go what is held."""
+        with self._changed:
+            self._faults.clear()
+            self._unplugged.clear()
+            for hold in self._holds:
+                hold.go.set()
+            self._holds.clear()
+
+    @contextmanager
+    def held(self, step: Step) -> Iterator[Hold]:
+        """Have the rig wait at a step, the next time that it comes there; it goes on at the end of the block."""
+        hold = Hold(step)
+        with self._changed:
+            self._holds.append(hold)
+        try:
+            yield hold
+        finally:
+            hold.go.set()
+            with self._changed:
+                self._holds = [each for each in self._holds if each is not hold]
+
+    @property
+    def lit(self) -> bool:
+        """Whether the last thing that the projector was told, and did, leaves light on."""
+        with self._changed:
+            return bool(self.light) and self.light[-1][1]
+
+    def was_lit(self) -> bool:
+        """Whether there was any light since `forget`: a projector that never shone proves nothing by its darkness."""
+        with self._changed:
+            return any(lit for _, lit in self.light)
+
+    def shines(self) -> bool:
+        """Wait until the projector gives light; return whether it did."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self.light) and self.light[-1][1], WAIT_S)
+
+    def dark(self) -> bool:
+        """Wait until the projector is dark; return whether it became so."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self.light or not self.light[-1][1], WAIT_S)
+
+    def came(self, device: str, step: str) -> bool:
+        """Wait until a device comes to a step; return whether it did."""
+        with self._changed:
+            return self._changed.wait_for(lambda: any(each[:2] == (device, step) for each in self.steps), WAIT_S)
+
+    def forget(self) -> None:
+        """Begin a new record. What the projector was told last stays."""
+        with self._changed:
+            del self.light[:-1]
+            self.steps.clear()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                connection, _ = self._listener.accept()
+                threading.Thread(target=self._serve, args=(connection,), name="desk-line", daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        # A driver whose process is killed leaves in the middle of a word.
+        with suppress(OSError, ValueError), connection, connection.makefile("rwb", buffering=0) as stream:
+            self._converse(stream)
+
+    def _converse(self, stream: socket.SocketIO) -> None:
+        for line in stream:
+            message = json.loads(line)
+            if "light" in message:
+                with self._changed:
+                    self.light.append((message["command"], message["light"]))
+                    self._changed.notify_all()
+                answer = "go"
+            else:
+                answer = self._answer(message["device"], message["step"], message["number"])
+            stream.write(json.dumps(answer).encode() + b"\n")
+
+    def _answer(self, device: str, step: str, number: int) -> str:
+        with self._changed:
+            self.steps.append((device, step, number))
+            self._changed.notify_all()
+            hold = next(
+                (each for each in self._holds if each.step.meets(device, step, number) and not each.reached.is_set()),
+                None,
+            )
+            if hold is not None:
+                hold.reached.set()
+        if hold is not None:
+            hold.go.wait()
+        with self._changed:
+            what = next((each for at, each in self._faults.items() if at.meets(device, step, number)), "go")
+            if what == "unplug":
+                self._unplugged.add(device)
+            return "unplug" if device in self._unplugged else what

@@ -1,0 +1,338 @@
+"""The driver of the faulty rig. It runs inside the service, asks the desk (`desk.py`) before every step, and obeys.
+
+What happens to it there is what happens to drivers: the device is gone, held by another, silent, refused by the system.
+It waits where the desk makes it wait, for as long as it does.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slrig.bundle.faults import Strict
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Projector, ProjectorInfo, Shown, Trigger
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    DeviceStateError,
+    FrameTimeoutError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import CameraFormat, Frame, PatternSequence, Pixels
+from tests.e2e.faulty_rig import scenery
+
+PLAYER = "projector"
+
+
+class Options(Strict):
+    """The driver's keys of a rig file. desk : the socket to ask; trigger : of the camera; plays : of the projector."""
+
+    desk: str
+    trigger: str = Trigger.SOFTWARE
+    plays: bool = False
+
+
+class Line:
+    """The way to the desk: one connection for each thread, since a thread may be held there while others go on."""
+
+    def __init__(self, desk: str) -> None:
+        self._desk = desk
+        self._local = threading.local()
+
+    def told(self, **message: Any) -> str:
+        """Say something, wait for the answer, and return it."""
+        stream = getattr(self._local, "stream", None)
+        if stream is None:
+            connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            connection.connect(self._desk)
+            stream = self._local.stream = connection.makefile("rwb", buffering=0)
+        stream.write(json.dumps(message).encode() + b"\n")
+        answer: str = json.loads(stream.readline())
+        return answer
+
+
+class Wall:
+    """What is lit now, for the camera to see. One for the process: it stays when devices are opened again."""
+
+    def __init__(self) -> None:
+        self.profile: Pixels | None = None
+        self.play: tuple[PatternSequence, int, float, float] | None = None
+
+
+WALL = Wall()
+_OPEN: set[str] = set()
+"""The devices that are open, gone or not. Nobody can open one twice: not even the service, if it forgot one."""
+
+
+class Handle:
+    """A device while it is open. Once it is gone it stays gone: only opening it again helps."""
+
+    def __init__(self, name: str, line: Line) -> None:
+        self.name = name
+        self.line = line
+        self._gone = False
+        self.closed = False
+        if name in _OPEN:
+            message = f"{name} is held by this service itself"
+            raise DeviceBusyError(message)
+        self.step("open")
+        _OPEN.add(name)
+
+    def step(self, step: str, number: int = 0) -> None:
+        """Ask whether a step may be done, and meet the fault that it is to meet."""
+        if self._gone:
+            raise self._unplugged()
+        match self.line.told(device=self.name, step=step, number=number):
+            case "go":
+                return
+            case "unplug":
+                self._gone = True
+                raise self._unplugged()
+            case "busy" if step == "open":
+                message = f"{self.name} is held by another program; end that program, then scan again"
+                raise DeviceBusyError(message)
+            case "busy":
+                raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), f"/dev/{self.name}")
+            case "time-out" if step == "read":
+                message = f"no frame from {self.name} in time"
+                raise FrameTimeoutError(message)
+            case "time-out":
+                message = f"{self.name} did not answer {step} within 0.15 s; check its cable and power"
+                raise DeviceError(message)
+            case "input/output error":
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+            case "defect":
+                message = "list index out of range"
+                raise IndexError(message)
+            case unknown:
+                raise AssertionError(unknown)
+
+    def require_open(self) -> None:
+        """Raise DeviceStateError after `close`."""
+        if self.closed:
+            message = f"{self.name} is closed; open the rig again"
+            raise DeviceStateError(message)
+
+    def close(self) -> bool:
+        """Ask to be closed, once; return whether it was to be done. A device that is gone has nothing to be asked."""
+        if self.closed:
+            return False
+        self.closed = True
+        _OPEN.discard(self.name)
+        if not self._gone:
+            self.step("close")
+        return not self._gone
+
+    def _unplugged(self) -> DeviceGoneError:
+        message = f"{self.name} was unplugged; plug it in, then scan again"
+        return DeviceGoneError(message)
+
+
+class FaultyCamera:
+    """Implements `slrig.devices.Camera`."""
+
+    def __init__(self, name: str, options: Options) -> None:
+        self._handle = Handle(name, Line(options.desk))
+        self._way = Trigger(options.trigger)
+        self._noise = np.random.default_rng(1)
+        self._exposure_s = 0.002
+        self._armed = False
+        self._triggered_ns: int | None = None
+        self._count = self._read = 0
+        self._pace = threading.Event()
+        form = CameraFormat(scenery.CAMERA, 8)
+        self.info = CameraInfo(name, "faulty camera", "c1", form, frozenset({self._way}), (0.001, 1.0), (1.0, 4.0))
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`."""
+        self._handle.require_open()
+        self._handle.step("configure")
+        self._exposure_s = settings.exposure_s
+        return AppliedSettings(settings.exposure_s, settings.gain)
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`."""
+        self._handle.require_open()
+        if self._armed or trigger is not self._way or count < 1:
+            message = f"{self._handle.name} is {'armed' if self._armed else 'not armed'}, asked {count} by {trigger}"
+            raise DeviceStateError(message)
+        self._handle.step("arm")
+        self._armed, self._read, self._triggered_ns = True, 0, None
+
+    def trigger(self) -> None:
+        """See `Camera`."""
+        self._handle.require_open()
+        self._handle.step("trigger")
+        self._triggered_ns = time.monotonic_ns()
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`. No frame to wait for is told at once: the time it takes is not what is tested."""
+        self._handle.require_open()
+        if not self._armed:
+            message = f"{self._handle.name} is not armed"
+            raise DeviceStateError(message)
+        self._handle.step("read", self._read)
+        start_ns = max(after_ns, time.monotonic_ns())
+        if self._way is Trigger.SOFTWARE:
+            if self._triggered_ns is None:
+                message = f"{self._handle.name} was not triggered, and gave nothing within {timeout_s:g} s"
+                raise FrameTimeoutError(message)
+            start_ns, self._triggered_ns = self._triggered_ns, None
+        elif self._way is Trigger.HARDWARE:
+            start_ns = max(self._pulse(timeout_s), after_ns)
+        end_ns = start_ns + round(self._exposure_s * 1e9)
+        while (left_ns := end_ns - time.monotonic_ns()) > 0:
+            # Closing ends the wait.
+            if self._pace.wait(left_ns / 1e9):
+                break
+        self._handle.require_open()
+        self._read += 1
+        self._count += 1
+        image = scenery.seen(WALL.profile, self._noise)
+        return Frame(self._handle.name, image, start_ns, end_ns, 0, self._count, 0, self._exposure_s, 1.0)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        if self._armed and not self._handle.closed:
+            self._handle.step("disarm")
+        self._armed = False
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self._armed = False
+        self._pace.set()
+        self._handle.close()
+
+    def _pulse(self, timeout_s: float) -> int:
+        """When the wire's next pulse came, and with it the next pattern of the play."""
+        if WALL.play is None or self._read >= len(WALL.play[0]):
+            message = f"no pulse came to {self._handle.name} within {timeout_s:g} s"
+            raise FrameTimeoutError(message)
+        sequence, began_ns, _, period_s = WALL.play
+        WALL.profile = sequence.profiles[self._read]
+        return max(began_ns + round(self._read * period_s * 1e9), time.monotonic_ns())
+
+
+class FaultyProjector:
+    """Implements `slrig.devices.Projector`. It tells the desk of its light, and is told there what to meet."""
+
+    def __init__(self, options: Options) -> None:
+        self._handle = Handle(PLAYER, Line(options.desk))
+        self._sequence: PatternSequence | None = None
+        self.info = ProjectorInfo(PLAYER, "faulty projector", "p1", scenery.PROJECTOR, options.plays, 0.001)
+        self._light(None, "open")
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`."""
+        self._handle.require_open()
+        self._handle.step("load")
+        self._light(None, "load")
+        self._sequence = sequence
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`. A fault comes when it has lit the pattern already: its answer is what is lost."""
+        self._handle.require_open()
+        if self._sequence is None:
+            message = f"asked to show pattern {index}, nothing is loaded"
+            raise DeviceStateError(message)
+        self._light(self._sequence.profiles[index], f"show {index}")
+        self._handle.step("show", index)
+        return Shown(index, time.monotonic_ns(), 0)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`."""
+        self._handle.require_open()
+        if not self.info.plays or self._sequence is None:
+            message = "this projector does not play, or has nothing to"
+            raise UnsupportedByDeviceError(message)
+        WALL.play = (self._sequence, time.monotonic_ns(), exposure_s, period_s)
+        self._light(self._sequence.profiles[0], "play")
+        self._handle.step("play")
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self._dark("stop")
+
+    def blank(self) -> None:
+        """See `Projector`."""
+        self._dark("blank")
+
+    def close(self) -> None:
+        """See `Projector`."""
+        if self._handle.close():
+            self._light(None, "close")
+
+    def _dark(self, step: str) -> None:
+        if not self._handle.closed:
+            self._handle.step(step)
+            self._light(None, step)
+
+    def _light(self, profile: Pixels | None, command: str) -> None:
+        if profile is None:
+            WALL.play = None
+        WALL.profile = profile
+        lit = profile is not None and bool(profile.any())
+        self._handle.line.told(device=PLAYER, light=lit, command=command)
+
+
+class DiskHook:
+    """Meets faults where the service writes below `.incoming`, as the system would raise them: an audit hook.
+
+    Steps of "disk": `write` a new file, `rename` it, `sync` the whole bundle after the capture, `commit` a whole scan
+    by its last rename.
+    """
+
+    def __init__(self, desk: str) -> None:
+        self._line = Line(desk)
+        self._asking = threading.local()
+
+    def __call__(self, event: str, given: tuple[Any, ...]) -> None:
+        """Look at an event of the interpreter."""
+        if event not in {"open", "os.rename"} or getattr(self._asking, "now", False):
+            return
+        path = os.fsdecode(given[0]) if isinstance(given[0], (str, bytes, os.PathLike)) else ""
+        _, incoming, below = path.partition("/.incoming/")
+        if event == "os.rename":
+            step = "rename" if "/" in below else "commit"
+        else:
+            step = "write" if "x" in str(given[1] or "") else "sync"
+        # Folders are opened to be removed, too, and no disk refuses that.
+        if not incoming or (step == "sync" and below.split("/")[1:2] != ["bundle"]):
+            return
+        self._asking.now = True
+        try:
+            answer = self._line.told(device="disk", step=step, number=0, path=path)
+        finally:
+            self._asking.now = False
+        if answer == "full":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+
+
+_HOOKED: set[str] = set()
+
+
+def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
+    """Open the camera."""
+    del folder
+    return FaultyCamera(name, Options.model_validate(dict(options)))
+
+
+def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
+    """Open the projector; the first one brings the hook that makes disks full."""
+    del folder
+    table = Options.model_validate(dict(options))
+    if table.desk not in _HOOKED:
+        _HOOKED.add(table.desk)
+        sys.addaudithook(DiskHook(table.desk))
+    return FaultyProjector(table)

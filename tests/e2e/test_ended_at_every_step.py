@@ -1,0 +1,145 @@
+"""The service, told to end or killed while its rig is at each step of a scan.
+
+Told to end (SIGTERM) it leaves the projector dark, every scan marked as interrupted, and whoever follows one knows it.
+Killed (SIGKILL) it can do none of that: then the light is the duty of the projector's own watchdog, if it has one,
+until the service is started again and opens the projector, which darkens it; and the scan is marked at that start.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.e2e.conftest import STOP_LIMIT_S, ServiceProcess
+from tests.e2e.faulty_rig.desk import Desk, Step
+from tests.e2e.faulty_rig.driver import PLAYER
+from tests.e2e.faulty_rig.following import Follower
+from tests.e2e.faulty_rig.scenery import CAMERA_NAME
+from tests.e2e.faulty_rig.service import gone, half_written, installed, scanned, write_rig
+
+pytestmark = pytest.mark.slow
+
+DARK_STEPS = {"open", "configure", "arm", "load"}
+STEPS = (
+    Step(PLAYER, "open"),
+    Step(CAMERA_NAME, "open"),
+    Step(CAMERA_NAME, "configure"),
+    Step(PLAYER, "load"),
+    Step(CAMERA_NAME, "arm"),
+    Step(PLAYER, "show", 0),
+    Step(CAMERA_NAME, "trigger"),
+    Step(CAMERA_NAME, "read", 0),
+    Step("disk", "write"),
+    Step(PLAYER, "show", 7),
+    Step(CAMERA_NAME, "read", 7),
+    Step(PLAYER, "blank"),
+    Step(CAMERA_NAME, "disarm"),
+    Step("disk", "sync"),
+    Step("disk", "commit"),
+)
+
+
+@pytest.fixture
+def desk() -> Iterator[Desk]:
+    with Desk() as desk:
+        yield desk
+
+
+@pytest.fixture
+def serve(tmp_path: Path, desk: Desk) -> Iterator[Callable[[], ServiceProcess]]:
+    """Start the service on one rig and one data folder, one after the other."""
+    rig = write_rig(tmp_path / "rig", desk, "software")
+    running: list[ServiceProcess] = []
+
+    def served() -> ServiceProcess:
+        running.append(ServiceProcess(rig, tmp_path / "data"))
+        return running[-1]
+
+    with installed(tmp_path / "site"):
+        yield served
+    for service in running:
+        if service.process.poll() is None:
+            service.kill()
+
+
+@contextmanager
+def at(
+    desk: Desk, step: Step, service: Callable[[], ServiceProcess]
+) -> Iterator[tuple[ServiceProcess, dict[str, Any]]]:
+    """A service whose rig is held at a step of a scan."""
+    desk.forget()
+    with desk.held(step) as hold:
+        running = service()
+        with running.client() as client:
+            if step.name == "open":
+                hold.until_reached()
+            scan = client.start({})
+        hold.until_reached()
+        assert desk.was_lit() or step.name in DARK_STEPS
+        yield running, scan
+
+
+def marked(service: ServiceProcess, scan: dict[str, Any]) -> str:
+    """The state of a scan, and the kind of what is on record as its cause."""
+    with service.client() as client:
+        record = client.get(scan["links"]["self"])
+    if record["state"] == "succeeded":
+        return "succeeded"
+    assert record["error"]["type"] == "/problems/scan-interrupted", record
+    assert "Scan again" in record["error"]["detail"]
+    return str(record["state"])
+
+
+def test_told_to_end_at_every_step(serve: Callable[[], ServiceProcess], desk: Desk) -> None:
+    before: dict[str, Any] | None = None
+    for step in STEPS:
+        with at(desk, step, serve) as (service, scan):
+            if before is not None:
+                assert marked(service, before) == "interrupted"
+            follower = Follower(service, scan)
+            began_s = time.monotonic()
+            service.process.send_signal(signal.SIGTERM)
+            desk.lift()
+            code = gone(service, STOP_LIMIT_S)
+        took_s = time.monotonic() - began_s
+        print(f"SIGTERM at {step!s:16} exit {code} in {took_s:.1f} s, {follower.last():12}", end="")  # noqa: T201
+        print(f"projector {'lit' if desk.lit else 'dark'}")  # noqa: T201
+        assert code == 0
+        assert not desk.lit, desk.light
+        assert {device for device, name, _ in desk.steps if name == "close"} >= _opened(desk)
+        assert follower.last() == "interrupted" or step.name == "commit"
+        assert half_written(service.data) == []
+        before = scan if follower.last() == "interrupted" else None
+    with serve().client() as client:
+        assert scanned(client)["state"] == "succeeded"
+
+
+def _opened(desk: Desk) -> set[str]:
+    """The devices that had been opened: their opening was not the last that was asked of them."""
+    return {device for device in (PLAYER, CAMERA_NAME) if desk.steps.count((device, "open", 0))}
+
+
+def test_killed_at_every_step(serve: Callable[[], ServiceProcess], desk: Desk) -> None:
+    before: dict[str, Any] | None = None
+    for step in STEPS:
+        with at(desk, step, serve) as (service, scan):
+            if before is not None:
+                print(marked(service, before), end="\n")  # noqa: T201
+                assert marked(service, before) == "interrupted"
+            service.kill()
+        print(f"SIGKILL at {step!s:16} projector {'lit' if desk.lit else 'dark'}, then ", end="")  # noqa: T201
+        before = scan
+    last = serve()
+    assert before is not None
+    print(marked(last, before))  # noqa: T201
+    assert marked(last, before) == "interrupted"
+    assert half_written(last.data) == []
+    with last.client() as client:
+        assert scanned(client)["state"] == "succeeded"
+    assert desk.dark()

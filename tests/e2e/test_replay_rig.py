@@ -1,0 +1,94 @@
+"""A recording as a rig: POST /scan on it gives the recording again, and from it the original mesh, byte for byte."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.replay import open_head
+from slrig.bundle import read_capture
+from slrig.devices import CameraSettings, Rig
+from slrig.model import Capture
+from slrig.scan.acquisition import capture_bundle
+from slrig.scan.pipeline import reconstruct_bundle
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from tests.e2e.conftest import Start, write_rig
+
+SECOND_CAMERA = """
+[[head.camera]]
+name = "right"
+size_px = [240, 192]
+saturation_s = 0.02
+focal_px = [952.0, 950.0]
+position_mm = [160.0, 10.0, -560.0]
+target_mm = [0.0, 0.0, 0.0]
+blur_px = 0.6
+bit_depth = 12
+"""
+MESHES = ("mesh.ply", "points.ply")
+
+
+def scanned(start: Start, rig: Path, data: Path) -> Path:
+    """Serve a rig, POST one scan; the folder of its files."""
+    service = start(rig, data)
+    with service.client() as client:
+        scan = client.start({})
+        for _ in client.follow(scan):
+            pass
+        record = client.get(scan["links"]["self"])
+    assert record["state"] == "succeeded", record
+    assert service.stop() == 0
+    return data / "scans" / str(record["id"])
+
+
+def reconstructed(bundle: Path, output: Path) -> Path:
+    """What `slrig reconstruct` writes."""
+    reconstruct_bundle(bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False)
+    return output
+
+
+def frames(bundle: Path) -> list[dict[str, Any]]:
+    description: dict[str, Any] = json.loads((bundle / "bundle.json").read_text())
+    found: list[dict[str, Any]] = description["frames"]
+    return found
+
+
+def images(capture: Capture) -> dict[tuple[int, str], bytes]:
+    return {(shot.pattern, shot.camera): shot.image.tobytes() for shot in capture.shots}
+
+
+def require_equal_meshes(first: Path, second: Path) -> None:
+    for name in MESHES:
+        assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [0, 20])
+def test_a_scan_of_a_recorded_scan_is_that_scan(start: Start, tmp_path: Path, speed: int) -> None:
+    original = scanned(start, write_rig(tmp_path / "rig", faults=SECOND_CAMERA), tmp_path / "first")
+    bundle = tmp_path / "recording"
+    (original / "bundle").rename(bundle)
+    rig = tmp_path / "replayed.toml"
+    rig.write_text(f'name = "replayed"\n[head]\ndriver = "replay"\nbundle = "recording"\nspeed = {speed}\n')
+    again = scanned(start, rig, tmp_path / "second")
+    # Times and exposures to the last digit, every pixel, and therefore every byte of the mesh.
+    assert frames(again / "bundle") == frames(bundle)
+    assert images(read_capture(again / "bundle")) == images(read_capture(bundle))
+    require_equal_meshes(again, original)
+    require_equal_meshes(again, reconstructed(bundle, tmp_path / "reconstructed"))
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+def test_a_scan_of_somebody_elses_recording_gives_its_mesh(shared: Path, tmp_path: Path) -> None:
+    bundle = shared / "bundles" / "gauge"
+    head = open_head({"bundle": str(bundle)}, tmp_path)
+    settings = {name: CameraSettings(camera.info.exposure_range_s[0]) for name, camera in head.cameras.items()}
+    plan = ScanPlan(PatternPlan(gray_cell_px=1))
+    again = tmp_path / "again"
+    with Rig("replayed", head.cameras, head.projector, settings, head.calibration, head) as rig:
+        capture_bundle(rig, plan, again, progress=lambda *_: None, cancelled=lambda: False)
+    require_equal_meshes(reconstructed(again, tmp_path / "new"), reconstructed(bundle, tmp_path / "old"))

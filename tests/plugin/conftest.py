@@ -1,0 +1,73 @@
+"""Third-party packages, built and installed by pip into folders of their own."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+LEAST_SETUPTOOLS = 77
+
+# Not ours to import: they are installed, and some of them fail on purpose.
+collect_ignore_glob = ["*_package/*"]
+
+
+def pip_install(sources: Sequence[Path], work: Path) -> Path:
+    """Build packages from copies of their sources and install them into a folder, offline; return that folder."""
+    found = importlib.metadata.version("setuptools")
+    if int(found.split(".")[0]) < LEAST_SETUPTOOLS:
+        pytest.fail(
+            f"asked setuptools {LEAST_SETUPTOOLS} to build packages with, found {found}: pip install -e '.[test]'"
+        )
+    # Building leaves folders beside the sources.
+    copies = [str(shutil.copytree(source, work / "sources" / source.name)) for source in sources]
+    target = work / "site"
+    options = ["--quiet", "--disable-pip-version-check", "--no-deps", "--no-build-isolation", "--no-index"]
+    done = subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-m", "pip", "install", *options, "--target", str(target), *copies],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+def path_with(*sites: Path) -> str:
+    """PYTHONPATH with these folders first."""
+    known = os.environ.get("PYTHONPATH")
+    return os.pathsep.join([*map(str, sites), *([known] if known else [])])
+
+
+def slrig(*arguments: str, path: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run slrig as a process of its own, in a folder, with a PYTHONPATH."""
+    return subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-m", "slrig.cli", *arguments],
+        env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200"},
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+@pytest.fixture(scope="session")
+def example_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the example camera and the projector that lights its chart are installed."""
+    sources = [HERE / "example_package", HERE / "projector_package"]
+    return pip_install(sources, tmp_path_factory.mktemp("examples"))
+
+
+@pytest.fixture(scope="session")
+def broken_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the packages are installed that fail, each in its own way."""
+    names = ("broken_package", "factory_fault_package", "finder_fault_package", "lacking_package")
+    return pip_install([HERE / name for name in names], tmp_path_factory.mktemp("broken"))
