@@ -28,6 +28,8 @@ from slrig.devices import (
     FoundDevice,
     Head,
     KeepsTime,
+    Positioner,
+    Positions,
     Projector,
     Rig,
     Synchronisation,
@@ -170,6 +172,7 @@ def open_rig(config: RigConfig) -> Rig:
             head,
             _synchronisation(config, cameras),
             _clock(head),
+            _positioner(head),
         )
         opened.pop_all()
         return rig
@@ -185,6 +188,10 @@ def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) ->
 
 def _clock(head: object) -> Clock:
     return head.clock if isinstance(head, KeepsTime) else SystemClock()
+
+
+def _positioner(head: object) -> Positioner | None:
+    return head.positioner if isinstance(head, Positions) else None
 
 
 def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchronisation | None:

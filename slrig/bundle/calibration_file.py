@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,9 +16,10 @@ from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
 from slrig.bundle.opencv_calibration import read_opencv_calibration
 from slrig.bundle.storage import write_file
 from slrig.errors import CalibrationError
-from slrig.model import Calibration, Pinhole, Size
+from slrig.model import DEVICE_PARAMETERS, Calibration, Pinhole, Size, Solved
 
 MOST_CALIBRATION_BYTES = 4 * 2**20
+MOST_DEVICES = 16
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
@@ -34,6 +36,23 @@ class DeviceEntry(Strict):
     translation_mm: Vector3
 
 
+class SolvedEntry(Strict):
+    """How the calibration was found: see `slrig.model.Solved`. Absent where it says nothing of its own error."""
+
+    id: Annotated[str, Field(min_length=1, max_length=64)]
+    solved_at: Annotated[datetime, Field(description="ISO 8601 with the offset from UTC")]
+    covariance: Annotated[
+        list[list[float]],
+        Field(
+            max_length=MOST_DEVICES * DEVICE_PARAMETERS,
+            description="of fx, fy, cx, cy, k1, k2, p1, p2, k3, a small turn (rad) and the translation (mm) of each "
+            "device: cameras in order, then the projector",
+        ),
+    ]
+    volume_mm: Annotated[list[Vector3], Field(min_length=2, max_length=2)]
+    expected_error_mm: Annotated[float, Field(ge=0)]
+
+
 class CalibrationEntry(Strict):
     """The whole of calibration.json. Without a projector only cameras can be triangulated with each other."""
 
@@ -41,6 +60,7 @@ class CalibrationEntry(Strict):
     version: Literal[1]
     cameras: Annotated[dict[CameraName, DeviceEntry], Field(min_length=1)]
     projector: DeviceEntry | None = None
+    solved: SolvedEntry | None = None
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -62,7 +82,11 @@ def read_calibration(path: Path) -> Calibration:
         raise CalibrationError(message) from cause
     cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
     projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
-    return Calibration(cameras, projector)
+    try:
+        return Calibration(cameras, projector, _solved(entry.solved))
+    except (CalibrationError, ValueError) as cause:
+        message = f"{path}: solved.{cause}"
+        raise CalibrationError(message) from cause
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -80,6 +104,14 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     }
     if calibration.projector is not None:
         data["projector"] = _device(calibration.projector)
+    if calibration.solved is not None:
+        data["solved"] = {
+            "id": calibration.solved.id,
+            "solved_at": calibration.solved.solved_at,
+            "covariance": calibration.solved.covariance.tolist(),
+            "volume_mm": calibration.solved.volume_mm.tolist(),
+            "expected_error_mm": calibration.solved.expected_error_mm,
+        }
     write_file(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
 
 
@@ -104,6 +136,18 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
         lines = "\n".join(f"  {fault}" for fault in faults)
         message = f"{source}: the calibration is for other devices; calibrate these or name the right file:\n{lines}"
         raise CalibrationError(message)
+
+
+def _solved(entry: SolvedEntry | None) -> Solved | None:
+    if entry is None:
+        return None
+    return Solved(
+        entry.id,
+        entry.solved_at.isoformat(),
+        np.array(entry.covariance, dtype=np.float64),
+        np.array(entry.volume_mm, dtype=np.float64),
+        entry.expected_error_mm,
+    )
 
 
 def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:

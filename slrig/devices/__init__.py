@@ -2,6 +2,7 @@
 
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
+from slrig.devices.positioner import Positioner, Positions
 from slrig.devices.projector import Projector, ProjectorInfo, Shown
 from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
@@ -14,6 +15,8 @@ __all__ = [
     "FoundDevice",
     "Head",
     "KeepsTime",
+    "Positioner",
+    "Positions",
     "Projector",
     "ProjectorInfo",
     "Rig",

@@ -9,6 +9,7 @@ from typing import Protocol, Self, runtime_checkable
 
 from slrig.devices.camera import Camera, CameraSettings
 from slrig.devices.clock import Clock, SystemClock
+from slrig.devices.positioner import Positioner
 from slrig.devices.projector import Projector
 from slrig.model import Calibration, Truth
 
@@ -65,7 +66,8 @@ class Synchronisation:
 class Rig:
     """Open devices, with what is known about them. A context manager: leaving it darkens and closes everything.
 
-    `synchronisation` is None where latency was not measured. All time stamps count in `clock`.
+    `synchronisation` is None where latency was not measured. All time stamps count in `clock`. `positioner` is None
+    where a person moves the calibration board.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Rig:
     head: Head | None = field(default=None)
     synchronisation: Synchronisation | None = None
     clock: Clock = field(default_factory=SystemClock)
+    positioner: Positioner | None = None
 
     def truth(self) -> Truth | None:
         """What a rendered rig knows of its scene; None on metal."""
@@ -85,6 +88,8 @@ class Rig:
         """Darken the projector, then close every device, whatever state each is in. Return what they raised."""
         faults: list[Exception] = []
         steps: list[Callable[[], None]] = [self.projector.blank, self.projector.close]
+        if self.positioner is not None:
+            steps.append(self.positioner.close)
         for step in (*steps, *(camera.close for camera in self.cameras.values())):
             try:
                 step()

@@ -1,0 +1,106 @@
+"""Calibration boards: what is printed on them, and where each of their corners lies.
+
+A board's own frame lies in its plane: the origin at corner 0, x to the right and y down as one looks at the print, z
+away from the one who looks. Corners count from left to right, then from top to bottom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from slrig.errors import CalibrationError
+from slrig.model import FloatArray
+
+DICTIONARY = "DICT_5X5_250"
+"""The markers of a ChArUco board, unless another dictionary of OpenCV is named."""
+
+MARKER_SHARE = 0.75
+"""A marker's side over the square that it lies in, unless given."""
+
+_FEWEST, _MOST = 3, 60
+_LEAST_MM, _MOST_MM = 0.1, 1000.0
+
+
+class BoardKind(StrEnum):
+    """What is printed."""
+
+    CHARUCO = "charuco"
+    CHESSBOARD = "chessboard"
+    CIRCLES = "circles"
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A board. A frozen value that travels from a request to the solve.
+
+    columns, rows : inner corners of a ChArUco board or chessboard; of asymmetric circles, the circles of one row, and
+    the rows (OpenCV's 4 x 11). square_mm : side of a square; of circles, the distance of two neighbouring rows, which
+    is half of that of two circles in one row. marker_mm, dictionary : of a ChArUco board only.
+
+    Raises
+    ------
+    CalibrationError
+        No such board can be printed or told apart.
+    """
+
+    kind: BoardKind
+    columns: int
+    rows: int
+    square_mm: float
+    marker_mm: float | None = None
+    dictionary: str | None = None
+
+    def __post_init__(self) -> None:
+        charuco = self.kind is BoardKind.CHARUCO
+        if charuco and self.marker_mm is None:
+            object.__setattr__(self, "marker_mm", MARKER_SHARE * self.square_mm)
+        if charuco and self.dictionary is None:
+            object.__setattr__(self, "dictionary", DICTIONARY)
+        faults = []
+        if not (_FEWEST <= self.columns <= _MOST and _FEWEST <= self.rows <= _MOST):
+            faults.append(f"expected {_FEWEST} to {_MOST} corners each way, found {self.columns} x {self.rows}")
+        if not _LEAST_MM <= self.square_mm <= _MOST_MM:
+            faults.append(f"square_mm: expected {_LEAST_MM:g} to {_MOST_MM:g} mm, found {self.square_mm:g}")
+        if charuco and not 0 < (self.marker_mm or 0) < self.square_mm:
+            faults.append(f"marker_mm: expected less than the square's {self.square_mm:g} mm, found {self.marker_mm:g}")
+        if not charuco and (self.marker_mm is not None or self.dictionary is not None):
+            faults.append(f"marker_mm and dictionary belong to a ChArUco board, and this is a board of {self.kind}")
+        if faults:
+            message = "the board: " + "; ".join(faults)
+            raise CalibrationError(message)
+
+    @property
+    def corner_count(self) -> int:
+        """How many corners (circles) there are."""
+        return self.columns * self.rows
+
+    @property
+    def points_mm(self) -> FloatArray:
+        """(n, 3) float64: every corner (the centre of every circle) in the board's frame."""
+        row, column = np.divmod(np.arange(self.corner_count), self.columns)
+        across = 2 * column + row % 2 if self.kind is BoardKind.CIRCLES else column
+        flat = np.column_stack([across, row, np.zeros_like(row)])
+        return np.asarray(flat * self.square_mm, dtype=np.float64)
+
+    @property
+    def print_mm(self) -> FloatArray:
+        """(2, 2) float64: the least and the greatest (x, y) of what is printed, in the board's frame."""
+        if self.kind is BoardKind.CIRCLES:
+            least = np.array([-1.0, -1.0])
+            most = np.array([2.0 * self.columns, float(self.rows)])
+        else:
+            least = np.array([-1.0, -1.0])
+            most = np.array([float(self.columns), float(self.rows)])
+        return np.stack([least, most]) * self.square_mm
+
+    @property
+    def title(self) -> str:
+        """A few words for it.
+
+        >>> Board(BoardKind.CHESSBOARD, 11, 8, 12.0).title
+        'chessboard 11x8, 12 mm'
+        """
+        return f"{self.kind} {self.columns}x{self.rows}, {self.square_mm:g} mm"

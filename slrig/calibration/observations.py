@@ -1,0 +1,79 @@
+"""What one pose of the board gives a solve: its corners in each camera, and the projector's light on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.board import Board
+from slrig.model import FloatArray, IntArray, Size
+
+COLUMN, ROW = 0, 1
+"""Which projector coordinate a correspondence has."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """The corners of the board that one camera sees.
+
+    corner : (n,) int32, their numbers, rising; points_px : (n, 2) float64; sigma_px : (n,) float64, the standard
+    deviation of each coordinate as the detector states it.
+    """
+
+    corner: IntArray
+    points_px: FloatArray
+    sigma_px: FloatArray
+
+    def __post_init__(self) -> None:
+        count = len(self.corner)
+        if self.points_px.shape != (count, 2) or self.sigma_px.shape != (count,):
+            message = f"a view of {count} corners, {self.points_px.shape} points and {self.sigma_px.shape} deviations"
+            raise ValueError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class Correspondences:
+    """Where camera pixels on the board get their light from: one projector coordinate each.
+
+    pixels_px : (n, 2) float64, (x, y) in the camera; axis : (n,) uint8, COLUMN or ROW; position_px : (n,) float64, that
+    coordinate of the projector pixel; sigma_px : (n,) float64, its standard deviation from noise, projector pixels.
+    A pixel whose both coordinates are known comes twice.
+    """
+
+    pixels_px: FloatArray
+    axis: NDArray[np.uint8]
+    position_px: FloatArray
+    sigma_px: FloatArray
+
+    def __post_init__(self) -> None:
+        count = len(self.axis)
+        if self.pixels_px.shape != (count, 2) or self.position_px.shape != (count,) or self.sigma_px.shape != (count,):
+            message = (
+                f"correspondences: {count} axes, {self.pixels_px.shape} pixels, {self.position_px.shape} positions"
+            )
+            raise ValueError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseObservation:
+    """One pose of the board. `views` and `light` are by camera; `light` is empty where no projector was used."""
+
+    name: str
+    views: Mapping[str, BoardView]
+    light: Mapping[str, Correspondences] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """All poses of one board before one rig: what a solve takes. `projector` is None where none is calibrated.
+
+    The first of `cameras` is the one whose frame becomes the world.
+    """
+
+    board: Board
+    cameras: Mapping[str, Size]
+    projector: Size | None
+    poses: tuple[PoseObservation, ...]

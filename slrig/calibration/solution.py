@@ -1,0 +1,87 @@
+"""What a solve gives: the devices, how well each number is known, and what is left over.
+
+Parameters of a device, 15 in this order, each with its row and column in the covariance:
+fx, fy, cx, cy (px), k1, k2, p1, p2, k3, a small turn (three angles, rad: R' = exp([turn]x) R), translation (mm).
+The world is the first camera's frame, so that its pose has no variance; a term that was not solved for has none either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from slrig.model import Calibration, FloatArray, IntArray
+
+PARAMETERS = (
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "turn_x",
+    "turn_y",
+    "turn_z",
+    "x_mm",
+    "y_mm",
+    "z_mm",
+)
+CELLS = 6
+"""Residual maps have 6 x 6 cells over the image."""
+
+PROJECTOR = "projector"
+"""The projector's name among devices."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPose:
+    """Where the board stood: X_world = rotation @ X_board + translation_mm; (3, 3) and (3,) float64."""
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceResiduals:
+    """What is left of one device's observations, px: rms of the distance for a camera's corners (both coordinates), rms
+    per coordinate for the projector's light.
+
+    count : observations; outlying : of them, given next to no weight, and in no other figure; stated_rms_px : what
+    their own deviations predict; held_out_rms_px : rms at poses that the solve had not seen, NaN if there were too
+    few; pose_rms_px : by pose. map_rms_px : (6, 6) float64, NaN where nothing was seen; map_count : (6, 6) int32;
+    map_mean_px : (6, 6, 2) float64, the mean residual vector of a cell.
+    """
+
+    rms_px: float
+    stated_rms_px: float
+    held_out_rms_px: float
+    count: int
+    outlying: int
+    pose_rms_px: Mapping[str, float]
+    map_rms_px: FloatArray
+    map_mean_px: FloatArray
+    map_count: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A solved calibration.
+
+    calibration : cameras and projector in the world, the first camera's frame.
+    covariance : (15 d, 15 d) float64, of the parameters of all d devices, cameras in order, then the projector.
+    distortion : by device, the names of the lens terms that held-out poses were better with.
+    poses : by name, those that were used; outliers : those left out, each with the reason in words.
+    residuals : by device, PROJECTOR among them.
+    board_shape_mm : (n, 3) float64, by how much each corner lies off its place, or None where that was not solved.
+    """
+
+    calibration: Calibration
+    covariance: FloatArray
+    distortion: Mapping[str, tuple[str, ...]]
+    poses: Mapping[str, BoardPose]
+    outliers: Mapping[str, str]
+    residuals: Mapping[str, DeviceResiduals]
+    board_shape_mm: FloatArray | None = None

@@ -1,0 +1,54 @@
+"""Frozen values that travel between the rooms of slrig, shape-checked once, on construction.
+
+Conventions: arrays are (row, column); extents only as `Size`; pixel centres at integer coordinates (OpenCV);
+world to device `X_dev = R @ X_world + t_mm`; millimetres; unmeasured is NaN.
+"""
+
+from slrig.model.arrays import FloatArray, IntArray, Pixels
+from slrig.model.frames import (
+    FEWEST_EXPOSURES,
+    MOST_EXPOSURES,
+    CameraFormat,
+    Capture,
+    Frame,
+    Shot,
+    bracket_fault,
+    exposure_groups,
+)
+from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, White
+from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, Pinhole, Size, Solved
+from slrig.model.surfaces import CameraTruth, FlipRule, Mesh, PointCurves, Refusal, Source, Surface, Truth
+
+__all__ = [
+    "DEVICE_PARAMETERS",
+    "FEWEST_EXPOSURES",
+    "MOST_EXPOSURES",
+    "Axis",
+    "Black",
+    "Calibration",
+    "CameraFormat",
+    "CameraTruth",
+    "Capture",
+    "FlipRule",
+    "FloatArray",
+    "Frame",
+    "Gray",
+    "IntArray",
+    "LineShift",
+    "Mesh",
+    "Pattern",
+    "PatternSequence",
+    "Pinhole",
+    "Pixels",
+    "PointCurves",
+    "Refusal",
+    "Shot",
+    "Size",
+    "Solved",
+    "Source",
+    "Surface",
+    "Truth",
+    "White",
+    "bracket_fault",
+    "exposure_groups",
+]

@@ -1,0 +1,102 @@
+"""What a projector shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from slrig.errors import PatternError
+from slrig.model.arrays import Pixels
+from slrig.model.rig import Axis, Size
+
+
+@dataclass(frozen=True, slots=True)
+class White:
+    """Every projector pixel lit."""
+
+    kind: Literal["white"] = "white"
+
+
+@dataclass(frozen=True, slots=True)
+class Black:
+    """No projector pixel lit."""
+
+    kind: Literal["black"] = "black"
+
+
+@dataclass(frozen=True, slots=True)
+class Gray:
+    """One bit of a Gray code: lights position c when bit `bits - 1 - bit` of gray(⌊(c + offset_px)/cell_px⌋) is 1."""
+
+    axis: Axis
+    bit: int
+    bits: int
+    cell_px: int = 1
+    offset_px: int = 0
+    inverted: bool = False
+    kind: Literal["gray"] = "gray"
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.bits <= 24 or not 0 <= self.bit < self.bits or self.cell_px < 1 or self.offset_px < 0:
+            message = (
+                f"gray pattern: need 1 ≤ bits ≤ 24, 0 ≤ bit < bits, cell_px ≥ 1, offset_px ≥ 0; found bit {self.bit} "
+                f"of {self.bits}, cell {self.cell_px} px, offset {self.offset_px} px"
+            )
+            raise PatternError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class LineShift:
+    """One frame of shifted lines: lights position c when (c - shift) mod period < line width."""
+
+    axis: Axis
+    shift: int
+    period_px: int
+    line_width_px: int = 1
+    kind: Literal["line_shift"] = "line_shift"
+
+    def __post_init__(self) -> None:
+        if self.period_px < 4 or not 0 <= self.shift < self.period_px or not 1 <= self.line_width_px < self.period_px:
+            message = (
+                "line shift pattern: need period ≥ 4, 0 ≤ shift < period, 1 ≤ line width < period; found shift "
+                f"{self.shift}, period {self.period_px}, width {self.line_width_px}"
+            )
+            raise PatternError(message)
+
+    @property
+    def centre_px(self) -> float:
+        """Position of the first line's centre: shift + (width - 1)/2."""
+        return self.shift + (self.line_width_px - 1) / 2
+
+
+Pattern = White | Black | Gray | LineShift
+
+
+@dataclass(frozen=True, slots=True)
+class PatternSequence:
+    """What a projector shows: specifications, and the light each one asks for.
+
+    Patterns vary along one axis only, so each image is kept as one row or one column and spread when looked at.
+
+    profiles : one (1, Wp), (Hp, 1) or (1, 1) uint8 array per pattern.
+    """
+
+    projector: Size
+    patterns: tuple[Pattern, ...]
+    profiles: tuple[Pixels, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.patterns) != len(self.profiles):
+            message = f"a sequence needs one profile per pattern, found {len(self.patterns)} and {len(self.profiles)}"
+            raise ValueError(message)
+        for profile in self.profiles:
+            np.broadcast_shapes(profile.shape, self.projector.shape)
+
+    def __len__(self) -> int:
+        return len(self.patterns)
+
+    def image(self, index: int) -> Pixels:
+        """(Hp, Wp) uint8, a read-only view: the full image of pattern `index`."""
+        return np.broadcast_to(self.profiles[index], self.projector.shape)

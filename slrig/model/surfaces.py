@@ -1,0 +1,141 @@
+"""Surfaces, measured and known: curves of points, meshes, truth, and why a pixel gave no point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model.arrays import FloatArray, IntArray, require
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A bare triangle surface: vertices_mm (V, 3) float64, faces (F, 3) int32."""
+
+    vertices_mm: FloatArray
+    faces: IntArray
+
+    def __post_init__(self) -> None:
+        require(self.vertices_mm, "Surface.vertices_mm", (None, 3), "f")
+        require(self.faces, "Surface.faces", (None, 3), "i")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTruth:
+    """What a rendered rig knows of one camera's view.
+
+    depth_mm : (H, W) float64, distance along the optical axis at the pixel centre, NaN where nothing is seen.
+    projector_px : (H, W, 2) float64, (column, row) of the projector pixel lighting that point, NaN in shadow.
+    visible_points_mm : (n, 3) float64, world: surface points seen by this camera and lit by the projector.
+    """
+
+    depth_mm: FloatArray
+    projector_px: FloatArray
+    visible_points_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        require(self.depth_mm, "CameraTruth.depth_mm", (None, None), "f")
+        require(self.projector_px, "CameraTruth.projector_px", (*self.depth_mm.shape, 2), "f")
+        require(self.visible_points_mm, "CameraTruth.visible_points_mm", (None, 3), "f")
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a rendered rig knows of its scene, in the calibration's world frame."""
+
+    surface: Surface
+    cameras: Mapping[str, CameraTruth]
+
+
+class Refusal(IntEnum):
+    """Why a camera pixel gave no surface point, one cause each: the first in the walk that refused it."""
+
+    NONE = 0
+    NOT_LIT = 1
+    SATURATED = 2
+    AMBIGUOUS_BIT = 3
+    BEYOND_PROJECTOR = 4
+    AMBIGUOUS_LINE = 5
+    STRAY_CODE = 6
+    SHORT_STRIPE = 7
+    SHADOW_EDGE = 8
+    DEPTH_EDGE = 9
+    OFF_PROJECTOR = 10
+
+
+class FlipRule(StrEnum):
+    """When an edge of the mesh is exchanged for the other diagonal of its two triangles (paper, section 3.1)."""
+
+    CONSTRAINED = "constrained"
+    DELAUNAY = "delaunay"
+
+
+class Source(IntEnum):
+    """Which devices a point was triangulated from."""
+
+    CAMERA_PROJECTOR = 0
+    CAMERA_CAMERA = 1
+    ALL = 2
+
+
+@dataclass(frozen=True, slots=True)
+class PointCurves:
+    """Curves of surface points in the world, one per light sheet, ordered along it and by column.
+
+    Curve i holds the points offsets[i]:offsets[i + 1].
+
+    offsets : (c + 1,) int32; column_px : (c,) float64, the projector column of each curve.
+    points_mm : (n, 3) float64; sigma_mm : (n,) float64, standard deviation along the viewing ray's surface normal.
+    bridge_after : (n,) bool, True where the step to the next point joins two stripes (paper, section 2).
+    source : (n,) uint8, `Source`; grey : (n,) uint8, brightness in the white frame.
+    """
+
+    offsets: IntArray
+    column_px: FloatArray
+    points_mm: FloatArray
+    sigma_mm: FloatArray
+    bridge_after: NDArray[np.bool_]
+    source: NDArray[np.uint8]
+    grey: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        count = len(self.points_mm)
+        require(self.points_mm, "PointCurves.points_mm", (None, 3), "f")
+        require(self.column_px, "PointCurves.column_px", (len(self.offsets) - 1,), "f")
+        require(self.sigma_mm, "PointCurves.sigma_mm", (count,), "f")
+        require(self.bridge_after, "PointCurves.bridge_after", (count,), "b")
+        require(self.source, "PointCurves.source", (count,), "u")
+        require(self.grey, "PointCurves.grey", (count,), "u")
+        if self.offsets[0] != 0 or self.offsets[-1] != count or (np.diff(self.offsets) < 0).any():
+            message = "PointCurves.offsets must rise from 0 to the number of points"
+            raise ValueError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A triangle mesh in the calibration's world frame; triangles counter-clockwise seen from the camera.
+
+    vertices_mm : (V, 3) float32; faces : (F, 3) int32; normals : (V, 3) float32, unit;
+    grey : (V,) uint8, brightness in the white frame; sigma_mm : (V,) float32, standard deviation along the normal;
+    stripe : (V,) int32, the projector column (rounded down) that the vertex was found on.
+    """
+
+    vertices_mm: NDArray[np.float32]
+    faces: IntArray
+    normals: NDArray[np.float32]
+    grey: NDArray[np.uint8]
+    sigma_mm: NDArray[np.float32]
+    stripe: IntArray
+
+    def __post_init__(self) -> None:
+        count = len(self.vertices_mm)
+        require(self.vertices_mm, "Mesh.vertices_mm", (None, 3), "f")
+        require(self.faces, "Mesh.faces", (None, 3), "i")
+        require(self.normals, "Mesh.normals", (count, 3), "f")
+        require(self.grey, "Mesh.grey", (count,), "u")
+        require(self.sigma_mm, "Mesh.sigma_mm", (count,), "f")
+        require(self.stripe, "Mesh.stripe", (count,), "i")
