@@ -106,6 +106,26 @@ class CameraNotFoundError(SlrigError):
     """The rig has no camera of this name. Name those that it has."""
 
 
+class PoseRefusedError(SlrigError):
+    """A pose of the calibration board cannot be used: the board is not in view, is another one, moved, is too dark.
+    Raise it when another pose, or the same one shot again, would do.
+    """
+
+
+class SolveRefusedError(SlrigError):
+    """The poses are sound one by one, and together determine no calibration: too few, all parallel, contradictory.
+    Name the poses, and what to shoot instead.
+    """
+
+
+class CalibrationNotFoundError(SlrigError):
+    """No calibration, or no pose of one, of this id is on record here."""
+
+
+class CalibrationStateError(SlrigError):
+    """The calibration exists and is in a state that forbids the call: activating one that is not solved, for example."""
+
+
 class ScanNotFoundError(SlrigError):
     """No scan of this id is on record here."""
 

@@ -67,6 +67,29 @@ class DeviceResiduals:
 
 
 @dataclass(frozen=True, slots=True)
+class ExpectedError:
+    """What a scan with this calibration may be wrong by, mm, over the volume in which the board was held.
+
+    Root mean squares over the volume of one standard deviation each. Errors of position as a whole, which move and
+    turn everything alike, are no errors of a measurement and are left out.
+
+    volume_mm : (2, 3) float64, opposite corners of the volume's box in the world.
+    point_mm : of a point along the viewing direction, from the calibration alone. noise_mm : from the noise of one
+    point's light alone. total_mm : both. length_share : of a length over that length, from the calibration alone, for
+    lengths of half the volume's diagonal in all directions.
+    grid_mm : (n, 3) float64, places in the volume that the devices see; grid_point_mm : (n,) float64, point_mm there.
+    """
+
+    volume_mm: FloatArray
+    point_mm: float
+    noise_mm: float
+    total_mm: float
+    length_share: float
+    grid_mm: FloatArray
+    grid_point_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Solution:
     """A solved calibration.
 
