@@ -123,7 +123,7 @@ class CalibrationNotFoundError(SlrigError):
 
 
 class CalibrationStateError(SlrigError):
-    """The calibration exists and is in a state that forbids the call: activating one that is not solved, for example."""
+    """The calibration exists and is in a state that forbids the call: activating one before it is solved, say."""
 
 
 class ScanNotFoundError(SlrigError):
