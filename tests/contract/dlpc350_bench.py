@@ -151,6 +151,8 @@ class WiredCamera:
         """See `Camera`."""
         with self._changed:
             self._armed = None
+            # An exposure under way ends here: the next trigger must not be lost to it.
+            self._busy_until_ns = 0
             self._exposures.clear()
 
     def close(self) -> None:

@@ -38,7 +38,9 @@ def test_contract_on_a_node(told: dict[str, Any], check: Check) -> None:
     result = next(each for each in told["contract"]["checks"] if each["name"] == check.name)
     sys.stdout.write(f"{result['seconds']:.2f} s\n")
     # The camera of the bench is triggered, by wire or by software.
-    assert result["outcome"] == (Outcome.NOT_APPLICABLE if Need.FREE in check.needs else Outcome.PASSED), result
+    assert result["outcome"] == (Outcome.NOT_APPLICABLE if Need.FREE in check.needs else Outcome.PASSED), json.dumps(
+        result["failure"], indent=1
+    )
 
 
 def test_the_engine_conforms(told: dict[str, Any]) -> None:
