@@ -31,6 +31,14 @@ class PatternError(InvalidInputError):
     """A pattern cannot be shown or decoded on this projector: too few bits, too small, an impossible period."""
 
 
+class ScheduleError(InvalidInputError):
+    """A schedule cannot be kept: cron text that means nothing or never comes, an unknown time zone, a negative grace."""
+
+
+class ScheduleNotFoundError(SlrigError):
+    """No schedule of this id is on record here."""
+
+
 class ScanEvidenceError(SlrigError):
     """The frames themselves contradict what they should show: white not brighter than black, a repeated frame,
     a bit that equals its inverse. Raise it when showing the same patterns again might help.

@@ -1,22 +1,20 @@
-"""The record of scans: SQLite, write-ahead log, synchronous FULL, so that what was answered survives a power cut."""
+"""The record of scans, their events and idempotency keys, in the service's database."""
 
 from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import create_engine, delete, event, select, text
-from sqlalchemy.engine.interfaces import DBAPIConnection
-from sqlalchemy.exc import DatabaseError, OperationalError
+from sqlalchemy import delete, select, text
 from sqlalchemy.orm import Session
 
-from slrig.errors import IdempotencyError, ScanNotFoundError, StorageError
+from slrig.errors import IdempotencyError, ScanNotFoundError
+from slrig.scan.database import Database
 from slrig.scan.faults import KeyInFlightError, ScanFault
 from slrig.scan.migrations import upgrade
 from slrig.scan.plan import ScanPlan
@@ -44,22 +42,17 @@ class ScanStore:
     def __init__(self, database: Path, *, clock: Clock = utc_now, key_life_s: float = KEY_LIFE_S) -> None:
         self._clock = clock
         self._key_life = timedelta(seconds=key_life_s)
-        self._database = database
-        self._writing = threading.Lock()
         self._watching = threading.Lock()
         self._watchers: dict[UUID, list[Callable[[], None]]] = defaultdict(list)
-        self._engine = create_engine(f"sqlite:///{database}")
-        event.listen(self._engine, "connect", _set_pragmas)
-        with self._refusals(), self._engine.begin() as connection:
-            upgrade(connection)
+        self._database = Database(database, upgrade=upgrade)
 
     def close(self) -> None:
         """Let the database go."""
-        self._engine.dispose()
+        self._database.close()
 
     def check(self) -> None:
         """Raise StorageError unless the database answers."""
-        with self._reading() as session:
+        with self._database.reading() as session:
             session.execute(text("SELECT 1"))
 
     def create(self, plan: ScanPlan, *, rig: str, label: str | None, key: str | None = None) -> ScanRecord:
@@ -76,7 +69,7 @@ class ScanStore:
             detail="",
             last_event=0,
         )
-        with self._changing() as session:
+        with self._database.changing() as session:
             session.add(row)
             session.flush()
             if key is not None and (held := session.get(KeyRow, key)) is not None:
@@ -86,7 +79,7 @@ class ScanStore:
 
     def get(self, scan_id: UUID) -> ScanRecord:
         """Return a scan. Raises ScanNotFoundError."""
-        with self._reading() as session:
+        with self._database.reading() as session:
             return _record(_find(session, scan_id))
 
     def page(self, *, before: int | None, limit: int) -> Sequence[ScanRecord]:
@@ -94,26 +87,26 @@ class ScanStore:
         query = select(ScanRow).order_by(ScanRow.number.desc()).limit(limit)
         if before is not None:
             query = query.where(ScanRow.number < before)
-        with self._reading() as session:
+        with self._database.reading() as session:
             return [_record(row) for row in session.scalars(query)]
 
     def unfinished(self) -> Sequence[ScanRecord]:
         """Return the scans that are in no final state, oldest first."""
         running = [state for state in ScanState if not state.final]
         query = select(ScanRow).where(ScanRow.state.in_(running)).order_by(ScanRow.number)
-        with self._reading() as session:
+        with self._database.reading() as session:
             return [_record(row) for row in session.scalars(query)]
 
     def states(self) -> dict[UUID, ScanState]:
         """Return the state of every scan on record."""
-        with self._reading() as session:
+        with self._database.reading() as session:
             return {
                 UUID(found): ScanState(state) for found, state in session.execute(select(ScanRow.id, ScanRow.state))
             }
 
     def advance(self, scan_id: UUID, state: ScanState) -> datetime:
         """Record that a running scan entered another running state, and return when."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             row = _find(session, scan_id)
             row.state = state
             now = self._now()
@@ -124,7 +117,7 @@ class ScanStore:
 
     def progress(self, scan_id: UUID, progress: ScanProgress) -> None:
         """Record how far a running scan is."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             row = _find(session, scan_id)
             row.stage, row.fraction, row.detail = progress.stage, progress.fraction, progress.detail
             _append(session, row, "progress", {**progress.as_json(), "state": row.state})
@@ -139,7 +132,7 @@ class ScanStore:
         summary: Mapping[str, Any] | None = None,
     ) -> bool:
         """Record a final state. The first one stands: returns False, and changes nothing, for a finished scan."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             row = _find(session, scan_id)
             if ScanState(row.state).final:
                 return False
@@ -149,12 +142,12 @@ class ScanStore:
 
     def lose_files(self, scan_id: UUID, fault: ScanFault) -> None:
         """Record that a finished scan's files are gone."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             self._close_row(session, _find(session, scan_id), ScanState.FAILED, fault, None)
 
     def delete(self, scan_id: UUID) -> None:
         """Forget a scan and its events. Raises ScanNotFoundError."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             session.delete(_find(session, scan_id))
         # Whoever waits for its next event would wait for ever.
         self._wake(scan_id)
@@ -164,12 +157,12 @@ class ScanStore:
         query = (
             select(EventRow).where(EventRow.scan_id == str(scan_id), EventRow.number > after).order_by(EventRow.number)
         )
-        with self._reading() as session:
+        with self._database.reading() as session:
             return [ScanEvent(row.number, row.kind, row.data) for row in session.scalars(query)]
 
     def last_event(self, scan_id: UUID) -> int:
         """Return the number of a scan's newest event. Raises ScanNotFoundError."""
-        with self._reading() as session:
+        with self._database.reading() as session:
             return _find(session, scan_id).last_event
 
     def watch(self, scan_id: UUID, wake: Callable[[], None]) -> Callable[[], None]:
@@ -197,7 +190,7 @@ class ScanStore:
         IdempotencyError
             The first request had another body.
         """
-        with self._changing() as session:
+        with self._database.changing() as session:
             expired = _stamp(self._clock() - self._key_life)
             session.execute(delete(KeyRow).where(KeyRow.created_at < expired))
             held = session.get(KeyRow, key)
@@ -217,12 +210,12 @@ class ScanStore:
 
     def release_key(self, key: str) -> None:
         """Free a key whose request made no scan, so that it may be tried again."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             session.execute(delete(KeyRow).where(KeyRow.key == key, KeyRow.scan_id.is_(None)))
 
     def release_keys(self) -> None:
         """Free every key whose request was cut off. For the start of the service, when none can be in flight."""
-        with self._changing() as session:
+        with self._database.changing() as session:
             session.execute(delete(KeyRow).where(KeyRow.scan_id.is_(None)))
 
     def _close_row(
@@ -252,31 +245,6 @@ class ScanStore:
         for wake in watchers:
             wake()
 
-    @contextmanager
-    def _reading(self) -> Iterator[Session]:
-        with self._refusals(), Session(self._engine, expire_on_commit=False) as session:
-            yield session
-
-    @contextmanager
-    def _changing(self) -> Iterator[Session]:
-        # SQLite has one writer; a lock here keeps a second thread from ever seeing "database is locked".
-        with self._refusals(), self._writing, Session(self._engine, expire_on_commit=False) as session, session.begin():
-            yield session
-
-    @contextmanager
-    def _refusals(self) -> Iterator[None]:
-        try:
-            yield
-        except DatabaseError as error:
-            if not isinstance(error, OperationalError) and type(error) is not DatabaseError:
-                # A broken constraint or statement is a defect of ours, not the disk's.
-                raise
-            message = (
-                f"The record of scans {self._database} could not be used: {error.orig}. "
-                "Check that its disk has free space and can be written."
-            )
-            raise StorageError(message) from error
-
 
 class ProgressRecorder:
     """Takes progress from the work and records the steps worth telling: a new stage, or a hundredth of the way."""
@@ -299,13 +267,6 @@ class ProgressRecorder:
         if stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
             self._told = ScanProgress(stage, overall, detail.replace(self._hidden, ""))
             self._store.progress(self._scan_id, self._told)
-
-
-def _set_pragmas(connection: DBAPIConnection, _record: object) -> None:
-    cursor = connection.cursor()
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
 
 
 def _find(session: Session, scan_id: UUID) -> ScanRow:

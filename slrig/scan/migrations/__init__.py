@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from alembic import command
-from alembic.config import Config
 from sqlalchemy import Connection
+
+from slrig.scan.database import run_migrations
 
 
 def upgrade(connection: Connection) -> None:
     """Bring the database behind `connection` to the newest tables. Does nothing when it is there already."""
-    config = Config()
-    config.set_main_option("script_location", "slrig.scan:migrations")
-    config.set_main_option("path_separator", "os")
-    config.attributes["connection"] = connection
-    command.upgrade(config, "head")
+    run_migrations(connection, "slrig.scan:migrations")
