@@ -132,7 +132,8 @@ class Scheduler:
         state, reason, result = RunState.FAILED, None, None
         try:
             result = self._work(schedule, run, cancelled=self._stop.is_set)
-            state, reason = RunState.SUCCEEDED, run.reason
+            state = RunState.SUCCEEDED
+            reason = f"at try {run.attempts + 1}" if run.attempts else run.reason
         except RigBusyError as error:
             now = self._clock()
             again = now + timedelta(seconds=schedule.order.retry_s)

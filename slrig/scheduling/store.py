@@ -162,6 +162,7 @@ class ScheduleStore:
             row = session.get(RunRow, run.number)
             if row is not None and not RunState(row.state).final:
                 _close(row, state, now, reason)
+                row.reason = reason
                 row.result = None if result is None else dict(result)
 
     def beat(self, now: datetime) -> None:

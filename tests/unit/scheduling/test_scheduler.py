@@ -113,7 +113,7 @@ def test_a_busy_rig_is_tried_again_within_the_grace(desk: Desk) -> None:
     desk.busy = None
     desk.look(minutes=10)
     assert desk.rows(daily) == [("23 06:00", RunState.SUCCEEDED, 1)]
-    assert desk.run(daily).attempts == 3
+    assert (desk.run(daily).attempts, desk.run(daily).reason) == (3, "at try 3")
 
 
 def test_a_rig_that_stays_busy_is_a_row_and_not_a_silence(desk: Desk) -> None:
