@@ -144,7 +144,7 @@ class SimulatedCamera:
             ready = exposure is not None and exposure.t_ready_ns <= deadline_ns
             if exposure is not None and ready and not self._is_dropped(exposure.number):
                 # Tracing its light takes a while of real time: better while it shines than after its read-out.
-                self._view.image(self._lights(exposure))
+                self._view.rehearse(self._lights(exposure))
             self._clock.wait_until(exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._closed)
             self._require_usable()
             if exposure is None or not ready:

@@ -11,7 +11,8 @@ from simulated_rig.camera import SimulatedCamera
 from simulated_rig.options import HeadOptions
 from simulated_rig.projector import SimulatedProjector
 from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import SceneSurface, read_scene, surface_of
+from simulated_rig.scene import read_scene
+from simulated_rig.staging import Script, Staging
 from simulated_rig.tables import checked
 from simulated_rig.world import Flicker, VirtualClock
 from slrig.devices import Camera, Clock, Head, SystemClock
@@ -21,26 +22,25 @@ from slrig.model import Calibration, Surface, Truth
 class SimulatedHead:
     """Implements `slrig.devices.Head` on the rendered world.
 
-    The calibration it carries is exact. `clock` is the world's time; all time stamps count in it.
+    The calibration it carries is exact. `clock` is the world's time; all time stamps count in it. `script` says what
+    stands where.
     """
 
-    def __init__(self, options: HeadOptions, surface: SceneSurface) -> None:
+    def __init__(self, options: HeadOptions, script: Script) -> None:
         self.clock: Clock = SystemClock() if options.realtime else VirtualClock()
         lens = options.projector.pinhole()
-        stage = Stage(
-            surface,
+        self._stage = Stage(
+            script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
         )
-        self._surface = surface
-        self._projector = SimulatedProjector(options.projector, self.clock, faults=options.faults, seed=options.seed)
         swing = None
         if options.ambient_flicker_depth > 0:
             swing = Flicker(options.ambient_flicker_hz, options.ambient_flicker_depth)
         self._views = {
             camera.name: View(
                 camera.pinhole(),
-                stage,
+                self._stage,
                 blur_px=camera.blur_px,
                 ambient=options.ambient,
                 samples_per_axis=options.samples_per_axis,
@@ -50,6 +50,10 @@ class SimulatedHead:
             )
             for camera in options.camera
         }
+        self._staging = Staging(options, script, self._stage, self._views, self.clock)
+        self._projector = SimulatedProjector(
+            options.projector, self.clock, faults=options.faults, seed=options.seed, staging=self._staging
+        )
         self._cameras = {
             camera.name: SimulatedCamera(
                 camera,
@@ -63,6 +67,7 @@ class SimulatedHead:
             for index, camera in enumerate(options.camera)
         }
         self._calibration = Calibration({camera.name: camera.pinhole() for camera in options.camera}, lens)
+        self._carries_calibration = options.carries_calibration
         self._truth: Truth | None = None
 
     @property
@@ -76,16 +81,32 @@ class SimulatedHead:
         return self._projector
 
     @property
-    def calibration(self) -> Calibration:
-        """See `Head`."""
+    def calibration(self) -> Calibration | None:
+        """See `Head`. None if the options say so."""
+        return self._calibration if self._carries_calibration else None
+
+    @property
+    def exact_calibration(self) -> Calibration:
+        """What the options say of the devices, whether or not the head carries it."""
         return self._calibration
 
+    @property
+    def positioner(self) -> Staging | None:
+        """See `slrig.devices.Positions`. None where the options have no poses."""
+        return self._staging if self._staging.poses else None
+
     def truth(self) -> Truth:
-        """See `Head`. Works in every state, also after close."""
-        if self._truth is None:
-            surface = Surface(self._surface.vertices_mm, self._surface.faces)
-            self._truth = Truth(surface, {name: view.truth() for name, view in self._views.items()})
-        return self._truth
+        """See `Head`. Of what stands there now. Works in every state, also after close."""
+        cameras = {name: view.truth() for name, view in self._views.items()}
+        shape = self._stage.setting.surface
+        known = self._truth
+        if (
+            known is None
+            or known.surface.vertices_mm is not shape.vertices_mm
+            or any(known.cameras[name] is not camera for name, camera in cameras.items())
+        ):
+            known = self._truth = Truth(Surface(shape.vertices_mm, shape.faces), cameras)
+        return known
 
 
 def open_head(options: Mapping[str, object], folder: Path) -> Head:
@@ -105,4 +126,4 @@ def simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead
     """Return `open_head`'s instrument under its own type."""
     table = checked(HeadOptions, options, source="the [head] table of the rendered rig")
     path = folder / table.scene
-    return SimulatedHead(table, surface_of(read_scene(path), path.parent))
+    return SimulatedHead(table, Script(table, read_scene(path), path.parent))

@@ -108,3 +108,12 @@ def look_at(position_mm: FloatArray, target_mm: FloatArray, down: FloatArray) ->
     z, x = forward / distance, right / spread
     rotation = np.stack([x, np.cross(z, x), z])
     return rotation, -rotation @ position_mm
+
+
+def image_positions(points_mm: FloatArray, device: Pinhole) -> FloatArray:
+    """(n, 2) float64: where a device images points of the world, (n, 3), before it; perhaps beside its image."""
+    at = points_mm @ device.rotation.T + device.translation_mm
+    x, y = at[:, 0] / at[:, 2], at[:, 1] / at[:, 2]
+    lens = lens_array(device)
+    xd, yd = distorted.py_func(x, y, lens)
+    return np.column_stack([lens[0] * xd + lens[2], lens[1] * yd + lens[3]])

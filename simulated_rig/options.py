@@ -7,8 +7,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from simulated_rig.disturbing import PROJECTOR, Bump, Drift, Moving
 from simulated_rig.light import Response
 from simulated_rig.optics import look_at
+from simulated_rig.poses import Pose, PoseSeries
 from simulated_rig.sensor import Sensor
 from simulated_rig.tables import Fraction, NotNegative, Pair, Positive, Table, Triple, at_least_one
 from slrig.errors import CalibrationError
@@ -165,7 +167,8 @@ class Faults(Table):
     dark. light_delay_s : light comes this much later than the projector says. picture : how the patterns lie on the
     projector; "rotated" is by half a turn. other_display : patterns go to another display, and the projector lights the
     scene with a desktop; other_display_glow of white is what that display sends to the scene, as a fraction of the
-    projector's.
+    projector's. bump : a device is moved at a pose (see `disturbing.Bump`). moving : the object of a pose does not
+    stand still (see `disturbing.Moving`).
     """
 
     cameras: Names | None = None
@@ -185,6 +188,8 @@ class Faults(Table):
     picture: Literal["upright", "mirrored", "upside_down", "rotated"] = "upright"
     other_display: bool = False
     other_display_glow: Fraction = 0.0
+    bump: Annotated[tuple[Bump, ...], Field(strict=False)] = ()
+    moving: Annotated[tuple[Moving, ...], Field(strict=False)] = ()
 
 
 class HeadOptions(Table):
@@ -194,6 +199,9 @@ class HeadOptions(Table):
     as fast as possible. samples_per_axis, jitter : sub-pixel samples (see `transport.paths`). ambient : light of the
     room, as a fraction of the projector's white at the working distance; ambient_flicker_hz, ambient_flicker_depth : it
     swings about its mean by that fraction (lamps on mains of 50 Hz flicker at 100 Hz). workers : threads that trace.
+    carries_calibration : whether the head knows its own calibration, exactly, but for what `faults.bump` and `drift`
+    do to it. pose, poses : a script for the scene's board, or another object, listed, made up, or both, in this order;
+    the first is taken at the start. drift : devices that move slowly (see `disturbing.Drift`).
     """
 
     scene: Annotated[str, Field(min_length=1)]
@@ -208,6 +216,10 @@ class HeadOptions(Table):
     projector: ProjectorOptions
     camera: Annotated[tuple[CameraOptions, ...], Field(strict=False), AfterValidator(at_least_one)]
     faults: Faults = Faults()
+    carries_calibration: bool = True
+    pose: Annotated[tuple[Pose, ...], Field(strict=False)] = ()
+    poses: PoseSeries | None = None
+    drift: Annotated[tuple[Drift, ...], Field(strict=False)] = ()
 
     @field_validator("camera")
     @classmethod
@@ -224,5 +236,14 @@ class HeadOptions(Table):
         unknown = sorted(set(self.faults.cameras or ()) - names)
         if unknown:
             message = f"faults.cameras names {unknown}, the rig has {sorted(names)}"
+            raise ValueError(message)
+        return self
+
+    @model_validator(mode="after")
+    def _pushed_devices_exist(self) -> HeadOptions:
+        names = {PROJECTOR, *(camera.name for camera in self.camera)}
+        unknown = sorted({push.device for push in (*self.faults.bump, *self.drift)} - names)
+        if unknown:
+            message = f"faults.bump and drift name {unknown}, the rig has {sorted(names)}"
             raise ValueError(message)
         return self

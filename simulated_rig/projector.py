@@ -9,6 +9,7 @@ import numpy as np
 
 from simulated_rig.light import LightTable, desktop_light, light_table, no_light
 from simulated_rig.options import Faults, ProjectorOptions
+from simulated_rig.staging import Staging
 from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
 from slrig.devices import Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
@@ -18,12 +19,15 @@ NAME = "projector"
 
 
 class SimulatedProjector:
-    """Implements `slrig.devices.Projector` on the rendered world."""
+    """Implements `slrig.devices.Projector` on the rendered world. Tells `staging` of each capture and pattern."""
 
-    def __init__(self, options: ProjectorOptions, clock: Clock, *, faults: Faults, seed: int) -> None:
+    def __init__(
+        self, options: ProjectorOptions, clock: Clock, *, faults: Faults, seed: int, staging: Staging | None = None
+    ) -> None:
         self._options = options
         self._clock = clock
         self._faults = faults
+        self._staging = staging
         self._response = options.response()
         self._dark = self._table(np.zeros((1, 1), np.uint8))
         swing = Flicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
@@ -81,6 +85,8 @@ class SimulatedProjector:
                 raise UnsupportedByDeviceError(message)
         self.blank()
         self._sequence, self._tables = sequence, {}
+        if self._staging is not None:
+            self._staging.begun(len(sequence))
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
@@ -96,6 +102,8 @@ class SimulatedProjector:
             self.lamp.darken(at_ns=self._clock.now_ns())
             self._require_usable()
         self._shows += 1
+        if self._staging is not None:
+            self._staging.shown()
         if index not in self._tables:
             self._tables[index] = self._table(self._sequence.profiles[index])
         error_s = self._options.visible_error_s

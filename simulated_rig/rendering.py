@@ -16,27 +16,70 @@ from simulated_rig.transport import Paths
 from slrig.model import CameraTruth, Pinhole
 
 
-class Stage:
-    """The scene's surface before the projector, and the caster that finds it. Built once, when first needed."""
+class Setting:
+    """A surface before a projector, for as long as both stand still, and the caster that finds the surface."""
 
-    def __init__(self, surface: SceneSurface, projector: Pinhole, *, working_distance_mm: float) -> None:
+    def __init__(self, surface: SceneSurface, projector: Pinhole) -> None:
         self.surface = surface
         self.projector = projector
-        self.working_distance_mm = working_distance_mm
         self._rays: Caster | None = None
         self._lock = threading.Lock()
 
     @property
     def rays(self) -> Caster:
-        """The caster of the surface."""
+        """The caster of the surface. Built once, when first needed."""
         with self._lock:
             if self._rays is None:
                 self._rays = caster(self.surface.vertices_mm, self.surface.faces)
             return self._rays
 
 
+class Stage:
+    """What stands before the cameras now, and the projector: exchanged as a whole when something moves."""
+
+    def __init__(self, surface: SceneSurface, projector: Pinhole, *, working_distance_mm: float) -> None:
+        self.setting = Setting(surface, projector)
+        self.working_distance_mm = working_distance_mm
+
+    @property
+    def surface(self) -> SceneSurface:
+        """What stands there now."""
+        return self.setting.surface
+
+    @property
+    def projector(self) -> Pinhole:
+        """The projector where it is now."""
+        return self.setting.projector
+
+    @property
+    def rays(self) -> Caster:
+        """The caster of the surface."""
+        return self.setting.rays
+
+    def change(self, *, surface: SceneSurface | None = None, projector: Pinhole | None = None) -> None:
+        """Put another surface there, or move the projector. Nothing happens if the projector stands there already."""
+        now = self.setting
+        if surface is not None or (projector is not None and not same_pose(projector, now.projector)):
+            self.setting = Setting(surface or now.surface, projector or now.projector)
+
+
+class _Seen:
+    """What was traced of one setting by a camera in one place.
+
+    room : its image under the room's light alone; last : under the projector's light that was asked for last.
+    """
+
+    def __init__(self, setting: Setting, camera: Pinhole) -> None:
+        self.setting = setting
+        self.camera = camera
+        self.paths: Paths | None = None
+        self.room: Float32Array | None = None
+        self.last: tuple[LightTable, Float32Array] | None = None
+        self.truth: CameraTruth | None = None
+
+
 class View:
-    """One camera's view of a stage. Its light paths are traced once, by `prepare` or the first image."""
+    """One camera's view of a stage. Its light paths are traced once for each setting, by `prepare` or an image."""
 
     def __init__(
         self,
@@ -58,25 +101,44 @@ class View:
         self._jitter = jitter
         self._seed = seed
         self._workers = workers
-        self._paths: Paths | None = None
-        self._last: tuple[LightTable, Float32Array] | None = None
-        self._truth: CameraTruth | None = None
+        self._newest = _Seen(stage.setting, camera)
+
+    @property
+    def camera(self) -> Pinhole:
+        """The camera where it is now."""
+        return self._camera
+
+    def move(self, camera: Pinhole) -> None:
+        """Put the camera elsewhere. Nothing happens if it stands there already."""
+        if not same_pose(camera, self._camera):
+            self._camera = camera
+
+    @property
+    def _seen(self) -> _Seen:
+        """What is known of the present setting: a fresh start when something has moved."""
+        setting, camera = self._stage.setting, self._camera
+        if self._newest.setting is not setting or self._newest.camera is not camera:
+            self._newest = _Seen(setting, camera)
+        return self._newest
 
     def prepare(self) -> Paths:
         """Trace the light paths, unless that is done, and return them."""
-        if self._paths is None:
-            self._paths = transport.paths(
-                self._camera,
-                self._stage.projector,
-                self._stage.surface,
-                self._stage.rays,
+        return self._traced_paths(self._seen)
+
+    def _traced_paths(self, seen: _Seen) -> Paths:
+        if seen.paths is None:
+            seen.paths = transport.paths(
+                seen.camera,
+                seen.setting.projector,
+                seen.setting.surface,
+                seen.setting.rays,
                 samples_per_axis=self._samples_per_axis,
                 jitter=self._jitter,
                 seed=self._seed,
                 working_distance_mm=self._stage.working_distance_mm,
                 workers=self._workers,
             )
-        return self._paths
+        return seen.paths
 
     def image(
         self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
@@ -87,48 +149,63 @@ class View:
         this exposure over its mean, (H, 1) or (1, 1); absent, the mean.
         1 is a white diffuser, at the working distance and facing the projector, under full white.
         """
-        paths = self.prepare()
-        total = blurred(paths.albedo * np.float32(self._ambient), self._blur_px)
-        if ambient is not None:
-            total *= ambient
+        seen = self._seen
+        paths = self._traced_paths(seen)
+        if seen.room is None:
+            seen.room = blurred(paths.albedo * np.float32(self._ambient), self._blur_px)
+        total = seen.room.copy() if ambient is None else seen.room * ambient
         for fraction, light in lights:
-            total += np.asarray(fraction, np.float32) * self._under(paths, light)
+            total += np.asarray(fraction, np.float32) * self._under(seen, paths, light)
         return total
 
-    def _under(self, paths: Paths, light: LightTable) -> Float32Array:
+    def rehearse(self, lights: Sequence[tuple[float | Float32Array, LightTable]]) -> None:
+        """Do the work of `image` that does not depend on fractions, so that it is quick when time matters."""
+        seen = self._seen
+        paths = self._traced_paths(seen)
+        for _, light in lights:
+            self._under(seen, paths, light)
+
+    def _under(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
-        if self._last is None or self._last[0] is not light:
+        if seen.last is None or seen.last[0] is not light:
             image = radiance(paths, light, blur_px=self._blur_px)
             if light.glow > 0:
                 image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
-            self._last = (light, image)
-        return self._last[1]
+            seen.last = (light, image)
+        return seen.last[1]
 
     def truth(self) -> CameraTruth:
-        """Return depth, projector coordinates and visible points, from rays of their own at the pixel centres."""
-        if self._truth is None:
-            self._truth = self._traced_truth()
-        return self._truth
+        """Return depth, projector coordinates and visible points of what stands there, by rays at the pixel centres."""
+        seen = self._seen
+        if seen.truth is None:
+            seen.truth = self._traced_truth(seen)
+        return seen.truth
 
-    def _traced_truth(self) -> CameraTruth:
-        shape = self._camera.size.shape
+    def _traced_truth(self, seen: _Seen) -> CameraTruth:
+        camera, setting = seen.camera, seen.setting
+        shape = camera.size.shape
         depth = np.full(shape, np.nan)
         projector_px = np.full((*shape, 2), np.nan)
         visible: list[NDArray[np.float64]] = []
-        for rows, u, v in transport.pixel_centres(self._camera):
+        for rows, u, v in transport.pixel_centres(camera):
             hits = transport.trace(
                 u,
                 v,
-                self._camera,
-                self._stage.projector,
-                self._stage.surface,
-                self._stage.rays,
+                camera,
+                setting.projector,
+                setting.surface,
+                setting.rays,
                 working_distance_mm=self._stage.working_distance_mm,
             )
-            along = hits.points_mm @ self._camera.rotation[2] + self._camera.translation_mm[2]
+            along = hits.points_mm @ camera.rotation[2] + camera.translation_mm[2]
             coordinates = np.column_stack([hits.column_px, hits.row_px])
             coordinates[~hits.lit] = np.nan
             depth[rows] = along.reshape(depth[rows].shape)
             projector_px[rows] = coordinates.reshape(projector_px[rows].shape)
             visible.append(hits.points_mm[hits.lit])
         return CameraTruth(depth, projector_px, np.concatenate(visible))
+
+
+def same_pose(one: Pinhole, other: Pinhole) -> bool:
+    """Whether two devices stand alike, to the last bit."""
+    return np.array_equal(one.rotation, other.rotation) and np.array_equal(one.translation_mm, other.translation_mm)

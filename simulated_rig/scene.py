@@ -6,7 +6,8 @@ An object's front therefore faces -z, and a relief of positive height comes towa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,44 +15,14 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
-from scipy.spatial.transform import Rotation
 
 from simulated_rig import shapes
+from simulated_rig.boards import Board, Print
+from simulated_rig.placed import Placed, turned_by
 from simulated_rig.shapes import Part
-from simulated_rig.tables import Fraction, NotNegative, Pair, Positive, Table, Triple, at_least_one, checked, read_toml
+from simulated_rig.tables import NotNegative, Pair, Positive, Table, at_least_one, checked, read_toml
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
-
-TEXTURES = ("uniform", "checker", "noise")
-
-
-class Texture(Table):
-    """Albedo that varies: times 1 - contrast * t, t in 0..1 over the object's own coordinates.
-
-    `checker` alternates squares of `scale_mm` over x and y; `noise` is smooth random shading with grains of that size.
-    """
-
-    kind: Literal["uniform", "checker", "noise"] = "uniform"
-    contrast: Fraction = 0.5
-    scale_mm: Positive = 10.0
-
-
-class Specular(Table):
-    """A Phong lobe added to the Lambertian light: strength * cos(angle to the mirror direction) ^ exponent."""
-
-    strength: NotNegative = 0.0
-    exponent: Annotated[float, Field(ge=1)] = 20.0
-
-
-class Placed(Table):
-    """What every object has: a pose (rotation about its own x, then y, then z axis as fixed axes) and a material."""
-
-    name: str = ""
-    position_mm: Triple = (0.0, 0.0, 0.0)
-    rotation_deg: Triple = (0.0, 0.0, 0.0)
-    albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
-    texture: Texture = Texture()
-    specular: Specular = Specular()
 
 
 class Plane(Placed):
@@ -214,7 +185,7 @@ class MeshFile(Placed):
 
 
 Thing = Annotated[
-    Plane | Sphere | BallBar | Stairs | Relief | Turned | MeshFile,
+    Plane | Sphere | BallBar | Stairs | Relief | Turned | MeshFile | Board,
     Field(discriminator="shape"),
 ]
 
@@ -234,6 +205,7 @@ class SceneSurface:
     sphere_mm : (P, 4) float64, centre and radius of a part that is a ball, radius 0 for the others.
     to_object : (P, 3, 4) float64, world to the object's own frame.
     material : (P, 6) float64: albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent.
+    prints : what is printed on the parts that are boards.
     """
 
     vertices_mm: FloatArray
@@ -243,6 +215,7 @@ class SceneSurface:
     sphere_mm: FloatArray
     to_object: FloatArray
     material: FloatArray
+    prints: Mapping[int, Print] = field(default_factory=dict)
 
 
 def read_scene(path: Path) -> Scene:
@@ -256,15 +229,18 @@ def surface_of(scene: Scene, folder: Path) -> SceneSurface:
     spheres: list[tuple[float, ...]] = []
     inverses: list[FloatArray] = []
     materials: list[tuple[float, ...]] = []
+    prints: dict[int, Print] = {}
     faults, first = [], 0
     for thing in scene.object:
-        rotation = Rotation.from_euler("xyz", thing.rotation_deg, degrees=True).as_matrix()
+        rotation = turned_by(thing.rotation_deg)
         shift = np.array(thing.position_mm)
         try:
             parts = thing.parts(folder)
         except ConfigError as error:
             faults.append(str(error))
             continue
+        if isinstance(thing, Board):
+            prints[len(spheres)] = thing.printed()
         for part in parts:
             vertices.append(part.vertices_mm @ rotation.T + shift)
             faces.append(part.faces + first)
@@ -272,7 +248,7 @@ def surface_of(scene: Scene, folder: Path) -> SceneSurface:
             owners.append(np.full(len(part.faces), len(spheres), np.int32))
             spheres.append((*(rotation @ np.array(part.sphere_mm[:3]) + shift), part.sphere_mm[3]))
             inverses.append(np.column_stack([rotation.T, -rotation.T @ shift]))
-            materials.append(_material(thing))
+            materials.append(thing.material())
             first += len(part.vertices_mm)
     if faults:
         message = "\n".join(faults)
@@ -285,10 +261,5 @@ def surface_of(scene: Scene, folder: Path) -> SceneSurface:
         sphere_mm=np.array(spheres, np.float64),
         to_object=np.array(inverses, np.float64),
         material=np.array(materials, np.float64),
+        prints=prints,
     )
-
-
-def _material(thing: Placed) -> tuple[float, ...]:
-    texture, lobe = thing.texture, thing.specular
-    kind = float(TEXTURES.index(texture.kind))
-    return (thing.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)

@@ -39,9 +39,26 @@ class Part:
 
 def rectangle(width_mm: float, height_mm: float) -> Part:
     """A flat rectangle in x and y that faces -z."""
-    x, y = width_mm / 2, height_mm / 2
-    vertices = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], np.float64)
+    reach = np.array([width_mm, height_mm]) / 2
+    return rectangle_between(-reach, reach)
+
+
+def rectangle_between(least_mm: FloatArray, most_mm: FloatArray) -> Part:
+    """A flat rectangle that faces -z between two corners (x, y)."""
+    (left, top), (right, bottom) = least_mm, most_mm
+    vertices = np.array([(left, top, 0), (right, top, 0), (right, bottom, 0), (left, bottom, 0)], np.float64)
     return _flat(vertices, np.array([(0, 2, 1), (0, 3, 2)], np.int32))
+
+
+def bent_sheet(across_mm: tuple[float, float], down_mm: tuple[float, float], curvature_per_mm: float) -> Part:
+    """The sheet z = curvature x² that faces -z, in strips narrow enough for FACET_ERROR_MM / 30."""
+    # A chord of a parabola over a strip of width w sags by curvature w² / 4.
+    width = np.sqrt(4 * FACET_ERROR_MM / 30 / abs(curvature_per_mm))
+    count = int(np.ceil((across_mm[1] - across_mm[0]) / width)) + 1
+    x = np.linspace(*across_mm, count)
+    z = curvature_per_mm * x**2
+    vertices = np.concatenate([np.column_stack([x, np.full(count, y), z]) for y in down_mm])
+    return _smooth(vertices, _grid_faces(2, count, closed=False), crease_rad=np.pi)
 
 
 def ball(radius_mm: float, *, centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Part:

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from simulated_rig.casting import Caster
 from simulated_rig.optics import LensArray, distorted, field_radius, lens_array, world_directions
+from simulated_rig.printing import pigment
 from simulated_rig.scene import SceneSurface
+from simulated_rig.textures import texture_value
 from slrig.model import FloatArray, IntArray, Pinhole
 
 SHADOW_BIAS_MM = 0.05
@@ -68,11 +70,14 @@ def trace(
     rays: Caster,
     *,
     working_distance_mm: float,
+    footprint_px: float = 0.0,
 ) -> Hits:
     """Follow the camera's rays through pixel positions u, v ((n,) float64) to the surface and on to the projector.
 
     The weight is the Lambert and Phong light times (working distance / distance to the projector)², so that a white
-    diffuser at the working distance that faces the projector has weight 1.
+    diffuser at the working distance that faces the projector has weight 1. footprint_px : side of the square of the
+    image that each ray stands for: prints are averaged over it, and their points lie in the middle of what it sends
+    back. 0 takes them at the point.
     """
     eye, lamp = camera.centre_mm, projector.centre_mm
     directions = world_directions(u, v, lens_array(camera), camera.rotation)
@@ -87,6 +92,7 @@ def trace(
         surface.part,
         surface.sphere_mm,
     )
+    pigments = pigment(points, normals, triangle, u, v, camera, surface, footprint_px=footprint_px)
     seen = np.isfinite(points[:, 0])
     to_point = points - lamp
     distance = np.linalg.norm(to_point, axis=1)
@@ -108,6 +114,7 @@ def trace(
         surface.part,
         surface.to_object,
         surface.material,
+        pigments,
         lamp,
         lens_array(projector),
         projector.rotation,
@@ -152,7 +159,16 @@ def paths(
         u, v = _sample_positions(
             first, last, columns, samples_per_axis, np.random.default_rng((seed, first)) if jitter else None
         )
-        hits = trace(u, v, camera, projector, surface, rays, working_distance_mm=working_distance_mm)
+        hits = trace(
+            u,
+            v,
+            camera,
+            projector,
+            surface,
+            rays,
+            working_distance_mm=working_distance_mm,
+            footprint_px=1 / samples_per_axis,
+        )
         shape = (last - first, columns, count)
         known = np.isfinite(hits.column_px)
         out.column_px[first:last] = np.where(known, hits.column_px, 0.0).reshape(shape)
@@ -282,40 +298,6 @@ def _hit_points(
 
 
 @njit(cache=True, nogil=True)
-def _hash01(x: int, y: int, z: int) -> float:
-    """A number in 0..1 that looks random, the same for the same lattice point."""
-    # 64-bit arithmetic cut to 32 bits after each product: the same under numba and in plain Python.
-    h = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & 0xFFFFFFFF
-    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
-    h = ((h ^ (h >> 16)) * 0x45D9F3B) & 0xFFFFFFFF
-    return float(h ^ (h >> 16)) / 4294967295.0
-
-
-@njit(cache=True, nogil=True)
-def texture_value(kind: int, x: float, y: float, z: float) -> float:
-    """Darkness 0..1 of a texture at (x, y, z), in grains. 0 uniform, 1 checker, 2 smooth value noise, two octaves."""
-    if kind == 1:
-        return float((int(np.floor(x)) + int(np.floor(y))) % 2)
-    if kind != 2:
-        return 0.0
-    total = 0.0
-    for octave in range(2):
-        scale = 1.0 + octave
-        xs, ys, zs = x * scale, y * scale, z * scale
-        i, j, k = int(np.floor(xs)), int(np.floor(ys)), int(np.floor(zs))
-        fx, fy, fz = xs - i, ys - j, zs - k
-        # Smoothstep, so that the shading has no creases at the lattice.
-        fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
-        value = 0.0
-        for corner in range(8):
-            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-            share = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
-            value += share * _hash01(i + a, j + b, k + c)
-        total += value * (2.0 / 3.0 if octave == 0 else 1.0 / 3.0)
-    return total
-
-
-@njit(cache=True, nogil=True)
 def _light_points(
     points: FloatArray,
     normals: FloatArray,
@@ -329,6 +311,7 @@ def _light_points(
     part: IntArray,
     to_object: FloatArray,
     material: FloatArray,
+    pigments: FloatArray,
     lamp: FloatArray,
     lens: LensArray,
     rotation: FloatArray,
@@ -354,7 +337,7 @@ def _light_points(
             y = (f[1, 0] * p[0] + f[1, 1] * p[1] + f[1, 2] * p[2] + f[1, 3]) / grain
             z = (f[2, 0] * p[0] + f[2, 1] * p[1] + f[2, 2] * p[2] + f[2, 3]) / grain
             darkness = texture_value(int(m[1]), x, y, z)
-        albedo[i] = m[0] * (1.0 - m[2] * darkness)
+        albedo[i] = m[0] * (1.0 - m[2] * darkness) * pigments[i]
         cosine = -(n[0] * light[0] + n[1] * light[1] + n[2] * light[2])
         if cosine <= 0.0:
             continue

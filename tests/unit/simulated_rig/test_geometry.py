@@ -78,7 +78,7 @@ def test_projector_coordinates_of_a_known_point_follow_from_a_projection_by_hand
 def test_projector_coordinates_agree_with_opencv_for_every_visible_point(tmp_path: Path) -> None:
     scene = '[[object]]\nshape = "sphere"\nradius_mm = 30.0\n' + FACING_PLATE + "position_mm = [0.0, 0.0, 40.0]\n"
     head = small_head(tmp_path, scene, projector={"distortion": [-0.2, 0.1, 0.001, -0.002, 0.05]})
-    truth, lens = head.truth().cameras["eye"], head.calibration.projector
+    truth, lens = head.truth().cameras["eye"], head.exact_calibration.projector
     assert lens is not None
     rotation, _ = cv2.Rodrigues(lens.rotation)
     pixels, _ = cv2.projectPoints(truth.visible_points_mm, rotation, lens.translation_mm, lens.matrix, lens.distortion)
@@ -107,7 +107,7 @@ def test_a_ball_throws_its_shadow_where_the_tangents_meet_the_plate(tmp_path: Pa
     # In the plane y = 0, as an angle from the plate's normal at the lamp: the ball's centre, and the tangents.
     centre, half = np.arctan2(100.0, 440.0), np.arcsin(10.0 / np.hypot(100.0, 440.0))
     edges = 100.0 - 500.0 * np.tan(np.array([centre + half, centre - half]))
-    camera = head.calibration.cameras["eye"]
+    camera = head.exact_calibration.cameras["eye"]
     row = 64
     pixel_ray = np.column_stack([(np.arange(512) - 255.5) / 1600, np.zeros(512), np.ones(512)])
     points = (pixel_ray * truth.depth_mm[row][:, None] - camera.translation_mm) @ camera.rotation

@@ -195,7 +195,7 @@ def test_a_rendered_frame_equals_shading_by_brute_force(tmp_path: Path, axis: st
     view = head._views["eye"]
     found = view.image([(1.0, light_table(profile, size, view_response(gamma=1.8, leak=0.01)))])
 
-    camera, lens = head.calibration.cameras["eye"], head.calibration.projector
+    camera, lens = head.exact_calibration.cameras["eye"], head.exact_calibration.projector
     assert lens is not None
     expected = np.zeros((48, 64))
     linear = 0.01 + 0.99 * (profile.ravel() / 255.0) ** 1.8

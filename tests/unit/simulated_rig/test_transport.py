@@ -11,7 +11,8 @@ import trimesh
 from simulated_rig import transport
 from simulated_rig.casting import EMBREE, Caster, EmbreeCaster, TreeCaster
 from simulated_rig.optics import lens_array, world_directions
-from simulated_rig.transport import Hits, texture_value
+from simulated_rig.textures import texture_value
+from simulated_rig.transport import Hits
 from slrig.model import FloatArray, IntArray
 from tests.unit.simulated_rig.building import FACING_PLATE, small_head
 

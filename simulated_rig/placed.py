@@ -1,0 +1,59 @@
+"""What every object of a scene has: a name, a pose and a material."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from simulated_rig.tables import Fraction, NotNegative, Positive, Table, Triple
+from slrig.model import FloatArray
+
+TEXTURES = ("uniform", "checker", "noise")
+
+
+class Texture(Table):
+    """Albedo that varies: times 1 - contrast * t, t in 0..1 over the object's own coordinates.
+
+    `checker` alternates squares of `scale_mm` over x and y; `noise` is smooth random shading with grains of that size.
+    """
+
+    kind: Literal["uniform", "checker", "noise"] = "uniform"
+    contrast: Fraction = 0.5
+    scale_mm: Positive = 10.0
+
+
+class Specular(Table):
+    """A Phong lobe added to the Lambertian light: strength * cos(angle to the mirror direction) ^ exponent."""
+
+    strength: NotNegative = 0.0
+    exponent: Annotated[float, Field(ge=1)] = 20.0
+
+
+class Standing(Table):
+    """An object in a pose (rotation about its own x, then y, then z axis as fixed axes), with a gloss."""
+
+    name: str = ""
+    position_mm: Triple = (0.0, 0.0, 0.0)
+    rotation_deg: Triple = (0.0, 0.0, 0.0)
+    specular: Specular = Specular()
+
+
+class Placed(Standing):
+    """An object of one albedo, or of one that a texture varies."""
+
+    albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
+    texture: Texture = Texture()
+
+    def material(self) -> tuple[float, ...]:
+        """(6,): albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent."""
+        texture, lobe = self.texture, self.specular
+        kind = float(TEXTURES.index(texture.kind))
+        return (self.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)
+
+
+def turned_by(rotation_deg: Triple) -> FloatArray:
+    """(3, 3) float64: object to world, of a pose's rotation."""
+    return np.asarray(Rotation.from_euler("xyz", rotation_deg, degrees=True).as_matrix(), np.float64)

@@ -1,0 +1,177 @@
+"""The script of a rendered rig: the poses that an object takes one after the other, listed or made up.
+
+A made-up series is what a careful person does with a calibration board: tilted every way, near and far, turned in its
+plane, and brought to the middle, the corners and the sides of the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from simulated_rig.boards import Board
+from simulated_rig.optics import field_radius, image_positions
+from simulated_rig.placed import turned_by
+from simulated_rig.tables import NotNegative, Pair, Table, Triple
+from slrig.errors import ConfigError
+from slrig.model import FloatArray, Pinhole
+
+_GOLDEN_TURN = np.pi * (3 - np.sqrt(5))
+_TRIES = 200
+_HALVINGS = 20
+_FARTHEST_MM = 1000.0
+_NEAR_MIDDLE = 0.15
+_SIDES = (1, 5, 3, 7, 0, 4, 2, 6)
+"""Eighths of a turn: corners are odd."""
+
+
+class Pose(Table):
+    """One pose: `[[head.pose]]`.
+
+    object : the name of what is moved; absent, the scene's board. position_mm, rotation_deg : as of an object of a
+    scene. name : absent, "pose N" counted from 1.
+    """
+
+    name: str = ""
+    object: str | None = None
+    position_mm: Triple
+    rotation_deg: Triple = (0.0, 0.0, 0.0)
+
+
+class PoseSeries(Table):
+    """Poses of the scene's board, made up from a seed: `[head.poses]`.
+
+    tilt_deg : least and most angle between the board and the plane across the line from it to the devices, about axes
+    all round. roll_deg : most turn in its own plane to either side. centre_mm : about what point the board is held,
+    depth_mm : least and most distance from there along the line away from the devices. edge_px : the paper stays so
+    far inside every image, the projector's too.
+    """
+
+    count: Annotated[int, Field(ge=1, le=200)] = 20
+    seed: Annotated[int, Field(ge=0)] = 1
+    tilt_deg: Pair = (15.0, 40.0)
+    roll_deg: NotNegative = 25.0
+    centre_mm: Triple = (0.0, 0.0, 0.0)
+    depth_mm: Pair = (-60.0, 60.0)
+    edge_px: NotNegative = 6.0
+
+    @model_validator(mode="after")
+    def _rising(self) -> PoseSeries:
+        if not 0 <= self.tilt_deg[0] <= self.tilt_deg[1] <= 70 or self.depth_mm[0] > self.depth_mm[1]:
+            message = "tilt_deg needs 0 <= least <= most <= 70, depth_mm least <= most"
+            raise ValueError(message)
+        return self
+
+
+def made_up(series: PoseSeries, board: Board, devices: Sequence[Pinhole]) -> tuple[Pose, ...]:
+    """Return the poses of a series.
+
+    Tilt axes go round by the golden angle, so that any few of them lie well apart. The board is slid from the middle
+    towards a side or a corner until its paper touches the borders of some device's image.
+
+    Raises
+    ------
+    ConfigError
+        The board does not fit into every image, however it is held.
+    """
+    rng = np.random.default_rng((series.seed, 0x706F7365))
+    fields = [(device, field_radius(device)) for device in devices]
+    centre = np.array(series.centre_mm)
+    away = centre - np.mean([device.centre_mm for device in devices], axis=0)
+    facing = _facing(away / np.linalg.norm(away))
+    least, most = board.paper_mm
+    rim = np.array([(x, y) for x in np.linspace(least[0], most[0], 5) for y in np.linspace(least[1], most[1], 5)])
+    paper = board.on_sheet_mm(rim)
+    poses: list[Pose] = []
+    slid = 0
+    for number in range(series.count):
+        # Two in nine stay near the middle; the others go to each corner, then to each side, and so on.
+        share = _NEAR_MIDDLE if number % 9 in (0, 4) else 1.0
+        side = _SIDES[slid % len(_SIDES)]
+        in_corner = share == 1.0 and side % 2 == 1
+        slid += share == 1.0
+        for _try in range(_TRIES):
+            # Depth and tilt are spread evenly, each in an order of its own, and jittered.
+            depth = _spread(series.depth_mm, (number * 7 + 3) % series.count, series.count, rng)
+            tilt = np.deg2rad(_spread(series.tilt_deg, (number * 3 + 1) % series.count, series.count, rng))
+            about = number * _GOLDEN_TURN + rng.uniform(-0.2, 0.2)
+            towards = side * np.pi / 4 + rng.uniform(-0.15, 0.15)
+            # A board that is turned much leaves the corner free into which it is slid.
+            most_roll = series.roll_deg * (0.4 if in_corner else 1.0)
+            roll = np.deg2rad(rng.uniform(-most_roll, most_roll))
+            leaning = Rotation.from_rotvec(tilt * np.array([np.cos(about), np.sin(about), 0.0]))
+            rotation = facing @ (leaning * Rotation.from_rotvec([0.0, 0.0, roll])).as_matrix()
+            middle = centre + depth * facing[:, 2]
+            held = paper @ rotation.T + middle
+            if not _inside(held, fields, series.edge_px):
+                continue
+            across, down = np.cos(towards) * facing[:, 0], 0.75 * np.sin(towards) * facing[:, 1]
+            slide = np.zeros(3)
+            # Together until the first border, then each alone: so corners are reached.
+            for sideways in (across + down, across, down):
+                slide += _reach(held + slide, sideways, fields, series.edge_px) * sideways
+            poses.append(_pose(number, middle + share * slide, rotation))
+            break
+        else:
+            message = (
+                f"[head.poses]: pose {number + 1} of {series.count}: the board's paper ({most[0] - least[0]:.0f} x "
+                f"{most[1] - least[1]:.0f} mm) does not fit into every device's image about {series.centre_mm}; make "
+                "the board smaller, move centre_mm or narrow depth_mm"
+            )
+            raise ConfigError(message)
+    return tuple(poses)
+
+
+def _spread(bounds: tuple[float, float], step: int, count: int, rng: np.random.Generator) -> float:
+    return bounds[0] + (bounds[1] - bounds[0]) * (step + float(rng.random())) / count
+
+
+def _facing(away: FloatArray) -> FloatArray:
+    """(3, 3): board to world of a board across `away`, its x as near the world's as that allows."""
+    right = np.array([1.0, 0.0, 0.0]) - away[0] * away
+    right /= np.linalg.norm(right)
+    return np.column_stack([right, np.cross(away, right), away])
+
+
+def _pose(number: int, middle: FloatArray, rotation: FloatArray) -> Pose:
+    # Rounded, so that what a log or a listing says of a pose is the pose.
+    turn = Rotation.from_matrix(rotation).as_euler("xyz", degrees=True)
+    x, y, z = (round(float(each), 4) for each in middle)
+    a, b, c = (round(float(each), 4) for each in turn)
+    return Pose(name=f"pose {number + 1}", position_mm=(x, y, z), rotation_deg=(a, b, c))
+
+
+def _reach(held: FloatArray, sideways: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float) -> float:
+    """How many times `sideways`, mm, a board can be slid until it touches a border."""
+    low, high = 0.0, _FARTHEST_MM
+    for _ in range(_HALVINGS):
+        half = (low + high) / 2
+        if _inside(held + half * sideways, fields, edge_px):
+            low = half
+        else:
+            high = half
+    return low
+
+
+def _inside(points: FloatArray, fields: Sequence[tuple[Pinhole, float]], edge_px: float) -> bool:
+    """Whether every device images all points; a field is a device and the radius that its lens images."""
+    return all(_in_image(points, device, radius, edge_px) for device, radius in fields)
+
+
+def _in_image(points: FloatArray, device: Pinhole, radius: float, edge_px: float) -> bool:
+    at = points @ device.rotation.T + device.translation_mm
+    if (at[:, 2] <= 0).any() or (np.hypot(at[:, 0], at[:, 1]) > radius * at[:, 2]).any():
+        return False
+    pixels = image_positions(points, device)
+    limit = np.array([device.size.width_px, device.size.height_px]) - 1 - edge_px
+    return bool(((pixels >= edge_px) & (pixels <= limit)).all())
+
+
+def middle_pose(board: Board, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """Return (rotation, translation_mm) of the designed board's frame, whose origin is corner 0: X_world = R X + t."""
+    rotation = turned_by(pose.rotation_deg)
+    return rotation, np.array(pose.position_mm) - rotation @ np.array([*board.middle_mm, 0.0])

@@ -1,0 +1,184 @@
+"""The script at work: what stands where at each pose, and which device has been bumped or has drifted by then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from simulated_rig.boards import Board
+from simulated_rig.disturbing import PROJECTOR, Moving, Push, pushed
+from simulated_rig.options import HeadOptions
+from simulated_rig.placed import Standing, turned_by
+from simulated_rig.poses import Pose, made_up
+from simulated_rig.rendering import Stage, View
+from simulated_rig.scene import Scene, SceneSurface, surface_of
+from simulated_rig.world import NS_PER_S
+from slrig.devices import Clock
+from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
+from slrig.model import Pinhole
+
+
+class Script:
+    """The poses that a rig's options and scene give, and the surface at each. Raises ConfigError, with all faults."""
+
+    def __init__(self, options: HeadOptions, scene: Scene, folder: Path) -> None:
+        self._scene = scene
+        self._folder = folder
+        self.poses: tuple[Pose, ...] = options.pose
+        boards = [thing for thing in scene.object if isinstance(thing, Board)]
+        self._mover: Standing | None = boards[0] if boards else scene.object[0]
+        faults: list[str] = []
+        if options.poses is not None:
+            if boards:
+                devices = [each.pinhole() for each in (*options.camera, options.projector)]
+                self.poses += made_up(options.poses, boards[0], devices)
+            else:
+                faults.append('[head.poses] moves a board, and the scene has none: add an object of shape = "board"')
+        names = {thing.name: thing for thing in scene.object}
+        self._moved: list[Standing] = []
+        for number, pose in enumerate(self.poses):
+            if pose.object is None and not boards:
+                faults.append(
+                    f"pose {number + 1}: expected `object`, for the scene has no board; it has {sorted(names)}"
+                )
+            elif pose.object is not None and pose.object not in names:
+                faults.append(f"pose {number + 1}: there is no object {pose.object!r}; the scene has {sorted(names)}")
+            else:
+                self._moved.append(boards[0] if pose.object is None else names[pose.object])
+        count = len(self.poses)
+        for what, at in (
+            *(("faults.bump", bump.pose) for bump in options.faults.bump),
+            *(("faults.moving", moving.pose) for moving in options.faults.moving),
+        ):
+            if at is not None and at >= max(count, 1):
+                faults.append(f"{what}: there is no pose {at}, the script has {count}, counted from 0")
+        if faults:
+            message = "\n".join(["the script of the rendered rig has faults; correct each and try again:", *faults])
+            raise ConfigError(message)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The poses by name."""
+        return tuple(pose.name or f"pose {number + 1}" for number, pose in enumerate(self.poses))
+
+    def surface(self, index: int, movings: Sequence[tuple[Moving, float]] = ()) -> SceneSurface:
+        """The scene at a pose, after a share of each movement. Without poses: as the scene file has it."""
+        scripted = self.poses[index] if self.poses else None
+        mover = self._moved[index] if self.poses else self._mover
+        if mover is None or (scripted is None and not movings):
+            return surface_of(self._scene, self._folder)
+        stand = scripted if scripted is not None else mover
+        position, turn = np.array(stand.position_mm), turned_by(stand.rotation_deg)
+        for moving, share in movings:
+            position = position + share * np.array(moving.shift_mm)
+            turn = Rotation.from_rotvec(share * np.deg2rad(moving.turn_deg)).as_matrix() @ turn
+        x, y, z = (float(each) for each in position)
+        a, b, c = (float(each) for each in Rotation.from_matrix(turn).as_euler("xyz", degrees=True))
+        if scripted is not None and not movings:
+            a, b, c = scripted.rotation_deg
+        placed = {"position_mm": (x, y, z), "rotation_deg": (a, b, c)}
+        things = tuple(each.model_copy(update=placed) if each is mover else each for each in self._scene.object)
+        return surface_of(self._scene.model_copy(update={"object": things}), self._folder)
+
+
+class Staging:
+    """Puts the world into the state that the script wants: at a move, at a capture's beginning, between its patterns.
+
+    Implements `slrig.devices.Positioner`. Devices and surface are exchanged on the stage and its views, which then
+    trace anew; nothing is traced before it is looked at.
+    """
+
+    def __init__(
+        self, options: HeadOptions, script: Script, stage: Stage, views: Mapping[str, View], clock: Clock
+    ) -> None:
+        self._options = options
+        self._script = script
+        self._stage = stage
+        self._views = views
+        self._clock = clock
+        self._stated: dict[str, Pinhole] = {each.name: each.pinhole() for each in options.camera}
+        self._stated[PROJECTOR] = options.projector.pinhole()
+        self._t_opened_ns = clock.now_ns()
+        self._index = 0
+        self._captures = 0
+        self._pattern_count = 1
+        self._shows = 0
+        self._step: tuple[int, ...] = ()
+        self._closed = False
+        self._set_devices()
+
+    @property
+    def poses(self) -> Sequence[str]:
+        """See `Positioner`."""
+        return self._script.names
+
+    @property
+    def index(self) -> int:
+        """The pose taken last; 0 at first."""
+        return self._index
+
+    def move(self, index: int) -> None:
+        """See `Positioner`."""
+        if self._closed:
+            message = "the rendered rig's positioner is closed; open the rig again"
+            raise DeviceStateError(message)
+        count = len(self._script.poses)
+        if not 0 <= index < count:
+            message = f"asked for pose {index}, the script has poses 0 to {count - 1}: {', '.join(self.poses)}"
+            raise UnsupportedByDeviceError(message)
+        self._index = index
+        self._set_objects()
+        self._set_devices()
+
+    def close(self) -> None:
+        """See `Positioner`."""
+        self._closed = True
+
+    def begun(self, pattern_count: int) -> None:
+        """A capture of so many patterns begins: what drifts does it now, what moves starts anew."""
+        self._pattern_count, self._shows = max(pattern_count, 1), 0
+        if self._options.drift:
+            self._set_devices()
+        self._captures += 1
+        if self._step:
+            self._set_objects()
+
+    def shown(self) -> None:
+        """One more pattern is about to be shown: what moves has moved on."""
+        movings = self._movings
+        if movings:
+            done = min(self._shows, self._pattern_count - 1)
+            step = tuple(done * moving.steps // self._pattern_count for moving in movings)
+            if step != (self._step or (0,) * len(step)):
+                shares = [at / (moving.steps - 1) for at, moving in zip(step, movings, strict=True)]
+                surface = self._script.surface(self._index, list(zip(movings, shares, strict=True)))
+                self._stage.change(surface=surface)
+            self._step = step
+        self._shows += 1
+
+    @property
+    def _movings(self) -> list[Moving]:
+        return [each for each in self._options.faults.moving if each.pose in (None, self._index)]
+
+    def _set_objects(self) -> None:
+        self._step = ()
+        self._stage.change(surface=self._script.surface(self._index))
+
+    def _set_devices(self) -> None:
+        time_s = (self._clock.now_ns() - self._t_opened_ns) / NS_PER_S
+        pushes: list[tuple[Push, float]] = [
+            *((bump, 1.0) for bump in self._options.faults.bump if bump.pose <= self._index),
+            *((drift, drift.share(time_s, self._captures)) for drift in self._options.drift),
+        ]
+        for name, stated in self._stated.items():
+            now = stated
+            for push, share in pushes:
+                if push.device == name:
+                    now = pushed(now, push, share=share)
+            if name == PROJECTOR:
+                self._stage.change(projector=now)
+            else:
+                self._views[name].move(now)
