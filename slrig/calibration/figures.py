@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class ViewFigures:
     """How well one camera saw the board in one pose. NaN where a figure could not be measured.
 
-    moved_px : rms distance of the corners between the first and the last white frame of the pose.
+    moved_px : greatest rms distance of the corners from where the first frame has them; inf where the board is lost.
     saturated : share of the board's pixels that are clipped in the white frame.
     contrast : of the board's light squares, white minus black (the projector's light), median, as a share of full
     scale; where no projector was used, light squares minus dark ones.
