@@ -1,0 +1,144 @@
+"""A rig of pinholes with lens distortion, and the poses of a board before it, made with OpenCV's own projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.figures import ViewFigures
+from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation
+from slrig.calibration.solution import PROJECTOR, BoardPose
+from slrig.model import FloatArray, Pinhole, Size
+
+CHESSBOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
+CHARUCO = Board(BoardKind.CHARUCO, 11, 8, 12.0)
+SHARP = ViewFigures(moved_px=0.05, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
+
+
+def looking(
+    position_mm: tuple[float, float, float], *, target_mm: tuple[float, float, float] = (0, 0, 600)
+) -> BoardPose:
+    """The pose (world to device) of a device at a position that looks at a target, its columns downwards."""
+    ahead = np.subtract(target_mm, position_mm) / np.linalg.norm(np.subtract(target_mm, position_mm))
+    across = np.cross([0.0, 1.0, 0.0], ahead)
+    across /= np.linalg.norm(across)
+    rotation = np.stack([across, np.cross(ahead, across), ahead])
+    return BoardPose(rotation, -rotation @ np.asarray(position_mm, dtype=np.float64))
+
+
+def device(
+    size: Size, focal_px: float, principal_px: tuple[float, float], distortion: tuple[float, ...], pose: BoardPose
+) -> Pinhole:
+    matrix = np.array([[focal_px, 0, principal_px[0]], [0, 1.001 * focal_px, principal_px[1]], [0, 0, 1]])
+    return Pinhole(size, matrix, np.array(distortion), pose.rotation, pose.translation_mm)
+
+
+def two_cameras_and_projector() -> dict[str, Pinhole]:
+    """The left camera is the world; the projector's principal point lies below its image."""
+    size = Size(1280, 1024)
+    upright = BoardPose(np.eye(3), np.zeros(3))
+    return {
+        "left": device(size, 2100.0, (650.0, 500.0), (-0.11, 0.15, -3e-4, 5e-4, 0.0), upright),
+        "right": device(size, 2080.0, (630.0, 520.0), (-0.09, 0.10, 2e-4, -4e-4, 0.0), looking((170.0, 5.0, 20.0))),
+        PROJECTOR: device(
+            Size(1024, 768), 1700.0, (510.0, 860.0), (0.03, -0.02, 3e-4, 0.0, 0.0),
+            looking((80.0, 160.0, 0.0), target_mm=(80.0, 160.0, 600.0)),
+        ),
+    }  # fmt: skip
+
+
+def turned(about_x_deg: float, about_y_deg: float, in_plane_deg: float) -> FloatArray:
+    """A board's rotation: in its plane first, then about the camera's y, then about its x."""
+    rotation = np.eye(3)
+    for axis, angle in ((2, in_plane_deg), (1, about_y_deg), (0, about_x_deg)):
+        vector = np.zeros(3)
+        vector[axis] = np.radians(angle)
+        rotation = cv2.Rodrigues(vector)[0] @ rotation
+    return np.asarray(rotation, dtype=np.float64)
+
+
+def held(
+    board: Board,
+    *,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    in_plane_deg: float = 0.0,
+    middle_mm: tuple[float, float, float] = (0.0, 0.0, 600.0),
+) -> BoardPose:
+    """The board with its middle at a place in the world, tilted about the world's x and y."""
+    rotation = turned(*tilt, in_plane_deg)
+    return BoardPose(rotation, np.asarray(middle_mm, dtype=np.float64) - rotation @ board.points_mm.mean(axis=0))
+
+
+def seen_by(pinhole: Pinhole, points_mm: FloatArray) -> FloatArray:
+    """(n, 2) float64: where points of the world fall in a device."""
+    vector, _ = cv2.Rodrigues(pinhole.rotation)
+    points_px, _ = cv2.projectPoints(points_mm, vector, pinhole.translation_mm, pinhole.matrix, pinhole.distortion)
+    return np.asarray(points_px.reshape(-1, 2), dtype=np.float64)
+
+
+def inside(points_px: FloatArray, size: Size) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    return np.asarray(((points_px > 2) & (points_px < [size.width_px - 3, size.height_px - 3])).all(axis=1))
+
+
+@dataclass
+class Shooting:
+    """Shoots poses of a board with a rig of known devices. A chessboard is seen whole or not at all."""
+
+    board: Board
+    devices: dict[str, Pinhole]
+    sigma_px: float = 0.05
+    seed: int = 1
+    random: np.random.Generator = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.random = np.random.default_rng(self.seed)
+
+    @property
+    def sizes(self) -> dict[str, Size]:
+        return {name: each.size for name, each in self.devices.items()}
+
+    def shot(self, name: str, pose: BoardPose) -> PoseObservation:
+        points_mm = self.board.points_mm @ pose.rotation.T + pose.translation_mm
+        views, light = {}, {}
+        for camera, pinhole in self.devices.items():
+            if camera == PROJECTOR:
+                continue
+            points_px = seen_by(pinhole, points_mm)
+            corner = np.flatnonzero(inside(points_px, pinhole.size)).astype(np.int32)
+            if len(corner) < self.board.corner_count and (self.board.kind is not BoardKind.CHARUCO or len(corner) < 6):
+                continue
+            noisy = points_px[corner] + self.random.normal(0, self.sigma_px, (len(corner), 2))
+            views[camera] = BoardView(corner, noisy, np.full(len(corner), self.sigma_px))
+            if PROJECTOR in self.devices:
+                light[camera] = self._light(pinhole, pose)
+        return PoseObservation(name, views, light)
+
+    def _light(self, camera: Pinhole, pose: BoardPose) -> Correspondences:
+        projector = self.devices[PROJECTOR]
+        (left, top), (right, bottom) = self.board.print_mm
+        across, down = np.meshgrid(np.linspace(left, right, 60), np.linspace(top, bottom, 45))
+        flat = np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
+        space = flat @ pose.rotation.T + pose.translation_mm
+        pixels_px, positions_px = seen_by(camera, space), seen_by(projector, space)
+        lit = inside(positions_px, projector.size) & inside(pixels_px, camera.size)
+        pixels_px, positions_px = pixels_px[lit], positions_px[lit]
+        count = len(pixels_px)
+        positions_px = positions_px + self.random.normal(0, 0.1, (count, 2))
+        return Correspondences(
+            np.concatenate([pixels_px, pixels_px]),
+            np.repeat(np.array([COLUMN, ROW], dtype=np.uint8), count),
+            np.concatenate([positions_px[:, 0], positions_px[:, 1]]),
+            np.full(2 * count, 0.1),
+        )
+
+
+def first_poses(board: Board) -> list[BoardPose]:
+    """What a person begins with: three poses in the middle."""
+    return [
+        held(board),
+        held(board, tilt=(20.0, 0.0), middle_mm=(10.0, 5.0, 590.0)),
+        held(board, tilt=(0.0, -20.0), middle_mm=(-10.0, 0.0, 610.0)),
+    ]
