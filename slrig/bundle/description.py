@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import AwareDatetime, Field, ValidationError, field_validator, model_validator
 
 from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
 from slrig.errors import BundleError, PatternError
@@ -151,6 +151,9 @@ class Description(Strict):
     cameras: Annotated[dict[CameraName, CameraEntry], Field(min_length=1)]
     patterns: Annotated[list[PatternEntry], Field(min_length=1)]
     frames: Annotated[list[FrameEntry], Field(min_length=1)]
+    captured_at: Annotated[
+        AwareDatetime | None, Field(description="when the capture began, ISO 8601 with the offset from UTC")
+    ] = None
 
     def projector_size(self) -> Size:
         """Extent of the projector."""

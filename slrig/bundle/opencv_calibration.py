@@ -10,6 +10,17 @@ samples, with the pose beside them:
        distortion_coefficients: !!opencv-matrix ...  k1, k2, p1, p2 and, where there is one, k3
        rotation: !!opencv-matrix ...                 3 x 3, world to device
        translation_mm: !!opencv-matrix ...           3, world to device
+
+A calibration that states its own error has one more map, `solved`, which other programs pass over:
+
+    solved:
+       id: "..."
+       solved_at: "..."                              ISO 8601 with the offset from UTC
+       covariance: !!opencv-matrix ...               15 d x 15 d, see `slrig.model.Solved`
+       volume_mm: !!opencv-matrix ...                2 x 3
+       expected_error_mm: 0.0071
+
+Its devices are numbered in the order of their maps, the projector last.
 """
 
 from __future__ import annotations
@@ -24,10 +35,11 @@ import numpy as np
 from slrig.bundle.faults import read_text
 from slrig.bundle.storage import write_file
 from slrig.errors import CalibrationError
-from slrig.model import Calibration, FloatArray, Pinhole, Size
+from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 
 MOST_FILE_BYTES = 4 * 2**20
 PROJECTOR = "projector"
+SOLVED = "solved"
 NODE_NAME = re.compile(r"^[A-Za-z_][A-Za-z0-9_-]*$")
 DEVICE_KEYS = (
     "image_width",
@@ -37,10 +49,13 @@ DEVICE_KEYS = (
     "rotation",
     "translation_mm",
 )
+SOLVED_KEYS = ("id", "solved_at", "covariance", "volume_mm", "expected_error_mm")
 
 
 def read_opencv_calibration(path: Path) -> Calibration:
-    """Return the calibration in an OpenCV FileStorage file; the map `projector` is the projector, others are cameras.
+    """Return the calibration in an OpenCV FileStorage file.
+
+    The map `projector` is the projector, `solved` what the calibration says of its own error, others are cameras.
 
     Raises
     ------
@@ -56,13 +71,18 @@ def read_opencv_calibration(path: Path) -> Calibration:
     try:
         root = storage.root()
         names = list(root.keys()) if root.isMap() else []
-        devices = {name: _read_device(root.getNode(name), path, name) for name in names}
+        devices = {name: _read_device(root.getNode(name), path, name) for name in names if name != SOLVED}
+        solved = _read_solved(root.getNode(SOLVED), path) if SOLVED in names else None
     finally:
         storage.release()
     cameras = {name: device for name, device in devices.items() if name != PROJECTOR}
     if not cameras:
         _refuse(path, "one map per device", f"{', '.join(names) or 'nothing'}", "name each camera and its six keys")
-    return Calibration(cameras, devices.get(PROJECTOR))
+    try:
+        return Calibration(cameras, devices.get(PROJECTOR), solved)
+    except CalibrationError as cause:
+        message = f"{path}: {SOLVED}.{cause}"
+        raise CalibrationError(message) from cause
 
 
 def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
@@ -79,10 +99,10 @@ def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
     if ending not in {".yml", ".yaml", ".xml"}:
         _refuse(path, "a name that ends in .yml, .yaml or .xml", f"'{path.name}'", "choose one of these endings")
     for name in calibration.cameras:
-        if name == PROJECTOR or not NODE_NAME.match(name):
+        if name in {PROJECTOR, SOLVED} or not NODE_NAME.match(name):
             _refuse(
                 path,
-                "camera names that begin with a letter and are not 'projector'",
+                "camera names that begin with a letter and are not 'projector' or 'solved'",
                 f"'{name}'",
                 "rename the camera or keep the calibration as JSON",
             )
@@ -91,6 +111,8 @@ def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
         _write_device(storage, name, pinhole)
     if calibration.projector is not None:
         _write_device(storage, PROJECTOR, calibration.projector)
+    if calibration.solved is not None:
+        _write_solved(storage, calibration.solved)
     text: str = storage.releaseAndGetString()
     write_file(path, text.encode())
 
@@ -130,6 +152,39 @@ def _read_device(node: Any, path: Path, name: str) -> Pinhole:
     except CalibrationError as cause:
         message = f"{path}: {name}.{cause}"
         raise CalibrationError(message) from cause
+
+
+def _read_solved(node: Any, path: Path) -> Solved:
+    keys = set(node.keys()) if node.isMap() else set()
+    if keys != set(SOLVED_KEYS):
+        wrong = [f"no {key}" for key in SOLVED_KEYS if key not in keys]
+        wrong += [f"the unknown key {key}" for key in sorted(keys - set(SOLVED_KEYS))]
+        _refuse(path, f"{', '.join(SOLVED_KEYS)} in '{SOLVED}'", ", ".join(wrong), "leave the whole map out")
+    words = [node.getNode(key) for key in ("id", "solved_at")]
+    number = node.getNode("expected_error_mm")
+    if not all(each.isString() and each.string() for each in words) or not (number.isReal() or number.isInt()):
+        _refuse(path, f"text as id and solved_at of '{SOLVED}' and a number as expected_error_mm", "something else",
+                "export it again, or leave the whole map out")  # fmt: skip
+    error_mm = number.real()
+    if not 0 <= error_mm < np.inf:
+        _refuse(path, f"{SOLVED}.expected_error_mm of 0 or more", f"{error_mm}", "export it again")
+    covariance = _matrix(node, "covariance", path, SOLVED)
+    volume_mm = _matrix(node, "volume_mm", path, SOLVED)
+    try:
+        return Solved(words[0].string(), words[1].string(), covariance, volume_mm, error_mm)
+    except (CalibrationError, ValueError) as cause:
+        message = f"{path}: {SOLVED}.{cause}"
+        raise CalibrationError(message) from cause
+
+
+def _write_solved(storage: Any, solved: Solved) -> None:
+    storage.startWriteStruct(SOLVED, cv2.FileNode_MAP)
+    storage.write("id", solved.id)
+    storage.write("solved_at", solved.solved_at)
+    storage.write("covariance", solved.covariance)
+    storage.write("volume_mm", solved.volume_mm)
+    storage.write("expected_error_mm", solved.expected_error_mm)
+    storage.endWriteStruct()
 
 
 def _matrix(node: Any, key: str, path: Path, name: str) -> FloatArray:

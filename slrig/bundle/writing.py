@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -38,7 +39,7 @@ class BundleWriter:
 
     The bundle grows in a hidden folder beside `folder`, which is renamed into place when the block ends well. Any
     error, in the block or on the disk, removes it: the folder is whole or absent. Only `keep` leaves a bundle of a
-    capture that was cut short, and says so in it.
+    capture that was cut short, and says so in it. captured_at : when the capture began, with the offset from UTC.
 
     Raises
     ------
@@ -55,6 +56,8 @@ class BundleWriter:
         patterns: Sequence[Pattern],
         cameras: Mapping[str, CameraFormat],
         calibration: Calibration | None = None,
+        *,
+        captured_at: datetime | None = None,
     ) -> None:
         wrong = [name for name in cameras if not re.fullmatch(CAMERA_NAME, name)]
         if wrong:
@@ -70,6 +73,7 @@ class BundleWriter:
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
         self._calibration = calibration
+        self._captured_at = captured_at
         self._places: list[_Place] = []
         self._refused: list[RefusedEntry] = []
         self._count: Counter[str] = Counter()
@@ -161,7 +165,7 @@ class BundleWriter:
         if not frames and self._ended is None:
             message = f"{self.folder}: expected frames, found none; a bundle holds at least one frame"
             raise BundleError(message)
-        data = {
+        data: dict[str, Any] = {
             "format": "slrig-bundle",
             "version": 1,
             "projector": {"size_px": _extent(self._projector)},
@@ -172,6 +176,8 @@ class BundleWriter:
             "patterns": [_pattern(pattern) for pattern in self._patterns],
             "frames": frames,
         }
+        if self._captured_at is not None:
+            data["captured_at"] = self._captured_at.isoformat(timespec="seconds")
         if self._calibration is not None:
             write_calibration(self._staging / CALIBRATION, self._calibration)
         with refusals_of(self.folder):

@@ -2,7 +2,8 @@
 
 Parameters of a device, 15 in this order, each with its row and column in the covariance:
 fx, fy, cx, cy (px), k1, k2, p1, p2, k3, a small turn (three angles, rad: R' = exp([turn]x) R), translation (mm).
-The world is the first camera's frame, so that its pose has no variance; a term that was not solved for has none either.
+The world is the first camera's frame, so that its pose has no variance. A lens term that was left out is 0 and has the
+variance that it has where it is solved for: leaving it out says nothing of it (`slrig.calibration.covariance`).
 """
 
 from __future__ import annotations
@@ -74,9 +75,10 @@ class ExpectedError:
     turn everything alike, are no errors of a measurement and are left out.
 
     volume_mm : (2, 3) float64, opposite corners of the volume's box in the world.
-    point_mm : of a point along the viewing direction, from the calibration alone. noise_mm : from the noise of one
-    point's light alone. total_mm : both. length_share : of a length over that length, from the calibration alone, for
-    lengths of half the volume's diagonal in all directions.
+    point_mm : of a point along the first camera's viewing ray, from the calibration alone. noise_mm : from the noise of
+    one point's light alone, that of a surface as bright as the board's paper; NaN where no light was observed.
+    total_mm : both. length_share : of a length over that length, from the calibration alone, for lengths of half the
+    volume's diagonal in all directions that occur in it.
     grid_mm : (n, 3) float64, places in the volume that the devices see; grid_point_mm : (n,) float64, point_mm there.
     """
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import structlog
@@ -60,7 +61,9 @@ def capture_bundle(
         _log.info(words, rig=rig.name)
         progress("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-    writer = BundleWriter(folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration)
+    writer = BundleWriter(
+        folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
+    )
     with writer, Recorder(writer) as recorder:
         exposing = Exposing(rig, sequence, exposures_s, cancelled=cancelled, refused=recorder.refuse)
         if frames is not None:

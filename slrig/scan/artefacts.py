@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle.storage import refusals_of, write_file
 from slrig.errors import InvalidInputError
-from slrig.model import Mesh, PointCurves
+from slrig.model import FloatArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
 
 MESH = "mesh.ply"
@@ -29,6 +29,7 @@ ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {"mesh.stl": encode_mesh_stl
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _END_OF_HEADER = b"\nend_header\n"
+_CALIBRATION_PART = "sigma_calibration_mm"
 _FACE = np.dtype([("count", "<u1"), ("vertices", "<i4", (3,))])
 _NO_MESH = Mesh(
     vertices_mm=np.zeros((0, 3), dtype=np.float32),
@@ -40,11 +41,14 @@ _NO_MESH = Mesh(
 )
 
 
-def write_mesh(mesh: Mesh, folder: Path) -> None:
-    """Write mesh.ply and mesh.glb into `folder`; other formats are made of them on request. Raises StorageError."""
+def write_mesh(mesh: Mesh, folder: Path, *, sigma_calibration_mm: FloatArray | None = None) -> None:
+    """Write mesh.ply and mesh.glb into `folder`; other formats are made of them on request. Raises StorageError.
+
+    sigma_calibration_mm : as for `encode_mesh_ply`.
+    """
     # One at a time: each is as large as the mesh.
-    for name, encode in ((MESH, encode_mesh_ply), ("mesh.glb", encode_mesh_glb)):
-        write_file(folder / name, encode(mesh))
+    write_file(folder / MESH, encode_mesh_ply(mesh, sigma_calibration_mm=sigma_calibration_mm))
+    write_file(folder / "mesh.glb", encode_mesh_glb(mesh))
 
 
 def write_converted(folder: Path, name: str) -> None:
@@ -62,9 +66,9 @@ def write_converted(folder: Path, name: str) -> None:
     write_file(folder / name, ON_REQUEST[name](decode_mesh_ply(data)))
 
 
-def write_points(curves: PointCurves, path: Path) -> None:
-    """Write the points of `curves` as PLY. Raises StorageError."""
-    write_file(path, encode_points_ply(curves))
+def write_points(curves: PointCurves, path: Path, *, sigma_calibration_mm: FloatArray | None = None) -> None:
+    """Write the points of `curves` as PLY; sigma_calibration_mm as for `encode_points_ply`. Raises StorageError."""
+    write_file(path, encode_points_ply(curves, sigma_calibration_mm=sigma_calibration_mm))
 
 
 def write_report(report: Mapping[str, object], path: Path) -> None:
@@ -81,9 +85,13 @@ def write_report(report: Mapping[str, object], path: Path) -> None:
     write_file(path, (text + "\n").encode())
 
 
-def encode_mesh_ply(mesh: Mesh) -> bytes:
-    """Binary little-endian PLY in mm: position, normal, colour, `sigma_mm`, `stripe` per vertex; triangles."""
-    vertices = _records(len(mesh.vertices_mm), _vertex_properties(mesh))
+def encode_mesh_ply(mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
+    """Binary little-endian PLY in mm: position, normal, colour, `sigma_mm`, `stripe` per vertex; triangles.
+
+    sigma_calibration_mm : (V,), the part of `sigma_mm` that the calibration's own error makes, one property more; None
+    where the calibration does not state it.
+    """
+    vertices = _records(len(mesh.vertices_mm), {**_vertex_properties(mesh), **_calibration_part(sigma_calibration_mm)})
     faces = np.zeros(len(mesh.faces), dtype=_FACE)
     faces["count"] = 3
     faces["vertices"] = mesh.faces
@@ -91,7 +99,7 @@ def encode_mesh_ply(mesh: Mesh) -> bytes:
 
 
 def decode_mesh_ply(data: bytes) -> Mesh:
-    """The mesh in a PLY that `encode_mesh_ply` made.
+    """The mesh in a PLY that `encode_mesh_ply` made, without the calibration's part of its standard deviations.
 
     Raises
     ------
@@ -100,7 +108,8 @@ def decode_mesh_ply(data: bytes) -> Mesh:
     """
     head, mark, body = data.partition(_END_OF_HEADER)
     counts = [int(count) for count in re.findall(rb"^element \w+ (\d{1,12})$", head, re.MULTILINE)]
-    none = _records(0, _vertex_properties(_NO_MESH))
+    stated = np.zeros(0) if f" {_CALIBRATION_PART}\n".encode() in head else None
+    none = _records(0, {**_vertex_properties(_NO_MESH), **_calibration_part(stated)})
     vertex_count, face_count = counts if len(counts) == 2 else (0, 0)
     vertex_bytes = vertex_count * none.dtype.itemsize
     length = vertex_bytes + face_count * _FACE.itemsize
@@ -136,16 +145,20 @@ def _vertex_properties(mesh: Mesh) -> dict[str, tuple[str, NDArray[Any]]]:
     }
 
 
+def _calibration_part(sigma_calibration_mm: FloatArray | None) -> dict[str, tuple[str, NDArray[Any]]]:
+    return {} if sigma_calibration_mm is None else {_CALIBRATION_PART: ("f4", sigma_calibration_mm)}
+
+
 def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count: int | None = None) -> list[str]:
     faces = [f"element face {face_count}", "property list uchar int vertex_indices"]
     return [*_vertex_element(vertices, count=vertex_count), *faces]
 
 
-def encode_points_ply(curves: PointCurves) -> bytes:
+def encode_points_ply(curves: PointCurves, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
     """Binary little-endian PLY in mm: position, colour, `sigma_mm`, `stripe`, `source`, `bridge_after` per point.
 
     `stripe` is the projector column rounded down, as in the mesh; `bridge_after` is 1 where the step to the next
-    point of its curve joins two stripes.
+    point of its curve joins two stripes. sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
     """
     columns = np.floor(curves.column_px).astype(np.int32)
     points = _records(
@@ -157,6 +170,7 @@ def encode_points_ply(curves: PointCurves) -> bytes:
             "stripe": ("i4", np.repeat(columns, np.diff(curves.offsets))),
             "source": ("u1", curves.source),
             "bridge_after": ("u1", curves.bridge_after),
+            **_calibration_part(sigma_calibration_mm),
         },
     )
     return _ply(_vertex_element(points), points)

@@ -22,13 +22,15 @@ from slrig.errors import CalibrationError, NothingToReconstructError, PatternErr
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import brightness, compact_mesh
-from slrig.model import Axis, Calibration, Mesh, Pinhole, PointCurves, Refusal
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves, Refusal
+from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.merging import MergedCurves, merged
 from slrig.reconstruction.redundancy import Redundancy, redundancy
 from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
+from slrig.scan.calibration_report import calibration_report
 from slrig.scan.outline import Outline
 from slrig.scan.output import REPORT, staged_folder
 from slrig.scan.pictures import preview, rejection_picture, write_png
@@ -60,11 +62,29 @@ class _Walked:
 
 
 @dataclass(frozen=True, slots=True)
+class _Triangulated:
+    """The curves of all cameras, what they say of one another, and the cameras with the points that fell off the
+    projector among their refusals. second : index of the camera that the first is paired with, without a projector.
+    """
+
+    joined: MergedCurves
+    spare: Redundancy
+    cameras: list[Seen]
+    second: int = 1
+
+
+@dataclass(frozen=True, slots=True)
 class _Meshed:
-    """The mesh and its points, the cameras with all their refusals, and what the report says."""
+    """The mesh and its points, the cameras with all their refusals, and what the report says.
+
+    share_mm : (n,) float64, the calibration's part of each point's standard deviation, and mesh_share_mm : (V,) of each
+    vertex's; None where the calibration does not state its error.
+    """
 
     mesh: Mesh
     curves: PointCurves
+    share_mm: FloatArray | None
+    mesh_share_mm: FloatArray | None
     cameras: list[Seen]
     stages: tuple[Stage, ...]
     figures: Mapping[str, object]
@@ -113,11 +133,11 @@ def reconstruct_bundle(
         _require(any(each.curves.decoded_pixels > 0 for each in seen), bundle, "no pixel could be decoded", seen)
         _require(any(each.curves.stripe_count > 0 for each in seen), bundle, "no stripe was found", seen)
         entered("triangulate", 0.6, "")
-        meshed = _meshed(bundle, seen, devices.projector, axis, plan, step, entered)
+        meshed = _meshed(bundle, seen, devices, axis, plan, step, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
-        write_points(meshed.curves, staging / "points.ply")
-        write_mesh(mesh, staging)
+        write_points(meshed.curves, staging / "points.ply", sigma_calibration_mm=meshed.share_mm)
+        write_mesh(mesh, staging, sigma_calibration_mm=meshed.mesh_share_mm)
         entered("pictures", 0.85, "")
         _write_pictures(mesh, cameras, staging)
         known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
@@ -126,6 +146,7 @@ def reconstruct_bundle(
         seconds = watch.finished()
         report = {
             **walked.sections,
+            "calibration": calibration_report(devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "plan": asdict(plan),
             "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
             "redundancy": dict(meshed.redundancy),
@@ -197,7 +218,6 @@ def _walked(
         entered("check frames", 0.58, "")
         evidence = check_exposures(recorded.capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
-    sections["calibration"] = {"id": calibration_id(devices)}
     return _Walked(devices, stream.axis, seen, step_px(stream.outline.shown, stream.axis), sections)
 
 
@@ -216,12 +236,7 @@ def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
     )
 
 
-def _triangulated(
-    cameras: list[Seen], projector: Pinhole | None, axis: Axis
-) -> tuple[MergedCurves, Redundancy, list[Seen]]:
-    """The curves of all cameras, what they say of one another, and the cameras with the points that fell off the
-    projector among their refusals.
-    """
+def _triangulated(cameras: list[Seen], projector: Pinhole | None, axis: Axis) -> _Triangulated:
     devices = {seen.name: seen.device for seen in cameras}
     if projector is not None:
         parts = [camera_projector(seen.curves.ensemble, seen.device, projector, axis) for seen in cameras]
@@ -230,13 +245,15 @@ def _triangulated(
             for seen, part in zip(cameras, parts, strict=True)
         ]
         spare = redundancy(parts, devices, axis, widest_gap_px=_WIDEST_GAP_PX)
-        return merged(parts, projector.centre_mm, widest_gap_px=_WIDEST_GAP_PX), spare, told
+        return _Triangulated(merged(parts, projector.centre_mm, widest_gap_px=_WIDEST_GAP_PX), spare, told)
     first, *others = cameras
     parts = [camera_camera(first.curves.ensemble, seen.curves.ensemble, first.device, seen.device) for seen in others]
     # Without a projector the light sheet has no rows to merge by; the pair that gives most is used.
-    best = max(parts, key=lambda part: len(part.points_mm))
+    second = max(range(len(parts)), key=lambda index: len(parts[index].points_mm))
+    best = parts[second]
     spare = redundancy([best], devices, axis, widest_gap_px=_WIDEST_GAP_PX)
-    return merged([best], first.device.centre_mm, widest_gap_px=_WIDEST_GAP_PX), spare, cameras
+    joined = merged([best], first.device.centre_mm, widest_gap_px=_WIDEST_GAP_PX)
+    return _Triangulated(joined, spare, cameras, 1 + second)
 
 
 def _with_dropped(curves: CameraCurves, triangulated: SheetCurves) -> NDArray[np.uint8]:
@@ -257,15 +274,16 @@ def _with_dropped(curves: CameraCurves, triangulated: SheetCurves) -> NDArray[np
 def _meshed(
     folder: Path,
     cameras: list[Seen],
-    projector: Pinhole | None,
+    calibration: Calibration,
     axis: Axis,
     plan: ReconstructionPlan,
     step_px: float,
     entered: Callable[[str, float, str], None],
 ) -> _Meshed:
     """Triangulate and mesh."""
-    first = cameras[0]
-    joined_curves, spare, cameras = _triangulated(cameras, projector, axis)
+    first, projector = cameras[0], calibration.projector
+    found = _triangulated(cameras, projector, axis)
+    cameras, joined_curves = found.cameras, found.joined
     points = joined_curves.curves
     _require(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
     count = f"{len(points.points_mm)} points"
@@ -284,6 +302,9 @@ def _meshed(
     _require(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
     entered("vertices", 0.72, count)
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
+    share = _calibration_share(calibration, found, axis, surface.normals)
+    if share is not None:
+        sigma = np.hypot(sigma, share)
     grey = brightness(
         points.pixels_px, joined_curves.camera,
         [seen.white for seen in cameras], [float(seen.full_scale) for seen in cameras],
@@ -300,10 +321,35 @@ def _meshed(
     mesh = compact_mesh(
         surface.faces, points.points_mm, surface.normals, grey, sigma, points.offsets, points.position_px
     )
-    figures = mesh_report(surface, mesh, curves)
     return _Meshed(
-        mesh, curves, cameras, surface.stages, figures, redundancy_report(joined_curves, points.source, spare)
+        mesh=mesh,
+        curves=curves,
+        share_mm=share,
+        mesh_share_mm=None if share is None else share[_used(surface.faces, len(share))],
+        cameras=cameras,
+        stages=surface.stages,
+        figures=mesh_report(surface, mesh, curves),
+        redundancy=redundancy_report(joined_curves, points.source, found.spare),
     )
+
+
+def _used(faces: IntArray, count: int) -> NDArray[np.bool_]:
+    """(count,) bool: the points that a triangle uses, which are the vertices of the mesh in the same order."""
+    used = np.zeros(count, dtype=np.bool_)
+    used[faces] = True
+    return used
+
+
+def _calibration_share(
+    calibration: Calibration, found: _Triangulated, axis: Axis, normals: NDArray[np.float32]
+) -> FloatArray | None:
+    """(n,) float64: the calibration's part of each point's standard deviation; None where it states no error."""
+    modes = calibration_modes(calibration, [seen.name for seen in found.cameras], axis, second=found.second)
+    if modes is None:
+        return None
+    points = found.joined.curves
+    tangents = stripe_tangents(points.points_mm, points.offsets, points.bridge_after)
+    return calibration_sigma(modes, points.points_mm, normals, points.source, found.joined.camera, tangents)
 
 
 def _write_pictures(mesh: Mesh, cameras: list[Seen], staging: Path) -> None:

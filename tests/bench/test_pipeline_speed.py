@@ -95,7 +95,7 @@ class Run:
         watch.enter("triangulate")
         step = step_px(stream.outline.shown, stream.axis)
         meshed = _meshed(
-            folder, seen, calibration.projector, stream.axis, ReconstructionPlan(), step,
+            folder, seen, calibration, stream.axis, ReconstructionPlan(), step,
             lambda stage, _fraction, _detail: watch.enter(stage),
         )  # fmt: skip
         self.stages_s = watch.finished()

@@ -1,0 +1,199 @@
+"""By how much a triangulated point moves when the devices are not quite what a calibration says.
+
+A point X is found from three equations h(X, θ) = m: its pixel (u, v) in a camera, and a third one, m fixed as it was
+measured. A small change of the devices' parameters θ moves it by
+
+    dX = -(∂h/∂X)⁻¹ ∂h/∂θ dθ
+
+(the implicit function theorem). The third equation is the projector's column (or row) of the light; without a
+projector, the second camera's coordinate along the epipolar line, as for a stripe that runs straight across it.
+
+Where several cameras see the light of one projector pixel, a scan takes the mean of their points, weighted by inverse
+variance; with equal noise in all of them the weight is the square of how far a camera sees the point move, in pixels,
+when it moves along the projector's ray.
+
+Lenses are Brown's (1966), in OpenCV's order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.solution import PARAMETERS
+from slrig.model import Axis, FloatArray, Pinhole
+
+_EACH = len(PARAMETERS)
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """How n points move. by_parameter : (n, 3, p) float64, mm per unit of each of the p parameters of all devices.
+
+    by_noise : (n, 3, e) float64, mm for each of e independent errors of one pixel of the light that a point is found
+    by. seen : (n,) bool, whether enough devices see the point; the numbers of the others mean nothing.
+    """
+
+    by_parameter: FloatArray
+    by_noise: FloatArray
+    seen: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class _Projected:
+    """pixel : (n, 2); by_point : (n, 2, 3); by_parameter : (n, 2, 15); inside : (n,) bool, in the image."""
+
+    pixel: FloatArray
+    by_point: FloatArray
+    by_parameter: FloatArray
+    inside: NDArray[np.bool_]
+
+
+def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_mm: FloatArray, /) -> Moved:
+    """How points (n, 3) in the world move with the parameters of the cameras, in order, then of the projector.
+
+    Without a projector, a point is found by the first camera and the one that shares most of the points with it.
+    """
+    views = [_projected(camera, points_mm) for camera in cameras]
+    if projector is None:
+        return _by_two_cameras(cameras, views, points_mm)
+    light = _projected(projector, points_mm)
+    coordinate = 0 if triangulated_axis(cameras[0], projector) is Axis.COLUMN else 1
+    ray = points_mm - projector.centre_mm
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    weights = np.stack([np.where(view.inside, _squares(view.by_point, ray), 0.0) for view in views])
+    total = weights.sum(axis=0)
+    weights = weights / np.where(total > 0, total, 1.0)
+    by_parameter = np.zeros((len(points_mm), 3, _EACH * (len(cameras) + 1)))
+    noises = []
+    for index, (view, weight) in enumerate(zip(views, weights, strict=True)):
+        inverse = _inverses(np.concatenate([view.by_point, light.by_point[:, coordinate, None]], axis=1))
+        # A camera that does not see a point has no part in it, not even one that is not a number.
+        inverse = np.where(weight[:, None, None] > 0, inverse * weight[:, None, None], 0.0)
+        own = slice(_EACH * index, _EACH * (index + 1))
+        by_parameter[:, :, own] = -inverse[:, :, :2] @ np.nan_to_num(view.by_parameter)
+        by_parameter[:, :, -_EACH:] -= inverse[:, :, 2:] @ light.by_parameter[:, coordinate, None]
+        noises.append(inverse[:, :, 2])
+    return Moved(by_parameter, np.stack(noises, axis=2), light.inside & (total > 0))
+
+
+def triangulated_axis(camera: Pinhole, projector: Pinhole) -> Axis:
+    """The axis of patterns that a scan triangulates by: the one that the camera stands to the side of."""
+    beside, above, _ = projector.rotation @ camera.centre_mm + projector.translation_mm
+    return Axis.COLUMN if abs(beside) >= abs(above) else Axis.ROW
+
+
+def rigid_free(points_mm: FloatArray, fields: FloatArray, /) -> FloatArray:
+    """(n, 3, k): fields of displacement (n, 3, k), each without the rigid motion that is nearest to it.
+
+    A small rigid motion moves X by t + ω × X; t and ω are those that leave the least sum of squares.
+    """
+    from_middle = points_mm - points_mm.mean(axis=0)
+    scale = max(float(np.abs(from_middle).max()), 1e-300)
+    motions = np.zeros((len(points_mm), 3, 6))
+    motions[:, :, :3] = np.eye(3)
+    for axis in range(3):
+        motions[:, :, 3 + axis] = np.cross(np.eye(3)[axis], from_middle / scale)
+    flat = fields.reshape(3 * len(points_mm), -1)
+    basis, _ = np.linalg.qr(motions.reshape(-1, 6))
+    return np.asarray((flat - basis @ (basis.T @ flat)).reshape(fields.shape))
+
+
+def modes_of(covariance: FloatArray, /) -> FloatArray:
+    """(p, k): independent changes of the parameters by one standard deviation each: modes @ modes.T = covariance.
+
+    The parameters are divided by their deviations first: focal lengths and angles differ by many orders.
+    """
+    deviation = np.sqrt(np.clip(np.diagonal(covariance), 0, None))
+    known = deviation > 0
+    scaled = covariance[np.ix_(known, known)] / np.outer(deviation[known], deviation[known])
+    values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
+    kept = values > 0
+    modes = np.zeros((len(covariance), int(kept.sum())))
+    modes[known] = deviation[known, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return modes
+
+
+def _by_two_cameras(cameras: Sequence[Pinhole], views: list[_Projected], points_mm: FloatArray) -> Moved:
+    shared = [view.inside & views[0].inside for view in views[1:]]
+    other = 1 + int(np.argmax([each.sum() for each in shared]))
+    first, second = views[0], views[other]
+    ray = points_mm - cameras[0].centre_mm
+    along = _unit(np.einsum("nij,nj->ni", second.by_point, ray))
+    back = points_mm - cameras[other].centre_mm
+    across = _unit(np.einsum("nij,nj->ni", first.by_point, back))
+    third = np.einsum("ni,nij->nj", along, second.by_point)
+    inverse = _inverses(np.concatenate([first.by_point, third[:, None]], axis=1))
+    by_parameter = np.zeros((len(points_mm), 3, _EACH * len(cameras)))
+    by_parameter[:, :, :_EACH] = -inverse[:, :, :2] @ first.by_parameter
+    moved = np.einsum("ni,nip->np", along, second.by_parameter)
+    by_parameter[:, :, _EACH * other : _EACH * (other + 1)] = -inverse[:, :, 2:] * moved[:, None]
+    # A stripe is found with an error across it in either image.
+    own = np.einsum("nij,nj->ni", inverse[:, :, :2], across)
+    return Moved(by_parameter, np.stack([inverse[:, :, 2], own], axis=2), shared[other - 1])
+
+
+def _projected(device: Pinhole, points_mm: FloatArray) -> _Projected:
+    """Project points into a device, with the derivatives by the point and by the device's parameters."""
+    turned = points_mm @ device.rotation.T
+    x, y, z = (turned + device.translation_mm).T
+    before = z > 0
+    z = np.where(before, z, np.nan)
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = device.distortion
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
+    bent = np.stack(
+        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
+        axis=1,
+    )
+    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    by_x = np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, cross], axis=1)
+    by_y = np.stack([cross, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=1)
+    matrix = device.matrix[:2, :2]
+    pixel = bent @ matrix.T + device.matrix[:2, 2]
+    by_normalised = matrix @ np.stack([by_x, by_y], axis=2)
+    perspective = np.zeros((len(x), 2, 3))
+    perspective[:, 0, 0] = perspective[:, 1, 1] = 1 / z
+    perspective[:, 0, 2], perspective[:, 1, 2] = -x / z, -y / z
+    by_device = by_normalised @ perspective
+    by = np.zeros((len(x), 2, _EACH))
+    by[:, 0, 0], by[:, 1, 1] = bent[:, 0], bent[:, 1]
+    by[:, 0, 2] = by[:, 1, 3] = 1
+    lens = [
+        np.stack([x * r2, y * r2], axis=1),
+        np.stack([x * r2**2, y * r2**2], axis=1),
+        np.stack([2 * x * y, r2 + 2 * y * y], axis=1),
+        np.stack([r2 + 2 * x * x, 2 * x * y], axis=1),
+        np.stack([x * r2**3, y * r2**3], axis=1),
+    ]
+    by[:, :, 4:9] = matrix @ np.stack(lens, axis=2)
+    # R' X = R X + turn x (R X).
+    by[:, :, 9:12] = np.cross(turned[:, None, :], by_device)
+    by[:, :, 12:15] = by_device
+    inside = before & (pixel > -0.5).all(axis=1)
+    inside &= (pixel[:, 0] < device.size.width_px - 0.5) & (pixel[:, 1] < device.size.height_px - 0.5)
+    # Beyond the radius at which its distortion turns back a lens sees nothing, whatever the polynomial says there.
+    inside &= by_x[:, 0] * by_y[:, 1] - cross * cross > 0
+    return _Projected(pixel, by_device @ device.rotation, by, inside)
+
+
+def _squares(by_point: FloatArray, direction: FloatArray) -> FloatArray:
+    return np.asarray((np.einsum("nij,nj->ni", by_point, direction) ** 2).sum(axis=1))
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _inverses(matrices: FloatArray) -> FloatArray:
+    """(n, 3, 3): the inverses; NaN where there is none, or where a matrix is not finite."""
+    finite = np.flatnonzero(np.isfinite(matrices).all(axis=(1, 2)))
+    good = finite[np.abs(np.linalg.det(matrices[finite])) > 0]
+    result = np.full_like(matrices, np.nan)
+    result[good] = np.linalg.inv(matrices[good])
+    return result
