@@ -1,9 +1,10 @@
-"""The data folder: where scans lie, how they get there in one rename, and who may use it.
+"""The data folder: where scans and calibrations lie, how scans get there in one rename, and who may use it.
 
 DATA/lock            held by the one process that owns the folder; holds its process id
 DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
-DATA/.incoming/ID/   a scan being made; swept at the next start
+DATA/calibrations/   calibrations and their sessions: see `slrig.sessions.calibration_store`
+DATA/.incoming/ID/   a scan, a pose or a solve being made; swept at the next start
 DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work
 DATA/cache/          compiled kernels, where the package's own folder cannot be written
 """
@@ -39,7 +40,7 @@ class DataFolder:
         self.root = root.resolve()
         self._free = free
         with disk_errors(self.root):
-            for folder in (self.root, self.scans, self.incoming):
+            for folder in (self.root, self.scans, self.calibrations, self.incoming):
                 folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self.root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -61,8 +62,13 @@ class DataFolder:
         return self.root / "scans"
 
     @property
+    def calibrations(self) -> Path:
+        """Where calibrations lie."""
+        return self.root / "calibrations"
+
+    @property
     def incoming(self) -> Path:
-        """Where scans are made."""
+        """Where scans, and what belongs to calibrations, are made."""
         return self.root / ".incoming"
 
     @property
@@ -86,7 +92,7 @@ class DataFolder:
         free = self._free(self.root)
         if free < needed_bytes:
             message = (
-                f"This scan may need {needed_bytes / 1e6:.0f} MB in {self.root}, and {free / 1e6:.0f} MB are free. "
+                f"This may need {needed_bytes / 1e6:.0f} MB in {self.root}, and {free / 1e6:.0f} MB are free. "
                 "Delete scans that are no longer wanted (DELETE /scan/ID), or move the data folder to a larger disk."
             )
             raise StorageError(message)

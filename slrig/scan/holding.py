@@ -5,18 +5,20 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import structlog
 
+from slrig.bundle.calibration_file import check_calibration
 from slrig.bundle.description import MOST_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
-from slrig.errors import DeviceError, UnsupportedByDeviceError
-from slrig.model import PatternSequence, Size
+from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
+from slrig.model import Calibration, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
-from slrig.scan.faults import ScanFault, fault_of
+from slrig.scan.faults import UNEXPECTED, ScanFault, fault_of
 from slrig.scan.guarding import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
 from slrig.scan.plan import PatternPlan, ScanPlan
+from slrig.scan.positioning import GuardedPositioner
 
 _LAST_RESORT_S = 1.0
 
@@ -25,11 +27,29 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RigFacts:
-    """What an open rig declares about itself: data that any thread may read."""
+    """What an open rig declares about itself: data that any thread may read.
+
+    calibration : of the rig file, or of the head. positions : the poses that what moves the board can take, by name;
+    none where a person does.
+    """
 
     cameras: Mapping[str, CameraInfo]
     projector: ProjectorInfo
-    calibrated: bool
+    calibration: Calibration | None
+    positions: tuple[str, ...] = ()
+
+    @property
+    def sizes(self) -> Mapping[str, Size]:
+        """The extent of each camera's frames."""
+        return {name: camera.format.size for name, camera in self.cameras.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveCalibration:
+    """A calibration that takes the place of the rig's own. name : the id that it is on record by."""
+
+    name: str
+    calibration: Calibration
 
 
 @contextmanager
@@ -46,8 +66,11 @@ def driver_errors(rig: str) -> Iterator[None]:
 
 
 class HeldRig:
-    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `give_up` and
-    `darken_from_outside` belong to it.
+    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `active`, `misfit`,
+    `refuse_misfit`, `give_up` and `darken_from_outside` belong to it.
+
+    Whoever sets `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
+    for other devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
     """
 
     def __init__(self, name: str, open_rig: Callable[[], Rig], *, calls: Calls | None = None) -> None:
@@ -58,6 +81,7 @@ class HeldRig:
         self._bare: Rig | None = None
         self.facts: RigFacts | None = None
         self.fault: ScanFault | None = None
+        self.active: ActiveCalibration | None = None
         self._dropped = False
 
     def open(self) -> Rig:
@@ -68,17 +92,44 @@ class HeldRig:
             rig: Rig | None = None
             try:
                 rig = self.calls.make(f"rig '{self.name}'", OPEN, OPEN_LIMIT_S, self._opened)
-                cameras = {name: camera.info for name, camera in rig.cameras.items()}
-                self.facts = RigFacts(cameras, rig.projector.info, rig.calibration is not None)
+                self.facts = _facts(rig)
             except Exception as error:
                 self.fault = fault_of(error)
                 if rig is not None:
                     self._close(rig)
                 raise
-            self._rig, self._bare = guarded(rig, self.calls), rig
+            self._rig, self._bare = _guarded(rig, self.calls), rig
             self.calls.failure = None
             self.fault = None
-        return self._rig
+        active = self.active
+        if active is None:
+            return self._rig
+        return replace(self._rig, calibration=None if self.misfit(active) else active.calibration)
+
+    def misfit(self, active: ActiveCalibration) -> CalibrationError | None:
+        """Why a calibration cannot be used with the devices of this rig; None if it can, or before it was open."""
+        if self.facts is None:
+            return None
+        try:
+            source = f"calibration {active.name}"
+            check_calibration(active.calibration, self.facts.projector.size, self.facts.sizes, source)
+        except CalibrationError as error:
+            return error
+        return None
+
+    def refuse_misfit(self) -> None:
+        """Raise CalibrationError if the calibration in use is for other devices."""
+        active = self.active
+        error = None if active is None else self.misfit(active)
+        if error is not None:
+            message = f"{error}\nActivate another one (POST /calibration/ID/activate), or calibrate this rig."
+            raise CalibrationError(message)
+
+    def doubt(self, error: Exception) -> None:
+        """Let the rig go if an error leaves the state of its devices unknown; the next work opens them afresh."""
+        failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
+        if failed or fault_of(error).kind == UNEXPECTED:
+            self.let_go(error)
 
     def _opened(self) -> Rig:
         with driver_errors(self.name):
@@ -148,6 +199,17 @@ class HeldRig:
     def _close(self, rig: Rig) -> None:
         for fault in rig.close():
             _log.error("a device could not be closed in good order", rig=self.name, cause=repr(fault))
+
+
+def _facts(rig: Rig) -> RigFacts:
+    cameras = {name: camera.info for name, camera in rig.cameras.items()}
+    positions = () if rig.positioner is None else tuple(rig.positioner.poses)
+    return RigFacts(cameras, rig.projector.info, rig.calibration, positions)
+
+
+def _guarded(rig: Rig, calls: Calls) -> Rig:
+    positioner = None if rig.positioner is None else GuardedPositioner(rig.positioner, calls)
+    return replace(guarded(rig, calls), positioner=positioner)
 
 
 def pattern_sequence(plan: PatternPlan, size: Size) -> PatternSequence:

@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from slrig.api.app import create_app
 from slrig.api.security import digest
-from slrig.api.service import Service
+from slrig.api.service import assembled_service
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.scan.folder import DataFolder
 from slrig.scan.holding import HeldRig
@@ -20,6 +20,7 @@ from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
 from slrig.scan.worker import ReconstructionWorker
 from tests.unit.scan.fakes import WAIT_S, TameBench
+from tests.unit.sessions.calibration_bench import TameCalibrating
 
 KEY = "the key of the tests"
 
@@ -37,7 +38,10 @@ class ServedBench(TameBench):
         rig = HeldRig("bench", self.open_rig)
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
-        self.service = Service(settings, defaults, folder, store, runner)
+        self.tame = TameCalibrating(self)
+        self.service = assembled_service(
+            settings, defaults, folder, store, runner, rig_name="bench", calibration_tools=self.tame.tools()
+        )
         self.app: FastAPI = create_app(self.service, key_digest=digest(KEY))
 
     def held(self, client: TestClient) -> dict[str, Any]:

@@ -129,7 +129,7 @@ def facts(size: Size = SMALL, bit_depth: int = 8) -> RigFacts:
         "left", "", "", CameraFormat(size, bit_depth), frozenset({Trigger.SOFTWARE}), (0.001, 0.1), (1.0, 1.0)
     )
     projector = ProjectorInfo("projector", "", "", Size(128, 96), False, 0.0)
-    return RigFacts({"left": info, "right": replace(info, name="right")}, projector, True)
+    return RigFacts({"left": info, "right": replace(info, name="right")}, projector, None)
 
 
 def test_a_bracket_takes_as_many_bytes_as_it_has_exposures() -> None:

@@ -51,7 +51,7 @@ def test_held_rig_is_refused_by_the_name_of_its_holder(bench: Bench) -> None:
     started = bench.store.get(holder.id).started_at
     assert started is not None
     assert busy.value.since == started.isoformat(timespec="seconds")
-    assert bench.runner.status().holder == holder.id
+    assert bench.runner.status().holder == str(holder.id)
     bench.gate.set()
     bench.until(holder.id)
     assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED

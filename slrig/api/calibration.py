@@ -1,0 +1,241 @@
+"""/calibration: open a session, shoot its poses, solve it, have scans use it; list, import, compare, delete."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter, Body, Header, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+
+from slrig.api.calibration_schemas import (
+    CalibrationBody,
+    CalibrationList,
+    CalibrationRequest,
+    ComparisonBody,
+    PoseBody,
+    PoseRequestBody,
+    ScriptRequest,
+    board_of,
+    calibration_body,
+    calibration_summary,
+    comparison_body,
+    pose_body,
+)
+from slrig.api.openapi import problems
+from slrig.api.schemas import pattern_plan
+from slrig.api.service import Service, Serving
+from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
+from slrig.sessions.calibrating import EXPORTS
+from slrig.sessions.calibration_records import PoseRecord, PoseState, SessionRecord
+from slrig.sessions.calibration_store import REPORT
+from slrig.sessions.pose_shooting import PoseRequest
+
+IMPORT_PATH = "/calibration/import"
+MOST_IMPORT_BYTES = MOST_CALIBRATION_BYTES
+"""How long the body of an import may be: a covariance is longer than any other request."""
+
+_ENDINGS = {
+    "application/json": ".json",
+    "application/yaml": ".yml",
+    "application/x-yaml": ".yml",
+    "text/yaml": ".yml",
+    "application/xml": ".xml",
+    "text/xml": ".xml",
+}
+
+router = APIRouter(prefix="/calibration", tags=["calibration"])
+
+PoseNumber = int
+Key = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=255,
+        description="makes a repeat of this request return the first one's pose instead of shooting another; kept as "
+        "long as the calibration",
+    ),
+]
+Label = Annotated[str | None, Query(min_length=1, max_length=200, description="free text, to find it again")]
+
+
+def answered(service: Service, record: SessionRecord) -> CalibrationBody:
+    """A calibration as an answer."""
+    calibrations = service.calibrations
+    return calibration_body(
+        record,
+        active=calibrations.active,
+        files=ready_files(service, record),
+        last_event=calibrations.register.last_event(record.id),
+    )
+
+
+def ready_files(service: Service, record: SessionRecord) -> dict[str, str]:
+    """Name to URL path of each file of a calibration that can be fetched now."""
+    if not record.solve:
+        return {}
+    place = service.calibrations.store.solve(record.id, record.solve)
+    names = [*EXPORTS, *([REPORT] if (place / REPORT).is_file() else [])]
+    return {name: f"/calibration/{record.id}/{name}" for name in names}
+
+
+@router.post("", status_code=201, responses=problems(422, 507))
+def open_calibration(service: Serving, response: Response, request: CalibrationRequest) -> CalibrationBody:
+    """Open a calibration session for a board. Touches no device."""
+    patterns = pattern_plan(request.patterns, service.scan_defaults)
+    if request.patterns.rows is None:
+        patterns = replace(patterns, rows=True)
+    record = service.calibrations.open(board_of(request.board), label=request.label, patterns=patterns)
+    response.headers["Location"] = f"/calibration/{record.id}"
+    return answered(service, record)
+
+
+@router.get("", responses=problems(422))
+def list_calibrations(service: Serving, limit: Annotated[int, Query(ge=1, le=200)] = 50) -> CalibrationList:
+    """List calibrations from new to old, and say which one scans use."""
+    active = service.calibrations.active
+    shown = service.calibrations.latest()[:limit]
+    return CalibrationList(
+        calibrations=[calibration_summary(each, active=active, files=ready_files(service, each)) for each in shown],
+        active=active,
+    )
+
+
+@router.post(
+    "/import",
+    status_code=201,
+    responses=problems(415, 422, 507),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                name: {"schema": {"type": "string"}}
+                for name in ("application/json", "application/yaml", "application/xml")
+            },
+        }
+    },
+)
+async def import_calibration(
+    request: Request, service: Serving, response: Response, label: Label = None
+) -> CalibrationBody:
+    """Take in a calibration: slrig's JSON, or OpenCV FileStorage as YAML or XML. It can then be activated."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    ending = _ENDINGS.get(kind)
+    if ending is None:
+        message = (
+            f"Content-Type: expected one of {', '.join(_ENDINGS)}, found '{kind}'. Send the file as it is, with the "
+            "type that it has."
+        )
+        raise HTTPException(415, message)
+    text = await request.body()
+    record = await run_in_threadpool(service.calibrations.take_in, text, ending, label=label)
+    response.headers["Location"] = f"/calibration/{record.id}"
+    return await run_in_threadpool(answered, service, record)
+
+
+@router.get("/compare", responses=problems(404, 409, 422))
+def compare_calibrations(service: Serving, first: UUID, second: UUID) -> ComparisonBody:
+    """Compare two calibrations of one rig: each device's differences in their σ, and by how much points move."""
+    return comparison_body(first, second, service.calibrations.compare(first, second))
+
+
+@router.get("/{calibration_id}", responses=problems(404, 422))
+def look_at_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+    """Return a calibration: its poses with their answers, what is covered, what to move next, and what came of it."""
+    return answered(service, service.calibrations.register.get(calibration_id))
+
+
+@router.post("/{calibration_id}/pose", status_code=202, responses=problems(404, 409, 422, 429, 502, 503, 507))
+def shoot_pose(
+    service: Serving,
+    response: Response,
+    calibration_id: UUID,
+    request: Annotated[PoseRequestBody, Body(default_factory=PoseRequestBody)],
+    idempotency_key: Key = None,
+) -> PoseBody:
+    """Shoot a pose of the board. The answer comes at once; look at the pose for what was found."""
+    asked = PoseRequest(request.position, request.exposure_s, idempotency_key, fingerprint(request))
+    pose = service.calibrations.poses.shoot(calibration_id, asked, wait=request.if_busy == "queue")
+    return _accepted(service, response, calibration_id, pose)
+
+
+@router.post("/{calibration_id}/script", status_code=202, responses=problems(404, 409, 422, 429, 502, 503, 507))
+def shoot_script(
+    service: Serving,
+    response: Response,
+    calibration_id: UUID,
+    request: Annotated[ScriptRequest, Body(default_factory=ScriptRequest)],
+    idempotency_key: Key = None,
+) -> PoseBody:
+    """Have the positioner take its poses one after the other, and shoot each; return the first. Other work may come
+    between two of them. To stop, cancel the pose that is under way.
+    """
+    asked = PoseRequest(None, request.exposure_s, idempotency_key, fingerprint(request))
+    poses = service.calibrations.poses
+    pose = poses.script(calibration_id, request.positions, asked, wait=request.if_busy == "queue")
+    return _accepted(service, response, calibration_id, pose)
+
+
+def fingerprint(request: BaseModel) -> str:
+    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
+    return hashlib.sha256(f"{type(request).__name__} {request.model_dump_json()}".encode()).hexdigest()
+
+
+def _accepted(service: Service, response: Response, calibration_id: UUID, pose: PoseRecord) -> PoseBody:
+    """The pose as it was when it was made, so that a repeated request gets the same answer."""
+    first = PoseRecord(
+        pose.number, PoseState.QUEUED, pose.created_at, pose.position, pose.position_name, pose.exposure_s
+    )
+    body = pose_body(calibration_id, first, service.calibrations.register.get(calibration_id).cameras)
+    response.headers["Location"] = body.links.self
+    return body
+
+
+@router.get("/{calibration_id}/pose/{number}", responses=problems(404, 422))
+def look_at_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> PoseBody:
+    """Return a pose: its state, and what was found, or why it was refused and what to do."""
+    register = service.calibrations.register
+    pose = register.pose(calibration_id, number)
+    return pose_body(calibration_id, pose, register.get(calibration_id).cameras)
+
+
+@router.post("/{calibration_id}/pose/{number}/cancel", status_code=202, responses=problems(404, 422))
+def cancel_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> PoseBody:
+    """Ask a pose to end early, and with it the script that it is part of. May be repeated."""
+    pose = service.calibrations.poses.cancel(calibration_id, number)
+    return pose_body(calibration_id, pose, service.calibrations.register.get(calibration_id).cameras)
+
+
+@router.delete("/{calibration_id}/pose/{number}", status_code=204, responses=problems(404, 409, 422, 507))
+def drop_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> None:
+    """Drop a pose with its frames. The next solve does without it."""
+    service.calibrations.poses.drop(calibration_id, number)
+
+
+@router.post("/{calibration_id}/solve", status_code=202, responses=problems(404, 409, 422, 507))
+def solve_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+    """Solve the calibration from its accepted poses. The answer comes at once; `progress` tells how far it is."""
+    return answered(service, service.calibrations.solves.solve(calibration_id))
+
+
+@router.post("/{calibration_id}/activate", responses=problems(404, 409, 422, 507))
+def activate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+    """Have the scans that follow use this calibration in place of the rig's own, after a restart too."""
+    return answered(service, service.calibrations.activate(calibration_id))
+
+
+@router.post("/{calibration_id}/deactivate", responses=problems(404, 409, 422, 507))
+def deactivate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+    """Have the scans that follow use the rig's own calibration again."""
+    return answered(service, service.calibrations.deactivate(calibration_id))
+
+
+@router.delete("/{calibration_id}", status_code=204, responses=problems(404, 409, 422, 507))
+def delete_calibration(service: Serving, calibration_id: UUID) -> None:
+    """Delete a calibration with all its poses. The one in use is refused."""
+    service.calibrations.delete(calibration_id)

@@ -1,0 +1,318 @@
+"""What requests of a calibration may say and what answers hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from pydantic import BaseModel, Field
+
+from slrig.api.problems import fault_problem
+from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, Strict
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.comparison import Comparison, Difference
+from slrig.scan.plan import PatternPlan
+from slrig.sessions.calibration_records import PoseRecord, PoseState, SessionRecord, SessionState, plain
+
+Millimetres = Annotated[float, Field(gt=0, le=1000)]
+CornerCount = Annotated[int, Field(ge=3, le=60)]
+IfBusy = Literal["reject", "queue"]
+
+
+class BoardRequest(Strict):
+    """The board that is printed: see `slrig calibrate board`."""
+
+    kind: Annotated[BoardKind, Field(strict=False)]
+    corners: Annotated[
+        list[CornerCount],
+        Field(min_length=2, max_length=2, description="inner corners (circles), columns then rows"),
+    ]
+    square_mm: Millimetres = Field(
+        description="side of a square as measured on the print; of circles, the distance of two neighbouring rows"
+    )
+    marker_mm: Millimetres | None = Field(default=None, description="of a ChArUco board. Default 0.75 of square_mm")
+    dictionary: Annotated[str, Field(min_length=1, max_length=64)] | None = Field(
+        default=None, description="of a ChArUco board's markers, by OpenCV's name. Default DICT_5X5_250"
+    )
+
+
+class CalibrationRequest(Strict):
+    """A calibration session."""
+
+    board: BoardRequest
+    label: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    patterns: PatternRequest = Field(
+        default_factory=PatternRequest,
+        description="what each pose is lit with. Default: as the rig file says, with both axes",
+    )
+
+
+class PoseRequestBody(Strict):
+    """A pose. An empty request shoots the board where it is held."""
+
+    position: Annotated[int, Field(ge=0, le=10_000)] | Annotated[str, Field(min_length=1, max_length=200)] | None = (
+        Field(
+            default=None, description="of the positioner, by its number from 0 or its name. Default: a person holds it"
+        )
+    )
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = Field(
+        default=None, description="of every camera, seconds. Default: as the rig file says per camera"
+    )
+    if_busy: IfBusy = Field(
+        default="reject", description="what to do while the rig is held: answer 409, or wait in line"
+    )
+
+
+class ScriptRequest(Strict):
+    """Poses of the positioner, one after the other. An empty request shoots all of them."""
+
+    positions: Annotated[
+        list[Annotated[int, Field(ge=0, le=10_000)] | Annotated[str, Field(min_length=1, max_length=200)]],
+        Field(max_length=1000),
+    ] = Field(default_factory=list, description="by number from 0 or by name. Default: all, in their order")
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None
+    if_busy: IfBusy = "reject"
+
+
+class PoseLinks(BaseModel):
+    """Where to go from a pose."""
+
+    self: str
+    events: str
+    cancel: str
+    pictures: dict[str, str] = Field(description="by camera: the white frame, with the corners that were found")
+
+
+class PoseBody(BaseModel):
+    """A pose of a session."""
+
+    number: int
+    name: str
+    state: PoseState
+    created_at: datetime
+    position: int | None
+    position_name: str | None
+    exposure_s: float | None
+    answer: dict[str, Any] | None = Field(
+        description="by camera: corners found, share of the image filled, tilt, distance, sharpness, saturation, "
+        "movement; and warnings in words"
+    )
+    error: FaultBody = Field(description="why it was refused, and what to do")
+    seconds: float | None = Field(description="from the last frame to the answer")
+    links: PoseLinks
+
+
+class CalibrationLinks(BaseModel):
+    """Where to go from a calibration. `files` holds those that are ready."""
+
+    self: str
+    events: str
+    pose: str
+    solve: str
+    activate: str
+    coverage: dict[str, str] = Field(description="by device: a picture of what is covered, and where to go next")
+    files: dict[str, str]
+
+
+class BoardBody(BaseModel):
+    """The board of a session."""
+
+    kind: BoardKind
+    corners: tuple[int, int]
+    square_mm: float
+    marker_mm: float | None
+    dictionary: str | None
+    title: str
+
+
+class CalibrationSummary(BaseModel):
+    """A calibration, as a list shows it."""
+
+    id: UUID
+    state: SessionState
+    label: str | None
+    rig: str
+    created_at: datetime
+    solved_at: datetime | None
+    imported: bool
+    active: bool = Field(description="scans use it")
+    poses: int = Field(description="those that were accepted")
+    verdict: str | None = Field(description="of the last solve, in a sentence")
+    links: CalibrationLinks
+
+
+class CalibrationBody(CalibrationSummary):
+    """A calibration session with its poses and what came of them."""
+
+    board: BoardBody | None
+    patterns: PatternPlan
+    shot: list[PoseBody] = Field(description="every pose, refused and failed ones too")
+    script: list[int] = Field(description="positions of the positioner that are still to be taken")
+    coverage: dict[str, Any] | None = Field(
+        description="by device: a 6 x 6 grid of how many poses were seen where, depths, tilts and turns; and what is "
+        "still missing, in words"
+    )
+    next_move: dict[str, Any] | None = Field(description="what to move next, and why")
+    progress: ProgressBody | None = Field(description="of what is under way")
+    error: FaultBody = Field(description="why the last solve failed")
+    result: dict[str, Any] | None = Field(
+        description="of the last solve that went well: devices with rms and values, each with its standard deviation; "
+        "the expected error in mm; the verdict and why"
+    )
+    last_event: int = Field(description="to follow `links.events` from here: send it as Last-Event-ID")
+
+
+class CalibrationList(BaseModel):
+    """Calibrations from new to old."""
+
+    calibrations: list[CalibrationSummary]
+    active: UUID | None = Field(description="the one that scans use; null where it is the rig's own")
+
+
+class DifferenceBody(BaseModel):
+    """Second minus first, and its standard deviation; null where either says nothing of its own error."""
+
+    value: float
+    sigma: float | None
+    sigmas: float | None = Field(description="the size of the difference in its standard deviation")
+    words: str
+
+
+class DeviceDifferenceBody(BaseModel):
+    """What differs of one device; the last two are null for the first camera, which both start from."""
+
+    focal_percent: DifferenceBody
+    principal_px: DifferenceBody
+    rotation_deg: DifferenceBody | None
+    baseline_mm: DifferenceBody | None
+
+
+class ComparisonBody(BaseModel):
+    """Two calibrations, compared."""
+
+    first: UUID
+    second: UUID
+    devices: dict[str, DeviceDifferenceBody]
+    missing: list[str] = Field(description="devices that only one of them has")
+    moved_rms_mm: float | None = Field(description="by how much points in the volume move; null without a volume")
+    moved_most_mm: float | None
+    words: list[str]
+
+
+def board_of(request: BoardRequest) -> Board:
+    """The board that a request means. Raises CalibrationError."""
+    columns, rows = request.corners
+    return Board(request.kind, columns, rows, request.square_mm, request.marker_mm, request.dictionary)
+
+
+def pose_body(session_id: UUID, pose: PoseRecord, cameras: Mapping[str, object]) -> PoseBody:
+    """A pose as an answer; `cameras` are those of the session."""
+    here = f"/calibration/{session_id}/pose/{pose.number}"
+    shown = pose.state in {PoseState.ACCEPTED, PoseState.REFUSED}
+    pictures = {name: f"{here}/picture.png?camera={name}" for name in cameras} if shown else {}
+    return PoseBody(
+        number=pose.number,
+        name=pose.name,
+        state=pose.state,
+        created_at=pose.created_at,
+        position=pose.position,
+        position_name=pose.position_name,
+        exposure_s=pose.exposure_s,
+        answer=None if pose.answer is None else dict(pose.answer),
+        error=None if pose.fault is None else fault_problem(pose.fault),
+        seconds=pose.seconds,
+        links=PoseLinks(
+            self=here, events=f"/calibration/{session_id}/events", cancel=f"{here}/cancel", pictures=pictures
+        ),
+    )
+
+
+def calibration_summary(record: SessionRecord, *, active: UUID | None, files: Mapping[str, str]) -> CalibrationSummary:
+    """A calibration as a list shows it; `files` maps the names of those that are ready to their paths."""
+    return CalibrationSummary(**_summary(record, active, files))
+
+
+def calibration_body(
+    record: SessionRecord, *, active: UUID | None, files: Mapping[str, str], last_event: int
+) -> CalibrationBody:
+    """A calibration as an answer."""
+    return CalibrationBody(
+        **_summary(record, active, files),
+        board=None if record.board is None else _board(record.board),
+        patterns=record.patterns,
+        shot=[pose_body(record.id, pose, record.cameras) for pose in record.poses],
+        script=list(record.script),
+        coverage=None if record.coverage is None else dict(record.coverage),
+        next_move=None if record.next_move is None else dict(record.next_move),
+        progress=None if record.progress is None else ProgressBody(**record.progress.as_json()),
+        error=None if record.fault is None else fault_problem(record.fault),
+        result=None if record.result is None else dict(record.result),
+        last_event=last_event,
+    )
+
+
+def comparison_body(first: UUID, second: UUID, found: Comparison) -> ComparisonBody:
+    """A comparison as an answer."""
+    return ComparisonBody(
+        first=first,
+        second=second,
+        devices={
+            name: DeviceDifferenceBody(
+                focal_percent=_difference(each.focal_percent),
+                principal_px=_difference(each.principal_px),
+                rotation_deg=None if each.rotation_deg is None else _difference(each.rotation_deg),
+                baseline_mm=None if each.baseline_mm is None else _difference(each.baseline_mm),
+            )
+            for name, each in found.devices.items()
+        },
+        missing=list(found.missing),
+        moved_rms_mm=plain(found.moved_rms_mm),
+        moved_most_mm=plain(found.moved_most_mm),
+        words=list(found.words),
+    )
+
+
+def _summary(record: SessionRecord, active: UUID | None, files: Mapping[str, str]) -> dict[str, Any]:
+    here = f"/calibration/{record.id}"
+    devices = [*record.cameras, *(["projector"] if record.projector is not None else [])]
+    verdict = (record.result or {}).get("verdict") or {}
+    return {
+        "id": record.id,
+        "state": record.state,
+        "label": record.label,
+        "rig": record.rig,
+        "created_at": record.created_at,
+        "solved_at": record.solved_at,
+        "imported": record.board is None,
+        "active": active == record.id,
+        "poses": len(record.accepted),
+        "verdict": verdict.get("summary"),
+        "links": CalibrationLinks(
+            self=here,
+            events=f"{here}/events",
+            pose=f"{here}/pose",
+            solve=f"{here}/solve",
+            activate=f"{here}/activate",
+            coverage={
+                name: f"{here}/coverage.png?device={name}" for name in (devices if record.board is not None else ())
+            },
+            files=dict(files),
+        ),
+    }
+
+
+def _board(board: Board) -> BoardBody:
+    return BoardBody(
+        kind=board.kind,
+        corners=(board.columns, board.rows),
+        square_mm=board.square_mm,
+        marker_mm=board.marker_mm,
+        dictionary=board.dictionary,
+        title=board.title,
+    )
+
+
+def _difference(found: Difference) -> DifferenceBody:
+    return DifferenceBody(value=found.value, sigma=plain(found.sigma), sigmas=plain(found.sigmas), words=found.words)

@@ -1,0 +1,146 @@
+"""A scan on the rig: captured, reconstructed, put in its place, and ended in one final state whatever happens."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import structlog
+
+from slrig.errors import ScanCancelledError, SlrigError
+from slrig.scan.endings import Ending, Endings
+from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
+from slrig.scan.folder import DataFolder, sync_tree
+from slrig.scan.holding import HeldRig, check_plan, driver_errors
+from slrig.scan.records import ScanRecord, ScanState, report_summary
+from slrig.scan.store import ProgressRecorder, ScanStore
+from slrig.scan.work import CaptureBundle, Holder
+from slrig.scan.worker import Job, ReconstructionWorker
+
+CAPTURE_SHARE = 0.5
+"""The part of a scan's progress that is capture."""
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanTools:
+    """What every scan is made with. `spare_bytes` are left free on the disk; `ending` tells that the service ends."""
+
+    store: ScanStore
+    folder: DataFolder
+    worker: ReconstructionWorker
+    capture: CaptureBundle
+    endings: Endings
+    spare_bytes: int
+    ending: Callable[[], bool]
+
+
+class ScanWalk:
+    """One scan that waits or is under way. Implements `slrig.scan.lending.Task`."""
+
+    def __init__(self, record: ScanRecord, tools: ScanTools) -> None:
+        self.id = record.id
+        self.holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
+        self.since = record.created_at
+        self.stop = threading.Event()
+        self._plan = record.plan
+        self._tools = tools
+        self._ending = Ending(record.id, ScanState.FAILED, fault_of(RuntimeError()))
+
+    def run(self, held: HeldRig) -> None:
+        """See `Task`."""
+        self._tools.endings.settle()
+        self._ending = self._ended(held)
+
+    def clear_up(self) -> None:
+        """See `Task`."""
+        if self._ending.state is not ScanState.SUCCEEDED:
+            self._keep_evidence(self._ending.state)
+        self._tools.worker.start()
+
+    def conclude(self) -> None:
+        """See `Task`."""
+        self._tools.endings.add(self._ending)
+
+    def cut_off(self, error: SlrigError) -> None:
+        """See `Task`."""
+        state = ScanState.FAILED
+        if isinstance(error, ScanInterruptedError):
+            state = ScanState.INTERRUPTED
+        elif isinstance(error, ScanCancelledError) or self.stop.is_set():
+            state = ScanState.CANCELLED
+        self._tools.endings.add(Ending(self.id, state, fault_of(error)))
+
+    def settle(self) -> None:
+        """See `Task`."""
+        self._tools.endings.settle()
+
+    def _ended(self, held: HeldRig) -> Ending:
+        log = _log.bind(scan=str(self.id))
+        state, summary, fault = ScanState.FAILED, None, None
+        try:
+            summary = self._walk(held)
+            state = ScanState.SUCCEEDED
+        except Exception as error:
+            fault = self._told(error)
+            if self._tools.ending():
+                state, fault = ScanState.INTERRUPTED, fault_of(interruption())
+            elif isinstance(error, ScanCancelledError):
+                state = ScanState.CANCELLED
+            elif fault.kind == UNEXPECTED:
+                log.exception("scan failed", kind=fault.kind)
+            else:
+                log.warning("scan failed", kind=fault.kind, cause=fault.message)
+        return Ending(self.id, state, fault, summary)
+
+    def _told(self, error: Exception) -> ScanFault:
+        # The staging folder is gone when the message is read: what it names is then the scan's own bundle.
+        fault = fault_of(error)
+        return ScanFault(fault.kind, fault.message.replace(f"{self._tools.folder.staging(self.id)}/", ""))
+
+    def _walk(self, held: HeldRig) -> Mapping[str, Any]:
+        tools = self._tools
+        progress = ProgressRecorder(tools.store, self.id, hidden=f"{tools.folder.staging(self.id)}/")
+        self.since = tools.store.advance(self.id, ScanState.CAPTURING)
+        rig = held.open()
+        held.refuse_misfit()
+        if held.facts is not None:
+            tools.folder.require_space(2 * check_plan(self._plan, held.facts) + tools.spare_bytes)
+        staged = tools.folder.stage(self.id)
+        bundle = staged / "bundle"
+        progress.span(0.0, CAPTURE_SHARE)
+        feed = tools.worker.feed()
+        try:
+            with driver_errors(held.name):
+                tools.capture(rig, self._plan, bundle, progress=progress, cancelled=self.stop.is_set, frames=feed)
+        except Exception as error:
+            feed.abandon()
+            held.doubt(error)
+            raise
+        held.darken()
+        with disk_errors(staged):
+            sync_tree(bundle)
+        if self.stop.is_set():
+            feed.abandon()
+            message = "The scan was cancelled."
+            raise ScanCancelledError(message)
+        tools.store.advance(self.id, ScanState.RECONSTRUCTING)
+        progress.span(CAPTURE_SHARE, 1.0)
+        job = Job(bundle, staged / "result", self._plan.reconstruction)
+        report = tools.worker.run(job, progress=progress, cancelled=self.stop.is_set, feed=feed)
+        tools.folder.commit(self.id)
+        return report_summary(report)
+
+    def _keep_evidence(self, state: ScanState) -> None:
+        """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
+        folder = self._tools.folder
+        try:
+            if state is not ScanState.CANCELLED and (folder.staging(self.id) / "bundle").is_dir():
+                folder.keep_bundle(self.id)
+        except Exception:  # noqa: BLE001 - see below
+            # The scan's own fault is the one to tell; without its bundle it is told all the same.
+            _log.exception("the bundle of a failed scan could not be kept", scan=str(self.id))
+        folder.discard(self.id)

@@ -1,0 +1,102 @@
+"""/acceptance over a tame rig: opened, measured, refused, fetched."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from slrig.api import acceptance as router_module
+from slrig.api.problems import install_problems
+from slrig.api.service import _of_request
+from slrig.sessions.acceptance_desk import AcceptanceDesk
+from tests.unit.sessions.test_acceptance import RIG
+from tests.unit.sessions.test_acceptance_desk import PLAN, TameLender, desk, lender
+
+__all__ = ["desk", "lender"]
+
+EXACT = {
+    "sphere": {"value_mm": 30, "uncertainty_mm": 0.001},
+    "bar": {"value_mm": 110, "uncertainty_mm": 0.002},
+    "plane_mm": [160, 110],
+    "sphere_form_mm": 0.001,
+    "plane_form_mm": 0.002,
+}
+VOLUME = [[-100, -75, -40], [100, 75, 40]]
+
+
+@pytest.fixture
+def client(desk: AcceptanceDesk) -> TestClient:
+    app = FastAPI()
+    app.include_router(router_module.router)
+    install_problems(app)
+    app.dependency_overrides[_of_request] = lambda: SimpleNamespace(acceptance=desk)
+    return TestClient(app)
+
+
+def test_a_test_is_opened_and_says_what_to_do_first(client: TestClient) -> None:
+    answer = client.post("/acceptance", json={"artefacts": EXACT, "volume_mm": VOLUME, "repeats": 2})
+    assert answer.status_code == 201
+    body = answer.json()
+    assert client.get(answer.headers["location"]).json() == body
+    assert (body["captures"], body["captures_done"], body["state"]) == (26, 0, "open")
+    assert body["next"]["words"] == "Put the sphere in the middle of the volume."
+    assert len(body["positions"]) == 23
+
+
+def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
+    client: TestClient, desk: AcceptanceDesk, tmp_path: Path
+) -> None:
+    test = desk.open(lambda _: PLAN)
+    path = f"/acceptance/{test.id}"
+    early = client.get(f"{path}/report.json")
+    assert (early.status_code, early.json()["type"]) == (409, "/problems/artefact-not-ready")
+    first = client.post(f"{path}/position").json()
+    assert first["captures_done"] == PLAN.repeats
+    assert set(first["readings"][0]["errors_mm"]) == {"PF", "PS"}
+    client.post(f"{path}/position", json={"scripted": True})
+    body = client.get(path).json()
+    assert (body["state"], body["decision"], body["next"]) == ("finished", "passes", None)
+    assert client.get(body["files"]["report.json"]).json()["decision"] == "passes"
+    assert "No conformity" in client.get(body["files"]["report.html"]).text
+    assert client.post(f"{path}/position").status_code == 409
+    assert (tmp_path / "acceptance" / str(test.id) / "points").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({"artefacts": {**EXACT, "sphere": {"value_mm": 3, "uncertainty_mm": 0}}}, "expected a diameter of"),
+        ({"artefacts": {**EXACT, "sphere": {"value_mm": 30}}}, "uncertainty_mm"),
+        ({"artefacts": EXACT, "volume_mm": VOLUME[::-1]}, "least corner"),
+        ({"repeats": 0}, "repeats"),
+        ({"colour": "red"}, "colour"),
+    ],
+)
+def test_what_cannot_be_tested_is_refused(client: TestClient, body: dict[str, object], words: str) -> None:
+    answer = client.post("/acceptance", json={"volume_mm": VOLUME, **body})
+    assert answer.status_code == 422
+    assert words in answer.text
+
+
+def test_a_held_rig_answers_409_and_an_unknown_test_404(
+    client: TestClient, desk: AcceptanceDesk, lender: TameLender
+) -> None:
+    test = desk.open(lambda _: PLAN)
+    lender.busy = True
+    answer = client.post(f"/acceptance/{test.id}/position")
+    assert (answer.status_code, answer.json()["holder"]) == (409, "1")
+    assert client.get("/acceptance/00000000-0000-0000-0000-000000000000").status_code == 404
+    assert client.post(f"/acceptance/{test.id}/cancel").json()["state"] == "cancelled"
+
+
+def test_exact_artefacts_are_refused_on_metal(client: TestClient) -> None:
+    assert RIG.solved is None
+    opened = client.post("/acceptance", json={"volume_mm": VOLUME}).json()
+    client.post(f"/acceptance/{opened['id']}/position", json={"scripted": True})
+    error = client.get(f"/acceptance/{opened['id']}").json()["error"]
+    assert error["status"] == 422
+    assert "exact artefacts are those of a rendered rig" in error["detail"]
