@@ -109,6 +109,16 @@ class ServiceClient:
         with self._reaching():
             return _content(self._http.get(path))
 
+    def post(self, path: str, request: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Send a request that may be repeated without harm, and return the JSON answer. Raises ServiceError."""
+        with self._reaching():
+            return _content(self._http.post(path, json=None if request is None else dict(request)))
+
+    def delete_at(self, path: str) -> None:
+        """Delete what is at a path. Raises ServiceError."""
+        with self._reaching():
+            _refuse_problem(self._http.delete(path))
+
     def cancel(self, scan: Mapping[str, Any]) -> None:
         """Ask a scan to stop. Raises ServiceError."""
         with self._reaching():
@@ -116,8 +126,7 @@ class ServiceClient:
 
     def delete(self, scan: Mapping[str, Any]) -> None:
         """Delete a finished scan. Raises ServiceError."""
-        with self._reaching():
-            _refuse_problem(self._http.delete(scan["links"]["self"]))
+        self.delete_at(scan["links"]["self"])
 
     def follow(self, scan: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         """Yield what happens to a scan, from its first event to its last, whatever happens to the connection.

@@ -13,6 +13,8 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
+from slrig.cli import calibrate, schedule
+from slrig.cli.options import USUAL_URL, KeyFile, Url
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -41,11 +43,9 @@ app = typer.Typer(
     help="Structured-light scanning: from a projector and cameras to a triangle mesh in millimetres.",
     epilog="Start with: slrig demo",
 )
+app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(schedule.app, name="schedule")
 
-Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")]
-KeyFile = Annotated[
-    Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
-]
 KeepHoles = Annotated[
     bool | None,
     typer.Option("--keep-holes/--close-holes", help="Leave gaps within a stripe open, or close them (default)."),
@@ -79,9 +79,6 @@ class WatchedBy(StrEnum):
 
     FREE = "free"
     SOFTWARE = "software"
-
-
-USUAL_URL = "http://127.0.0.1:8731"
 
 
 @app.command()

@@ -1,0 +1,223 @@
+"""`slrig calibrate`: print a board, walk through its poses, solve them, and look after what came of it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from slrig.cli.options import USUAL_URL, KeyFile, Url
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Calibrate a rig, and say in millimetres how good it is.",
+    epilog="Start with: slrig calibrate board, then slrig calibrate run.",
+)
+
+
+class BoardName(StrEnum):
+    """What is printed on the board."""
+
+    CHARUCO = "charuco"
+    CHESSBOARD = "chessboard"
+    CIRCLES = "circles"
+
+
+CalibrationId = Annotated[str, typer.Argument(help="Id of the calibration, or the beginning of it that no other has.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Kind = Annotated[BoardName | None, typer.Option("--board", help="What is printed on the board.")]
+Corners = Annotated[
+    str | None, typer.Option(help="Inner corners across x down, as 11x8; of circles, those of one row x rows.")
+]
+SquareMm = Annotated[
+    float | None,
+    typer.Option(help="Side of a square, mm, measured on the print; of circles, the distance of two rows."),
+]
+MarkerMm = Annotated[
+    float | None, typer.Option(help="Side of a marker of a ChArUco board, mm. Default: 0.75 of the square.")
+]
+Dictionary = Annotated[
+    str | None, typer.Option(help="Markers of a ChArUco board, by OpenCV's name. Default DICT_5X5_250.")
+]
+
+
+@app.command()
+def board(
+    output: Annotated[Path, typer.Option(help="File for the page: .pdf or .svg.")],
+    kind: Kind = None,
+    corners: Corners = None,
+    square_mm: SquareMm = None,
+    marker_mm: MarkerMm = None,
+    dictionary: Dictionary = None,
+    page: Annotated[
+        str, typer.Option(help="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm.")
+    ] = "A4",
+) -> None:
+    """Write a board to print, in true size, with scales to check the printer by."""
+    from slrig.cli.calibrate_board import write_board
+
+    write_board(_board(kind, corners, square_mm, marker_mm, dictionary), output, page=page)
+
+
+@app.command()
+def solve(
+    folder: Annotated[Path, typer.Argument(help="Folder with one bundle per pose, each a folder with bundle.json.")],
+    output: Annotated[Path, typer.Option(help="File for the calibration: .json, or OpenCV's .yml or .xml.")],
+    kind: Kind = None,
+    corners: Corners = None,
+    square_mm: SquareMm = None,
+    marker_mm: MarkerMm = None,
+    dictionary: Dictionary = None,
+    report: Annotated[Path | None, typer.Option(help="Write the report, one HTML page with pictures, as well.")] = None,
+    earlier: Annotated[
+        Path | None, typer.Option(help="Calibration of the same rig: is the board's size what it was then?")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate from recorded poses. Needs no service and no rig."""
+    from slrig.cli.calibrate_solve import solve_folder
+
+    chosen = _board(kind, corners, square_mm, marker_mm, dictionary)
+    solve_folder(folder, chosen, output, report=report, earlier=earlier, as_json=as_json)
+
+
+@app.command()
+def run(
+    kind: Kind = None,
+    corners: Corners = None,
+    square_mm: SquareMm = None,
+    marker_mm: MarkerMm = None,
+    dictionary: Dictionary = None,
+    resume: Annotated[str | None, typer.Option("--id", help="Take up a session again that was left.")] = None,
+    scripted: Annotated[
+        bool,
+        typer.Option("--scripted", help="Have the rig's positioner take its poses one after the other, and solve."),
+    ] = False,
+    position: Annotated[
+        list[str] | None, typer.Option(help="With --scripted: a pose of the positioner, by name; may be repeated.")
+    ] = None,
+    activate: Annotated[bool, typer.Option("--activate", help="With --scripted: have scans use the result.")] = False,
+    label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
+    exposure_s: Annotated[
+        float | None, typer.Option(help="Exposure of every camera, seconds. Default: as the rig file says.")
+    ] = None,
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+) -> None:
+    """Walk through a calibration with a running service: shoot, be told what to move and why, solve."""
+    from slrig.cli.calibrate_stored import whole_id
+    from slrig.cli.calibrate_walk import opened, walk
+
+    chosen = None if resume is not None else _board(kind, corners, square_mm, marker_mm, dictionary)
+    with _client(url, key_file) as client:
+        session = (
+            opened(client, chosen, label=label)
+            if chosen is not None
+            else client.get(f"/calibration/{whole_id(client, str(resume))}")
+        )
+        walk(client, session, scripted=scripted, positions=position or (), activate=activate, exposure_s=exposure_s)
+
+
+@app.command(name="list")
+def list_stored(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
+    """List the calibrations that a service keeps, from new to old."""
+    from slrig.cli.calibrate_stored import list_calibrations
+
+    with _client(url, key_file) as client:
+        list_calibrations(client, as_json=as_json)
+
+
+@app.command()
+def show(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
+    """Show how good a calibration is, or what its poses still lack."""
+    from slrig.cli.calibrate_stored import show_calibration
+
+    with _client(url, key_file) as client:
+        show_calibration(client, calibration, as_json=as_json)
+
+
+@app.command()
+def compare(
+    first: CalibrationId,
+    second: CalibrationId,
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what a second calibration says otherwise than a first, and by how much points move for it."""
+    from slrig.cli.calibrate_stored import compare_calibrations
+
+    with _client(url, key_file) as client:
+        compare_calibrations(client, first, second, as_json=as_json)
+
+
+@app.command()
+def activate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+    """Have scans use a calibration from now on."""
+    from slrig.cli.calibrate_stored import activate_calibration
+
+    with _client(url, key_file) as client:
+        activate_calibration(client, calibration)
+
+
+@app.command()
+def deactivate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+    """Have scans use the rig's own calibration again."""
+    from slrig.cli.calibrate_stored import deactivate_calibration
+
+    with _client(url, key_file) as client:
+        deactivate_calibration(client, calibration)
+
+
+@app.command()
+def export(
+    calibration: CalibrationId,
+    file: Annotated[Path, typer.Argument(help="File to write: .json, OpenCV's .yml or .xml, or the report as .html.")],
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+) -> None:
+    """Write a calibration that a service keeps into a file."""
+    from slrig.cli.calibrate_stored import export_calibration
+
+    with _client(url, key_file) as client:
+        export_calibration(client, calibration, file)
+
+
+@app.command(name="import")
+def take_in(
+    file: Annotated[Path, typer.Argument(help="Calibration: slrig's .json, or OpenCV's .yml or .xml.")],
+    label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+) -> None:
+    """Give a service a calibration that was found elsewhere."""
+    from slrig.cli.calibrate_stored import import_calibration
+
+    with _client(url, key_file) as client:
+        import_calibration(client, file, label=label)
+
+
+def _client(url: str, key_file: Path | None) -> Any:
+    from slrig.cli.client import ServiceClient, read_key
+
+    return ServiceClient(url, read_key(key_file))
+
+
+def _board(
+    kind: BoardName | None,
+    corners: str | None,
+    square_mm: float | None,
+    marker_mm: float | None,
+    dictionary: str | None,
+) -> Any:
+    from slrig.cli.board_options import board_option
+    from slrig.errors import CalibrationError
+
+    if kind is None or corners is None or square_mm is None:
+        given = {"--board": kind, "--corners": corners, "--square-mm": square_mm}
+        missing = ", ".join(name for name, value in given.items() if value is None)
+        message = f"Which board? Missing: {missing}. Say, for example: --board charuco --corners 11x8 --square-mm 12"
+        raise CalibrationError(message)
+    return board_option(kind.value, corners, square_mm, marker_mm, dictionary)

@@ -1,0 +1,269 @@
+"""`slrig calibrate solve`: a folder with one bundle per pose becomes a calibration, in this process."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+
+from slrig.bundle import read_calibration, write_calibration, write_opencv_calibration
+from slrig.bundle.storage import write_file
+from slrig.calibration.board import Board
+from slrig.calibration.pose_checks import check_same_devices
+from slrig.calibration.solution import PROJECTOR
+from slrig.cli.calibration_screen import tell_result
+from slrig.cli.display import ProgressDisplay, progress_shown
+from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
+from slrig.model import Calibration, Size
+from slrig.scan.worker import prepare_kernel_cache
+from slrig.sessions.pose_frames import bundle_device_sizes
+
+if TYPE_CHECKING:
+    from slrig.sessions.calibration_solving import CalibrationResult, ReadPose
+    from slrig.sessions.calibration_tools import Setting
+
+DESCRIPTION = "bundle.json"
+ENDINGS = (".json", ".yml", ".yaml", ".xml")
+_READING_SHARE = 0.5
+_MOST_TOLD = 5
+
+
+@dataclass(slots=True)
+class Readings:
+    """What was read. refused : by pose, why it was left out; remarks : by pose, what could be better about it."""
+
+    poses: list[ReadPose] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+    remarks: dict[str, Sequence[str]] = field(default_factory=dict)
+
+
+def solve_folder(
+    folder: Path, board: Board, output: Path, *, report: Path | None, earlier: Path | None, as_json: bool
+) -> None:
+    """Read the poses, solve, print how good the calibration is, and write it and its report.
+
+    earlier : file of a calibration of the same devices, to compare the scale with.
+
+    Raises
+    ------
+    ConfigError
+        The output cannot be written: another ending, or no such folder.
+    BundleError
+        There are no bundles in the folder.
+    CalibrationError
+        The poses are of different rigs, or the earlier calibration cannot be read.
+    PoseRefusedError
+        None of the poses can be used.
+    SolveRefusedError
+        They determine no calibration.
+    StorageError
+        The disk refused.
+    """
+    _require_writable(output, report)
+    bundles = pose_bundles(folder)
+    before = None if earlier is None else read_calibration(earlier)
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    prepare_kernel_cache(Path(base) / "slrig")
+    with progress_shown() as display:
+        display("loading", 0.0, "")
+        # numba and its kernels: a second or two, and many the first time.
+        from slrig.sessions.calibration_solving import solve_poses
+        from slrig.sessions.calibration_tools import Setting
+        from slrig.sessions.pose_judging import summary
+
+        sizes, unreadable = _one_rig(bundles)
+        setting = Setting(
+            board, {name: size for name, size in sizes.items() if name != PROJECTOR}, sizes.get(PROJECTOR)
+        )
+        readable = {name: path for name, path in bundles.items() if name not in unreadable}
+        found = _read(readable, setting, display)
+        found.refused.update(unreadable)
+        if not found.poses:
+            raise PoseRefusedError(_none_left(folder, board, found.refused))
+
+        def solving(stage: str, fraction: float, detail: str) -> None:
+            display(stage, _READING_SHARE + (1 - _READING_SHARE) * fraction, detail)
+
+        try:
+            result = solve_poses(
+                board, setting.cameras, setting.projector, found.poses, progress=solving, earlier=before
+            )
+        except SolveRefusedError as error:
+            raise SolveRefusedError(_with_refused(str(error), found.refused)) from error
+        document = {**summary(result), "refused": found.refused, "remarks": found.remarks}
+        _write_calibration(output, result.calibration)
+        if report is not None:
+            display("writing the report", 1.0, "")
+            write_file(report, _report(result, found, folder, bundles, setting).encode())
+        display("done", 1.0, "")
+    if as_json:
+        typer.echo(json.dumps({**document, "output": str(output), "report": report and str(report)}, indent=1))
+        return
+    tell_result(document, Console())
+    typer.echo(f"\n{'written':<10}{output}")
+    if report is not None:
+        typer.echo(f"{'report':<10}{report}")
+
+
+def pose_bundles(folder: Path) -> dict[str, Path]:
+    """The bundles in a folder, one per pose, by name and in the order of their names.
+
+    Raises
+    ------
+    BundleError
+        There is no such folder, or no folder with a bundle.json in it.
+    """
+    what = "expected a folder with one bundle per pose, each a folder with a bundle.json"
+    if not folder.is_dir():
+        message = f"{folder}: {what}; found {'a file' if folder.exists() else 'nothing'} there"
+        raise BundleError(message)
+    found = {path.name: path for path in sorted(folder.iterdir()) if (path / DESCRIPTION).is_file()}
+    if not found:
+        inside = sum(path.is_dir() for path in folder.iterdir())
+        folders = "1 folder" if inside == 1 else f"{inside} folders"
+        remedy = f"it holds {folders} without a bundle.json" if inside else "it holds no folders"
+        if (folder / DESCRIPTION).is_file():
+            remedy = "this is one bundle itself: name the folder that holds it and those of the other poses"
+        message = f"{folder}: {what}; {remedy}"
+        raise BundleError(message)
+    return found
+
+
+def _require_writable(output: Path, report: Path | None) -> None:
+    """Find out before minutes of work what would spoil them."""
+    if output.suffix.lower() not in ENDINGS:
+        message = (
+            f"--output {output}: expected a name that ends in .json (slrig's own) or .yml, .yaml or .xml (OpenCV's), "
+            f"found '{output.suffix}'"
+        )
+        raise ConfigError(message)
+    for option, file in (("--output", output), ("--report", report)):
+        if file is None:
+            continue
+        if file.is_dir():
+            message = f"{option} {file}: expected the name of a file, found a folder; name a file in it"
+            raise ConfigError(message)
+        if not file.absolute().parent.is_dir():
+            message = f"{option} {file}: there is no folder {file.absolute().parent}; create it first"
+            raise ConfigError(message)
+
+
+def _one_rig(bundles: Mapping[str, Path]) -> tuple[Mapping[str, Size], dict[str, str]]:
+    """The devices that most of the bundles are of, and by name those whose description cannot be read, with the cause.
+
+    Raises
+    ------
+    CalibrationError
+        A bundle is of another rig than most.
+    """
+    sizes: dict[str, Mapping[str, Size]] = {}
+    unreadable = {}
+    for name, path in bundles.items():
+        try:
+            sizes[name] = bundle_device_sizes(path)
+        except BundleError as error:
+            unreadable[name] = _first_line(error)
+    if not sizes:
+        return {}, unreadable
+    counted = Counter(frozenset(each.items()) for each in sizes.values())
+    usual = dict(counted.most_common(1)[0][0])
+    ordered = next(each for each in sizes.values() if dict(each) == usual)
+    for name, each in sizes.items():
+        check_same_devices(f"pose '{name}'", each, ordered)
+    return ordered, unreadable
+
+
+def _read(bundles: Mapping[str, Path], setting: Setting, display: ProgressDisplay) -> Readings:
+    from slrig.sessions.pose_judging import judgement
+    from slrig.sessions.pose_reading import read_pose
+
+    found = Readings()
+    for at, (name, path) in enumerate(bundles.items()):
+        display(f"reading {name}", _READING_SHARE * at / len(bundles), f"{at + 1} of {len(bundles)}")
+        try:
+            pose = read_pose(path, setting.board, name)
+        except (PoseRefusedError, PatternError, BundleError) as error:
+            found.refused[name] = _first_line(error).removeprefix(f"pose '{name}': ")
+            continue
+        judged = judgement(pose, found.poses, setting)
+        if judged.refusals:
+            found.refused[name] = "; ".join(judged.refusals)
+            continue
+        found.poses.append(pose)
+        if judged.answer["warnings"]:
+            found.remarks[name] = list(judged.answer["warnings"])
+    return found
+
+
+def _none_left(folder: Path, board: Board, refused: Mapping[str, str]) -> str:
+    """Words for the case that no pose can be used: the causes, each with the poses that it is of."""
+    causes: dict[str, list[str]] = {}
+    for name, cause in refused.items():
+        causes.setdefault(cause, []).append(name)
+    lines = [f"{folder}: none of its poses ({len(refused)}) shows a {board.title} that can be used:"]
+    lines += [f"  {_listed(names)}: {cause}" for cause, names in list(causes.items())[:_MOST_TOLD]]
+    if len(causes) > _MOST_TOLD:
+        lines.append(f"  and {len(causes) - _MOST_TOLD} causes more")
+    lines.append(
+        "Is this the board? --corners counts inner corners, across x down (where four squares meet), and of circles "
+        "those of one row x rows."
+    )
+    return "\n".join(lines)
+
+
+def _with_refused(message: str, refused: Mapping[str, str]) -> str:
+    if not refused:
+        return message
+    lines = [f"  {name}: {cause}" for name, cause in list(refused.items())[:_MOST_TOLD]]
+    more = [f"  and {len(refused) - _MOST_TOLD} more"] if len(refused) > _MOST_TOLD else []
+    counted = "1 pose was" if len(refused) == 1 else f"{len(refused)} poses were"
+    return "\n".join([message, f"{counted} not used:", *lines, *more])
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 3 else f"{names[0]} to {names[-1]} ({len(names)})"
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines()]
+    return " ".join(lines[:3])
+
+
+def _write_calibration(output: Path, calibration: Calibration) -> None:
+    if output.suffix.lower() == ".json":
+        write_calibration(output, calibration)
+    else:
+        write_opencv_calibration(output, calibration)
+
+
+def _report(
+    result: CalibrationResult, found: Readings, folder: Path, bundles: Mapping[str, Path], setting: Setting
+) -> str:
+    from slrig.sessions.calibration_report import report_html
+    from slrig.sessions.pose_pictures import white_frame
+
+    pictures = {
+        pose.observation.name: {
+            camera: white_frame(bundles[pose.observation.name], camera) for camera in pose.observation.views
+        }
+        for pose in found.poses
+    }
+    return report_html(
+        result,
+        found.poses,
+        pictures,
+        board=setting.board,
+        title=f"Calibration from {folder.absolute().name}",
+        remarks=found.remarks,
+        refused=found.refused,
+        machine=f"on {platform.node()} ({platform.system()} {platform.machine()}), slrig {version('slrig')}",
+    )

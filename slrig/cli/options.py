@@ -1,0 +1,15 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+USUAL_URL = "http://127.0.0.1:8731"
+
+Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")]
+KeyFile = Annotated[
+    Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
+]

@@ -1,0 +1,199 @@
+"""`slrig schedule`: what a running service does by the clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from slrig.cli.options import USUAL_URL, KeyFile, Url
+
+app = typer.Typer(no_args_is_help=True, help="Work for the rig at set times: add, list, runs, pause, resume, remove.")
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+ScheduleId = Annotated[str, typer.Argument(help="Id of the schedule, or the beginning of it that no other has.")]
+
+
+@app.command()
+def add(
+    cron: Annotated[str, typer.Argument(help="Five fields: '30 6 * * mon-fri' is 06:30 on working days.")],
+    task: Annotated[str, typer.Argument(help="verification, calibration or acceptance.")],
+    time_zone: Annotated[str, typer.Option(help="Whose clocks; a name such as Europe/Berlin.")] = "UTC",
+    label: Annotated[str | None, typer.Option(help="Free text, to find the schedule again.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="Of the task, as name=value; the value is JSON or text. May be repeated.")
+    ] = None,
+    grace_s: Annotated[float | None, typer.Option(help="How late a run may start, seconds. Default 3600.")] = None,
+    retry_s: Annotated[
+        float | None, typer.Option(help="How often a busy rig is tried again, seconds. Default 60.")
+    ] = None,
+    catch_up: Annotated[
+        bool, typer.Option("--catch-up/--no-catch-up", help="After a long pause, run once for what was missed.")
+    ] = True,
+    paused: Annotated[bool, typer.Option("--paused", help="Put it on record without starting it.")] = False,
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Have a service do something by the clock, and show the next five times."""
+    request = {
+        "cron": cron,
+        "task": task,
+        "time_zone": time_zone,
+        "catch_up": catch_up,
+        "enabled": not paused,
+        "options": _options(option or []),
+        **{
+            name: value
+            for name, value in (("label", label), ("grace_s", grace_s), ("retry_s", retry_s))
+            if value is not None
+        },
+    }
+    with _client(url, key_file) as client:
+        _tell_schedule(client.post("/schedule", request), as_json=as_json)
+
+
+@app.command(name="list")
+def list_schedules(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
+    """List schedules with the time that each is due next."""
+    with _client(url, key_file) as client:
+        found = client.get("/schedule")
+    if as_json:
+        _print_json(found)
+        return
+    if not found["schedules"]:
+        typer.echo("no schedules; add one with: slrig schedule add '30 6 * * *' verification")
+        return
+    rows = [
+        (
+            each["id"][:8],
+            each["task"],
+            f"{each['cron']}  {each['time_zone']}",
+            _clock(each["upcoming"][0]) if each["enabled"] else "paused",
+            each["label"] or "",
+        )
+        for each in found["schedules"]
+    ]
+    _print_table(("id", "task", "when", "next", "label"), rows)
+
+
+@app.command()
+def runs(
+    schedule: ScheduleId,
+    limit: Annotated[int, typer.Option(min=1, max=200, help="How many, from the newest.")] = 20,
+    url: Url = USUAL_URL,
+    key_file: KeyFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """List what became of a schedule's due times, from new to old."""
+    with _client(url, key_file) as client:
+        found = client.get(f"/schedule/{_whole_id(client, schedule)}/runs?limit={limit}")
+    if as_json:
+        _print_json(found)
+        return
+    if not found["runs"]:
+        typer.echo("nothing was due yet")
+        return
+    rows = [
+        (
+            _clock(run["due"]),
+            run["state"] + (f" × {run['count']}" if run["count"] > 1 else ""),
+            run["reason"] or "",
+        )
+        for run in found["runs"]
+    ]
+    _print_table(("due (here)", "what became of it", "why"), rows)
+
+
+@app.command()
+def pause(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+    """Let nothing become due until the schedule is resumed."""
+    with _client(url, key_file) as client:
+        client.post(f"/schedule/{_whole_id(client, schedule)}/pause", None)
+    typer.echo("paused")
+
+
+@app.command()
+def resume(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+    """Go on after a pause."""
+    with _client(url, key_file) as client:
+        _tell_schedule(client.post(f"/schedule/{_whole_id(client, schedule)}/resume", None), as_json=False)
+
+
+@app.command()
+def remove(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+    """Forget a schedule and its runs."""
+    with _client(url, key_file) as client:
+        client.delete_at(f"/schedule/{_whole_id(client, schedule)}")
+    typer.echo("removed")
+
+
+def _client(url: str, key_file: Path | None) -> Any:
+    from slrig.cli.client import ServiceClient, read_key
+
+    return ServiceClient(url, read_key(key_file))
+
+
+def _options(given: list[str]) -> dict[str, Any]:
+    import json
+
+    from slrig.errors import ScheduleError
+
+    options: dict[str, Any] = {}
+    for each in given:
+        name, equals, value = each.partition("=")
+        if not name or not equals:
+            message = f"--option: expected name=value, found '{each}'"
+            raise ScheduleError(message)
+        try:
+            options[name] = json.loads(value)
+        except ValueError:
+            options[name] = value
+    return options
+
+
+def _whole_id(client: Any, beginning: str) -> str:
+    from slrig.errors import ScheduleNotFoundError
+
+    ids = [each["id"] for each in client.get("/schedule")["schedules"]]
+    found = [each for each in ids if each.startswith(beginning)]
+    if len(found) == 1:
+        return str(found[0])
+    what = "no schedule's" if not found else f"{len(found)} schedules'"
+    known = ", ".join(each[:8] for each in ids) or "none"
+    message = f"'{beginning}' is the beginning of {what} id; there are: {known}"
+    raise ScheduleNotFoundError(message)
+
+
+def _tell_schedule(schedule: Mapping[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        _print_json(schedule)
+        return
+    state = "" if schedule["enabled"] else ", paused"
+    typer.echo(f"{schedule['id']}: {schedule['task']} at '{schedule['cron']}' in {schedule['time_zone']}{state}")
+    for due in schedule["upcoming"]:
+        typer.echo(f"  {datetime.fromisoformat(due):%a %Y-%m-%d %H:%M %z}")
+
+
+def _clock(stamp: str) -> str:
+    return f"{datetime.fromisoformat(stamp).astimezone():%a %Y-%m-%d %H:%M}"
+
+
+def _print_table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(*heads, box=None, pad_edge=False, header_style="bold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console().print(table)
+
+
+def _print_json(document: Mapping[str, Any]) -> None:
+    import json
+
+    typer.echo(json.dumps(document, indent=1))
