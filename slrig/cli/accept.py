@@ -1,0 +1,199 @@
+"""`slrig accept`: an acceptance test, step by step with a person, or by script on a rig that moves the artefacts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from slrig.calibration.artefacts import Decision
+from slrig.cli.display import progress_shown
+from slrig.config import RigConfig, read_rig
+from slrig.devices import Rig
+from slrig.discovery import open_rig
+from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
+from slrig.sessions.acceptance import AcceptanceResult, Place, required_calibration, run_acceptance
+from slrig.sessions.acceptance_plan import (
+    USUAL_REPEATS,
+    AcceptancePlan,
+    Artefacts,
+    Certified,
+    Limits,
+    Step,
+    exact_artefacts,
+    usual_limits,
+)
+from slrig.sessions.acceptance_positions import acceptance_plan, rig_volume_mm
+from slrig.sessions.acceptance_report import HTML, document
+from slrig.sessions.acceptance_scene import scripted_config
+
+_COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm.
+
+    sphere_mm, bar_mm : certified value and its expanded uncertainty. volume_mm : six numbers, the least corner first.
+    """
+
+    sphere_mm: tuple[float, float] | None = None
+    bar_mm: tuple[float, float] | None = None
+    plane_mm: tuple[float, float] | None = None
+    ball_mm: float | None = None
+    sphere_form_mm: float | None = None
+    plane_form_mm: float | None = None
+    volume_mm: Sequence[float] | None = None
+    spacing_limit_mm: float | None = None
+    form_limit_mm: float | None = None
+    size_limit_mm: float | None = None
+    flatness_limit_mm: float | None = None
+    repeats: int = USUAL_REPEATS
+    exposure_s: float | None = None
+    certificate: str = ""
+    temperature_c: float | None = None
+    notes: str = ""
+
+    def plan(self, rig: Rig) -> AcceptancePlan:
+        """The test of an open rig. Raises CalibrationError, InvalidInputError."""
+        calibration = required_calibration(rig)
+        rendered = rig.truth() is not None
+        volume = rig_volume_mm(calibration) if self.volume_mm is None else np.array(self.volume_mm).reshape(2, 3)
+        usual = usual_limits(volume, rendered=rendered)
+        limits = Limits(
+            usual.spacing_mm if self.spacing_limit_mm is None else self.spacing_limit_mm,
+            self.form_limit_mm,
+            self.size_limit_mm,
+            self.flatness_limit_mm,
+        )
+        return acceptance_plan(
+            calibration,
+            volume,
+            self._artefacts(exact_artefacts(volume) if rendered else None),
+            rendered=rendered,
+            limits=limits,
+            repeats=self.repeats,
+            exposure_s=self.exposure_s,
+            notes=self.notes,
+        )
+
+    def _artefacts(self, made: Artefacts | None) -> Artefacts:
+        if made is not None and (self.sphere_mm, self.bar_mm, self.plane_mm) == (None, None, None):
+            return replace(made, temperature_c=self.temperature_c)
+        if self.sphere_mm is None or self.bar_mm is None or self.plane_mm is None:
+            message = (
+                "an acceptance test needs --sphere DIAMETER U, --bar DISTANCE U and --plane LENGTH WIDTH: values and "
+                "expanded uncertainties (k = 2) from the certificates, in mm"
+            )
+            raise InvalidInputError(message)
+        exact = None if made is None else 0.0
+        return Artefacts(
+            Certified(*self.sphere_mm),
+            Certified(*self.bar_mm),
+            self.plane_mm,
+            self.ball_mm,
+            exact if self.sphere_form_mm is None else self.sphere_form_mm,
+            exact if self.plane_form_mm is None else self.plane_form_mm,
+            self.certificate,
+            self.temperature_c,
+        )
+
+
+def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_json: bool) -> bool:
+    """Do the test, print what was decided, and return whether the rig passes.
+
+    Raises
+    ------
+    SlrigError
+        As `run_acceptance`, or the rig file is wrong or the rig cannot be opened.
+    """
+    config = read_rig(rig_file)
+    console = Console(stderr=as_json)
+    with TemporaryDirectory(prefix="slrig-acceptance-") as scratch:
+        if scripted:
+            config = moving(config, asked, Path(scratch))
+        with open_rig(config) as rig:
+            plan = asked.plan(rig)
+            result = _tested(rig, plan, output, scripted=scripted, console=console)
+    if as_json:
+        typer.echo((output / "report.json").read_text(encoding="utf-8"), nl=False)
+    else:
+        tell(result, console)
+        console.print(f"report: {output / HTML}", markup=False, style="dim")
+    return result.decision is Decision.PASSES
+
+
+def moving(config: RigConfig, asked: Asked, folder: Path) -> RigConfig:
+    """The rig by which the artefacts are moved: itself if its positioner knows the positions, else, of a rendered rig,
+    one with a scene of artefacts in place of its own, which is written into `folder`.
+    """
+    with open_rig(config) as rig:
+        plan = asked.plan(rig)
+        known = () if rig.positioner is None else tuple(rig.positioner.poses)
+    if all(step.name in known for step in plan.steps):
+        return config
+    return scripted_config(config, plan, folder)
+
+
+def placed_by_hand(plan: AcceptancePlan, console: Console, *, ask: Callable[[str], str] | None = None) -> Place:
+    """A `Place` that tells a person what to do and waits for Enter; q ends the test (ScanCancelledError)."""
+    answer = console.input if ask is None else ask
+    names = [step.name for step in plan.steps]
+
+    def place(_rig: Rig, step: Step, /) -> None:
+        number = names.index(step.name) + 1
+        console.print(Text.assemble((f"\n{number} of {len(names)}  ", "bold"), step.words))
+        x, y, z = (float(each) for each in step.centre_mm)
+        console.print(f"Its middle about x {x:.0f}, y {y:.0f}, z {z:.0f} mm. Keep it still.", style="dim")
+        try:
+            told = answer("[bold]Enter[/bold] measure   [bold]q[/bold] leave > ").strip().lower()
+        except EOFError:
+            told = "q"
+        if told in {"q", "quit"}:
+            message = f"the acceptance test was left before {step.name}; the points of what was measured are kept"
+            raise ScanCancelledError(message)
+
+    return place
+
+
+def tell(result: AcceptanceResult, console: Console) -> None:
+    """Print what was decided."""
+    table = Table(box=None, title=f"Acceptance test of '{result.rig}'", title_justify="left")
+    for name in ("", "worst error", "limit", "U (k = 2)", "position", "decision"):
+        table.add_column(name, justify="left" if name in {"", "position", "decision"} else "right")
+    for each in result.verdicts:
+        table.add_row(
+            f"{each.quantity} {each.quantity.words}",
+            *(f"{1000 * value:.1f} µm" for value in (each.error_mm, each.limit_mm, each.uncertainty_mm)),
+            each.step,
+            Text(each.decision.value, style=_COLOURS[each.decision]),
+        )
+    console.print(table)
+    figures = document(result)
+    console.print(f"L0 {result.plan.diagonal_mm:.1f} mm. {figures['manner']}", markup=False, style="dim")
+    console.print(Text(f"The rig {result.decision.value}.", style=_COLOURS[result.decision]))
+
+
+def _tested(rig: Rig, plan: AcceptancePlan, output: Path, *, scripted: bool, console: Console) -> AcceptanceResult:
+    if scripted:
+        with progress_shown() as display:
+            return run_acceptance(rig, plan, output, progress=display, cancelled=lambda: False)
+    console.print(f"An acceptance test of {len(plan.steps)} positions, {len(plan.takes)} captures.", markup=False)
+
+    def again(step: Step, error: SlrigError) -> bool:
+        console.print(Text(f"{step.name}: {error}", style="red"))
+        return True
+
+    by_hand = placed_by_hand(plan, console)
+    return run_acceptance(rig, plan, output, progress=_quiet, cancelled=lambda: False, place=by_hand, again=again)
+
+
+def _quiet(_stage: str, _fraction: float, _detail: str, /) -> None:
+    """Prompts and a moving bar do not go together."""

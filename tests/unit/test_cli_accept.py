@@ -1,0 +1,127 @@
+"""`slrig accept`: what it asks, refuses, prints, and returns."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import typer
+from rich.console import Console
+from typer.testing import CliRunner
+
+from slrig.calibration.artefacts import Decision
+from slrig.cli import accept as accepting
+from slrig.cli.accept import Asked, moving, placed_by_hand
+from slrig.cli.acceptance_command import accept
+from slrig.config import read_rig
+from slrig.devices import Rig
+from slrig.discovery import open_rig
+from slrig.errors import InvalidInputError, ScanCancelledError, UnsupportedByDeviceError
+from slrig.sessions.acceptance import AcceptanceResult, run_acceptance
+from slrig.sessions.acceptance_plan import AcceptancePlan
+from slrig.sessions.acceptance_scene import scripted_config
+
+RIGS = Path(__file__).parents[2] / "config" / "rigs"
+BALL_BAR = RIGS / "ball_bar.toml"
+
+app = typer.Typer()
+app.command()(accept)
+
+
+@pytest.fixture(scope="module")
+def plan() -> AcceptancePlan:
+    with open_rig(read_rig(BALL_BAR)) as rig:
+        return Asked().plan(rig)
+
+
+def test_a_rendered_rig_needs_no_artefacts_and_states_exact_ones(plan: AcceptancePlan) -> None:
+    assert plan.rendered
+    assert plan.artefacts.diameter.uncertainty_mm == 0
+    assert plan.limits.spacing_mm == pytest.approx(plan.diagonal_mm / 20_000)
+    assert len(plan.steps) == 23
+
+
+def test_metal_needs_the_certificates() -> None:
+    with open_rig(read_rig(BALL_BAR)) as rig:
+        metal = replace(rig, head=None)
+        with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
+            Asked().plan(metal)
+        given = Asked(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
+        with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
+            given.plan(metal)
+        certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
+        assert certain.plan(metal).limits.spacing_mm == 0.05
+        assert not certain.plan(metal).rendered
+
+
+def test_a_given_volume_is_used() -> None:
+    with open_rig(read_rig(BALL_BAR)) as rig:
+        plan = Asked(volume_mm=(-50, -40, -25, 50, 40, 25)).plan(rig)
+    assert plan.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
+
+
+def test_a_rig_whose_script_has_the_positions_moves_its_own_artefacts(tmp_path: Path) -> None:
+    config = read_rig(RIGS / "rendered-acceptance.toml")
+    assert moving(config, Asked(), tmp_path) is config
+    other = moving(read_rig(BALL_BAR), Asked(), tmp_path)
+    with open_rig(other) as rig:
+        assert rig.positioner is not None
+        assert len(rig.positioner.poses) == 23
+
+
+def test_a_rig_that_is_not_rendered_cannot_be_scripted(tmp_path: Path, plan: AcceptancePlan) -> None:
+    config = read_rig(BALL_BAR)
+    with pytest.raises(UnsupportedByDeviceError, match="leave --scripted out"):
+        scripted_config(replace(config, head=None), plan, tmp_path)
+
+
+def test_a_person_is_told_each_position_and_may_leave(plan: AcceptancePlan) -> None:
+    shown = io.StringIO()
+    answers = iter(["", "q"])
+    place = placed_by_hand(plan, Console(file=shown, width=120), ask=lambda _: next(answers))
+    rig = Rig("tame", {}, None, {})  # type: ignore[arg-type]
+    place(rig, plan.steps[0])
+    assert "1 of 23" in shown.getvalue()
+    assert "Put the sphere in the middle of the volume." in shown.getvalue()
+    with pytest.raises(ScanCancelledError, match="left before sphere-2"):
+        place(rig, plan.steps[1])
+
+
+def test_the_end_of_input_leaves_too(plan: AcceptancePlan) -> None:
+    def ended(_: str) -> str:
+        raise EOFError
+
+    place = placed_by_hand(plan, Console(file=io.StringIO()), ask=ended)
+    with pytest.raises(ScanCancelledError):
+        place(Rig("tame", {}, None, {}), plan.steps[0])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_the_command_does_the_test_and_returns_the_decision(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, as_json: bool
+) -> None:
+    whole = run_acceptance
+
+    def shortened(rig: Rig, plan: AcceptancePlan, folder: Path, **options: object) -> AcceptanceResult:
+        steps = tuple(step for step in plan.steps if step.name == "bar-5")
+        return whole(rig, replace(plan, steps=steps, repeats=1), folder, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(accepting, "run_acceptance", shortened)
+    output = tmp_path / "out"
+    # Sphere spacing is right to a few µm: a limit of one tenth of a µm fails, the usual one passes.
+    tight = ["--spacing-limit-mm", "0.0000001"] if as_json else []
+    given = [str(BALL_BAR), "--scripted", "--output", str(output), *tight, *(["--json"] if as_json else [])]
+    ran = CliRunner().invoke(app, given)
+    report = json.loads((output / "report.json").read_text())
+    assert report["quantities"][0]["quantity"] == "SD"
+    if as_json:
+        assert json.loads(ran.stdout) == report
+        assert report["decision"] == Decision.FAILS
+        assert ran.exit_code == 1
+    else:
+        assert "SD sphere spacing error" in ran.stdout
+        assert report["decision"] == Decision.PASSES
+        assert ran.exit_code == 0
