@@ -58,7 +58,7 @@ def board(
     """Write a board to print, in true size, with scales to check the printer by."""
     from slrig.cli.calibrate_board import write_board
 
-    write_board(_board(kind, corners, square_mm, marker_mm, dictionary), output, page=page)
+    write_board(chosen_board(kind, corners, square_mm, marker_mm, dictionary), output, page=page)
 
 
 @app.command()
@@ -79,7 +79,7 @@ def solve(
     """Calibrate from recorded poses. Needs no service and no rig."""
     from slrig.cli.calibrate_solve import solve_folder
 
-    chosen = _board(kind, corners, square_mm, marker_mm, dictionary)
+    chosen = chosen_board(kind, corners, square_mm, marker_mm, dictionary)
     solve_folder(folder, chosen, output, report=report, earlier=earlier, as_json=as_json)
 
 
@@ -110,7 +110,7 @@ def run(
     from slrig.cli.calibrate_stored import whole_id
     from slrig.cli.calibrate_walk import opened, walk
 
-    chosen = None if resume is not None else _board(kind, corners, square_mm, marker_mm, dictionary)
+    chosen = None if resume is not None else chosen_board(kind, corners, square_mm, marker_mm, dictionary)
     with _client(url, key_file) as client:
         session = (
             opened(client, chosen, label=label)
@@ -205,13 +205,14 @@ def _client(url: str, key_file: Path | None) -> Any:
     return ServiceClient(url, read_key(key_file))
 
 
-def _board(
+def chosen_board(
     kind: BoardName | None,
     corners: str | None,
     square_mm: float | None,
     marker_mm: float | None,
     dictionary: str | None,
 ) -> Any:
+    """The board that the options describe. Raises CalibrationError that names those that are missing."""
     from slrig.cli.board_options import board_option
     from slrig.errors import CalibrationError
 

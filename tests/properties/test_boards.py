@@ -1,0 +1,107 @@
+"""Boards: whatever the board and the page, a page holds what it promises; whatever the view, its numberings agree."""
+
+from __future__ import annotations
+
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as some
+
+from slrig.calibration.artwork import artwork
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board_map import fitted_map
+from slrig.calibration.numbering import equivalent_views
+from slrig.calibration.observations import BoardView
+from slrig.calibration.printing import FIT, PAGES_MM, board_svg
+from slrig.errors import CalibrationError
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+boards = some.builds(
+    Board, some.sampled_from(BoardKind), some.integers(3, 14), some.integers(3, 14), some.floats(1.0, 60.0)
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(board=boards, page=some.sampled_from([*PAGES_MM, FIT]))
+def test_all_that_is_printed_lies_on_the_page_or_the_largest_square_is_told(board: Board, page: str) -> None:
+    try:
+        tree = ElementTree.fromstring(board_svg(board, page=page))  # noqa: S314 - our own text
+    except CalibrationError as refused:
+        assert page != FIT
+        told = re.search(r"largest square that fits there is ([\d.]+) mm", str(refused))
+        assert told is None or float(told[1]) < board.square_mm
+        return
+    width, height = (float(side) for side in tree.get("viewBox", "").split()[2:])
+    shapes = [
+        [float(number) for number in re.findall(r"-?[\d.]+", part)]
+        for path in tree.iter(f"{SVG}path")
+        for part in path.get("d", "").split("Z")[:-1]
+    ]
+    ends = [(x, y) for left, top, right, bottom, *_ in shapes for x, y in ((left, top), (right, bottom))]
+    for circle in tree.iter(f"{SVG}circle"):
+        x, y, radius = (float(circle.get(name, "")) for name in ("cx", "cy", "r"))
+        ends += [(x - radius, y - radius), (x + radius, y + radius)]
+    ends += [
+        (float(line.get(f"x{end}", "")), float(line.get(f"y{end}", "")))
+        for line in tree.iter(f"{SVG}line")
+        for end in "12"
+    ]
+    places = np.array(ends)
+    assert (places >= 0).all()
+    assert (places <= [width + 1e-3, height + 1e-3]).all()
+    drawn = artwork(board)
+    assert len(shapes) == len(drawn.rectangles_mm)
+    assert float(tree.get("width", "").removesuffix("mm")) == pytest.approx(width)
+
+
+@settings(max_examples=40, deadline=None)
+@given(board=boards, seed=some.integers(0, 999))
+def test_numberings_come_back_to_where_they_began(board: Board, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    corner = np.flatnonzero(random.random(board.corner_count) < 0.7).astype(np.int32)
+    view = BoardView(corner, random.random((len(corner), 2)), random.random(len(corner)))
+    views = equivalent_views(view, board)
+    numbers = {tuple(each.corner.tolist()) for each in views}
+    for each in views:
+        assert (np.diff(each.corner) > 0).all()
+        again = {tuple(other.corner.tolist()) for other in equivalent_views(each, board)}
+        assert again == numbers
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    angles=some.tuples(*[some.floats(-0.7, 0.7)] * 3),
+    lens=some.tuples(some.floats(-0.2, 0.2), some.floats(-0.003, 0.003), some.floats(-0.003, 0.003)),
+    count=some.sampled_from([(5, 4), (8, 6), (4, 11)]),
+)
+def test_the_map_of_a_board_follows_a_lens(
+    angles: tuple[float, float, float], lens: tuple[float, float, float], count: tuple[int, int]
+) -> None:
+    a, b, c = angles
+    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    about_y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+    about_z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    turn = about_z @ about_y @ about_x
+
+    def seen(
+        places: np.ndarray[tuple[int, int], np.dtype[np.float64]],
+    ) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        x, y, z = turn @ np.column_stack([places - np.array(count) / 2, np.zeros(len(places))]).T + [[0], [0], [20]]
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        k1, p1, p2 = lens
+        x, y = (
+            x * (1 + k1 * r2) + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * (1 + k1 * r2) + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+        return np.asarray(1200 * np.column_stack([x, y]) + 500)
+
+    places = np.array([(x, y) for y in range(count[1]) for x in range(count[0])], dtype=np.float64)
+    fitted = fitted_map(places, seen(places))
+    assert fitted is not None
+    between = places[:-1] + 0.5
+    assert np.abs(fitted(between) - seen(between)).max() < 0.02
