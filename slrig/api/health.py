@@ -1,0 +1,211 @@
+"""/rig/health and /rig/verification: whether the calibration still holds, its history, and a look at it now."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Body, Query, Response
+from pydantic import BaseModel, Field
+
+from slrig.api.calibration_schemas import BoardRequest, IfBusy, board_of
+from slrig.api.openapi import problems
+from slrig.api.problems import fault_problem
+from slrig.api.schemas import MOST_EXPOSURE_S, Strict
+from slrig.api.service import Service, Serving
+from slrig.calibration.board import Board
+from slrig.calibration.health_verdict import HealthState
+from slrig.errors import CalibrationError
+from slrig.scan.records import utc_now
+from slrig.sessions.health_plot import health_svg
+from slrig.sessions.health_store import VerificationRecord
+from slrig.sessions.verification import JobState, VerificationJob, solve_id
+
+router = APIRouter(prefix="/rig", tags=["health"])
+
+
+class DriftBody(BaseModel):
+    """One explanation of what is seen: the device, what happened to it in words, and how likely that is."""
+
+    device: str
+    kind: str
+    significance: float = Field(description="in standard deviations")
+    weight: float = Field(description="its probability among all explanations tried")
+    words: str
+
+
+class PairBody(BaseModel):
+    """The spare equation of two devices, px of the second one's image. Maps have 6 x 6 cells over the first one's."""
+
+    first: str
+    second: str
+    count: int
+    mean_px: float
+    rms_px: float
+    predicted_px: float
+    map_mean_px: list[list[float | None]]
+    map_rms_px: list[list[float | None]]
+    map_count: list[list[int]]
+
+
+class VerificationFigures(BaseModel):
+    """What one verification found."""
+
+    id: UUID
+    at: datetime
+    calibration: str
+    kind: str = Field(description="board or scan")
+    state: HealthState
+    reasons: list[str]
+    remedy: str | None
+    pairs: list[PairBody]
+    scale_percent: float | None
+    scale_sigma_percent: float | None
+    scale_mm: float | None
+    expected_mm: float | None
+    stated_mm: float | None
+    drift_mm: float | None
+    drifts: list[DriftBody]
+    open: str | None = Field(description="what the geometry leaves open")
+
+
+class HealthBody(BaseModel):
+    """The health of the calibration in use."""
+
+    state: HealthState
+    reasons: list[str]
+    remedy: str | None
+    calibration: str | None
+    calibration_age_s: float | None
+    refuses_scans_when_stale: bool
+    latest: VerificationFigures | None
+    links: dict[str, str]
+
+
+class HealthPage(BaseModel):
+    """Verifications, newest first."""
+
+    verifications: list[VerificationFigures]
+
+
+class VerificationRequest(Strict):
+    """A verification. An empty request shoots the board of the calibration in use, where it is."""
+
+    board: BoardRequest | None = Field(default=None, description="Default: that of the active calibration")
+    position: Annotated[int, Field(ge=0, le=10_000)] | None = Field(
+        default=None, description="of the positioner, by its number from 0. Default: the board stays where it is"
+    )
+    exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None
+    if_busy: IfBusy = Field(default="reject", description="while the rig is held: answer 409, or wait in line")
+
+
+class VerificationBody(BaseModel):
+    """A verification that was asked for."""
+
+    id: UUID
+    state: JobState
+    created_at: datetime
+    found: VerificationFigures | None
+    error: dict[str, Any] | None
+    links: dict[str, str]
+
+
+@router.get("/health")
+def look_at_health(service: Serving) -> HealthBody:
+    """Return whether the calibration in use still holds, why, and what to do. Touches no device."""
+    health, latest, calibration = service.verifications.health()
+    solved = None if calibration is None else calibration.solved
+    age_s = None if solved is None else (utc_now() - datetime.fromisoformat(solved.solved_at)).total_seconds()
+    return HealthBody(
+        state=health.state,
+        reasons=list(health.reasons),
+        remedy=health.remedy,
+        calibration=None if calibration is None else solve_id(calibration),
+        calibration_age_s=age_s,
+        refuses_scans_when_stale=service.refuse_when_stale,
+        latest=None if latest is None else _figures(latest),
+        links={"history": "/rig/health/history", "plot": "/rig/health.svg", "verify": "/rig/verification"},
+    )
+
+
+@router.get("/health/history", responses=problems(422))
+def list_health(
+    service: Serving,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    since: Annotated[datetime | None, Query(description="ISO 8601, with its offset from UTC")] = None,
+) -> HealthPage:
+    """List verifications, newest first."""
+    if since is not None and since.tzinfo is None:
+        message = f"since: expected a time with its offset from UTC, as 2026-11-20T06:00:00Z, found {since.isoformat()}"
+        raise CalibrationError(message)
+    found = service.verifications.store.history(limit=limit, since=since)
+    return HealthPage(verifications=[_figures(record) for record in found])
+
+
+@router.get(
+    "/health.svg",
+    response_class=Response,
+    responses={200: {"content": {"image/svg+xml": {}}, "description": "the plot"}, **problems(422)},
+)
+def plot_health(service: Serving, limit: Annotated[int, Query(ge=1, le=2000)] = 500) -> Response:
+    """Draw the newest verifications over time."""
+    records = service.verifications.store.history(limit=limit)
+    return Response(health_svg(records[::-1]), media_type="image/svg+xml")
+
+
+@router.post("/verification", status_code=202, responses=problems(409, 422, 429, 502, 503, 507))
+def verify_rig(
+    service: Serving,
+    response: Response,
+    request: Annotated[VerificationRequest, Body(default_factory=VerificationRequest)],
+) -> VerificationBody:
+    """Shoot the board and judge the calibration in use by it. The answer comes at once; look again later."""
+    board = _board_in_use(service) if request.board is None else board_of(request.board)
+    job = service.verifications.shoot(
+        board, position=request.position, exposure_s=request.exposure_s, wait=request.if_busy == "queue"
+    )
+    body = _body(job)
+    response.headers["Location"] = body.links["self"]
+    return body
+
+
+@router.get("/verification/{verification_id}", responses=problems(404, 422))
+def look_at_verification(service: Serving, verification_id: UUID) -> VerificationBody:
+    """Return a verification: its state, and what was found, or why nothing was."""
+    return _body(service.verifications.job(verification_id))
+
+
+@router.post("/verification/{verification_id}/cancel", status_code=202, responses=problems(404, 422))
+def cancel_verification(service: Serving, verification_id: UUID) -> VerificationBody:
+    """Ask a verification to end early. May be repeated."""
+    return _body(service.verifications.cancel(verification_id))
+
+
+def _board_in_use(service: Service) -> Board:
+    """The board of the active calibration. Raises CalibrationError where there is none."""
+    active = service.calibrations.active
+    board = None if active is None else service.calibrations.register.get(active).board
+    if board is None:
+        message = (
+            "board: the calibration in use was imported or is the rig's own, and its board is not known here; send "
+            '"board" with the kind, corners and square_mm of the one that is in view'
+        )
+        raise CalibrationError(message)
+    return board
+
+
+def _figures(record: VerificationRecord) -> VerificationFigures:
+    return VerificationFigures.model_validate(record.document())
+
+
+def _body(job: VerificationJob) -> VerificationBody:
+    here = f"/rig/verification/{job.id}"
+    return VerificationBody(
+        id=job.id,
+        state=job.state,
+        created_at=job.created_at,
+        found=None if job.record is None else _figures(job.record),
+        error=None if job.fault is None else fault_problem(job.fault),
+        links={"self": here, "cancel": f"{here}/cancel", "health": "/rig/health"},
+    )

@@ -1,0 +1,86 @@
+"""/rig/health over HTTP: the verdict, the history, the plot, and a verification from beginning to end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from fastapi import FastAPI
+from fastapi.testclient import TestClient
+
+from slrig.api import health
+from slrig.api.problems import install_problems
+from slrig.api.service import _of_request
+from slrig.scan.folder import DataFolder
+from slrig.sessions.health_store import HealthStore
+from slrig.sessions.verification import VerificationDesk
+from tests.unit.sessions.test_verification import TAME, Lender
+
+BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
+
+
+@pytest.fixture
+def lender() -> Lender:
+    return Lender()
+
+
+@pytest.fixture
+def client(tmp_path: Path, lender: Lender) -> Iterator[TestClient]:
+    folder = DataFolder(tmp_path / "data")
+    store = HealthStore(folder.database)
+    desk = VerificationDesk(folder, lender, store, tools=TAME)
+    service = SimpleNamespace(
+        verifications=desk, refuse_when_stale=True, calibrations=SimpleNamespace(active=None)
+    )  # fmt: skip
+    app = FastAPI()
+    app.include_router(health.router)
+    install_problems(app)
+    app.dependency_overrides[_of_request] = lambda: service
+    with TestClient(app) as found:
+        yield found
+    store.close()
+    folder.release()
+
+
+def test_a_verification_changes_the_health(client: TestClient) -> None:
+    before = client.get("/rig/health").json()
+    assert before["state"] == "unknown"
+    assert before["calibration"] == "0123456789ab"
+    assert before["refuses_scans_when_stale"] is True
+    answer = client.post("/rig/verification", json={"board": BOARD})
+    assert answer.status_code == 202
+    place = answer.headers["Location"]
+    deadline = time.monotonic() + 20
+    while client.get(place).json()["state"] not in ("done", "failed"):
+        assert time.monotonic() < deadline
+    found = client.get(place).json()
+    assert found["state"] == "done"
+    after = client.get("/rig/health").json()
+    assert after["state"] == "good"
+    assert after["latest"] == found["found"]
+    assert after["latest"]["pairs"][0]["map_mean_px"][0][0] == 0.01
+    (kept,) = client.get("/rig/health/history").json()["verifications"]
+    assert kept == found["found"]
+    assert client.get("/rig/health/history", params={"since": "2100-01-01T00:00:00Z"}).json()["verifications"] == []
+    plot = client.get("/rig/health.svg")
+    assert plot.headers["content-type"].startswith("image/svg+xml")
+    assert "Expected error of a scan" in plot.text
+
+
+def test_a_busy_rig_names_its_holder(client: TestClient, lender: Lender) -> None:
+    lender.held = "schedule 'nightly'"
+    answer = client.post("/rig/verification", json={"board": BOARD})
+    assert answer.status_code == 409
+    assert "schedule 'nightly'" in answer.json()["detail"]
+
+
+def test_what_is_missing_or_unknown_is_told(client: TestClient) -> None:
+    no_board = client.post("/rig/verification")
+    assert no_board.status_code == 422
+    assert 'send "board"' in no_board.json()["detail"]
+    assert client.get("/rig/health/history", params={"since": "2026-01-01T00:00:00"}).status_code == 422
+    nobody = client.get("/rig/verification/00000000-0000-0000-0000-000000000000")
+    assert nobody.status_code == 404
