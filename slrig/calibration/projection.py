@@ -1,0 +1,330 @@
+"""Where corners and light fall for given devices and poses, with analytic Jacobians, for kernels.
+
+A device is a row of 21: fx, fy, cx, cy, k1, k2, p1, p2, k3, its rotation row by row, its translation (mm): world to
+device. A pose is a row of 12: rotation and translation, board to world. Lenses are Brown's (1966), in OpenCV's order.
+
+The board's surface is (x, y, z(x, y)), z a polynomial of the second and third degree (`bend`, mm) in coordinates that
+are centred and divided by half the board's extent (`frame`: centre x, centre y, that half). It is 0 for a flat board.
+
+A corner is projected into its camera. Light is followed backwards: the camera pixel's ray is met with the board, and
+the point of meeting is projected into the projector. A small change moves that point by
+
+    dX = a + d (n·(dt_b + w_b x (X - t_b)) + φ·dbend - n·a) / (n·d),    a = do + s dd,
+
+with the ray o + s d, the surface's normal n, the board's turn w_b and shift dt_b, and the bend's basis φ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numba import get_num_threads, njit
+
+from slrig.model import FloatArray
+
+DEVICE, POSE, BEND = 15, 6, 7
+CORNER_TERMS = DEVICE + POSE + 2 + BEND
+LIGHT_TERMS = 2 * DEVICE + POSE + BEND
+_STEPS = 30
+_SETTLED = 1e-12
+_SHARED = 20_000
+
+
+def corner_rows(
+    devices: FloatArray, poses: FloatArray, points: FloatArray, bend: FloatArray, frame: FloatArray,
+    where: Any, measured: FloatArray, /, *, jacobian: bool = True,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Projected minus measured, (n, 2), and its derivatives (n, 2, 30), or (0, 2, 30) without `jacobian`.
+
+    points : (corners, 2) float64 on the board, mm; where : (n, 3) int32, device, pose and corner; measured : (n, 2).
+    The derivatives are by the device's 15, the pose's 6, the corner's x and y, and the 7 of the bend. NaN behind the
+    camera.
+    """
+    residual = np.full((len(where), 2), np.nan)
+    rows = np.zeros((len(where) if jacobian else 0, 2, CORNER_TERMS))
+
+    def part(first: int, last: int) -> None:
+        _corner_kernel(devices, poses, points, bend, frame, where, measured, jacobian, residual, rows, first, last)
+
+    _in_parts(part, len(where))
+    return residual, rows
+
+
+def light_rows(
+    devices: FloatArray, poses: FloatArray, bend: FloatArray, frame: FloatArray, where: Any, pixels: FloatArray,
+    positions: FloatArray, /, *, jacobian: bool = True,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Projected minus measured projector coordinate, (n,), and its derivatives (n, 43), or (0, 43) without `jacobian`.
+
+    where : (n, 3) int32, camera, pose and axis (0 column, 1 row); the projector is the last device. pixels : (n, 2).
+    The derivatives are by the camera's 15, the projector's 15, the pose's 6, and the 7 of the bend. NaN where the ray
+    misses the board's surface or meets it behind a device.
+    """
+    residual = np.full(len(where), np.nan)
+    rows = np.zeros((len(where) if jacobian else 0, LIGHT_TERMS))
+
+    def part(first: int, last: int) -> None:
+        _light_kernel(devices, poses, bend, frame, where, pixels, positions, jacobian, residual, rows, first, last)
+
+    _in_parts(part, len(where))
+    return residual, rows
+
+
+def weighed_blocks(
+    rows: FloatArray, residual: FloatArray, weight: FloatArray, starts: Any, /
+) -> tuple[FloatArray, FloatArray]:
+    """Jᵀ W J, (g, T, T), and Jᵀ W r, (g, T), of each run of rows.
+
+    rows : (n, T), residual and weight : (n,); starts : (g + 1,) int64, where the runs begin, and n. Rows of weight 0
+    are passed over, whatever they hold.
+    """
+    terms = rows.shape[1]
+    blocks, pulls = np.zeros((len(starts) - 1, terms, terms)), np.zeros((len(starts) - 1, terms))
+
+    def part(first: int, last: int) -> None:
+        _block_kernel(rows, residual, weight, starts, blocks, pulls, first, last)
+
+    _in_parts(part, len(starts) - 1, shared=len(rows) >= _SHARED)
+    return blocks, pulls
+
+
+def _in_parts(part: Callable[[int, int], None], count: int, *, shared: bool | None = None) -> None:
+    """Walk over `count` things; where they are many, in as many threads as numba may use, for kernels hold no lock.
+
+    Kernels that numba itself spreads over threads cost more than the work here: most calls are short, and many.
+    """
+    workers = get_num_threads() if (count >= _SHARED if shared is None else shared) else 1
+    if workers == 1 or count < workers:
+        part(0, count)
+        return
+    ends = np.linspace(0, count, workers + 1).astype(int).tolist()
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(part, ends[:-1], ends[1:]))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def distorted(d: Any, x: float, y: float) -> Any:
+    """Distorted coordinates and their derivatives: xd, yd, ∂xd/∂x, ∂xd/∂y = ∂yd/∂x, ∂yd/∂y."""
+    k1, k2, p1, p2, k3 = d[4], d[5], d[6], d[7], d[8]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+        2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
+        radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+    )
+
+
+@njit(cache=True, nogil=True)
+def undistorted(d: Any, u: float, v: float) -> Any:
+    """Normalised coordinates of a pixel by Newton's method; NaN where the lens sends no light."""
+    xd, yd = (u - d[2]) / d[0], (v - d[3]) / d[1]
+    x, y = xd, yd
+    for _ in range(_STEPS):
+        gx, gy, a, b, c = distorted(d, x, y)
+        det = a * c - b * b
+        if not det > 0:
+            break
+        dx, dy = (c * (xd - gx) - b * (yd - gy)) / det, (a * (yd - gy) - b * (xd - gx)) / det
+        x += dx
+        y += dy
+        if dx * dx + dy * dy < _SETTLED * _SETTLED:
+            return x, y
+    return np.nan, np.nan
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _height(bend: Any, frame: Any, x: float, y: float, basis: Any) -> Any:
+    """The surface's height, and its slopes, at board coordinates; fills the bend's basis (7,)."""
+    s = 1 / frame[2]
+    a, b = (x - frame[0]) * s, (y - frame[1]) * s
+    basis[0], basis[1], basis[2] = a * a, a * b, b * b
+    basis[3], basis[4], basis[5], basis[6] = a * a * a, a * a * b, a * b * b, b * b * b
+    z = 0.0
+    for k in range(BEND):
+        z += bend[k] * basis[k]
+    by_a = 2 * a * bend[0] + b * bend[1] + 3 * a * a * bend[3] + 2 * a * b * bend[4] + b * b * bend[5]
+    by_b = a * bend[1] + 2 * b * bend[2] + a * a * bend[4] + 2 * a * b * bend[5] + 3 * b * b * bend[6]
+    return z, by_a * s, by_b * s
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turned(m: Any, start: int, x: float, y: float, z: float) -> Any:
+    """R v for the rotation that starts at m[start]."""
+    return (
+        m[start] * x + m[start + 1] * y + m[start + 2] * z,
+        m[start + 3] * x + m[start + 4] * y + m[start + 5] * z,
+        m[start + 6] * x + m[start + 7] * y + m[start + 8] * z,
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turned_back(m: Any, start: int, x: float, y: float, z: float) -> Any:
+    """Rᵀ v for the rotation that starts at m[start]."""
+    return (
+        m[start] * x + m[start + 3] * y + m[start + 6] * z,
+        m[start + 1] * x + m[start + 4] * y + m[start + 7] * z,
+        m[start + 2] * x + m[start + 5] * y + m[start + 8] * z,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _device_row(d: Any, row: bool, x: float, y: float, z: float, w: Any, out: Any) -> Any:
+    """A coordinate's derivatives by its device's 15 parameters, into out; returns the gradient in the device.
+
+    (x, y, z) : the point in the device; w : the point turned into the device, before its translation.
+    """
+    xn, yn = x / z, y / z
+    xd, yd, a, b, c = distorted(d, xn, yn)
+    r2 = xn * xn + yn * yn
+    if row:
+        f, by_x, by_y = d[1], d[1] * b, d[1] * c
+        out[0], out[1], out[2], out[3] = 0.0, yd, 0.0, 1.0
+        out[6], out[7] = f * (r2 + 2 * yn * yn), f * 2 * xn * yn
+        radial = f * yn
+    else:
+        f, by_x, by_y = d[0], d[0] * a, d[0] * b
+        out[0], out[1], out[2], out[3] = xd, 0.0, 1.0, 0.0
+        out[6], out[7] = f * 2 * xn * yn, f * (r2 + 2 * xn * xn)
+        radial = f * xn
+    out[4], out[5], out[8] = radial * r2, radial * r2 * r2, radial * r2 * r2 * r2
+    gx, gy = by_x / z, by_y / z
+    gz = -(gx * xn + gy * yn)
+    out[9], out[10], out[11] = w[1] * gz - w[2] * gy, w[2] * gx - w[0] * gz, w[0] * gy - w[1] * gx
+    out[12], out[13], out[14] = gx, gy, gz
+    return gx, gy, gz
+
+
+@njit(cache=True, nogil=True)
+def _corner_kernel(
+    devices: Any, poses: Any, points: Any, bend: Any, frame: Any, where: Any, measured: Any, jacobian: bool,
+    residual: Any, rows: Any, first: int, last: int,
+) -> None:  # fmt: skip
+    basis = np.zeros(BEND)
+    for i in range(first, last):
+        d, p, corner = devices[where[i, 0]], poses[where[i, 1]], where[i, 2]
+        bx, by = points[corner, 0], points[corner, 1]
+        bz, slope_x, slope_y = _height(bend, frame, bx, by, basis)
+        q = _turned(p, 0, bx, by, bz)
+        w = _turned(d, 9, q[0] + p[9], q[1] + p[10], q[2] + p[11])
+        x, y, z = w[0] + d[18], w[1] + d[19], w[2] + d[20]
+        if not z > 0:
+            continue
+        xd, yd, _, _, _ = distorted(d, x / z, y / z)
+        residual[i, 0] = d[0] * xd + d[2] - measured[i, 0]
+        residual[i, 1] = d[1] * yd + d[3] - measured[i, 1]
+        if not jacobian:
+            continue
+        for k in range(2):
+            out = rows[i, k]
+            g = _device_row(d, k == 1, x, y, z, w, out)
+            gw = _turned_back(d, 9, g[0], g[1], g[2])
+            out[15], out[16] = q[1] * gw[2] - q[2] * gw[1], q[2] * gw[0] - q[0] * gw[2]
+            out[17] = q[0] * gw[1] - q[1] * gw[0]
+            out[18], out[19], out[20] = gw
+            gb = _turned_back(p, 0, gw[0], gw[1], gw[2])
+            out[21], out[22] = gb[0] + gb[2] * slope_x, gb[1] + gb[2] * slope_y
+            for m in range(BEND):
+                out[23 + m] = gb[2] * basis[m]
+
+
+@njit(cache=True, nogil=True)
+def _met(bend: Any, frame: Any, o: Any, e: Any, basis: Any) -> Any:
+    """Depth along a ray at which it meets the board, and the surface's slopes there. Ray in the board's frame."""
+    s = -o[2] / e[2]
+    for _ in range(_STEPS):
+        bx, by = o[0] + s * e[0], o[1] + s * e[1]
+        z, slope_x, slope_y = _height(bend, frame, bx, by, basis)
+        off = o[2] + s * e[2] - z
+        if abs(off) < 1e-10 * frame[2]:
+            return s, slope_x, slope_y
+        s -= off / (e[2] - slope_x * e[0] - slope_y * e[1])
+    return np.nan, 0.0, 0.0
+
+
+@njit(cache=True, nogil=True)
+def _light_kernel(
+    devices: Any, poses: Any, bend: Any, frame: Any, where: Any, pixels: Any, positions: Any, jacobian: bool,
+    residual: Any, rows: Any, first: int, last: int,
+) -> None:  # fmt: skip
+    projector = devices[len(devices) - 1]
+    basis = np.zeros(BEND)
+    for i in range(first, last):
+        c, p, row = devices[where[i, 0]], poses[where[i, 1]], where[i, 2] == 1
+        xn, yn = undistorted(c, pixels[i, 0], pixels[i, 1])
+        d = _turned_back(c, 9, xn, yn, 1.0)
+        o = _turned_back(c, 9, -c[18], -c[19], -c[20])
+        in_board = _turned_back(p, 0, o[0] - p[9], o[1] - p[10], o[2] - p[11])
+        s, slope_x, slope_y = _met(bend, frame, in_board, _turned_back(p, 0, d[0], d[1], d[2]), basis)
+        if not s > 0:
+            continue
+        px, py, pz = o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2]
+        w = _turned(projector, 9, px, py, pz)
+        x, y, z = w[0] + projector[18], w[1] + projector[19], w[2] + projector[20]
+        if not z > 0:
+            continue
+        xd, yd, _, _, _ = distorted(projector, x / z, y / z)
+        got = projector[1] * yd + projector[3] if row else projector[0] * xd + projector[2]
+        residual[i] = got - positions[i]
+        if not jacobian:
+            continue
+        out = rows[i]
+        g = _device_row(projector, row, x, y, z, w, out[15:30])
+        gw = _turned_back(projector, 9, g[0], g[1], g[2])
+        n = _turned(p, 0, -slope_x, -slope_y, 1.0)
+        share = (gw[0] * d[0] + gw[1] * d[1] + gw[2] * d[2]) / (n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
+        # What a shift of the ray does, in the camera: h = R_c (g - share n).
+        h = _turned(c, 9, gw[0] - share * n[0], gw[1] - share * n[1], gw[2] - share * n[2])
+        _ray_row(c, pixels[i, 0], pixels[i, 1], xn, yn, s, h, out)
+        qx, qy, qz = px - p[9], py - p[10], pz - p[11]
+        out[30], out[31] = share * (qy * n[2] - qz * n[1]), share * (qz * n[0] - qx * n[2])
+        out[32] = share * (qx * n[1] - qy * n[0])
+        out[33], out[34], out[35] = share * n[0], share * n[1], share * n[2]
+        for m in range(BEND):
+            out[36 + m] = share * basis[m]
+
+
+@njit(cache=True, nogil=True)
+def _ray_row(c: Any, u: float, v: float, xn: float, yn: float, s: float, h: Any, out: Any) -> None:
+    """Derivatives by the 15 parameters of the camera that a ray comes from; h : gradient in the camera."""
+    _, _, a, b, e = distorted(c, xn, yn)
+    det = a * e - b * b
+    # d(x, y) = J⁻¹ (d(xd, yd) - ∂distorted/∂k dk), and the gradient by (x, y) is s h.
+    gx, gy = s * (e * h[0] - b * h[1]) / det, s * (a * h[1] - b * h[0]) / det
+    r2 = xn * xn + yn * yn
+    radial = gx * xn + gy * yn
+    out[0], out[1] = -gx * (u - c[2]) / (c[0] * c[0]), -gy * (v - c[3]) / (c[1] * c[1])
+    out[2], out[3] = -gx / c[0], -gy / c[1]
+    out[4], out[5], out[8] = -radial * r2, -radial * r2 * r2, -radial * r2 * r2 * r2
+    out[6] = -(gx * 2 * xn * yn + gy * (r2 + 2 * yn * yn))
+    out[7] = -(gx * (r2 + 2 * xn * xn) + gy * 2 * xn * yn)
+    qx, qy, qz = s * xn - c[18], s * yn - c[19], s - c[20]
+    out[9], out[10], out[11] = h[1] * qz - h[2] * qy, h[2] * qx - h[0] * qz, h[0] * qy - h[1] * qx
+    out[12], out[13], out[14] = -h[0], -h[1], -h[2]
+
+
+@njit(cache=True, nogil=True)
+def _block_kernel(
+    rows: Any, residual: Any, weight: Any, starts: Any, blocks: Any, pulls: Any, first: int, last: int
+) -> None:
+    terms = rows.shape[1]
+    for group in range(first, last):
+        block, pull = blocks[group], pulls[group]
+        for i in range(starts[group], starts[group + 1]):
+            if not weight[i] > 0:
+                continue
+            row = rows[i]
+            for a in range(terms):
+                share = weight[i] * row[a]
+                pull[a] += share * residual[i]
+                for b in range(a, terms):
+                    block[a, b] += share * row[b]
+        for a in range(terms):
+            for b in range(a):
+                block[a, b] = block[b, a]

@@ -1,0 +1,90 @@
+"""What holds for any rig: units do not matter, nor the order of poses; and derivatives are those of the residuals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slrig.calibration.adjustment import corner_terms, light_terms
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.measurements import spread
+from slrig.calibration.solve import solve
+from tests.unit.calibration.synthetic import Recipe, made
+from tests.unit.calibration.test_adjustment import aside, true_geometry
+
+QUICK = Recipe(poses=5, side=10)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), bend=st.lists(st.floats(-3, 3), min_size=7, max_size=7))
+def test_a_step_changes_residuals_by_its_derivative(seed: int, bend: list[float]) -> None:
+    geometry, seen = true_geometry(Recipe(seed=seed % 7, poses=3, cameras=2, side=5))
+    geometry = replace(aside(geometry, seed), bend=np.array(bend))
+    step = np.random.default_rng(seed).normal(0, 1e-6, geometry.layout.count)
+    step[geometry.layout.first_offset :] = 0
+    ahead, behind = geometry.moved(step), geometry.moved(-step)
+    layout = geometry.layout
+    residual, rows = corner_terms(geometry, seen, jacobian=True)
+    place = np.hstack([
+        15 * seen.corner_where[:, :1] + np.arange(15), layout.first_pose + 6 * seen.corner_where[:, 1:2] + np.arange(6)
+    ])  # fmt: skip
+    change = np.einsum("nki,ni->nk", rows[:, :, :21], step[place])
+    by_number = (corner_terms(ahead, seen, jacobian=False)[0] - corner_terms(behind, seen, jacobian=False)[0]) / 2
+    good = np.isfinite(residual)
+    np.testing.assert_allclose(change[good], by_number[good], atol=1e-7)
+    residual, rows = light_terms(geometry, seen, jacobian=True)
+    place = np.hstack([
+        15 * seen.light_where[:, :1] + np.arange(15),
+        np.tile(15 * (layout.devices - 1) + np.arange(15), (len(residual), 1)),
+        layout.first_pose + 6 * seen.light_where[:, 1:2] + np.arange(6),
+    ])  # fmt: skip
+    change = np.einsum("ni,ni->n", rows[:, :36], step[place])
+    by_number = (light_terms(ahead, seen, jacobian=False)[0] - light_terms(behind, seen, jacobian=False)[0]) / 2
+    good = np.isfinite(residual)
+    assert good.any()
+    np.testing.assert_allclose(change[good], by_number[good], atol=1e-6)
+
+
+@pytest.mark.slow
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_the_order_of_poses_does_not_matter(seed: int) -> None:
+    observations, _ = made(replace(QUICK, seed=seed))
+    order = [0, *(np.random.default_rng(seed).permutation(4) + 1)]
+    again = replace(observations, poses=tuple(observations.poses[k] for k in order))
+    first, second = solve(observations), solve(again)
+    for one, other in zip(
+        (first.calibration.projector, *first.calibration.cameras.values()),
+        (second.calibration.projector, *second.calibration.cameras.values()), strict=True,
+    ):  # fmt: skip
+        assert one is not None
+        assert other is not None
+        if first.distortion == second.distortion:
+            np.testing.assert_allclose(one.matrix, other.matrix, atol=0.3)
+
+
+@pytest.mark.slow
+@settings(max_examples=3, deadline=None)
+@given(share=st.floats(0.2, 5.0))
+def test_the_board_s_unit_scales_lengths_and_nothing_else(share: float) -> None:
+    observations, _ = made(replace(QUICK, seed=1))
+    scaled = replace(observations, board=Board(BoardKind.CHESSBOARD, 11, 8, 12.0 * share))
+    first, second = solve(observations).calibration, solve(scaled).calibration
+    assert first.projector is not None
+    assert second.projector is not None
+    np.testing.assert_allclose(first.projector.matrix, second.projector.matrix, atol=0.05)
+    np.testing.assert_allclose(first.projector.translation_mm * share, second.projector.translation_mm, rtol=2e-3)
+
+
+@given(
+    count=st.integers(0, 400), limit=st.integers(1, 300), width=st.floats(0, 500), seed=st.integers(0, 99)
+)  # fmt: skip
+def test_a_spread_has_as_many_as_it_may_and_none_twice(count: int, limit: int, width: float, seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(0, 1, (count, 2)) * [width, 100]
+    kept = spread(points, limit)
+    assert len(kept) == min(count, limit)
+    assert len(set(kept.tolist())) == len(kept)
