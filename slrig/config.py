@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
@@ -104,6 +105,14 @@ class SynchronisationTable(Strict):
     line_time_s: Annotated[dict[CameraName, LineSeconds], Field(default_factory=dict)]
 
 
+class VerificationTable(Strict):
+    """What follows from the health of the calibration."""
+
+    refuse_when_stale: Annotated[
+        bool, Field(description="refuse scans while the calibration is stale; they are stamped with it in any case")
+    ] = False
+
+
 class RigTable(Strict):
     """A rig file: either `[head]`, or `[projector]` and one `[[camera]]` or more."""
 
@@ -113,6 +122,7 @@ class RigTable(Strict):
     projector: DriverTable | None = None
     camera: Annotated[list[CameraTable], Field(default_factory=list)]
     synchronisation: SynchronisationTable | None = None
+    verification: VerificationTable = VerificationTable()
     scan: ScanDefaults = ScanDefaults()
 
     @model_validator(mode="after")
@@ -155,6 +165,7 @@ class RigConfig:
     cameras: tuple[CameraTable, ...]
     scan: ScanDefaults
     synchronisation: SynchronisationTable | None = None
+    refuse_when_stale: bool = False
 
 
 def read_rig(path: Path) -> RigConfig:
@@ -181,6 +192,7 @@ def read_rig(path: Path) -> RigConfig:
         cameras=tuple(table.camera),
         scan=table.scan,
         synchronisation=table.synchronisation,
+        refuse_when_stale=table.verification.refuse_when_stale,
     )
 
 
@@ -200,7 +212,8 @@ class ServiceSettings(BaseSettings):
 
     `require_key` False opens the service to everyone who reaches it, so it is refused beyond this machine.
     `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
-    environment they are separated by commas.
+    environment they are separated by commas. `webhook_url` is told when a scheduled run was missed or failed, and when
+    the rig's health changes; without it nothing is sent anywhere.
     """
 
     model_config = SettingsConfigDict(
@@ -222,6 +235,7 @@ class ServiceSettings(BaseSettings):
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+    webhook_url: Annotated[str, Field(max_length=2000)] | None = None
 
     @property
     def key_path(self) -> Path:
@@ -237,6 +251,18 @@ class ServiceSettings(BaseSettings):
     @classmethod
     def _split(cls, hosts: object) -> object:
         return tuple(host.strip() for host in hosts.split(",") if host.strip()) if isinstance(hosts, str) else hosts
+
+    @field_validator("webhook_url")
+    @classmethod
+    def _a_web_address(cls, url: str | None) -> str | None:
+        if not url:
+            return None
+        parts = urlsplit(url)
+        if parts.scheme not in {"http", "https"} or not parts.hostname:
+            # What was found is not repeated: such an address often holds a secret.
+            message = "expected an address that begins with http:// or https:// and a host; correct it or leave it out"
+            raise ValueError(message)
+        return url
 
     @model_validator(mode="after")
     def _closed_beyond_this_machine(self) -> Self:

@@ -32,7 +32,7 @@ class PatternError(InvalidInputError):
 
 
 class ScheduleError(InvalidInputError):
-    """A schedule cannot be kept: cron text that means nothing or never comes, an unknown time zone, a negative grace."""
+    """A schedule cannot be kept: cron text that means nothing or never comes, an unknown zone, a negative grace."""
 
 
 class ScheduleNotFoundError(SlrigError):

@@ -8,10 +8,25 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
-from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from slrig.api import artefacts, events, preview, rig, scans, system
+from slrig.api import (
+    acceptance,
+    artefacts,
+    calibration,
+    calibration_events,
+    calibration_files,
+    events,
+    health,
+    metrics,
+    preview,
+    rig,
+    scans,
+    schedules,
+    system,
+)
+from slrig.api.body_limits import BodyLimits
+from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.events import OpenStreams
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
@@ -34,7 +49,9 @@ def bare_app() -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         lifespan=_life,
     )
-    for part in (scans, events, artefacts, rig, preview, system):
+    scanning = (scans, events, artefacts, rig, preview)
+    calibrating = (calibration, calibration_events, calibration_files, health)
+    for part in (*scanning, *calibrating, acceptance, schedules, metrics, system):
         app.include_router(part.router)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)
@@ -49,7 +66,8 @@ def create_app(service: Service, *, key_digest: str | None) -> FastAPI:
     app.state.streams = OpenStreams(settings.max_event_streams)
     # The last one added is the outermost: every refusal becomes a problem, Host comes first, then the key, then the
     # body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
-    app.add_middleware(RequestBodyLimitMiddleware, max_body_size=settings.max_body_bytes)
+    longer = {IMPORT_PATH: max(MOST_IMPORT_BYTES, settings.max_body_bytes)}
+    app.add_middleware(BodyLimits, most_bytes=settings.max_body_bytes, longer=longer)
     if key_digest is not None:
         app.add_middleware(KeyCheck, key_digest=key_digest)
     hosts = [*LOCAL_NAMES, settings.host, *settings.allowed_hosts]
@@ -61,7 +79,7 @@ def create_app(service: Service, *, key_digest: str | None) -> FastAPI:
 @asynccontextmanager
 async def _life(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
-    service.runner.start()
+    service.start()
     try:
         yield
     finally:

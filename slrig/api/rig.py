@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from datetime import datetime
+from uuid import UUID
 
 from fastapi import APIRouter
 
-from slrig.api.schemas import CameraBody, DeviceBody, DeviceList, DriverBody, MissingLibraryBody, ProjectorBody, RigBody
+from slrig.api.schemas import (
+    CalibrationInUse,
+    CameraBody,
+    DeviceBody,
+    DeviceList,
+    DriverBody,
+    MissingLibraryBody,
+    ProjectorBody,
+    RigBody,
+)
 from slrig.api.service import Serving
 from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.discovery import found_devices, installed_drivers
 from slrig.model import Size
+from slrig.scan.records import utc_now
+from slrig.scan.work import RunnerStatus
 
 router = APIRouter(tags=["rig"])
 
@@ -24,7 +37,9 @@ def look_at_rig(service: Serving) -> RigBody:
         name=status.rig,
         open=facts is not None and status.fault is None,
         error=status.fault,
-        calibrated=None if facts is None else facts.calibrated,
+        calibrated=None if facts is None else (status.active is not None or facts.calibration is not None),
+        calibration=_in_use(status),
+        positions=[] if facts is None else list(facts.positions),
         cameras=[] if facts is None else [_camera(name, camera) for name, camera in facts.cameras.items()],
         projector=None if facts is None else _projector(facts.projector),
         holder=status.holder,
@@ -53,6 +68,24 @@ def list_devices() -> DeviceList:
         devices=[DeviceBody(**asdict(device)) for device in found.devices],
         missing=[MissingLibraryBody(**asdict(library)) for library in found.missing],
         faults=[str(fault) for fault in found.faults],
+    )
+
+
+def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
+    active, facts = status.active, status.facts
+    calibration = active.calibration if active is not None else None if facts is None else facts.calibration
+    if calibration is None:
+        return None
+    solved = calibration.solved
+    solved_at = None if solved is None else datetime.fromisoformat(solved.solved_at)
+    return CalibrationInUse(
+        source="rig" if active is None else "session",
+        id=None if active is None else UUID(active.name),
+        solve=None if solved is None else solved.id,
+        solved_at=solved_at,
+        age_s=None if solved_at is None else round((utc_now() - solved_at).total_seconds(), 1),
+        expected_error_mm=None if solved is None else solved.expected_error_mm,
+        error=status.misfit,
     )
 
 

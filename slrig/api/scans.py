@@ -14,6 +14,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, scan_body, scan_plan
 from slrig.api.service import Service, Serving
 from slrig.scan.records import ScanProgress, ScanRecord, ScanState
+from slrig.sessions.verification import require_healthy
 
 USUAL_PAGE = 50
 
@@ -45,15 +46,22 @@ def _started(service: Service, request: ScanRequest, key: str | None) -> ScanRec
     plan = scan_plan(request, service.scan_defaults)
     wait = request.if_busy == "queue"
     if key is None:
+        _require_healthy(service)
         return service.runner.submit(plan, label=request.label, wait=wait)
     earlier = service.store.reserve_key(key, fingerprint(request))
     if earlier is not None:
         return service.store.get(earlier)
     try:
+        _require_healthy(service)
         return service.runner.submit(plan, label=request.label, wait=wait, key=key)
     finally:
         # Does nothing when the key has its scan; a refused request may be tried again with the same key.
         service.store.release_key(key)
+
+
+def _require_healthy(service: Service) -> None:
+    health, _, _ = service.verifications.health()
+    require_healthy(health, refuse_when_stale=service.refuse_when_stale)
 
 
 def fingerprint(request: ScanRequest) -> str:

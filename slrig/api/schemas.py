@@ -19,11 +19,13 @@ from slrig.scan.records import ScanRecord, ScanState
 MOST_EXPOSURE_S = 60.0
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """A request: no unknown field, no value of another kind."""
+
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class PatternRequest(_Strict):
+class PatternRequest(Strict):
     """Which patterns to play. What is absent or null is as the rig file says, and else the default."""
 
     line_shift: bool | None = Field(default=None, description="false: Gray code only. Default true")
@@ -40,7 +42,7 @@ class PatternRequest(_Strict):
     rows: bool | None = Field(default=None, description="play the row axis as well. Default false")
 
 
-class ReconstructionRequest(_Strict):
+class ReconstructionRequest(Strict):
     """How frames become a mesh. What is absent or null is as the rig file says, and else the default."""
 
     keep_holes: bool | None = Field(
@@ -65,7 +67,7 @@ class ReconstructionRequest(_Strict):
     )
 
 
-class ScanRequest(_Strict):
+class ScanRequest(Strict):
     """A scan. An empty request is a scan as the rig file describes it."""
 
     label: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
@@ -108,11 +110,16 @@ def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
     """
     usual = defaults.exposures_s if request.exposure_s is None else None
     return ScanPlan(
-        patterns=PatternPlan(**_chosen(PatternPlan, request.patterns, defaults)),
+        patterns=pattern_plan(request.patterns, defaults),
         reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, defaults)),
         exposure_s=request.exposure_s,
         exposures_s=request.exposures_s if request.exposures_s is not None else usual,
     )
+
+
+def pattern_plan(request: PatternRequest, defaults: ScanDefaults) -> PatternPlan:
+    """The patterns that a request means on a rig with these defaults."""
+    return PatternPlan(**_chosen(PatternPlan, request, defaults))
 
 
 def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict[str, Any]:
@@ -217,6 +224,21 @@ class ProjectorBody(BaseModel):
     latency_s: float
 
 
+class CalibrationInUse(BaseModel):
+    """The calibration that scans use."""
+
+    source: Literal["session", "rig"] = Field(description="activated here, or the rig file's or the head's own")
+    id: UUID | None = Field(description="GET /calibration/{id} has it; null where it is the rig's own")
+    solve: str | None = Field(description="names the solve, as the reports of scans do; null if it does not say")
+    solved_at: datetime | None
+    age_s: float | None
+    expected_error_mm: float | None = Field(
+        description="standard deviation of a measured point along the surface normal, from the calibration alone; null "
+        "if it says nothing of its own error"
+    )
+    error: str | None = Field(description="why scans are refused with it: it is for other devices")
+
+
 class RigBody(BaseModel):
     """The rig: what is known of its devices, who holds it, and how many scans wait."""
 
@@ -224,9 +246,11 @@ class RigBody(BaseModel):
     open: bool = Field(description="every device is open and was well when last used")
     error: str | None = Field(description="why it is not open; the next scan tries again")
     calibrated: bool | None = Field(description="null before the rig was first open")
+    calibration: CalibrationInUse | None = Field(description="what scans use now; null where there is none")
+    positions: list[str] = Field(description="poses that the rig's positioner can take; none where a person does")
     cameras: list[CameraBody]
     projector: ProjectorBody | None
-    holder: UUID | None = Field(description="the scan that holds the rig")
+    holder: str | None = Field(description="who holds the rig: the id of a scan, or other work by name")
     since: datetime | None
     waiting: int
     queue_length: int

@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 
 import structlog
 import uvicorn
@@ -19,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 
 from slrig.api.app import create_app
 from slrig.api.security import KEY_VARIABLE, claim_key
-from slrig.api.service import Service
+from slrig.api.service import Service, assembled_service
 from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
@@ -66,17 +65,32 @@ def open_service(
     ):
         for name in found:
             _log.warning("left by the last run", scan=str(name), found=what)
+    worker = ReconstructionWorker()
     runner = Runner(
         store,
         folder,
         HeldRig(rig.name, lambda: open_rig(rig)),
-        ReconstructionWorker(),
+        worker,
         capture=capture_bundle,
         queue_length=settings.queue_length,
         spare_bytes=settings.min_free_bytes,
         give_up=give_up,
     )
-    return Service(settings, rig.scan, folder, store, runner)
+    try:
+        return assembled_service(
+            settings,
+            rig.scan,
+            folder,
+            store,
+            runner,
+            rig_name=rig.name,
+            worker=worker,
+            refuse_when_stale=rig.refuse_when_stale,
+        )
+    except BaseException:
+        store.close()
+        folder.release()
+        raise
 
 
 def serve(
@@ -145,7 +159,7 @@ def serve(
             # Streams end by themselves once their scans have; this is for every other request under way.
             timeout_graceful_shutdown=1,
         )
-        server = _Server(config, service.runner, settings.shutdown_s)
+        server = _Server(config, service)
         with suppress(KeyboardInterrupt):
             server.run(sockets=[listener])
         if wrong:
@@ -159,14 +173,13 @@ def serve(
 class _Server(uvicorn.Server):
     """Ends the scans first, while everybody who follows one can still be told, and the connections after that."""
 
-    def __init__(self, config: uvicorn.Config, runner: Runner, patience_s: float) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
-        self._runner = runner
-        self._patience_s = patience_s
+        self._service = service
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """See `uvicorn.Server`."""
-        await run_in_threadpool(partial(self._runner.close, timeout_s=self._patience_s))
+        await run_in_threadpool(self._service.end_work)
         await super().shutdown(sockets)
 
 

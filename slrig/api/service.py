@@ -2,32 +2,140 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.scan.folder import DataFolder
+from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
+from slrig.scan.worker import Job, ReconstructionWorker
+from slrig.scheduling.naming import NamedLender
+from slrig.scheduling.notices import NoticedHealth, Notices
+from slrig.scheduling.scheduler import Scheduler
+from slrig.scheduling.store import ScheduleStore
+from slrig.scheduling.tasks import Tasks
+from slrig.sessions.acceptance import ReconstructBundle
+from slrig.sessions.acceptance_desk import AcceptanceDesk
+from slrig.sessions.calibrating import Calibrations
+from slrig.sessions.calibration_tools import CalibrationTools
+from slrig.sessions.verification import VerificationDesk, VerificationTools
+
+_SCHEDULE_END_S = 1.0
+"""How long a scheduled run may take to end by itself before the runner ends it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """One service: its settings, its data, and the one that scans."""
+    """One service: its settings, its data, the one that scans, those that calibrate, verify and test, and the schedule.
+
+    refuse_when_stale : whether the rig file has scans refused then.
+    """
 
     settings: ServiceSettings
     scan_defaults: ScanDefaults
     folder: DataFolder
     store: ScanStore
     runner: Runner
+    calibrations: Calibrations
+    verifications: VerificationDesk
+    acceptance: AcceptanceDesk
+    schedules: ScheduleStore
+    tasks: Tasks
+    scheduler: Scheduler
+    notices: Notices
+    refuse_when_stale: bool = False
+
+    def start(self) -> None:
+        """Open the rig, and look at the clock."""
+        self.runner.start()
+        self.scheduler.start()
+
+    def end_work(self) -> None:
+        """Stop scanning and calibrating, and record what was cut off. Idempotent."""
+        self.scheduler.close(timeout_s=min(_SCHEDULE_END_S, self.settings.shutdown_s))
+        self.runner.close(timeout_s=self.settings.shutdown_s)
+        # A run that held a deaf driver has its answer now.
+        self.scheduler.close(timeout_s=_SCHEDULE_END_S)
+        self.calibrations.close()
 
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""
-        self.runner.close(timeout_s=self.settings.shutdown_s)
+        self.end_work()
+        self.notices.close()
+        self.schedules.close()
+        self.verifications.store.close()
         self.store.close()
         self.folder.release()
+
+
+def assembled_service(
+    settings: ServiceSettings,
+    scan_defaults: ScanDefaults,
+    folder: DataFolder,
+    store: ScanStore,
+    runner: Runner,
+    *,
+    rig_name: str,
+    calibration_tools: CalibrationTools | None = None,
+    verification_tools: VerificationTools | None = None,
+    worker: ReconstructionWorker | None = None,
+    refuse_when_stale: bool = False,
+) -> Service:
+    """A service of what scans, and of the rest made to go with it. Nothing is started but what sends notices.
+
+    worker : the runner's, for the meshes of an acceptance test; None has them made in this process.
+
+    Raises
+    ------
+    StorageError
+        The disk refused. What was given is still the caller's to close.
+    """
+    spare_bytes = settings.min_free_bytes
+    lender = NamedLender(runner)
+    calibrations = Calibrations(folder, lender, rig_name=rig_name, tools=calibration_tools, spare_bytes=spare_bytes)
+    schedules = ScheduleStore(folder.database)
+    notices = Notices(settings.webhook_url, rig=rig_name)
+    health = NoticedHealth(folder.database, notices)
+    verifications = VerificationDesk(folder, lender, health, tools=verification_tools, spare_bytes=spare_bytes)
+    runner.watch_health(verifications)
+    acceptance = AcceptanceDesk(
+        folder.root / "acceptance", lender, reconstruct=None if worker is None else _elsewhere(worker)
+    )
+    tasks = Tasks(lender, calibrations, verifications, acceptance)
+    # The folder's lock keeps every other process out.
+    scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)
+    return Service(
+        settings=settings,
+        scan_defaults=scan_defaults,
+        folder=folder,
+        store=store,
+        runner=runner,
+        calibrations=calibrations,
+        verifications=verifications,
+        acceptance=acceptance,
+        schedules=schedules,
+        tasks=tasks,
+        scheduler=scheduler,
+        notices=notices,
+        refuse_when_stale=refuse_when_stale,
+    )
+
+
+def _elsewhere(worker: ReconstructionWorker) -> ReconstructBundle:
+    """Reconstruction in the process that scans have theirs in. Both call it on the thread that owns the rig."""
+
+    def reconstruct(
+        bundle: Path, output: Path, /, *, plan: ReconstructionPlan, progress: Progress, cancelled: Callable[[], bool]
+    ) -> Mapping[str, Any]:
+        return worker.run(Job(bundle, output, plan), progress=progress, cancelled=cancelled)
+
+    return reconstruct
 
 
 def _of_request(request: Request) -> Service:

@@ -1,5 +1,6 @@
 """slrig's commands and their exit codes: 0 well, 1 a defect of slrig, 2 something to be put right, 130 Ctrl-C.
-`slrig conform` exits with 1 for a defect of a driver, `slrig doctor` for one of the rig, too.
+`slrig conform` exits with 1 for a defect of a driver, `slrig doctor` for one of the rig, `slrig verify` for a stale
+calibration, `slrig accept` for a test that is not passed, too.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from slrig.cli import calibrate, schedule
+from slrig.cli import acceptance_command, calibrate, schedule, verify_command
 from slrig.cli.options import USUAL_URL, KeyFile, Url
 from slrig.errors import SlrigError
 
@@ -45,6 +46,8 @@ app = typer.Typer(
 )
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
+app.command()(verify_command.verify)
+app.command()(acceptance_command.accept)
 
 KeepHoles = Annotated[
     bool | None,

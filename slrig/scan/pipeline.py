@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle import read_bundle, read_calibration, read_truth
 from slrig.bundle.description import read_description
+from slrig.bundle.health import read_health
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import read_refused
 from slrig.capture.exposure import check_exposures
@@ -147,6 +148,7 @@ def reconstruct_bundle(
         report = {
             **walked.sections,
             "calibration": calibration_report(devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
+            "health": read_health(bundle),
             "plan": asdict(plan),
             "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
             "redundancy": dict(meshed.redundancy),

@@ -20,7 +20,7 @@ from slrig.scan.preview import Light, Watch
 from slrig.scan.records import ScanRecord, ScanState, utc_now
 from slrig.scan.store import ScanStore
 from slrig.scan.walking import ScanTools, ScanWalk
-from slrig.scan.work import CaptureBundle, Holder, Loan, RunnerStatus
+from slrig.scan.work import CaptureBundle, Holder, Loan, RunnerStatus, WatchesHealth
 from slrig.scan.worker import ReconstructionWorker
 
 _log = structlog.get_logger(__name__)
@@ -53,8 +53,16 @@ class Runner:
         self._closed = False
         self._lender = Lender(rig, queue_length=queue_length, give_up=give_up)
         self._endings = Endings(store)
+        self._health: WatchesHealth | None = None
         self._tools = ScanTools(
-            store, folder, worker, capture, self._endings, spare_bytes, ending=lambda: self._lender.ending
+            store,
+            folder,
+            worker,
+            capture,
+            self._endings,
+            spare_bytes,
+            ending=lambda: self._lender.ending,
+            health=lambda: self._health,
         )
 
     def start(self) -> None:
@@ -129,6 +137,10 @@ class Runner:
     def recall(self, loan: UUID) -> None:
         """Ask work that has the rig, or waits for it, to end early. Returns at once; one that is over stays so."""
         self._lender.cancel(loan)
+
+    def watch_health(self, health: WatchesHealth) -> None:
+        """Have scans that begin from now on carry the health of their calibration, and tell what they find of it."""
+        self._health = health
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:
         """Have what is begun from now on use a calibration; None has it use the rig's own.

@@ -9,6 +9,7 @@ from typing import Any
 
 import structlog
 
+from slrig.bundle.health import write_health
 from slrig.errors import ScanCancelledError, SlrigError
 from slrig.scan.endings import Ending, Endings
 from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
@@ -16,7 +17,7 @@ from slrig.scan.folder import DataFolder, sync_tree
 from slrig.scan.holding import HeldRig, check_plan, driver_errors
 from slrig.scan.records import ScanRecord, ScanState, report_summary
 from slrig.scan.store import ProgressRecorder, ScanStore
-from slrig.scan.work import CaptureBundle, Holder
+from slrig.scan.work import CaptureBundle, Holder, WatchesHealth
 from slrig.scan.worker import Job, ReconstructionWorker
 
 CAPTURE_SHARE = 0.5
@@ -27,7 +28,11 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ScanTools:
-    """What every scan is made with. `spare_bytes` are left free on the disk; `ending` tells that the service ends."""
+    """What every scan is made with.
+
+    spare_bytes : left free on the disk. ending : tells that the service ends. health : who knows whether the
+    calibration still holds, if anybody does.
+    """
 
     store: ScanStore
     folder: DataFolder
@@ -36,6 +41,7 @@ class ScanTools:
     endings: Endings
     spare_bytes: int
     ending: Callable[[], bool]
+    health: Callable[[], WatchesHealth | None] = lambda: None
 
 
 class ScanWalk:
@@ -121,7 +127,10 @@ class ScanWalk:
             held.doubt(error)
             raise
         held.darken()
+        health = tools.health()
         with disk_errors(staged):
+            if health is not None and (stamp := health.stamp()) is not None:
+                write_health(bundle, stamp)
             sync_tree(bundle)
         if self.stop.is_set():
             feed.abandon()
@@ -132,6 +141,8 @@ class ScanWalk:
         job = Job(bundle, staged / "result", self._plan.reconstruction)
         report = tools.worker.run(job, progress=progress, cancelled=self.stop.is_set, feed=feed)
         tools.folder.commit(self.id)
+        if health is not None:
+            _noted(health, report)
         return report_summary(report)
 
     def _keep_evidence(self, state: ScanState) -> None:
@@ -144,3 +155,11 @@ class ScanWalk:
             # The scan's own fault is the one to tell; without its bundle it is told all the same.
             _log.exception("the bundle of a failed scan could not be kept", scan=str(self.id))
         folder.discard(self.id)
+
+
+def _noted(health: WatchesHealth, report: Mapping[str, Any]) -> None:
+    """Tell what a scan says of its calibration. The scan stands, whatever becomes of that."""
+    try:
+        health.note(report)
+    except Exception:  # noqa: BLE001 - see above
+        _log.exception("what a scan says of its calibration could not be noted")

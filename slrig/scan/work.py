@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 from uuid import UUID
 
 import structlog
@@ -141,6 +141,18 @@ class CaptureBundle(Protocol):
         frames: FrameSink,
     ) -> None:
         """Play the patterns and write a complete bundle into `folder`; show each frame to `frames`."""
+        ...
+
+
+class WatchesHealth(Protocol):
+    """What knows the health of the rig's calibration, and learns from scans."""
+
+    def stamp(self) -> Mapping[str, Any] | None:
+        """The health now, as a scan's report has it; None where nothing was verified yet."""
+        ...
+
+    def note(self, report: Mapping[str, Any]) -> None:
+        """Take note of what a finished scan's report says of the calibration."""
         ...
 
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import structlog
 
-from slrig.errors import RigBusyError, SlrigError
+from slrig.errors import RigBusyError, ScheduleNotFoundError, SlrigError
 from slrig.scan.records import Clock, utc_now
 from slrig.scheduling.records import Run, RunState, Schedule
 from slrig.scheduling.store import ScheduleStore
@@ -99,6 +99,8 @@ class Scheduler:
     def tick(self) -> datetime:
         """Look at the clock once. Returns when to look again."""
         now = self._clock()
+        if self._idle.is_set():
+            self._tell(self._store.interrupt_own(now))
         self._store.beat(now)
         self._tell(self._store.interrupt_dead(now))
         self._tell(run for run in self._store.reckon(now) if run.state.final)
@@ -122,6 +124,9 @@ class Scheduler:
         def do() -> None:
             try:
                 self._end(schedule, run)
+            except SlrigError:
+                # A full disk: the next look takes down that it is over.
+                _log.exception("the end of a scheduled run could not be put on record", schedule=str(schedule.id))
             finally:
                 self._idle.set()
                 self.wake()
@@ -149,7 +154,14 @@ class Scheduler:
         if self._stop.is_set() and state is not RunState.SUCCEEDED:
             state, reason = RunState.INTERRUPTED, "the service ended in the middle of it"
         self._store.finish(run, state, self._clock(), reason=reason, result=result)
-        self._tell([next(each for each in self._store.runs(schedule.id) if each.number == run.number)])
+        self._tell(each for each in self._runs(schedule) if each.number == run.number)
+
+    def _runs(self, schedule: Schedule) -> Iterable[Run]:
+        """The newest runs of a schedule; none if it was removed meanwhile."""
+        try:
+            return self._store.runs(schedule.id)
+        except ScheduleNotFoundError:
+            return ()
 
     def _tell(self, runs: Iterable[Run]) -> None:
         for run in runs:

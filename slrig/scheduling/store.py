@@ -99,6 +99,16 @@ class ScheduleStore:
                 query = query.where(RunRow.number < before)
             return [_run(row) for row in session.scalars(query.order_by(RunRow.number.desc()).limit(limit))]
 
+    def counts(self) -> dict[tuple[TaskKind, RunState], int]:
+        """How many runs of each task are on record in each state. A row that stands for several counts as those."""
+        query = (
+            select(ScheduleRow.task, RunRow.state, func.sum(RunRow.count))
+            .join(RunRow, RunRow.schedule_id == ScheduleRow.id)
+            .group_by(ScheduleRow.task, RunRow.state)
+        )
+        with self._database.reading() as session:
+            return {(TaskKind(task), RunState(state)): int(count) for task, state, count in session.execute(query)}
+
     def reckon(self, now: datetime) -> Sequence[Run]:
         """Record what has become due. Returns the rows made."""
         made: list[RunRow] = []
@@ -188,6 +198,17 @@ class ScheduleStore:
             for row in dead:
                 _close(row, RunState.INTERRUPTED, now, "the service ended in the middle of it")
             return [_run(row) for row in dead]
+
+    def interrupt_own(self, now: datetime) -> Sequence[Run]:
+        """Record the runs that this process began as interrupted. Only while it has none under way: what it still has
+        on record as running ended while the disk refused to take that down.
+        """
+        query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
+        with self._database.changing() as session:
+            ended = list(session.scalars(query))
+            for row in ended:
+                _close(row, RunState.INTERRUPTED, now, "it ended, and how could not be put on record")
+            return [_run(row) for row in ended]
 
     def expire(self, now: datetime) -> Sequence[Run]:
         """Record runs that waited for the whole of their grace as skipped, each with what it waited for."""

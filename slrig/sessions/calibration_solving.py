@@ -9,12 +9,10 @@ from uuid import uuid4
 
 from slrig.calibration.board import Board
 from slrig.calibration.coverage import Coverage, coverage
-from slrig.calibration.expected_error import expected_error
 from slrig.calibration.figures import ViewFigures
 from slrig.calibration.observations import Observations, PoseObservation
 from slrig.calibration.scale_check import check_scale
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
-from slrig.calibration.solve import solve
 from slrig.calibration.verdict import Verdict, verdict
 from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.model import Calibration, Size, Solved
@@ -69,6 +67,10 @@ def solve_poses(
     SolveRefusedError
         The poses determine no calibration, or none that could measure.
     """
+    # Late: the service knows these values, and loads no compiled kernel before somebody solves.
+    from slrig.calibration.expected_error import expected_error
+    from slrig.calibration.solve import solve
+
     observed = tuple(pose.observation for pose in poses)
     if projector is None and len(cameras) < 2:
         message = (

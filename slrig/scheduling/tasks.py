@@ -1,0 +1,121 @@
+"""What schedules do with the rig: each task's options checked, and its work done in line with the scans."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+from uuid import UUID
+
+from slrig.errors import ScanStateError
+from slrig.scan.work import Holder
+from slrig.scheduling.acceptance_task import AcceptanceTask
+from slrig.scheduling.calibration_task import CalibrationTask
+from slrig.scheduling.naming import NamedLender
+from slrig.scheduling.records import Order, Run, Schedule, TaskKind
+from slrig.scheduling.verification_task import VerificationTask
+from slrig.scheduling.waiting import until
+from slrig.sessions.acceptance_desk import AcceptanceDesk
+from slrig.sessions.calibrating import Calibrations
+from slrig.sessions.verification import VerificationDesk
+
+
+class Task(Protocol):
+    """One kind of work."""
+
+    def check(self, options: Mapping[str, Any], /) -> None:
+        """Raise ScheduleError for options that no run could be done with."""
+        ...
+
+    def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """Do it, the rig held by `holder`, and return what there is to tell, as JSON values.
+
+        Raises
+        ------
+        RigBusyError
+            Somebody holds the rig: before anything was done.
+        SlrigError
+            It could not be done.
+        """
+        ...
+
+
+class Tasks:
+    """Every kind of work: a `slrig.scheduling.scheduler.Work`. Any thread may call.
+
+    The desks have to borrow the rig by way of `lender`: it is by it that a refusal names the schedule.
+    """
+
+    def __init__(
+        self,
+        lender: NamedLender,
+        calibrations: Calibrations,
+        verifications: VerificationDesk,
+        acceptance: AcceptanceDesk,
+    ) -> None:
+        self._lender = lender
+        self._of: Mapping[TaskKind, Task] = {
+            TaskKind.VERIFICATION: VerificationTask(lender, calibrations, verifications),
+            TaskKind.CALIBRATION: CalibrationTask(lender, calibrations),
+            TaskKind.ACCEPTANCE: AcceptanceTask(lender, acceptance),
+        }
+        self._lock = threading.Lock()
+        self._stops: dict[UUID, threading.Event] = {}
+
+    def check(self, order: Order) -> None:
+        """Raise ScheduleError, with every fault, for options that no run could be done with."""
+        self._of[order.task].check(order.options)
+
+    def __call__(self, schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """See `slrig.scheduling.scheduler.Work`."""
+        holder, stop = holder_of(schedule, run), threading.Event()
+
+        def ends() -> bool:
+            return cancelled() or stop.is_set()
+
+        with self._lock:
+            self._stops[schedule.id] = stop
+        try:
+            self._open_rig(holder, ends)
+            return self._of[schedule.order.task].do(holder, schedule.order.options, cancelled=ends)
+        finally:
+            with self._lock:
+                self._stops.pop(schedule.id, None)
+
+    def cancel(self, schedule: Schedule) -> None:
+        """Ask the run of a schedule that is under way to end early. Returns at once. Raises ScanStateError."""
+        with self._lock:
+            stop = self._stops.get(schedule.id)
+        if stop is None:
+            message = f"Schedule {schedule.id} has no run under way. GET /schedule/{schedule.id}/runs lists its runs."
+            raise ScanStateError(message)
+        stop.set()
+
+    def _open_rig(self, holder: Holder, cancelled: Callable[[], bool]) -> None:
+        """Have a rig opened that was not open yet: what it can do is known only then. Raises as a scan does."""
+        if self._lender.status().facts is not None:
+            return
+        errors: list[Exception | None] = []
+        with self._lender.named(holder):
+            loan = self._lender.borrow(lambda *_: None, holder=holder, wait=False, ended=errors.append)
+        until(lambda: bool(errors), cancelled, cancel=lambda: self._lender.recall(loan))
+        if errors[0] is not None:
+            raise errors[0]
+
+
+def holder_of(schedule: Schedule, run: Run) -> Holder:
+    """Who holds the rig for a run.
+
+    >>> from datetime import UTC, datetime
+    >>> from slrig.scheduling.cron import Cron
+    >>> from slrig.scheduling.records import RunState
+    >>> due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
+    >>> order = Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION)
+    >>> schedule = Schedule(UUID(int=7), order, due, due)
+    >>> run = Run(1, schedule.id, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
+    >>> holder_of(schedule, run).name
+    'schedule 00000000, verification due 06:30'
+    """
+    due = schedule.order.cron.local(run.due)
+    words = f"schedule {str(schedule.id)[:8]}, {schedule.order.task} due {due:%H:%M}"
+    return Holder(words, words, f"/schedule/{schedule.id}")

@@ -1,0 +1,119 @@
+"""`slrig schedule` against a service over a tame bench: the requests it sends are those that the service takes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from fastapi.testclient import TestClient
+from typer.testing import CliRunner, Result
+
+from slrig.cli import schedule
+from slrig.cli.client import ServiceClient
+from slrig.cli.commands import app
+from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.calibrate_command import refused
+
+BOARD = 'board={"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}'
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    bench = ServedBench(tmp_path_factory.mktemp("data"))
+    headers = {"Authorization": f"Bearer {KEY}"}
+    with TestClient(bench.app, base_url="http://127.0.0.1", headers=headers) as client:
+        yield client
+
+
+@pytest.fixture(autouse=True)
+def reached(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    def forward(request: httpx2.Request) -> httpx2.Response:
+        told = service.request(
+            request.method, request.url.raw_path.decode(), content=request.read(), headers=dict(request.headers)
+        )
+        kept = {"content-type": told.headers.get("content-type", "")}
+        return httpx2.Response(told.status_code, content=told.content, headers=kept)
+
+    def client(_url: str, _key_file: Path | None) -> ServiceClient:
+        return ServiceClient("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
+
+    monkeypatch.setattr(schedule, "_client", client)
+    yield
+    for each in kept(service):
+        service.delete(each["links"]["self"])
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["schedule", *arguments])
+
+
+def done(*arguments: str) -> str:
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def kept(service: TestClient) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = service.get("/schedule").json()["schedules"]
+    return found
+
+
+def test_add_shows_the_next_five_times(service: TestClient) -> None:
+    told = done("add", "30 6 * * mon", "verification", "--time-zone", "Europe/Berlin", "--option", BOARD).splitlines()
+    (made,) = kept(service)
+    assert told[0] == f"{made['id']}: verification at '30 6 * * mon' in Europe/Berlin"
+    assert len(told) == 6
+    assert all(line.startswith("  Mon ") and " 06:30 +0" in line for line in told[1:])
+    assert made["options"]["board"]["corners"] == [4, 3]
+
+
+def test_options_reach_the_service(service: TestClient) -> None:
+    more = ("--label", "nights", "--grace-s", "600", "--retry-s", "30", "--no-catch-up", "--paused", "--json")
+    given = ("--option", BOARD, "--option", "activate=true")
+    made = json.loads(done("add", "0 2 * * *", "calibration", *given, *more))
+    assert kept(service) == [made]
+    assert (made["label"], made["grace_s"], made["retry_s"]) == ("nights", 600, 30)
+    assert (made["catch_up"], made["enabled"], made["options"]["activate"]) == (False, False, True)
+
+
+def test_list_runs_pause_resume_and_remove(service: TestClient) -> None:
+    assert done("list") == "no schedules; add one with: slrig schedule add '30 6 * * *' verification\n"
+    made = json.loads(done("add", "0 2 * * *", "verification", "--label", "nights", "--json"))
+    beginning = made["id"][:8]
+    heads, row = done("list").splitlines()
+    assert heads.split() == ["id", "task", "when", "next", "label"]
+    assert row.split()[:2] == [beginning, "verification"]
+    assert row.endswith("nights")
+    assert json.loads(done("list", "--json"))["schedules"] == [made]
+    assert done("runs", beginning) == "nothing was due yet\n"
+    assert json.loads(done("runs", beginning, "--json"))["runs"] == []
+    assert done("pause", beginning) == "paused\n"
+    assert "paused" in done("list").splitlines()[1]
+    assert f"{made['id']}: verification at '0 2 * * *' in UTC\n" in done("resume", beginning)
+    assert done("remove", beginning) == "removed\n"
+    assert kept(service) == []
+
+
+def test_what_cannot_be_is_refused_in_words() -> None:
+    for arguments, words in (
+        (("add", "30 6", "verification"), "cron"),
+        (("add", "99 6 * * *", "verification"), "cron: Bad minute"),
+        (("add", "30 6 * * *", "dance"), "task"),
+        (("add", "30 6 * * *", "verification", "--option", "colour=red"), "colour: unknown key"),
+        (("add", "30 6 * * *", "verification", "--option", "colour"), "expected name=value, found 'colour'"),
+        (("runs", "3f2a"), "'3f2a' is the beginning of no schedule's id; there are: none"),
+    ):
+        result = run(*arguments)
+        assert result.exit_code != 0, arguments
+        assert words in result.stderr, (arguments, result.stderr)
+        assert "Traceback" not in result.stderr
+
+
+def test_beginning_that_is_not_known_lists_those_that_are(service: TestClient) -> None:
+    done("add", "0 2 * * *", "verification")
+    (made,) = kept(service)
+    assert f"there are: {made['id'][:8]}" in refused(run("pause", "zzz"))
