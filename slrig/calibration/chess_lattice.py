@@ -75,6 +75,8 @@ def grown_lattice(level: FloatArray, points_px: FloatArray, steps: IntArray) -> 
             return None
         corner, points = placed.view.corner, placed.view.points_px
         crossing = _crossing(level, placed.board_map, corner)
+        if not np.isfinite(crossing).all(axis=1).any():
+            return None
         polarity = 1.0 if np.nanmedian(crossing.sum(axis=1)) > 0 else -1.0
         strength = (polarity * crossing).min(axis=1)
         usual = float(np.nanmedian(strength))

@@ -32,6 +32,9 @@ _BUMP_SHARE = 0.82
 _ALIKE_GAIN = 0.9
 _TIMES_OTHERS = 2.5
 _SPREADS_FROM_OTHERS = 6.0
+_LEAST_OFF_PX = 0.05
+"""A pose that is off by less harms nothing, and lenses are not modelled better than that."""
+
 _MOST_LEFT_OUT = 1 / 3
 _MEDIAN = 0.6745
 
@@ -177,7 +180,7 @@ def worst_pose(problem: Problem, fit: Fit, /) -> tuple[int, str] | None:
         middle = float(np.nanmedian(median))
         spread = float(np.nanmedian(np.abs(median - middle))) / _MEDIAN
         bound = max(_TIMES_OTHERS * middle, middle + _SPREADS_FROM_OTHERS * spread)
-        excess = np.nan_to_num(median / bound, nan=0.0)
+        excess = np.where(median_px >= _LEAST_OFF_PX, np.nan_to_num(median / bound, nan=0.0), 0.0)
         number = int(np.argmax(excess))
         if excess[number] > 1 and (worst is None or excess[number] > worst[0]):
             worst = (

@@ -13,6 +13,7 @@ from slrig.calibration.consistency import most_left_out, refuse_bump, worst_pose
 from slrig.calibration.covariance import covariance_of
 from slrig.calibration.deviations import deviations_of
 from slrig.calibration.held_out import LADDER, chosen_terms, folds_of, held_out
+from slrig.calibration.held_out import LEAST_POSES as LEAST_HELD_OUT
 from slrig.calibration.initial import LEAST_POSES, start_of
 from slrig.calibration.initial_projector import projector_start
 from slrig.calibration.leftovers import residuals_of_devices
@@ -73,7 +74,8 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
     outliers = {name: _unseen() for name, good in zip(poses, seen, strict=True) if not good}
     everything = Problem((*names,), poses, False, measurements.of_poses(seen))
     corners_only = replace(everything, measurements=everything.measurements.of_poses(seen, light=False))
-    terms: dict[str, tuple[str, ...]] = dict.fromkeys([*names, PROJECTOR], ("k1", "k2"))
+    # Poses are compared under a lens that can be right: with one that cannot, those at the image's border are off.
+    terms = dict.fromkeys([*names, PROJECTOR], LADDER[-2] if int(seen.sum()) >= LEAST_HELD_OUT else LADDER[1])
     geometry = flat_geometry(observations.board, start.devices, start.poses)
     if observations.projector is None:
         corners_only, fit = _agreeing(corners_only, geometry, terms, outliers)

@@ -99,6 +99,7 @@ def test_the_end_of_input_leaves_too(plan: AcceptancePlan) -> None:
         place(Rig("tame", {}, None, {}), plan.steps[0])  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_json", [False, True])
 def test_the_command_does_the_test_and_returns_the_decision(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, as_json: bool

@@ -143,6 +143,7 @@ def test_report_is_written_with_what_each_camera_saw(
     assert "Calibration from poses" in text
 
 
+@pytest.mark.slow
 def test_earlier_calibration_is_what_the_scale_is_held_against(
     poses: Path, solving: dict[str, Any], tmp_path: Path
 ) -> None:

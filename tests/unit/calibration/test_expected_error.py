@@ -116,6 +116,7 @@ def test_noise_is_that_of_the_light_of_one_point() -> None:
     assert given.noise_mm == pytest.approx(3 * stated.noise_mm, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_two_cameras_without_a_projector() -> None:
     left, right = left_camera(), right_camera()
     solution, observations = solved({"left": left, "right": right}, None)

@@ -96,6 +96,7 @@ def test_every_vertex_states_its_share(recorded: Path, exact: tuple[Path, dict[s
     assert (tmp_path / "out" / "mesh.stl").read_bytes() == (exact[0] / "mesh.stl").read_bytes()
 
 
+@pytest.mark.slow
 def test_twice_the_error_has_twice_the_share(recorded: Path, tmp_path: Path) -> None:
     calibration = read_calibration(recorded / "calibration.json")
     shares = []

@@ -307,6 +307,7 @@ def test_two_cameras_taken_live_give_the_bytes_that_the_bundle_gives(tmp_path: P
     assert reports_alike(live, read)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["another calibration", "other frames", "an end that never came"])
 def test_frames_taken_live_that_are_not_those_of_the_bundle_are_passed_over(
     recorded: Path, tmp_path: Path, what: str
