@@ -22,7 +22,7 @@ from slrig.sessions.acceptance_scene import scripted_config
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
 """Small: the demonstration's resolution over half its view."""
 
-SEEDS = 6
+SEEDS = 3
 
 
 def seeded(config: RigConfig, seed: int) -> RigConfig:

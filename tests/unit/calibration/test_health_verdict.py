@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -89,11 +90,13 @@ def test_clean_captures_raise_no_alarm() -> None:
 
 
 @pytest.mark.slow
-def test_no_alarm_on_200_clean_captures() -> None:
+def test_no_alarm_on_many_clean_captures() -> None:
+    """60 of them; as many as SLRIG_CLEAN_CAPTURES says where it is set: 200 were looked at when the limits were set."""
+    count = int(os.environ.get("SLRIG_CLEAN_CAPTURES", "60"))
     for number in range(2):
         rig = bench(10 + number)
         looks: list[Look] = []
-        for seed in range(100):
+        for seed in range(count // 2):
             looks.append(look_at_board([look_of(rig.devices, 1000 * number + seed)], BOARD, rig.calibration))
             assert judged(looks).state is HealthState.GOOD
 
