@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-import numpy as np
 from fastapi import APIRouter, Body, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
@@ -14,21 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
 from slrig.api.service import Serving
-from slrig.errors import InvalidInputError
-from slrig.model import Calibration
 from slrig.scan.faults import fault_of
+from slrig.sessions.acceptance_asking import plan_asked
 from slrig.sessions.acceptance_desk import AcceptanceRecord, AcceptanceState
 from slrig.sessions.acceptance_evaluation import Reading
 from slrig.sessions.acceptance_plan import (
     USUAL_REPEATS,
-    AcceptancePlan,
-    Artefacts,
-    Certified,
-    Limits,
-    exact_artefacts,
-    usual_limits,
 )
-from slrig.sessions.acceptance_positions import acceptance_plan, rig_volume_mm
 
 router = APIRouter(prefix="/acceptance", tags=["acceptance"])
 
@@ -80,26 +72,6 @@ class AcceptanceRequest(_Strict):
     repeats: Annotated[int, Field(ge=1, le=50)] = USUAL_REPEATS
     exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
     notes: Annotated[str, Field(max_length=1000)] = ""
-
-    def plan(self, calibration: Calibration) -> AcceptancePlan:
-        """The plan for a rig so calibrated. Raises InvalidInputError."""
-        rendered = self.artefacts is None
-        volume = rig_volume_mm(calibration) if self.volume_mm is None else np.array(self.volume_mm, np.float64)
-        if not (volume[0] < volume[1]).all():
-            message = f"volume_mm: expected the least corner and then the greatest, found {volume.tolist()}"
-            raise InvalidInputError(message)
-        given = self.limits
-        usual = usual_limits(volume, rendered=rendered).spacing_mm
-        return acceptance_plan(
-            calibration,
-            volume,
-            exact_artefacts(volume) if self.artefacts is None else _artefacts(self.artefacts),
-            rendered=rendered,
-            limits=Limits(given.spacing_mm or usual, given.form_mm, given.size_mm, given.flatness_mm),
-            repeats=self.repeats,
-            exposure_s=self.exposure_s,
-            notes=self.notes,
-        )
 
 
 class PositionRequest(_Strict):
@@ -154,7 +126,7 @@ def open_acceptance(
     request: Annotated[AcceptanceRequest, Body(default_factory=AcceptanceRequest)],
 ) -> AcceptanceBody:
     """Open an acceptance test of the rig as it is calibrated now. Touches no device."""
-    record = service.acceptance.open(request.plan)
+    record = service.acceptance.open(partial(plan_asked, request))
     response.headers["Location"] = f"/acceptance/{record.id}"
     return _body(record)
 
@@ -192,19 +164,6 @@ def acceptance_page(service: Serving, test_id: UUID) -> FileResponse:
 def acceptance_report(service: Serving, test_id: UUID) -> FileResponse:
     """Return the report for machines."""
     return FileResponse(service.acceptance.file(test_id, "report.json"), media_type="application/json")
-
-
-def _artefacts(body: ArtefactsBody) -> Artefacts:
-    return Artefacts(
-        Certified(body.sphere.value_mm, body.sphere.uncertainty_mm),
-        Certified(body.bar.value_mm, body.bar.uncertainty_mm),
-        body.plane_mm,
-        body.ball_mm,
-        body.sphere_form_mm,
-        body.plane_form_mm,
-        body.certificate,
-        body.temperature_c,
-    )
 
 
 def _body(record: AcceptanceRecord) -> AcceptanceBody:

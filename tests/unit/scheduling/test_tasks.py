@@ -299,7 +299,7 @@ def test_schedule_that_is_removed_during_its_run_is_forgotten(bench: TaskBench) 
 def test_acceptance_is_measured_by_script_and_tells_its_decision(
     desk: AcceptanceDesk, lender: TameLender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("slrig.scheduling.acceptance_task.plan_of", lambda *_: PLAN)
+    monkeypatch.setattr("slrig.scheduling.acceptance_task.plan_asked", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
     named = NamedLender(cast("CalibratedRig", lender))
     desk._lender = named
