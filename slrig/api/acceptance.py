@@ -15,10 +15,10 @@ from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
 from slrig.api.service import Serving
 from slrig.scan.faults import fault_of
-from slrig.sessions.acceptance_asking import plan_asked
-from slrig.sessions.acceptance_desk import AcceptanceRecord, AcceptanceState
-from slrig.sessions.acceptance_evaluation import Reading
-from slrig.sessions.acceptance_plan import (
+from slrig.sessions.acceptance.asking import plan_asked
+from slrig.sessions.acceptance.desk import AcceptanceRecord, AcceptanceState
+from slrig.sessions.acceptance.evaluation import Reading
+from slrig.sessions.acceptance.plan import (
     USUAL_REPEATS,
 )
 

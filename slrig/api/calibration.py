@@ -30,10 +30,10 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
-from slrig.sessions.calibrating import EXPORTS
-from slrig.sessions.calibration_records import PoseRecord, PoseState, SessionRecord
-from slrig.sessions.calibration_store import REPORT
-from slrig.sessions.pose_shooting import PoseRequest
+from slrig.sessions.calibration.calibrating import EXPORTS
+from slrig.sessions.calibration.pose_shooting import PoseRequest
+from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord
+from slrig.sessions.calibration.store import REPORT
 
 IMPORT_PATH = "/calibration/import"
 MOST_IMPORT_BYTES = MOST_CALIBRATION_BYTES

@@ -17,7 +17,7 @@ from slrig.api.openapi import problems
 from slrig.api.service import Serving
 from slrig.errors import CalibrationNotFoundError
 from slrig.scan.records import ScanEvent
-from slrig.sessions.calibration_register import CalibrationRegister
+from slrig.sessions.calibration.register import CalibrationRegister
 
 _LAST_WORD_S = 2.0
 """How much longer than the work that it follows an event stream may live when the service ends."""

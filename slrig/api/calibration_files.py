@@ -13,9 +13,9 @@ from slrig.api.openapi import problems
 from slrig.api.service import Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
-from slrig.sessions.calibrating import EXPORTS
-from slrig.sessions.calibration_store import REPORT
-from slrig.sessions.pose_answering import picture_name
+from slrig.sessions.calibration.calibrating import EXPORTS
+from slrig.sessions.calibration.pose_answering import picture_name
+from slrig.sessions.calibration.store import REPORT
 
 MEDIA_TYPES = {
     "calibration.json": "application/json",

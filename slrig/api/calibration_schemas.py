@@ -12,9 +12,9 @@ from pydantic import BaseModel, Field
 from slrig.api.problems import fault_problem
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, Strict
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.comparison import Comparison, Difference
+from slrig.calibration.judging.comparison import Comparison, Difference
 from slrig.scan.plan import PatternPlan
-from slrig.sessions.calibration_records import PoseRecord, PoseState, SessionRecord, SessionState, plain
+from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
 
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 CornerCount = Annotated[int, Field(ge=3, le=60)]

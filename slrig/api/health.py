@@ -15,12 +15,12 @@ from slrig.api.problems import fault_problem
 from slrig.api.schemas import MOST_EXPOSURE_S, Strict
 from slrig.api.service import Service, Serving
 from slrig.calibration.board import Board
-from slrig.calibration.health_verdict import HealthState
+from slrig.calibration.health.verdict import HealthState
 from slrig.errors import CalibrationError
 from slrig.scan.records import utc_now
-from slrig.sessions.health_plot import health_svg
-from slrig.sessions.health_store import VerificationRecord
-from slrig.sessions.verification import JobState, VerificationJob, solve_id
+from slrig.sessions.health.plot import health_svg
+from slrig.sessions.health.store import VerificationRecord
+from slrig.sessions.health.verification import JobState, VerificationJob, solve_id
 
 router = APIRouter(prefix="/rig", tags=["health"])
 

@@ -13,7 +13,7 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_late
 from prometheus_client.registry import Collector
 
 from slrig.api.service import Service, Serving
-from slrig.calibration.health_verdict import HealthState
+from slrig.calibration.health.verdict import HealthState
 from slrig.scan.records import ScanState, utc_now
 from slrig.scheduling.records import RunState, TaskKind
 

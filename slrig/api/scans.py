@@ -14,7 +14,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, scan_body, scan_plan
 from slrig.api.service import Service, Serving
 from slrig.scan.records import ScanProgress, ScanRecord, ScanState
-from slrig.sessions.verification import require_healthy
+from slrig.sessions.health.verification import require_healthy
 
 USUAL_PAGE = 50
 

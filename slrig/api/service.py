@@ -20,11 +20,11 @@ from slrig.scheduling.notices import NoticedHealth, Notices
 from slrig.scheduling.scheduler import Scheduler
 from slrig.scheduling.store import ScheduleStore
 from slrig.scheduling.tasks import Tasks
-from slrig.sessions.acceptance import ReconstructBundle
-from slrig.sessions.acceptance_desk import AcceptanceDesk
-from slrig.sessions.calibrating import Calibrations
-from slrig.sessions.calibration_tools import CalibrationTools
-from slrig.sessions.verification import VerificationDesk, VerificationTools
+from slrig.sessions.acceptance.desk import AcceptanceDesk
+from slrig.sessions.acceptance.running import ReconstructBundle
+from slrig.sessions.calibration.calibrating import Calibrations
+from slrig.sessions.calibration.tools import CalibrationTools
+from slrig.sessions.health.verification import VerificationDesk, VerificationTools
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""

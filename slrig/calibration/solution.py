@@ -3,7 +3,7 @@
 Parameters of a device, 15 in this order, each with its row and column in the covariance:
 fx, fy, cx, cy (px), k1, k2, p1, p2, k3, a small turn (three angles, rad: R' = exp([turn]x) R), translation (mm).
 The world is the first camera's frame, so that its pose has no variance. A lens term that was left out is 0 and has the
-variance that it has where it is solved for: leaving it out says nothing of it (`slrig.calibration.covariance`).
+variance that it has where it is solved for: leaving it out says nothing of it (`slrig.calibration.solving.covariance`).
 """
 
 from __future__ import annotations

@@ -19,8 +19,7 @@ from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
-from slrig.sessions.acceptance import AcceptanceResult, Place, required_calibration, run_acceptance
-from slrig.sessions.acceptance_plan import (
+from slrig.sessions.acceptance.plan import (
     USUAL_REPEATS,
     AcceptancePlan,
     Artefacts,
@@ -30,9 +29,10 @@ from slrig.sessions.acceptance_plan import (
     exact_artefacts,
     usual_limits,
 )
-from slrig.sessions.acceptance_positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance_report import HTML, document
-from slrig.sessions.acceptance_scene import scripted_config
+from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
+from slrig.sessions.acceptance.report import HTML, document
+from slrig.sessions.acceptance.running import AcceptanceResult, Place, required_calibration, run_acceptance
+from slrig.sessions.acceptance.scene import scripted_config
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 

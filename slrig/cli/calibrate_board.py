@@ -21,7 +21,7 @@ def write_board(board: Board, output: Path, *, page: str) -> None:
     StorageError
         The file cannot be written.
     """
-    from slrig.calibration.printing import board_pdf, board_svg, solve_command
+    from slrig.calibration.boards.printing import board_pdf, board_svg, solve_command
 
     kind = output.suffix.lower()
     if kind not in (".pdf", ".svg"):

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slrig.sessions.calibration_words import rounded
+from slrig.sessions.calibration.words import rounded
 
 _COLOURS = {"good": "green", "usable": "yellow"}
 _NAMES = {
@@ -24,7 +24,7 @@ _MOST_POSES = 6
 
 
 def tell_result(document: Mapping[str, Any], console: Console) -> None:
-    """Print what `slrig.sessions.pose_judging.summary` holds, and which poses were `refused` or have `remarks`."""
+    """Print what `pose_judging.summary` of a session holds, and which poses were `refused` or have `remarks`."""
     verdict = document["verdict"]
     words = verdict["grade"].replace("_", " ")
     heading = Text.assemble(

@@ -17,9 +17,9 @@ from slrig.config import RigConfig, read_rig
 from slrig.devices import FoundDevice, Rig
 from slrig.discovery import found_devices, installed_drivers, open_rig
 from slrig.scan.holding import pattern_sequence
-from slrig.sessions.doctor import Diagnosis, examine
-from slrig.sessions.findings import Severity
-from slrig.sessions.rig_file import refuse_existing, write_rig_file
+from slrig.sessions.examination.doctor import Diagnosis, examine
+from slrig.sessions.examination.findings import Severity
+from slrig.sessions.examination.rig_file import refuse_existing, write_rig_file
 
 _COLOURS = {Severity.OK: "green", Severity.NOTE: "yellow", Severity.FAULT: "bold red"}
 

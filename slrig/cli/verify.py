@@ -13,8 +13,8 @@ from rich.markup import escape
 
 from slrig.bundle import read_calibration
 from slrig.calibration.board import Board
-from slrig.calibration.health_look import Look
-from slrig.calibration.health_verdict import Health, HealthState, judged
+from slrig.calibration.health.look import Look
+from slrig.calibration.health.verdict import Health, HealthState, judged
 from slrig.cli.display import progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -22,8 +22,8 @@ from slrig.errors import CalibrationError
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import Progress, ScanPlan
-from slrig.sessions.calibration_records import USUAL_PATTERNS
-from slrig.sessions.verification import verify_bundle
+from slrig.sessions.calibration.records import USUAL_PATTERNS
+from slrig.sessions.health.verification import verify_bundle
 
 _COLOURS = {HealthState.GOOD: "green", HealthState.WATCH: "yellow", HealthState.STALE: "bold red"}
 

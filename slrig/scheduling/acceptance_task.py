@@ -10,8 +10,8 @@ from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.task_options import AcceptanceOptions, checked
 from slrig.scheduling.waiting import error_of, until
-from slrig.sessions.acceptance_asking import plan_asked
-from slrig.sessions.acceptance_desk import AcceptanceDesk, AcceptanceState
+from slrig.sessions.acceptance.asking import plan_asked
+from slrig.sessions.acceptance.desk import AcceptanceDesk, AcceptanceState
 
 
 class AcceptanceTask:

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 from uuid import UUID
 
-from slrig.calibration.verdict import Grade
+from slrig.calibration.judging.verdict import Grade
 from slrig.errors import UnsupportedByDeviceError
 from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.task_options import CalibrationOptions, checked
 from slrig.scheduling.waiting import error_of, until
-from slrig.sessions.calibrating import Calibrations
-from slrig.sessions.calibration_records import PoseState, SessionRecord, SessionState
-from slrig.sessions.pose_shooting import PoseRequest
+from slrig.sessions.calibration.calibrating import Calibrations
+from slrig.sessions.calibration.pose_shooting import PoseRequest
+from slrig.sessions.calibration.records import PoseState, SessionRecord, SessionState
 
 
 class CalibrationTask:

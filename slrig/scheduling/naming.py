@@ -10,11 +10,11 @@ from uuid import UUID
 from slrig.devices import Rig
 from slrig.scan.holding import ActiveCalibration
 from slrig.scan.work import Holder, RunnerStatus
-from slrig.sessions.calibrating import CalibratedRig
+from slrig.sessions.calibration.calibrating import CalibratedRig
 
 
 class NamedLender:
-    """Implements `slrig.sessions.calibrating.CalibratedRig` by another one. Any thread may call.
+    """Implements `slrig.sessions.calibration.calibrating.CalibratedRig` by another one. Any thread may call.
 
     What a thread borrows inside `named` is held by that holder; everything else by the holder that it states.
     """

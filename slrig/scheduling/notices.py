@@ -16,11 +16,11 @@ from urllib.parse import urlsplit
 
 import structlog
 
-from slrig.calibration.health_look import Look
-from slrig.calibration.health_verdict import HealthState
+from slrig.calibration.health.look import Look
+from slrig.calibration.health.verdict import HealthState
 from slrig.scan.records import Clock, utc_now
 from slrig.scheduling.records import Run, RunState, Schedule
-from slrig.sessions.health_store import HealthStore, VerificationRecord
+from slrig.sessions.health.store import HealthStore, VerificationRecord
 
 TOLD = frozenset({RunState.MISSED, RunState.SKIPPED, RunState.FAILED, RunState.INTERRUPTED})
 """What becomes of a run that a person has to know of."""

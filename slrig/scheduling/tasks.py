@@ -15,9 +15,9 @@ from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.records import Order, Run, Schedule, TaskKind
 from slrig.scheduling.verification_task import VerificationTask
 from slrig.scheduling.waiting import until
-from slrig.sessions.acceptance_desk import AcceptanceDesk
-from slrig.sessions.calibrating import Calibrations
-from slrig.sessions.verification import VerificationDesk
+from slrig.sessions.acceptance.desk import AcceptanceDesk
+from slrig.sessions.calibration.calibrating import Calibrations
+from slrig.sessions.health.verification import VerificationDesk
 
 
 class Task(Protocol):

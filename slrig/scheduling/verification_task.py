@@ -11,8 +11,8 @@ from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.task_options import VerificationOptions, checked
 from slrig.scheduling.waiting import error_of, until
-from slrig.sessions.calibrating import Calibrations
-from slrig.sessions.verification import VerificationDesk
+from slrig.sessions.calibration.calibrating import Calibrations
+from slrig.sessions.health.verification import VerificationDesk
 
 _TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
 

@@ -19,10 +19,10 @@ from slrig.calibration.artefacts import Decision, fitted_sphere
 from slrig.config import HeadTable, read_rig
 from slrig.discovery import open_rig
 from slrig.model import FloatArray
-from slrig.sessions.acceptance import AcceptanceResult, run_acceptance
-from slrig.sessions.acceptance_plan import AcceptancePlan, Artefact, Quantity, Step, exact_artefacts
-from slrig.sessions.acceptance_positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance_scene import scripted_config
+from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Quantity, Step, exact_artefacts
+from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
+from slrig.sessions.acceptance.running import AcceptanceResult, run_acceptance
+from slrig.sessions.acceptance.scene import scripted_config
 
 RIG = Path(os.environ.get("SLRIG_RIG") or Path(__file__).parents[2] / "config" / "rigs" / "demo.toml")
 SEEDS = int(os.environ.get("SLRIG_SEEDS") or 30)

@@ -14,10 +14,10 @@ from slrig.config import HeadTable, RigConfig, read_rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError
 from slrig.model import Calibration
-from slrig.sessions.acceptance import AcceptanceResult, run_acceptance
-from slrig.sessions.acceptance_plan import AcceptancePlan, Quantity, exact_artefacts
-from slrig.sessions.acceptance_positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance_scene import scripted_config
+from slrig.sessions.acceptance.plan import AcceptancePlan, Quantity, exact_artefacts
+from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
+from slrig.sessions.acceptance.running import AcceptanceResult, run_acceptance
+from slrig.sessions.acceptance.scene import scripted_config
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
 """Small: the demonstration's resolution over half its view."""

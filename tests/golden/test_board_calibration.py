@@ -15,9 +15,9 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import COLUMN, ROW, Correspondences
 from slrig.calibration.solution import PARAMETERS, PROJECTOR
 from slrig.model import FloatArray
-from slrig.sessions.calibration_solving import CalibrationResult, ReadPose, solve_poses
-from slrig.sessions.pose_frames import bundle_device_sizes
-from slrig.sessions.pose_reading import read_pose
+from slrig.sessions.calibration.pose_frames import bundle_device_sizes
+from slrig.sessions.calibration.pose_reading import read_pose
+from slrig.sessions.calibration.solving import CalibrationResult, ReadPose, solve_poses
 
 BOARD = Board(BoardKind.CHESSBOARD, 7, 9, 75.0)
 POSES = ("pose_0", "pose_1", "pose_2", "pose_3")

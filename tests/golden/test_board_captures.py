@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.detection import blur_sigma_px, equivalent_views, find_board
+from slrig.calibration.boards.detection import blur_sigma_px, equivalent_views, find_board
 
 pytestmark = pytest.mark.shared
 

@@ -19,8 +19,8 @@ from slrig.discovery import open_rig
 from slrig.errors import ScanEvidenceError
 from slrig.model import PatternSequence
 from slrig.patterns.sequence import encode, scan_patterns
-from slrig.sessions.doctor import Diagnosis, examine
-from slrig.sessions.findings import Severity
+from slrig.sessions.examination.doctor import Diagnosis, examine
+from slrig.sessions.examination.findings import Severity
 
 BOARD = """
 name = "board"

@@ -30,17 +30,17 @@ from scipy.spatial.transform import Rotation
 from slrig.bundle import write_calibration
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free
-from slrig.calibration.expected_error import expected_error
+from slrig.calibration.judging.expected_error import expected_error
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import ExpectedError
-from slrig.calibration.solve import solve
+from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, FloatArray, Pinhole, Solved
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.sessions.pose_reading import read_pose
+from slrig.sessions.calibration.pose_reading import read_pose
 from tests.unit.calibration.perturbed import aligned, met_with_light, pixels
 
 pytestmark = pytest.mark.slow

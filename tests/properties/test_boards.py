@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from slrig.calibration.artwork import artwork
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.board_map import fitted_map
-from slrig.calibration.numbering import equivalent_views
+from slrig.calibration.boards.artwork import artwork
+from slrig.calibration.boards.board_map import fitted_map
+from slrig.calibration.boards.numbering import equivalent_views
+from slrig.calibration.boards.printing import FIT, PAGES_MM, board_svg
 from slrig.calibration.observations import BoardView
-from slrig.calibration.printing import FIT, PAGES_MM, board_svg
 from slrig.errors import CalibrationError
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slrig.calibration.adjustment import corner_terms, light_terms
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.measurements import spread
-from slrig.calibration.solve import solve
+from slrig.calibration.solving.adjustment import corner_terms, light_terms
+from slrig.calibration.solving.measurements import spread
+from slrig.calibration.solving.solve import solve
+from tests.unit.calibration.solving.test_adjustment import aside, true_geometry
 from tests.unit.calibration.synthetic import Recipe, made
-from tests.unit.calibration.test_adjustment import aside, true_geometry
 
 QUICK = Recipe(poses=5, side=10)
 

@@ -20,7 +20,7 @@ from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
 from slrig.scan.worker import ReconstructionWorker
 from tests.unit.scan.fakes import WAIT_S, TameBench
-from tests.unit.sessions.calibration_bench import TameCalibrating
+from tests.unit.sessions.calibration.calibration_bench import TameCalibrating
 
 KEY = "the key of the tests"
 

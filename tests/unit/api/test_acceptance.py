@@ -12,9 +12,9 @@ from fastapi.testclient import TestClient
 from slrig.api import acceptance as router_module
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
-from slrig.sessions.acceptance_desk import AcceptanceDesk
-from tests.unit.sessions.test_acceptance import RIG
-from tests.unit.sessions.test_acceptance_desk import PLAN, TameLender, desk, lender
+from slrig.sessions.acceptance.desk import AcceptanceDesk
+from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, lender
+from tests.unit.sessions.acceptance.test_running import RIG
 
 __all__ = ["desk", "lender"]
 

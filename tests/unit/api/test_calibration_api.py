@@ -16,7 +16,7 @@ from slrig.model import Size
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.api.test_scans import events_of
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.sessions.calibration_bench import PNG, tame_calibration
+from tests.unit.sessions.calibration.calibration_bench import PNG, tame_calibration
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
 

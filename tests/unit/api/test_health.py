@@ -15,9 +15,9 @@ from slrig.api import health
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
 from slrig.scan.folder import DataFolder
-from slrig.sessions.health_store import HealthStore
-from slrig.sessions.verification import VerificationDesk
-from tests.unit.sessions.test_verification import TAME, Lender
+from slrig.sessions.health.store import HealthStore
+from slrig.sessions.health.verification import VerificationDesk
+from tests.unit.sessions.health.test_verification import TAME, Lender
 
 BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
 

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.calibration.artwork import artwork, charuco_board
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.numbering import equivalent_views, turned_half
+from slrig.calibration.boards.artwork import artwork, charuco_board
+from slrig.calibration.boards.numbering import equivalent_views, turned_half
 from slrig.calibration.observations import BoardView
 from slrig.cli.board_options import board_option
 from slrig.errors import CalibrationError
-from tests.unit.calibration.painted import board_points
+from tests.unit.calibration.boards.painted import board_points
 
 BOARDS = [
     Board(BoardKind.CHARUCO, 11, 8, 12.0),

@@ -28,7 +28,7 @@ from slrig.scan.records import ScanState
 from slrig.scan.work import Holder
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.sessions.calibration_bench import tame_calibration
+from tests.unit.sessions.calibration.calibration_bench import tame_calibration
 
 HOLDER = Holder("measuring 7", "measuring 7", "/measuring/7")
 

@@ -21,7 +21,7 @@ from slrig.scheduling.cron import Cron
 from slrig.scheduling.notices import TOLD, NoticedHealth, Notices
 from slrig.scheduling.records import Order, Run, RunState, Schedule, TaskKind
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.sessions.health_bench import a_look, hours
+from tests.unit.sessions.health.health_bench import a_look, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
 SCHEDULE = Schedule(UUID(int=7), Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION), DUE, DUE)

@@ -33,14 +33,14 @@ from slrig.scheduling.scheduler import Scheduler
 from slrig.scheduling.store import ScheduleStore
 from slrig.scheduling.tasks import Tasks, holder_of
 from slrig.scheduling.waiting import error_of
-from slrig.sessions.acceptance_desk import AcceptanceDesk
-from slrig.sessions.calibrating import CalibratedRig, Calibrations
-from slrig.sessions.health_store import HealthStore
-from slrig.sessions.verification import VerificationDesk, VerificationTools
+from slrig.sessions.acceptance.desk import AcceptanceDesk
+from slrig.sessions.calibration.calibrating import CalibratedRig, Calibrations
+from slrig.sessions.health.store import HealthStore
+from slrig.sessions.health.verification import VerificationDesk, VerificationTools
 from tests.unit.scan.fakes import WAIT_S, SetClock
-from tests.unit.sessions.calibration_bench import CalibrationBench
-from tests.unit.sessions.health_bench import a_look
-from tests.unit.sessions.test_acceptance_desk import PLAN, TameLender, desk, lender
+from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, lender
+from tests.unit.sessions.calibration.calibration_bench import CalibrationBench
+from tests.unit.sessions.health.health_bench import a_look
 
 __all__ = ["desk", "lender"]
 

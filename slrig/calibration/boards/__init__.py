@@ -1,0 +1,1 @@
+"""Boards: how they are printed, and how their corners are found in an image."""

@@ -1,0 +1,134 @@
+"""Chessboards: the grid by OpenCV's sector detector (`findChessboardCornersSB`), the corners by a fit."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from slrig.calibration.board import Board
+from slrig.calibration.boards.board_map import fitted_map
+from slrig.calibration.boards.chess_lattice import chessboard_lattice, grown_lattice, holds_markers
+from slrig.calibration.boards.grey import Grey
+from slrig.calibration.boards.grid_fit import placed_corners
+from slrig.calibration.boards.lattice import Lattice, right_handed
+from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
+from slrig.calibration.boards.sightings import MarkersSeen, describe_other, markers_seen
+from slrig.calibration.observations import BoardView
+from slrig.errors import PoseRefusedError
+from slrig.model import FloatArray
+
+_QUICK_PX = 800
+_LEAST_FOUND = 0.8
+
+
+def chessboard_view(grey: Grey, board: Board) -> BoardView:
+    """See `slrig.calibration.boards.detection.find_board`."""
+    lattice = _grid(grey, board) or chessboard_lattice(grey)
+    if lattice is None or not _is_all_of(lattice, board):
+        raise PoseRefusedError(_cause(grey, board, lattice))
+    if holds_markers(grey.level, lattice):
+        raise PoseRefusedError(_with_markers(board, markers_seen(grey)))
+    rough_px = _numbered(grey.level, board, lattice)
+    placed = placed_corners(grey.level, board, np.arange(board.corner_count, dtype=np.int32), rough_px)
+    if placed is None or len(placed.view.corner) < _LEAST_FOUND * board.corner_count:
+        found = 0 if placed is None else len(placed.view.corner)
+        message = (
+            f"{board.title}: its grid is in view, but only {found} of its {board.corner_count} corners are clear "
+            f"enough to be placed: {grey.likely_cause()}"
+        )
+        raise PoseRefusedError(message)
+    return placed.view
+
+
+def _grid(grey: Grey, board: Board) -> Lattice | None:
+    """The grid of this size with all that it goes on into, None where there is none.
+
+    OpenCV finds a grid of the size asked for in a larger board, and between the markers of a ChArUco board, too.
+    """
+    small, factor = grey.reduced(_QUICK_PX)
+    for image, scale in ((small, factor), (grey.eight, 1.0))[: 1 if factor == 1.0 else 2]:
+        found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=0)
+        if found:
+            # A pixel's centre is at a whole number at either scale.
+            points = (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+            steps = np.argwhere(np.ones((board.rows, board.columns)))[:, ::-1].astype(np.int32)
+            lattice = grown_lattice(grey.level, points, steps)
+            if lattice is not None:
+                return lattice
+    return None
+
+
+def _is_all_of(lattice: Lattice, board: Board) -> bool:
+    """Whether the lattice is the whole board, but for a few corners within it."""
+    size = {lattice.columns, lattice.rows}
+    return size == {board.columns, board.rows} and len(lattice.places) >= _LEAST_FOUND * board.corner_count
+
+
+def _numbered(level: FloatArray, board: Board, lattice: Lattice) -> FloatArray:
+    """(n, 2) float64: about where every corner of the board lies, in the board's own order."""
+    board_map = fitted_map(lattice.places.astype(np.float64), lattice.points_px)
+    if board_map is None:
+        return np.full((board.corner_count, 2), np.nan)
+    y, x = np.mgrid[: lattice.rows, : lattice.columns].astype(np.float64)
+    grid = board_map(np.stack([x, y], axis=-1))
+    if lattice.columns != board.columns:
+        grid = grid.transpose(1, 0, 2)
+    points_px = right_handed(grid).reshape(-1, 2)
+    if half_turn_looks_same(board):
+        return pointing_right(points_px, board)
+    return points_px if _first_is_dark(level, points_px.reshape(board.rows, board.columns, 2)) else points_px[::-1]
+
+
+def _first_is_dark(level: FloatArray, grid: FloatArray) -> bool:
+    """Whether the square below and right of corner 0, and with it the one above and left, is dark."""
+    middles = np.round((grid[:-1, :-1] + grid[1:, 1:] + grid[:-1, 1:] + grid[1:, :-1]) / 4).astype(np.int64)
+    height, width = level.shape
+    found = level[np.clip(middles[..., 1], 0, height - 1), np.clip(middles[..., 0], 0, width - 1)]
+    row, column = np.indices(found.shape)
+    even = (row + column) % 2 == 0
+    return bool(np.median(found[even]) < np.median(found[~even]))
+
+
+def _cause(grey: Grey, board: Board, seen: Lattice | None) -> str:
+    """Why this chessboard is not found, with the chessboard that is seen."""
+    if seen is not None:
+        if holds_markers(grey.level, seen):
+            return _with_markers(board, markers_seen(grey))
+        complete = seen.complete(grey.level)
+        sides = seen.cut_sides(grey.level.shape)
+        if not seen.fits_in(board) or (complete and not sides):
+            return _another(board, seen)
+        return _half(board, seen, sides)
+    other = describe_other(grey, board.kind)
+    if other:
+        return f"another board: expected a {board.title}, found {other}"
+    return f"no {board.title} found: {grey.likely_cause()}"
+
+
+def _with_markers(board: Board, markers: MarkersSeen | None) -> str:
+    found = f"the markers of a ChArUco board ({markers.dictionary})" if markers else "something printed in its squares"
+    return (
+        f"another board: expected a {board.title}, found a chessboard with {found}: give --board charuco, or put the "
+        "chessboard there"
+    )
+
+
+def _another(board: Board, seen: Lattice) -> str:
+    return (
+        f"another board: expected {board.columns} x {board.rows} inner corners, found a chessboard of "
+        f"{max(seen.columns, seen.rows)} x {min(seen.columns, seen.rows)}: take the other board, or give its corners "
+        f"as --corners (those inside, where four squares meet)"
+    )
+
+
+def _half(board: Board, seen: Lattice, sides: list[str]) -> str:
+    part = f"{len(seen.places)} of the {board.corner_count} corners, in a grid of {seen.columns} x {seen.rows},"
+    if sides:
+        return (
+            f"half a board: only {part} are in view, the rest is beyond the image's {' and '.join(sides)} side: move "
+            "the board fully into view, or use a ChArUco board, which may reach out of it"
+        )
+    return (
+        f"half a board: only {part} are found, though the image does not end there: take away what covers the "
+        "rest or throws a reflection on it; if nothing does, this is another board and --corners is wrong"
+    )

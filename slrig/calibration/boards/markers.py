@@ -1,0 +1,158 @@
+"""ChArUco boards: markers by OpenCV (`CharucoDetector`), the corners between them by a fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from slrig.calibration.board import Board
+from slrig.calibration.boards.artwork import charuco_board
+from slrig.calibration.boards.board_map import fitted_map
+from slrig.calibration.boards.grey import Grey
+from slrig.calibration.boards.grid_fit import PlacedCorners, placed_corners
+from slrig.calibration.boards.marker_layout import fitting_width, rest_px
+from slrig.calibration.boards.sightings import describe_other, marker_numbers, markers_seen
+from slrig.calibration.observations import BoardView
+from slrig.errors import PoseRefusedError
+from slrig.model import FloatArray, IntArray
+
+FEWEST_CORNERS = 8
+"""Corners that a part of a ChArUco board must show, over two rows and two columns at least."""
+
+_FEWEST_MARKERS, _FEWEST_TO_JUDGE = 3, 8
+_SHARE_OFF = 0.06
+
+
+def charuco_view(grey: Grey, board: Board) -> BoardView:
+    """See `slrig.calibration.boards.detection.find_board`."""
+    printed = charuco_board(board)
+    corners, numbers, marker_corners, marker_ids = cv2.aruco.CharucoDetector(printed).detectBoard(grey.eight)
+    ids = np.zeros(0, dtype=int) if marker_ids is None else np.asarray(marker_ids).ravel()
+    outlines = np.asarray(marker_corners, dtype=np.float64).reshape(-1, 4, 2)
+    if len(ids) < _FEWEST_MARKERS:
+        raise PoseRefusedError(_nothing(grey, board))
+    _refuse_another(board, printed, ids, outlines)
+    if numbers is None or len(numbers) < 4:
+        found = 0 if numbers is None else len(numbers)
+        raise PoseRefusedError(_few(grey, board, found, len(ids)))
+    corner = np.asarray(numbers).ravel().astype(np.int32)
+    order = np.argsort(corner)
+    rough = np.asarray(corners, dtype=np.float64).reshape(-1, 2)[order]
+    placed = placed_corners(grey.level, board, corner[order], rough)
+    before = 0
+    while placed is not None and len(placed.view.corner) > before:
+        before = len(placed.view.corner)
+        placed = _with_neighbours(grey.level, board, placed)
+    if placed is None or not _spread(board, placed.view.corner):
+        raise PoseRefusedError(_few(grey, board, 0 if placed is None else len(placed.view.corner), len(ids)))
+    return placed.view
+
+
+def _with_neighbours(level: FloatArray, board: Board, placed: PlacedCorners) -> PlacedCorners:
+    """With those corners beside found ones whose own markers were cut off or unreadable, where a fit finds them."""
+    found = np.zeros((board.rows + 2, board.columns + 2), dtype=bool)
+    row, column = np.divmod(placed.view.corner, board.columns)
+    found[row + 1, column + 1] = True
+    near = np.asarray(cv2.dilate(found.astype(np.uint8), np.ones((3, 3), dtype=np.uint8)), dtype=bool)
+    beside = np.flatnonzero((near & ~found)[1:-1, 1:-1].ravel()).astype(np.int32)
+    squares = board.points_mm[:, :2] / board.square_mm
+    guessed = placed.board_map(squares[beside])
+    height, width = level.shape
+    inside = ((guessed > 4) & (guessed < np.array([width, height]) - 5)).all(axis=1)
+    if not inside.any():
+        return placed
+    corner = np.concatenate([placed.view.corner, beside[inside]])
+    rough = np.concatenate([placed.view.points_px, guessed[inside]])
+    order = np.argsort(corner)
+    more = placed_corners(level, board, corner[order], rough[order])
+    if more is None:
+        return placed
+    # A guess is worth as much as what was found only where its fit is as good as theirs.
+    known = np.isin(more.view.corner, placed.view.corner)
+    good = known | (more.view.sigma_px < 3 * np.median(placed.view.sigma_px))
+    view = BoardView(more.view.corner[good], more.view.points_px[good], more.view.sigma_px[good])
+    return PlacedCorners(view, more.board_map, more.blur_px[good])
+
+
+def _spread(board: Board, corner: IntArray) -> bool:
+    row, column = np.divmod(corner, board.columns)
+    return len(corner) >= FEWEST_CORNERS and len(np.unique(row)) > 1 and len(np.unique(column)) > 1
+
+
+def _refuse_another(board: Board, printed: Any, ids: IntArray, outlines: FloatArray) -> None:
+    """Raise PoseRefusedError unless the markers in view stand where this board has them, in their size."""
+    most = (board.columns + 1) * (board.rows + 1) // 2
+    foreign = ids >= most
+    if foreign.sum() >= 2 or (foreign.any() and len(ids) < _FEWEST_TO_JUDGE):
+        width = fitting_width(ids, outlines)
+        message = (
+            f"another board: {board.title} has the markers 0 to {most - 1} of {board.dictionary}, and marker "
+            f"{ids.max()} is in view{_said(board, width)}: give that board's --corners, or take the other one"
+        )
+        raise PoseRefusedError(message)
+    if len(ids) < _FEWEST_TO_JUDGE:
+        return
+    ids, outlines = ids[~foreign], outlines[~foreign]
+    places = np.asarray(printed.getObjPoints(), dtype=np.float64)[ids, :, :2] / board.square_mm
+    middles = outlines.mean(axis=1)
+    side = float(np.median(np.linalg.norm(np.roll(outlines, 1, axis=1) - outlines, axis=2)))
+    if rest_px(places.mean(axis=1), middles) > 0.3 * side:
+        width = fitting_width(ids, outlines)
+        message = (
+            f"another board: the markers of {board.dictionary} in view do not stand in the order of a {board.title}"
+            f"{_said(board, width)}: give that board's --corners, or take the other one"
+        )
+        raise PoseRefusedError(message)
+    board_map = fitted_map(places.mean(axis=1), middles)
+    if board_map is None:
+        return
+    slope = np.sqrt(np.abs(np.linalg.det(board_map.jacobian(places.mean(axis=1), step=0.05))))
+    share = float(np.median(np.sqrt(np.abs(_area(outlines))) / slope))
+    expected = float(board.marker_mm or 0) / board.square_mm
+    if abs(share - expected) > _SHARE_OFF + 1.5 / float(np.median(slope)):
+        message = (
+            f"another board: its markers are {share:.2f} of a square wide, and those of a {board.title} with markers "
+            f"of {board.marker_mm:g} mm are {expected:.2f}: measure both and give --square-mm and --marker-mm"
+        )
+        raise PoseRefusedError(message)
+
+
+def _area(outlines: FloatArray) -> FloatArray:
+    """(n,) float64: area of each quadrilateral, px^2, negative where it runs the other way round."""
+    x, y = outlines[..., 0], outlines[..., 1]
+    return np.asarray(0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1))
+
+
+def _said(board: Board, width: int | None) -> str:
+    return "" if width in (None, board.columns) else f" (they fit a board with {width} corners in a row)"
+
+
+def _few(grey: Grey, board: Board, corners: int, markers: int) -> str:
+    return (
+        f"too little of the {board.title}: {markers} of its markers and {corners} of its corners are clear in the "
+        f"image, {FEWEST_CORNERS} corners over two rows and two columns are the least: bring more of it into view; "
+        f"if all of it is: {grey.likely_cause()}"
+    )
+
+
+def _nothing(grey: Grey, board: Board) -> str:
+    """Why this ChArUco board is not found."""
+    mirrored = np.unique(marker_numbers(np.ascontiguousarray(grey.eight[:, ::-1]), str(board.dictionary)))
+    if len(mirrored) >= _FEWEST_MARKERS:
+        return (
+            f"a mirrored print: {len(mirrored)} markers of {board.dictionary} can be read only with left and right "
+            "changed over: print the file again without mirroring, and look at it from its printed side, not through "
+            "a mirror"
+        )
+    markers = markers_seen(grey, but=board.dictionary)
+    if markers is not None:
+        return (
+            f"another board: expected markers of {board.dictionary}, found {markers.count} of {markers.dictionary} or "
+            "a smaller dictionary of its family: give that one as --dictionary, or take the other board"
+        )
+    other = describe_other(grey, board.kind)
+    if other:
+        return f"another board: expected a {board.title}, found {other}"
+    return f"no {board.title} found: {grey.likely_cause()}"

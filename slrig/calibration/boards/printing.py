@@ -1,0 +1,306 @@
+"""Boards to print, in true size: a page as SVG or PDF, with rulers that tell whether the printer kept it.
+
+Everything is drawn in vectors, from one list of shapes in millimetres from the page's upper left corner.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import re
+import textwrap
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.boards.artwork import artwork
+from slrig.errors import CalibrationError
+from slrig.model import FloatArray
+
+PAGES_MM = {"A4": (210.0, 297.0), "A3": (297.0, 420.0), "letter": (215.9, 279.4)}
+"""Width and height of pages by name, upright."""
+
+FIT = "fit"
+"""The page that is as large as the board needs."""
+
+_MARGIN_MM = 6.0
+_QUIET_MM = 5.0
+_RULER_MM = 9.0
+_LINE_MM = 3.6
+_FONT_MM = 2.6
+_LETTER = 0.53
+"""Width of a letter of the font over its size, on average and a little more."""
+_LEAST_WIDTH_MM = 90.0
+"""Of a page that is made to fit: a line of the foot wants some room."""
+_LONGEST_RULER_MM = 100
+_STROKE_MM = 0.15
+_BORDER_GREY, _INK_GREY = 0.8, 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class _Text:
+    """x_mm, y_mm : of the line's start, or its middle; turned : written upwards."""
+
+    text: str
+    x_mm: float
+    y_mm: float
+    size_mm: float
+    centred: bool = False
+    turned: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    x_mm: float
+    y_mm: float
+    to_x_mm: float
+    to_y_mm: float
+    grey: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """rectangles_mm : per shape, (n, 2, 2), drawn as one path; circles_mm : (m, 3), x, y, radius."""
+
+    width_mm: float
+    height_mm: float
+    title: str
+    rectangles_mm: list[FloatArray]
+    circles_mm: FloatArray
+    lines: list[_Line]
+    texts: list[_Text]
+
+
+def board_svg(board: Board, *, page: str = "A4") -> str:
+    """A page with the board as an SVG document, to be printed at 100 %.
+
+    page : A4, A3, letter; `fit`, a page as large as the board needs; or WIDTHxHEIGHT in mm, 600x400. A page is turned
+    on its side where the board needs it.
+
+    Raises
+    ------
+    CalibrationError
+        There is no such page, or the board does not fit on it.
+    """
+    drawn = _laid_out(board, page)
+    parts = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_number(drawn.width_mm)}mm" '
+        f'height="{_number(drawn.height_mm)}mm" viewBox="0 0 {_number(drawn.width_mm)} {_number(drawn.height_mm)}">',
+        f"<title>{html.escape(drawn.title)}</title>",
+        f'<rect width="{_number(drawn.width_mm)}" height="{_number(drawn.height_mm)}" fill="#fff"/>',
+    ]
+    for shape in drawn.rectangles_mm:
+        path = "".join(
+            f"M{_number(x)} {_number(y)}H{_number(to_x)}V{_number(to_y)}H{_number(x)}Z"
+            for (x, y), (to_x, to_y) in shape
+        )
+        parts.append(f'<path d="{path}" fill="#000"/>')
+    parts += [
+        f'<circle cx="{_number(x)}" cy="{_number(y)}" r="{_number(radius)}" fill="#000"/>'
+        for x, y, radius in drawn.circles_mm
+    ]
+    parts += [
+        f'<line x1="{_number(line.x_mm)}" y1="{_number(line.y_mm)}" x2="{_number(line.to_x_mm)}" '
+        f'y2="{_number(line.to_y_mm)}" stroke="{_colour(line.grey)}" stroke-width="{_STROKE_MM}"/>'
+        for line in drawn.lines
+    ]
+    for text in drawn.texts:
+        anchor = ' text-anchor="middle"' if text.centred else ""
+        turn = f' transform="rotate(-90 {_number(text.x_mm)} {_number(text.y_mm)})"' if text.turned else ""
+        parts.append(
+            f'<text x="{_number(text.x_mm)}" y="{_number(text.y_mm)}" font-family="Helvetica, Arial, sans-serif" '
+            f'font-size="{_number(text.size_mm)}" fill="{_colour(_INK_GREY)}"{anchor}{turn}>'
+            f"{html.escape(text.text)}</text>"
+        )
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def board_pdf(board: Board, *, page: str = "A4") -> bytes:
+    """The same page as a PDF document. The same board and page give the same bytes.
+
+    Raises
+    ------
+    CalibrationError
+        As `board_svg`.
+    """
+    from reportlab.lib.units import mm
+    from reportlab.pdfgen.canvas import Canvas
+
+    drawn = _laid_out(board, page)
+    held = io.BytesIO()
+    canvas = Canvas(held, pagesize=(drawn.width_mm * mm, drawn.height_mm * mm), invariant=1)
+    canvas.setTitle(drawn.title)
+    canvas.setCreator("slrig")
+    # No scaling as the print dialogue's first choice: most readers heed it.
+    canvas.setViewerPreference("PrintScaling", "None")
+    top_mm = drawn.height_mm
+    canvas.setFillGray(0)
+    for shape in drawn.rectangles_mm:
+        path = canvas.beginPath()
+        for (x, y), (to_x, to_y) in shape:
+            path.rect(x * mm, (top_mm - to_y) * mm, (to_x - x) * mm, (to_y - y) * mm)
+        canvas.drawPath(path, stroke=0, fill=1)
+    for x, y, radius in drawn.circles_mm:
+        canvas.circle(x * mm, (top_mm - y) * mm, radius * mm, stroke=0, fill=1)
+    canvas.setLineWidth(_STROKE_MM * mm)
+    for line in drawn.lines:
+        canvas.setStrokeGray(line.grey)
+        canvas.line(line.x_mm * mm, (top_mm - line.y_mm) * mm, line.to_x_mm * mm, (top_mm - line.to_y_mm) * mm)
+    canvas.setFillGray(_INK_GREY)
+    for text in drawn.texts:
+        canvas.saveState()
+        canvas.translate(text.x_mm * mm, (top_mm - text.y_mm) * mm)
+        canvas.rotate(90 if text.turned else 0)
+        canvas.setFont("Helvetica", text.size_mm * mm)
+        (canvas.drawCentredString if text.centred else canvas.drawString)(0, 0, text.text)
+        canvas.restoreState()
+    canvas.save()
+    return held.getvalue()
+
+
+def solve_command(board: Board) -> str:
+    """The command that calibrates from poses of this board."""
+    further = ""
+    if board.kind is BoardKind.CHARUCO:
+        further = f" --marker-mm {board.marker_mm:g} --dictionary {board.dictionary}"
+    return (
+        f"slrig calibrate solve FOLDER --board {board.kind} --corners {board.columns}x{board.rows} "
+        f"--square-mm {board.square_mm:g}{further} --output calibration.json"
+    )
+
+
+def _laid_out(board: Board, page: str) -> _Page:
+    """The page: the board in its quiet zone, a ruler left of it and one below, text at the foot."""
+    (left, top), (right, bottom) = board.print_mm
+    wide_mm, high_mm = float(right - left), float(bottom - top)
+    width_mm, height_mm = _page_mm(board, page)
+    needed, texts = _needed_mm(board, width_mm), _foot(board, width_mm)
+    # The board stands in the middle of what rulers and text leave.
+    x_mm = _MARGIN_MM + _RULER_MM + _QUIET_MM + (width_mm - needed[0]) / 2
+    y_mm = _MARGIN_MM + _QUIET_MM + (height_mm - needed[1]) / 2
+    art = artwork(board)
+    origin = [x_mm - left, y_mm - top]
+    shapes = [art.rectangles_mm[art.group == group] + origin for group in range(int(art.group.max(initial=-1)) + 1)]
+    circles = art.circles_mm + np.array([*origin, 0.0])
+    below_mm = y_mm + high_mm + _QUIET_MM
+    lines = _border(x_mm - _QUIET_MM, y_mm - _QUIET_MM, x_mm + wide_mm + _QUIET_MM, below_mm)
+    foot_mm = height_mm - _MARGIN_MM - _LINE_MM * (len(texts) - 0.75)
+    written = [_Text(text, _MARGIN_MM, foot_mm + _LINE_MM * index, _FONT_MM) for index, text in enumerate(texts)]
+    for upright, start_x, start_y, room_mm in (
+        (False, x_mm, below_mm + 1.0, wide_mm),
+        (True, x_mm - _QUIET_MM - 1.0, y_mm, high_mm),
+    ):
+        ticks, numbers = _ruler(start_x, start_y, room_mm, upright=upright)
+        lines += ticks
+        written += numbers
+    return _Page(width_mm, height_mm, f"slrig: {board.title}", shapes, circles, lines, written)
+
+
+def _foot(board: Board, width_mm: float) -> list[str]:
+    """The lines at the foot of a page of this width: what the board is, how to print it, how to calibrate with it."""
+    kind = {
+        BoardKind.CHARUCO: f"{board.columns} x {board.rows} corners, squares of {board.square_mm:g} mm, "
+        f"markers of {board.marker_mm or 0:g} mm from {board.dictionary}",
+        BoardKind.CHESSBOARD: f"{board.columns} x {board.rows} inner corners, squares of {board.square_mm:g} mm",
+        BoardKind.CIRCLES: f"{board.columns} circles in each of {board.rows} rows, rows {board.square_mm:g} mm apart",
+    }[board.kind]
+    said = (
+        f"slrig: {board.kind}, {kind}",
+        "Print at 100 % (actual size). Hold a ruler to both scales: where they are off, give the lengths as measured.",
+        solve_command(board),
+    )
+    letters = max(20, int((width_mm - 2 * _MARGIN_MM) / (_LETTER * _FONT_MM)))
+    return [line for text in said for line in textwrap.wrap(text, letters, break_on_hyphens=False)]
+
+
+def _needed_mm(board: Board, width_mm: float) -> tuple[float, float]:
+    """Width and height, mm, that the board needs with margins, quiet zone, rulers and its foot on a page this wide."""
+    wide_mm, high_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
+    around_mm = 2 * _MARGIN_MM + 2 * _QUIET_MM + _RULER_MM
+    return wide_mm + around_mm, high_mm + around_mm + _LINE_MM * len(_foot(board, width_mm))
+
+
+def _page_mm(board: Board, page: str) -> tuple[float, float]:
+    """Width and height of the page, mm, turned on its side where the board needs that."""
+    if page == FIT:
+        width_mm = max(_needed_mm(board, _LEAST_WIDTH_MM)[0], _LEAST_WIDTH_MM)
+        return width_mm, _needed_mm(board, width_mm)[1]
+    sides = _sides_mm(page)
+    turned = _turned_to_fit(board, sides)
+    if turned is not None:
+        return turned
+    squares = ((board.print_mm[1] - board.print_mm[0]) / board.square_mm).tolist()
+    largest = 0.0
+    for width_mm, height_mm in (sides, sides[::-1]):
+        needed = _needed_mm(board, width_mm)
+        spare = (width_mm - needed[0], height_mm - needed[1])
+        largest = max(largest, board.square_mm + min(spare[0] / squares[0], spare[1] / squares[1]))
+    largest = math.floor(10 * largest + 1e-9) / 10
+    advice = f"the largest square that fits there is {largest:g} mm" if largest > 0 else "no square fits there"
+    other = [name for name in PAGES_MM if _turned_to_fit(board, PAGES_MM[name])]
+    if other:
+        advice += f"; it fits on {' and '.join(other)}"
+    needed = _needed_mm(board, max(sides))
+    message = (
+        f"the board: {board.title} needs a page of {needed[0]:.0f} x {needed[1]:.0f} mm with its rulers, and {page} "
+        f"has {sides[0]:g} x {sides[1]:g} mm: {advice}; --page {FIT} makes a page as large as it needs"
+    )
+    raise CalibrationError(message)
+
+
+def _turned_to_fit(board: Board, sides: tuple[float, float]) -> tuple[float, float] | None:
+    """The page upright or on its side, whichever is as the board is and holds it; None where neither does."""
+    wide_mm, high_mm = (board.print_mm[1] - board.print_mm[0]).tolist()
+    for width_mm, height_mm in sorted((sides, sides[::-1]), reverse=wide_mm > high_mm):
+        needed = _needed_mm(board, width_mm)
+        if needed[0] <= width_mm and needed[1] <= height_mm:
+            return width_mm, height_mm
+    return None
+
+
+def _sides_mm(page: str) -> tuple[float, float]:
+    named = {name.lower(): sides for name, sides in PAGES_MM.items()}.get(page.lower())
+    if named is not None:
+        return named
+    given = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
+    if given is None:
+        message = f"the page: expected {', '.join(PAGES_MM)}, {FIT} or WIDTHxHEIGHT in mm (600x400), found {page!r}"
+        raise CalibrationError(message)
+    return float(given[1]), float(given[2])
+
+
+def _border(left: float, top: float, right: float, bottom: float) -> list[_Line]:
+    corners = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
+    return [_Line(*one, *other, _BORDER_GREY) for one, other in pairwise(corners)]
+
+
+def _ruler(x_mm: float, y_mm: float, room_mm: float, *, upright: bool) -> tuple[list[_Line], list[_Text]]:
+    """A scale in mm from (x_mm, y_mm): to the right, its ticks downwards, or downwards, its ticks to the left."""
+    length = min(_LONGEST_RULER_MM, 10 * math.floor(room_mm / 10)) if room_mm >= 10 else math.floor(room_mm)
+    ticks, numbers = [], []
+    for at in range(length + 1):
+        tick = 4.0 if at % 10 == 0 else 3.0 if at % 5 == 0 else 2.0
+        if upright:
+            ticks.append(_Line(x_mm, y_mm + at, x_mm - tick, y_mm + at, 0.0))
+        else:
+            ticks.append(_Line(x_mm + at, y_mm, x_mm + at, y_mm + tick, 0.0))
+        if at % 10 == 0:
+            told = f"{at} mm" if at == length - length % 10 else str(at)
+            where = (x_mm - 4.7, y_mm + at) if upright else (x_mm + at, y_mm + 6.7)
+            numbers.append(_Text(told, *where, 2.2, centred=True, turned=upright))
+    end = (x_mm, y_mm + length) if upright else (x_mm + length, y_mm)
+    ticks.append(_Line(x_mm, y_mm, *end, 0.0))
+    return ticks, numbers
+
+
+def _number(value: float) -> str:
+    """Millimetres to a tenth of a micrometre, without needless zeros."""
+    return f"{value:.4f}".rstrip("0").rstrip(".")
+
+
+def _colour(grey: float) -> str:
+    return f"#{round(255 * grey):02x}" + f"{round(255 * grey):02x}" * 2

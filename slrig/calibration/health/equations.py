@@ -1,0 +1,263 @@
+"""What one look at the board says of the devices, as linear equations about a calibration.
+
+Observed are the corners in each camera and the projector's light, averaged over cells of the image. With the board's
+pose p, the calibration's own error e with covariance C = M Mᵀ, and a change δ of the devices since then,
+
+    predicted - measured = -(J_p p + J_θ (e + δ)) + noise,    e = M z, z ~ N(0, 1).
+
+p is free. Errors that neighbouring observations share (ink, stray light, what a lens model leaves over) would be taken
+for a change of the devices if they counted as independent: every camera and axis has a quadratic surface over the board
+with coefficients of `SHARED_PX` as further unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.board import Board
+from slrig.calibration.displacement import modes_of
+from slrig.calibration.health.devices import EACH, covariance_of, devices_of
+from slrig.calibration.observations import Observations, PoseObservation
+from slrig.calibration.solution import BoardPose
+from slrig.calibration.solving.measurements import Measurements, groups, measured
+from slrig.calibration.solving.parameters import device_row, pose_row, to_board_pose, turned
+from slrig.calibration.solving.projection import BEND, POSE, corner_rows, light_rows
+from slrig.errors import CalibrationError
+from slrig.model import Calibration, FloatArray, IntArray
+
+SHARED_PX = 0.01
+"""Standard deviation of each coefficient of an error that all observations of one camera and axis share, px."""
+
+_LIGHT = 12_000  # correspondences taken of each camera, pose and axis
+_CELLS = 14
+_FEWEST_IN_CELL = 3
+_OUTLYING = 6.0
+_PER_MEDIAN = 1.4826
+_TURNS = 4
+_SETTLED = 1e-5  # rad, mm
+
+
+@dataclass(frozen=True, slots=True)
+class Equations:
+    """n equations, each divided by its standard deviation, about the calibration as it is.
+
+    left : (n,) float64, measured minus predicted. by_device : (n, 15 d); by_pose : (n, 6 m). shared : (n, s), by the
+    coefficients of shared errors, each in units of its deviation. modes : (15 d, k), M. standing : by pose, where the
+    board is with the calibration as it is.
+    """
+
+    left: FloatArray
+    by_device: FloatArray
+    by_pose: FloatArray
+    shared: FloatArray
+    modes: FloatArray
+    standing: Mapping[str, BoardPose]
+
+
+def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> Equations:
+    """Set up the equations of one or more poses.
+
+    Raises
+    ------
+    CalibrationError
+        No camera of the calibration sees enough of the board.
+    """
+    names = list(calibration.cameras)
+    sizes = {name: camera.size for name, camera in calibration.cameras.items()}
+    light_size = None if calibration.projector is None else calibration.projector.size
+    everything = measured(Observations(board, sizes, light_size, tuple(poses)), {}, light_per_view=_LIGHT)
+    if not len(everything.corner_px):
+        seen = sorted({name for pose in poses for name in pose.views})
+        message = (
+            f"the calibration is of camera {', '.join(names)}, the board was seen by {', '.join(seen) or 'none'}: "
+            "check the calibration against the rig that shot the board"
+        )
+        raise CalibrationError(message)
+    devices = np.stack(
+        [
+            device_row(each.matrix, each.distortion, each.rotation, each.translation_mm)
+            for each in devices_of(calibration).values()
+        ]
+    )
+    bench = _Bench(everything, devices, board, np.stack([_standing(pose, board, calibration) for pose in poses]))
+    modes = modes_of(covariance_of(calibration))
+    found = bench.linear(modes)
+    for _ in range(_TURNS):
+        step = posterior_step(found)
+        rows = step[: POSE * len(poses)].reshape(-1, POSE)
+        bench.poses[:, :9] = turned(bench.poses[:, :9], rows[:, :3])
+        bench.poses[:, 9:] += rows[:, 3:]
+        found = bench.linear(modes)
+        if np.abs(rows).max() < _SETTLED:
+            break
+    standing = {pose.name: to_board_pose(row) for pose, row in zip(poses, bench.poses, strict=True)}
+    return replace(found, standing=standing)
+
+
+def posterior_step(found: Equations, /) -> FloatArray:
+    """The most likely board poses, modes and shared errors, with no change of the devices."""
+    return np.asarray(np.linalg.lstsq(design(found), padded(found, found.left), rcond=None)[0])
+
+
+def design(found: Equations, /) -> FloatArray:
+    """(n + k + s, 6 m + k + s): all that is not a change, and below it that the modes and shared errors are about 0."""
+    own = np.hstack([found.by_device @ found.modes, found.shared])
+    below = np.hstack([np.zeros((own.shape[1], found.by_pose.shape[1])), np.eye(own.shape[1])])
+    return np.vstack([np.hstack([found.by_pose, own]), below])
+
+
+def padded(found: Equations, values: FloatArray, /) -> FloatArray:
+    """Values (n, …) with zeros for the equations that `design` adds."""
+    below = found.modes.shape[1] + found.shared.shape[1]
+    return np.concatenate([values, np.zeros((below, *values.shape[1:]))])
+
+
+class _Bench:
+    """Observations about a pose, in cells."""
+
+    def __init__(self, everything: Measurements, devices: FloatArray, board: Board, poses: FloatArray) -> None:
+        self._all = everything
+        self._devices = devices
+        self._points = np.ascontiguousarray(board.points_mm[:, :2])
+        least, most = self._points.min(axis=0), self._points.max(axis=0)
+        middle = (least + most) / 2
+        self._half = float((most - least).max()) / 2
+        self._frame = np.array([*middle, self._half])
+        self._middle = middle
+        self._bend = np.zeros(BEND)
+        self.poses = poses
+
+    def linear(self, modes: FloatArray) -> Equations:
+        corners = self._corners()
+        light = self._light() if len(self._all.light_px) else []
+        parts = corners + light
+        blocks = np.zeros((sum(len(part[0]) for part in parts), 6 * len(parts)))
+        start = 0
+        for number, part in enumerate(parts):
+            blocks[start : start + len(part[0]), 6 * number : 6 * number + 6] = SHARED_PX * part[3] / part[4][:, None]
+            start += len(part[0])
+        scale = np.concatenate([part[4] for part in parts])
+        return Equations(
+            left=np.concatenate([part[0] for part in parts]) / scale,
+            by_device=np.concatenate([part[1] for part in parts]) / scale[:, None],
+            by_pose=np.concatenate([part[2] for part in parts]) / scale[:, None],
+            shared=blocks,
+            modes=modes,
+            standing={},
+        )
+
+    def _corners(self) -> list[tuple[FloatArray, ...]]:
+        m = self._all
+        residual, rows = corner_rows(
+            self._devices, self.poses, self._points, self._bend, self._frame, m.corner_where, m.corner_px
+        )
+        parts: list[tuple[FloatArray, ...]] = []
+        for run in groups(m.corner_where, columns=2):
+            camera, pose = m.corner_where[run][0, :2]
+            surface = self._surface(self._points[m.corner_where[run][:, 2]])
+            for axis in (0, 1):
+                left = -residual[run, axis]
+                sigma, kept = _sigma(left, m.corner_sigma[run], surface)
+                by_device = np.zeros((len(left), EACH * len(self._devices)))
+                by_device[:, EACH * camera : EACH * (camera + 1)] = rows[run, axis, :EACH]
+                by_pose = self._pose_columns(pose, rows[run, axis, EACH : EACH + POSE])
+                parts.append((left[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
+        return parts
+
+    def _light(self) -> list[tuple[FloatArray, ...]]:
+        m, lamp = self._all, len(self._devices) - 1
+        left = -light_rows(
+            self._devices, self.poses, self._bend, self._frame, m.light_where, m.light_pixel, m.light_px, jacobian=False
+        )[0]
+        parts: list[tuple[FloatArray, ...]] = []
+        for run in groups(m.light_where):
+            good = np.flatnonzero(np.isfinite(left[run])) + run.start
+            if len(good) < _CELLS:
+                continue
+            pixels, value, sigma = _cells(m.light_pixel[good], left[good], m.light_sigma[good])
+            where = np.repeat(m.light_where[good[:1]], len(value), axis=0)
+            camera, pose = where[0, :2]
+            _, rows = light_rows(
+                self._devices, self.poses, self._bend, self._frame, where, pixels, np.zeros(len(value))
+            )
+            surface = self._surface((pixels - pixels.mean(axis=0)) / np.ptp(pixels) * 2 * self._half + self._middle)
+            sigma, kept = _sigma(value, sigma, surface)
+            kept = kept & np.isfinite(rows).all(axis=1)
+            by_device = np.zeros((len(value), EACH * len(self._devices)))
+            by_device[:, EACH * camera : EACH * (camera + 1)] = rows[:, :EACH]
+            by_device[:, EACH * lamp :] += rows[:, EACH : 2 * EACH]
+            by_pose = self._pose_columns(pose, rows[:, 2 * EACH : 2 * EACH + POSE])
+            parts.append((value[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
+        return parts
+
+    def _pose_columns(self, pose: int, rows: FloatArray) -> FloatArray:
+        columns = np.zeros((len(rows), POSE * len(self.poses)))
+        columns[:, POSE * pose : POSE * (pose + 1)] = rows
+        return columns
+
+    def _surface(self, points_mm: FloatArray) -> FloatArray:
+        """(n, 6): the terms of a quadratic surface over the board."""
+        x, y = ((points_mm - self._middle) / self._half).T
+        return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+def _sigma(left: FloatArray, stated: FloatArray, surface: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Deviations (n,), the stated ones made larger where the scatter about a smooth surface says so; which to keep."""
+    cubic = np.column_stack([surface, surface[:, 1:3] * surface[:, 3:4], surface[:, 1:3] * surface[:, 5:6]])
+    kept = np.isfinite(left)
+    factor = 1.0
+    for _ in range(3):
+        weight = np.where(kept, 1 / stated, 0.0)
+        solved = np.linalg.lstsq(cubic * weight[:, None], np.nan_to_num(left) * weight, rcond=None)[0]
+        rest = np.abs(left - cubic @ solved) / stated
+        spare = max(kept.sum() - cubic.shape[1], 1) / max(kept.sum(), 1)
+        factor = max(_PER_MEDIAN * float(np.nanmedian(rest[kept])) / np.sqrt(spare), 1.0)
+        kept = np.isfinite(left) & (rest <= _OUTLYING * factor)
+    return stated * factor, kept
+
+
+def _cells(pixels_px: FloatArray, left: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Means over cells of the light's extent: pixels (c, 2), what is left (c,), and deviations (c,); outliers out."""
+    least = pixels_px.min(axis=0)
+    cell = np.minimum(((pixels_px - least) / (np.ptp(pixels_px, axis=0) + 1e-9) * _CELLS).astype(int), _CELLS - 1)
+    key: IntArray = cell[:, 0] * _CELLS + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    found = []
+    for rows in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+        middle = np.median(left[rows])
+        spread = _PER_MEDIAN * float(np.median(np.abs(left[rows] - middle))) + 1e-9
+        good = rows[np.abs(left[rows] - middle) <= _OUTLYING * spread]
+        if len(good) < _FEWEST_IN_CELL:
+            continue
+        weight = 1 / sigma[good] ** 2
+        weight /= weight.sum()
+        mean = float(weight @ left[good])
+        variance = max(float((weight**2) @ sigma[good] ** 2), float((weight**2) @ (left[good] - mean) ** 2))
+        found.append((*(weight @ pixels_px[good]), mean, np.sqrt(variance)))
+    table = np.array(found).reshape(-1, 4)
+    return np.ascontiguousarray(table[:, :2]), table[:, 2], table[:, 3]
+
+
+def _standing(pose: PoseObservation, board: Board, calibration: Calibration) -> FloatArray:
+    """(12,): about where the board is, by the camera that sees most of it."""
+    seen = [name for name in calibration.cameras if name in pose.views]
+    if not seen:
+        message = (
+            f"pose '{pose.name}': none of the calibration's cameras ({', '.join(calibration.cameras)}) sees the board; "
+            "put it where they all see it"
+        )
+        raise CalibrationError(message)
+    name = max(seen, key=lambda each: len(pose.views[each].corner))
+    view, camera = pose.views[name], calibration.cameras[name]
+    corners = board.points_mm[view.corner]
+    found, turn, shift = cv2.solvePnP(corners, view.points_px, camera.matrix, camera.distortion)
+    if not found:
+        message = f"pose '{pose.name}': the corners in camera '{name}' are of no board in one plane; shoot it again"
+        raise CalibrationError(message)
+    rotation = camera.rotation.T @ np.asarray(cv2.Rodrigues(turn)[0])
+    return pose_row(rotation, camera.rotation.T @ (np.ravel(shift) - camera.translation_mm))

@@ -1,0 +1,1 @@
+"""Poses of a board: what they cover, which can be used, and which to hold next."""

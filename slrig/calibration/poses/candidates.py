@@ -1,0 +1,141 @@
+"""Poses that a person could hold the board in next: places in one camera's picture, tilts, turns and distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.poses.light_view import within
+from slrig.calibration.poses.rough import DeviceGuess
+from slrig.calibration.solution import BoardPose
+from slrig.model import FloatArray
+
+TILT_DEG = 30.0
+"""Where a tilt tells most per corner that is lost to blur: the middle of what is wanted."""
+
+_TILTS = ((0.0, 0.0), (TILT_DEG, 0.0), (-TILT_DEG, 0.0), (0.0, TILT_DEG), (0.0, -TILT_DEG))
+_TURNS_DEG = (0.0, 35.0, 90.0)
+_NEARER_FARTHER = (0.85, 1.0, 1.17)
+_MUCH_FARTHER = (1.4, 1.8, 2.4)
+_MARGIN = 0.015
+_FILLED = 0.55
+"""Share of the picture's width that a first pose should fill."""
+
+_SETTLING = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A pose to hold the board in, as one camera would see it.
+
+    place : (-1, 0 or 1 across, the same down): left or top, middle, right or bottom. tilt_deg, turn_deg, distance_mm :
+    as in `Attitude`; nominal. stood : in the camera's frame. outline_px : (4, 2) float64, the outer corners in its
+    picture.
+    """
+
+    place: tuple[int, int]
+    tilt_deg: tuple[float, float]
+    turn_deg: float
+    distance_mm: float
+    stood: BoardPose
+    outline_px: FloatArray
+
+
+def candidates(guess: DeviceGuess, board: Board, *, distance_mm: float, upright_deg: float) -> list[Candidate]:
+    """Return all poses on a small grid that the camera sees; a board that must be seen whole is seen whole.
+
+    distance_mm : the middle distance. upright_deg : how the board usually stands in the picture.
+    """
+    for factors in (_NEARER_FARTHER, _MUCH_FARTHER):
+        found = _placed(guess, board, [factor * distance_mm for factor in factors], upright_deg)
+        if found:
+            return found
+    return []
+
+
+def first_distance_mm(guess: DeviceGuess, board: Board) -> float:
+    """Return the distance at which the board fills about half of the picture."""
+    extent = board.points_mm.max(axis=0) - board.points_mm.min(axis=0)
+    across = extent[0] * guess.matrix[0, 0] / guess.size.width_px
+    down = extent[1] * guess.matrix[1, 1] / guess.size.height_px
+    return float(max(across, down) / _FILLED)
+
+
+def board_rotation(tilt_deg: tuple[float, float], turn_deg: float) -> FloatArray:
+    """(3, 3) float64: turned in its plane, then about the picture's vertical axis, then about its horizontal one."""
+    rotation = np.eye(3)
+    for axis, angle in ((2, turn_deg), (1, tilt_deg[1]), (0, tilt_deg[0])):
+        vector = np.zeros(3)
+        vector[axis] = np.radians(angle)
+        rotation = cv2.Rodrigues(vector)[0] @ rotation
+    return np.asarray(rotation, dtype=np.float64)
+
+
+def projected(guess: DeviceGuess, space_mm: FloatArray) -> FloatArray:
+    """Return (..., 2) float64: where points (..., 3) of a device's frame fall, Brown's model; NaN behind the device.
+
+    All candidates at once, which OpenCV's own function takes one call each for.
+    """
+    depth = np.where(space_mm[..., 2] > 0, space_mm[..., 2], np.nan)
+    x, y = space_mm[..., 0] / depth, space_mm[..., 1] / depth
+    k1, k2, p1, p2 = guess.distortion[:4]
+    square = x * x + y * y
+    radial = 1 + square * (k1 + square * k2)
+    across = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+    down = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    matrix = guess.matrix
+    return np.stack([matrix[0, 0] * across + matrix[0, 2], matrix[1, 1] * down + matrix[1, 2]], axis=-1)
+
+
+def sample_corners(board: Board, most: int) -> FloatArray:
+    """(n, 3) float64: some of the board's corners, the outer four among them, evenly in both directions."""
+    grid = board.points_mm.reshape(board.rows, board.columns, 3)
+    across = max(2, min(board.columns, round(float(np.sqrt(most * board.columns / board.rows)))))
+    down = max(2, min(board.rows, most // across))
+    rows = np.linspace(0, board.rows - 1, down).round().astype(int)
+    columns = np.linspace(0, board.columns - 1, across).round().astype(int)
+    return np.asarray(grid[np.ix_(rows, columns)].reshape(-1, 3), dtype=np.float64)
+
+
+def outer_corners(board: Board) -> FloatArray:
+    """(4, 3) float64: the outer four corners, clockwise in the print from corner 0."""
+    grid = board.points_mm.reshape(board.rows, board.columns, 3)
+    return np.asarray([grid[0, 0], grid[0, -1], grid[-1, -1], grid[-1, 0]], dtype=np.float64)
+
+
+def _placed(guess: DeviceGuess, board: Board, distances_mm: Sequence[float], upright_deg: float) -> list[Candidate]:
+    kinds = list(product(product((-1, 0, 1), (-1, 0, 1)), _TILTS, _TURNS_DEG, distances_mm))
+    place = np.array([kind[0] for kind in kinds], dtype=np.float64)
+    depth = np.array([kind[3] for kind in kinds])
+    turns = {(tilt, turn): board_rotation(tilt, upright_deg + turn) for tilt in _TILTS for turn in _TURNS_DEG}
+    rotation = np.stack([turns[kind[1], kind[2]] for kind in kinds])
+    corners = outer_corners(board) - board.points_mm.mean(axis=0)
+    turned = np.einsum("cij,nj->cni", rotation, corners)
+    centre = np.column_stack([np.zeros((len(kinds), 2)), depth])
+    extent = np.array([guess.size.width_px, guess.size.height_px], dtype=np.float64)
+    focal = np.array([guess.matrix[0, 0], guess.matrix[1, 1]])
+    least, most = _MARGIN * extent, (1 - _MARGIN) * extent
+    outline = projected(guess, turned + centre[:, None, :])
+    for _ in range(_SETTLING):
+        low, high = outline.min(axis=1), outline.max(axis=1)
+        wanted = np.where(place < 0, least - low, np.where(place > 0, most - high, (extent - low - high) / 2))
+        centre[:, :2] += wanted * depth[:, None] / focal
+        outline = projected(guess, turned + centre[:, None, :])
+    low, high = outline.min(axis=1), outline.max(axis=1)
+    slack = 0.5 * _MARGIN * extent
+    whole = ((low >= least - slack) & (high <= most + slack)).all(axis=1)
+    middle_px = projected(guess, centre[:, None, :])[:, 0]
+    fits = whole if board.kind is not BoardKind.CHARUCO else within(middle_px, guess.size)
+    shift = centre - rotation @ board.points_mm.mean(axis=0)
+    return [
+        Candidate(
+            kind[0], kind[1], upright_deg + kind[2], kind[3], BoardPose(rotation[index], shift[index]), outline[index]
+        )
+        for index, kind in enumerate(kinds)
+        if fits[index]
+    ]

@@ -1,0 +1,1 @@
+"""The solve: from observations of a board to devices and their covariance."""

@@ -1,0 +1,323 @@
+"""Bundle adjustment: devices, poses of the board and its shape that leave the least residuals, by Levenberg-Marquardt.
+
+The cost is Σ ρ(r/σ) with Cauchy's ρ(z) = c²/2 log(1 + z²/c²), c = 2.385 (95 % efficient for normal errors), minimised
+by weights 1/(1 + z²/c²) that follow the residuals (Holland and Welsch 1977). What lies beyond six deviations when an
+adjustment starts has no weight in it at all. Normal equations are gathered block by block, one camera and pose at a
+time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.solving.linear import solved
+from slrig.calibration.solving.measurements import Measurements, groups
+from slrig.calibration.solving.parameters import Geometry, Layout
+from slrig.calibration.solving.projection import (
+    BEND,
+    CORNER_TERMS,
+    DEVICE,
+    LIGHT_TERMS,
+    POSE,
+    corner_rows,
+    light_rows,
+    weighed_blocks,
+)
+from slrig.model import FloatArray, IntArray
+
+CAUCHY = 2.385
+OUTLYING = 6.0
+_MOST_STEPS = 60
+_MOST_JUDGEMENTS = 3
+_LEAST_GAIN = 3e-4
+"""In squared deviations: a step that gains less moves no number by more than a small share of its own deviation."""
+_FIRST_DAMPING = 1e-6
+_MOST_DAMPING = 1e8
+_LEAST_DAMPING = 1e-12
+
+Weights = tuple[FloatArray, FloatArray]
+"""Of corners (n,) and of light (k,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """What is left: corners (n, 2), px, and light (k,), projector px; projected minus measured."""
+
+    corners: FloatArray
+    light: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Deviations:
+    """The deviations that observations are weighed with: corners (n,) and light (k,), px.
+
+    corner_worth, light_worth : (n,) and (k,), how much of an observation each tells; less than 1 where neighbours err
+    alike. It takes weight from all, and makes none of them more or less of an outlier.
+    """
+
+    corners: FloatArray
+    light: FloatArray
+    corner_worth: FloatArray
+    light_worth: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is known beforehand of the shape: its deviation, mm. See `NormalEquations`."""
+
+    shape_sigma_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """matrix (N, N) = Jᵀ W J and gradient (N,) = Jᵀ W r over the whole vector, free or not."""
+
+    matrix: FloatArray
+    gradient: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """The end of an adjustment. steps : of Levenberg-Marquardt; settled : the cost no longer fell."""
+
+    geometry: Geometry
+    residuals: Residuals
+    steps: int
+    settled: bool
+
+
+def residuals_of(geometry: Geometry, measurements: Measurements) -> Residuals:
+    """The residuals alone."""
+    return Residuals(
+        corner_terms(geometry, measurements, jacobian=False)[0], light_terms(geometry, measurements, jacobian=False)[0]
+    )
+
+
+def sizes_of(residuals: Residuals, deviations: Deviations) -> tuple[FloatArray, FloatArray]:
+    """Residuals over their deviations, of corners (n,) and light (k,), positive; a corner's is its distance over √2."""
+    corner = np.hypot(residuals.corners[:, 0], residuals.corners[:, 1]) / deviations.corners / np.sqrt(2)
+    return corner, np.abs(residuals.light) / deviations.light
+
+
+def kept_of(residuals: Residuals, deviations: Deviations) -> Weights:
+    """1 for what is not outlying, 0 for what is, or has no residual."""
+    corner, light = sizes_of(residuals, deviations)
+    return (corner <= OUTLYING).astype(np.float64), (light <= OUTLYING).astype(np.float64)
+
+
+def weights_of(residuals: Residuals, deviations: Deviations, kept: Weights) -> Weights:
+    """The robust weight over the variance, 0 where nothing is kept. Both coordinates of a corner have one weight."""
+    corner, light = sizes_of(residuals, deviations)
+    return (
+        _robust(corner, kept[0]) / deviations.corners**2 * deviations.corner_worth,
+        _robust(light, kept[1]) / deviations.light**2 * deviations.light_worth,
+    )
+
+
+def _robust(z: FloatArray, kept: FloatArray) -> FloatArray:
+    return np.where(kept > 0, 1 / (1 + (np.where(kept > 0, z, 0.0) / CAUCHY) ** 2), 0.0)
+
+
+def adjusted(
+    geometry: Geometry, measurements: Measurements, free: NDArray[np.bool_], deviations: Deviations, /, *,
+    prior: Prior | None = None, kept: Weights | None = None, most_steps: int = _MOST_STEPS,
+) -> Adjustment:  # fmt: skip
+    """The geometry of least cost, from a start. `free` is over the whole vector.
+
+    kept : what counts (`kept_of`); without it, what is outlying is judged at the start, by how far off all else is
+    there, and again at each end until no more changes.
+    """
+    if kept is not None:
+        return _adjusted(geometry, measurements, free, deviations, kept, prior, most_steps)
+    left = residuals_of(geometry, measurements)
+    kept = _kept_at_start(left, deviations)
+    made = _adjusted(geometry, measurements, free, deviations, kept, prior, most_steps)
+    for _ in range(_MOST_JUDGEMENTS):
+        again = kept_of(made.residuals, deviations)
+        if all(np.array_equal(one, other) for one, other in zip(kept, again, strict=True)):
+            break
+        kept = again
+        made = _adjusted(made.geometry, measurements, free, deviations, kept, prior, most_steps)
+    return made
+
+
+def _kept_at_start(left: Residuals, deviations: Deviations) -> Weights:
+    """As `kept_of`, but where half of the corners or of the light is off, as from a start, that half counts."""
+    kept = []
+    for size in sizes_of(left, deviations):
+        middle = float(np.nanmedian(size)) if np.isfinite(size).any() else 0.0
+        kept.append((size <= OUTLYING * max(1.0, middle)).astype(np.float64))
+    return kept[0], kept[1]
+
+
+def _adjusted(
+    geometry: Geometry, measurements: Measurements, free: NDArray[np.bool_], deviations: Deviations, kept: Weights,
+    prior: Prior | None, most_steps: int,
+) -> Adjustment:  # fmt: skip
+    left = residuals_of(geometry, measurements)
+    cost = _cost(geometry, left, deviations, kept, prior)
+    damping, steps, settled = _FIRST_DAMPING, 0, False
+    while steps < most_steps and not settled:
+        steps += 1
+        equations = normal_equations(geometry, measurements, weights_of(left, deviations, kept), prior=prior)
+        matrix, gradient = equations.matrix[np.ix_(free, free)], equations.gradient[free]
+        settled = True
+        while damping < _MOST_DAMPING:
+            step = np.zeros(len(free))
+            step[free] = -_damped_step(matrix, gradient, damping)
+            if not np.isfinite(step).all():
+                damping *= 10
+                continue
+            trial = geometry.moved(step)
+            after = residuals_of(trial, measurements)
+            new = _cost(trial, after, deviations, kept, prior)
+            if new < cost:
+                settled = cost - new < _LEAST_GAIN
+                geometry, left, cost = trial, after, new
+                damping = max(damping / 10, _LEAST_DAMPING)
+                break
+            # Where nothing is left to gain, rounding alone decides whether the cost falls.
+            if new - cost < _LEAST_GAIN:
+                break
+            damping *= 10
+    return Adjustment(geometry, left, steps, settled)
+
+
+def _damped_step(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """(H + damping diag H)⁻¹ g, scaled to a unit diagonal; NaN where that is singular."""
+    diagonal = np.sqrt(np.diagonal(matrix))
+    diagonal = np.where(diagonal > 0, diagonal, 1.0)
+    scaled = matrix / np.outer(diagonal, diagonal)
+    scaled[np.diag_indices_from(scaled)] += damping
+    return solved(scaled, gradient / diagonal) / diagonal
+
+
+def normal_equations(
+    geometry: Geometry, measurements: Measurements, weights: Weights, /, *, prior: Prior | None = None
+) -> NormalEquations:
+    """The normal equations at a geometry, for given weights (see `weights_of`)."""
+    layout = geometry.layout
+    matrix, gradient = np.zeros((layout.count, layout.count)), np.zeros(layout.count)
+    corners, corner_jacobian = corner_terms(geometry, measurements, jacobian=True)
+    light, light_jacobian = light_terms(geometry, measurements, jacobian=True)
+    _add_corners(
+        layout, measurements.corner_where, corners, corner_jacobian, weights[0], prior is not None,
+        matrix, gradient,
+    )  # fmt: skip
+    _add_light(layout, measurements.light_where, light, light_jacobian, weights[1], matrix, gradient)
+    if prior is not None:
+        _add_prior(geometry, prior, matrix, gradient)
+    return NormalEquations(matrix, gradient)
+
+
+def _add_corners(
+    layout: Layout, where: IntArray, residual: FloatArray, jacobian: FloatArray, weight: FloatArray,
+    shape: bool, matrix: FloatArray, gradient: FloatArray,
+) -> None:  # fmt: skip
+    runs = groups(where, columns=2)
+    bend = CORNER_TERMS - BEND
+    common = jacobian[:, :, np.r_[0 : DEVICE + POSE, bend:CORNER_TERMS]]
+    starts = np.array([0, *(2 * run.stop for run in runs)])
+    blocks, pulls = weighed_blocks(
+        np.ascontiguousarray(common.reshape(-1, DEVICE + POSE + BEND)), residual.ravel(), np.repeat(weight, 2), starts
+    )
+    for run, block, pull in zip(runs, blocks, pulls, strict=True):
+        place = np.concatenate([_device(where[run.start, 0]), _pose(layout, where[run.start, 1]), _bend(layout)])
+        matrix[place[:, None], place] += block
+        gradient[place] += pull
+        if not shape:
+            continue
+        used = np.arange(run.start, run.stop)[weight[run] > 0]
+        offset = jacobian[used, :, DEVICE + POSE : bend]
+        own = layout.first_offset + 2 * where[used, 2][:, None] + np.arange(2)
+        crossed = np.einsum("nki,nkj,n->nij", common[used], offset, weight[used])
+        for k in range(2):
+            matrix[place[:, None], own[:, k]] += crossed[:, :, k].T
+            matrix[own[:, k][:, None], place] += crossed[:, :, k]
+        matrix[own[:, :, None], own[:, None, :]] += np.einsum("nki,nkj,n->nij", offset, offset, weight[used])
+        gradient[own] += np.einsum("nki,nk,n->ni", offset, residual[used], weight[used])
+
+
+def _add_light(
+    layout: Layout, where: IntArray, residual: FloatArray, jacobian: FloatArray, weight: FloatArray,
+    matrix: FloatArray, gradient: FloatArray,
+) -> None:  # fmt: skip
+    runs = groups(where, columns=2)
+    starts = np.array([0, *(run.stop for run in runs)])
+    blocks, pulls = weighed_blocks(jacobian, residual, weight, starts)
+    for run, block, pull in zip(runs, blocks, pulls, strict=True):
+        place = np.concatenate([
+            _device(where[run.start, 0]), _device(layout.devices - 1), _pose(layout, where[run.start, 1]),
+            _bend(layout),
+        ])  # fmt: skip
+        matrix[place[:, None], place] += block
+        gradient[place] += pull
+
+
+def _add_prior(geometry: Geometry, prior: Prior, matrix: FloatArray, gradient: FloatArray) -> None:
+    """Offsets and bend are about as small as stated, and offsets move, turn and scale the board by nothing."""
+    layout, weight = geometry.layout, 1 / prior.shape_sigma_mm**2
+    shape = np.arange(layout.first_offset, layout.count)
+    values = np.concatenate([geometry.offsets.ravel(), geometry.bend])
+    matrix[shape, shape] += weight
+    gradient[shape] += weight * values
+    x, y = ((geometry.points - geometry.frame[:2]) / geometry.frame[2]).T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    for pair in ((one, zero), (zero, one), (-y, x), (x, y)):
+        row = np.stack(pair, axis=1).ravel() * np.sqrt(weight) * 1e3 / np.sqrt(len(x))
+        offsets = shape[: 2 * layout.corners]
+        matrix[np.ix_(offsets, offsets)] += np.outer(row, row)
+        gradient[offsets] += row * (row @ geometry.offsets.ravel())
+
+
+def _prior_cost(geometry: Geometry, prior: Prior) -> float:
+    return float(np.sum(geometry.offsets**2) + np.sum(geometry.bend**2)) / prior.shape_sigma_mm**2 / 2
+
+
+def _cost(geometry: Geometry, left: Residuals, deviations: Deviations, kept: Weights, prior: Prior | None) -> float:
+    """Half of Σ c² log(1 + z²/c²); infinite where an observation that counts has no residual."""
+    corner, light = losses_of(left, deviations)
+    total = float(np.sum(corner[kept[0] > 0]) + np.sum(light[kept[1] > 0]))
+    if not np.isfinite(total):
+        return np.inf
+    return total / 2 + (0.0 if prior is None else _prior_cost(geometry, prior))
+
+
+def losses_of(left: Residuals, deviations: Deviations) -> tuple[FloatArray, FloatArray]:
+    """Of corners (n,), both coordinates, and light (k,): their worth times c² log(1 + z²/c²), z² where small."""
+    corner, light = (CAUCHY**2 * np.log1p((size / CAUCHY) ** 2) for size in sizes_of(left, deviations))
+    return 2 * corner * deviations.corner_worth, light * deviations.light_worth
+
+
+def _device(number: int) -> IntArray:
+    return np.arange(DEVICE, dtype=np.int32) + DEVICE * number
+
+
+def _pose(layout: Layout, number: int) -> IntArray:
+    return np.arange(POSE, dtype=np.int32) + layout.first_pose + POSE * number
+
+
+def _bend(layout: Layout) -> IntArray:
+    return np.arange(layout.first_bend, layout.count, dtype=np.int32)
+
+
+def corner_terms(geometry: Geometry, m: Measurements, /, *, jacobian: bool) -> tuple[FloatArray, FloatArray]:
+    """Residuals (n, 2) of the corners and their derivatives; see `corner_rows`."""
+    points = geometry.points + geometry.offsets
+    return corner_rows(
+        geometry.devices, geometry.poses, points, geometry.bend, geometry.frame, m.corner_where, m.corner_px,
+        jacobian=jacobian,
+    )  # fmt: skip
+
+
+def light_terms(geometry: Geometry, m: Measurements, /, *, jacobian: bool) -> tuple[FloatArray, FloatArray]:
+    """Residuals (k,) of the light and their derivatives; see `light_rows`."""
+    if not len(m.light_where):
+        return np.zeros(0), np.zeros((0, LIGHT_TERMS))
+    return light_rows(
+        geometry.devices, geometry.poses, geometry.bend, geometry.frame, m.light_where, m.light_pixel, m.light_px,
+        jacobian=jacobian,
+    )  # fmt: skip

@@ -1,0 +1,94 @@
+"""How well each number of the devices is known: the inverse of the normal equations, poses and shape marginalised.
+
+Weights are those of the last adjustment, deviations those that residuals bear out and that allow for neighbours that
+err alike (`slrig.calibration.solving.deviations`). The robust weights lose about a tenth of the information of normal
+errors where the estimate itself loses a twentieth, so that deviations are rather a few per cent too large than too
+small.
+
+A lens term that was left out was set to 0, not known to be 0. So the covariance is that of the solve with all terms,
+plus the square of the shift by which leaving some out moved the rest: what an estimate is wrong by is its distance from
+that solve, and what that solve is wrong by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from slrig.calibration.solving.adjustment import adjusted, kept_of, normal_equations, weights_of
+from slrig.calibration.solving.deviations import deviations_of
+from slrig.calibration.solving.parameters import LENS_TERMS, difference
+from slrig.calibration.solving.problem import Fit, Problem, Terms, free_of
+from slrig.calibration.solving.projection import DEVICE
+from slrig.errors import SolveRefusedError
+from slrig.model import FloatArray
+
+LEAST_KNOWN = 0.05
+"""The greatest deviation of a focal length, over it, with which a calibration still is one."""
+
+
+def covariance_of(problem: Problem, fit: Fit, terms: Terms, /) -> FloatArray:
+    """(15 d, 15 d) float64: covariance of all devices' parameters; 0 for the world's pose.
+
+    Raises
+    ------
+    SolveRefusedError
+        The poses leave a number open, or a focal length all but open.
+    """
+    narrow = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
+    _refuse_open(problem, fit, narrow)
+    all_terms = dict.fromkeys(problem.devices, LENS_TERMS)
+    if all(terms[name] == LENS_TERMS for name in problem.devices):
+        return narrow
+    sigma = deviations_of(problem.measurements, fit.noise, problem.light)
+    free = free_of(problem, fit.geometry, all_terms)
+    wide = adjusted(
+        fit.geometry, problem.measurements, free, sigma, prior=problem.prior, kept=kept_of(fit.residuals, sigma)
+    )  # fmt: skip
+    shift = difference(wide.geometry.devices, fit.geometry.devices).ravel()
+    return _inverse(problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals), free) + np.outer(
+        shift, shift
+    )
+
+
+def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> FloatArray:
+    sigma = deviations_of(problem.measurements, fit.noise, problem.light)
+    kept = kept_of(fit.residuals, sigma)
+    weights = weights_of(fit.residuals, sigma, kept)
+    matrix = normal_equations(fit.geometry, problem.measurements, weights, prior=problem.prior).matrix
+    # A pose of which everything is outlying has no say, and nothing to say.
+    free = free & (np.diagonal(matrix) > 0)
+    matrix = matrix[np.ix_(free, free)]
+    scale = 1 / np.sqrt(np.diagonal(matrix))
+    devices = np.zeros((DEVICE * len(problem.devices),) * 2)
+    try:
+        factor = cho_factor(matrix * np.outer(scale, scale))
+    except LinAlgError as error:
+        message = (
+            f"the {int(problem.used.sum())} poses leave the calibration open: another one fits them as well; "
+            "shoot more, at several distances, tilted by 20° to 40° to all sides"
+        )
+        raise SolveRefusedError(message) from error
+    place = np.flatnonzero(free)
+    mine = place < len(devices)
+    unit = np.eye(len(place))[:, mine]
+    found = cho_solve(factor, unit)[mine] * np.outer(scale[mine], scale[mine])
+    devices[np.ix_(place[mine], place[mine])] = (found + found.T) / 2
+    return devices
+
+
+def _refuse_open(problem: Problem, fit: Fit, covariance: FloatArray) -> None:
+    for device, name in enumerate(problem.devices):
+        for axis in (0, 1):
+            focal = fit.geometry.devices[device, axis]
+            sigma = float(np.sqrt(covariance[DEVICE * device + axis, DEVICE * device + axis]))
+            if not sigma <= LEAST_KNOWN * focal:
+                message = (
+                    f"'{name}': the {int(problem.used.sum())} poses determine its focal length to {sigma / focal:.0%} "
+                    f"only; {LEAST_KNOWN:.0%} is the most that is of use: shoot more poses, tilted by 20° to 40° to "
+                    "the left, to the right, up and down"
+                )
+                raise SolveRefusedError(message)

@@ -1,0 +1,169 @@
+"""How well observations are really known: what they state, what residuals add to it, and how far neighbours err alike.
+
+A device's deviation is sqrt(scale² stated² + excess²), and each of its observations is worth 1/inflation of one. Where
+residuals are less than stated, `scale` is below 1; where they are more, `excess` fills up: both so that the median of
+|residual|/deviation is that of a normal error, 0.6745. `inflation` is for errors that neighbours share (blur, albedo, a
+print that is off): of n residuals that err independently, the square of a sum is on average the sum of squares, and
+where neighbours err alike it is more, by as much as their number tells less than it seems to. It is taken over cells of
+several sizes, and the worst counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.solving.adjustment import OUTLYING, Deviations, Residuals
+from slrig.calibration.solving.measurements import Measurements, groups
+from slrig.calibration.solving.parameters import Geometry
+from slrig.model import FloatArray, IntArray
+
+_MEDIAN = 0.6745  # of the absolute value of a standard normal
+_MEDIAN_2 = 0.8326  # of the distance of two standard normals, over √2
+_LEAST_SCALE = 0.05
+_LEAST_PX = 1e-5
+_LIGHT_CELLS = (6, 12, 24)
+_CORNER_CELLS = (3,)
+_MAP_CELLS = 6
+_LEAST_IN_GROUPS = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceNoise:
+    """scale (1), excess_px and inflation (1) of one device; see above."""
+
+    scale: float = 1.0
+    excess_px: float = 0.0
+    inflation: float = 1.0
+
+
+def noise_of(residuals: Residuals, measurements: Measurements, devices: int, light: bool, /) -> list[DeviceNoise]:
+    """Scale and excess of each device, with no inflation. `light` : the last device is the projector."""
+    noise = []
+    for device in range(devices):
+        if light and device == devices - 1:
+            noise.append(_fitted(np.abs(residuals.light), measurements.light_sigma, _MEDIAN, 1.0))
+            continue
+        mine = measurements.corner_where[:, 0] == device
+        views = len(np.unique(measurements.corner_where[mine, 1]))
+        count = 2 * int(mine.sum())
+        # What the views' poses take of the residuals.
+        left = count / max(count - 6 * views - 4, count / 4, 1)
+        distance = np.hypot(*residuals.corners[mine].T) / np.sqrt(2) * np.sqrt(left)
+        noise.append(_fitted(distance, measurements.corner_sigma[mine], _MEDIAN_2, 1.0))
+    return noise
+
+
+def _fitted(size: FloatArray, stated: FloatArray, median: float, inflation: float) -> DeviceNoise:
+    good = np.isfinite(size)
+    size, stated = size[good], stated[good]
+    if not len(size):
+        return DeviceNoise(inflation=inflation)
+    ratio = float(np.median(size / stated)) / median
+    if ratio <= 1:
+        return DeviceNoise(max(ratio, _LEAST_SCALE), _LEAST_PX, inflation)
+    low, high = 0.0, float(np.median(size)) / median * 2 + float(np.max(stated))
+    for _ in range(25):
+        middle = (low + high) / 2
+        if float(np.median(size / np.hypot(stated, middle))) > median:
+            low = middle
+        else:
+            high = middle
+    return DeviceNoise(1.0, high, inflation)
+
+
+def deviations_of(measurements: Measurements, noise: Sequence[DeviceNoise], light: bool, /) -> Deviations:
+    """The deviation of each observation, px, and what it is worth."""
+    scale = np.array([one.scale for one in noise])
+    excess = np.array([one.excess_px for one in noise])
+    inflation = np.array([one.inflation for one in noise])
+    device = measurements.corner_where[:, 0]
+    corners = np.hypot(scale[device] * measurements.corner_sigma, excess[device])
+    last = noise[-1] if light else DeviceNoise()
+    lit = np.hypot(last.scale * measurements.light_sigma, last.excess_px)
+    return Deviations(corners, lit, 1 / inflation[device], np.full(len(lit), 1 / last.inflation))
+
+
+def inflated(
+    noise: Sequence[DeviceNoise], geometry: Geometry, residuals: Residuals, measurements: Measurements, light: bool, /
+) -> list[DeviceNoise]:
+    """The same noise, with how much neighbours err alike."""
+    plain = [DeviceNoise(one.scale, one.excess_px) for one in noise]
+    sigma = deviations_of(measurements, plain, light)
+    made = []
+    for device, one in enumerate(plain):
+        if light and device == len(plain) - 1:
+            inflation = _of_light(residuals.light / sigma.light, measurements)
+        else:
+            mine = measurements.corner_where[:, 0] == device
+            z = residuals.corners / sigma.corners[:, None]
+            inflation = _of_corners(geometry, z, measurements, mine)
+        made.append(DeviceNoise(one.scale, one.excess_px, inflation))
+    return made
+
+
+def _of_light(z: FloatArray, measurements: Measurements) -> float:
+    good = np.isfinite(z) & (np.abs(z) < OUTLYING)
+    worst = 1.0
+    for cells in _LIGHT_CELLS:
+        key = np.zeros(len(z), dtype=np.int32)
+        first = 0
+        for rows in groups(measurements.light_where):
+            key[rows] = first + _cells(measurements.light_pixel[rows], cells)
+            first += cells * cells
+        poses = len(np.unique(measurements.light_where[:, 1])) if len(z) else 0
+        worst = max(worst, _alike(z[good], key[good], 6 * poses))
+    for axis in (0, 1):
+        mine = good & (measurements.light_where[:, 2] == axis)
+        worst = max(worst, _alike(z[mine], _cells(measurements.light_pixel[mine], _MAP_CELLS), 5))
+    return worst
+
+
+def _of_corners(geometry: Geometry, z: FloatArray, measurements: Measurements, mine: NDArray[np.bool_]) -> float:
+    good = mine & np.isfinite(z).all(axis=1) & (np.abs(z).max(axis=1, initial=0.0) < OUTLYING)
+    where = measurements.corner_where
+    worst = 1.0
+    for cells in _CORNER_CELLS:
+        key = np.zeros(len(z), dtype=np.int64)
+        first = 0
+        for rows in groups(where, columns=2):
+            key[rows] = first + _cells(measurements.corner_px[rows], cells)
+            first += cells * cells
+        views = len(np.unique(where[good, 1]))
+        both = np.concatenate([z[good, 0], z[good, 1]])
+        worst = max(worst, _alike(both, np.concatenate([key[good], key[good] + first]), 6 * views))
+    # A print that is off errs alike at one corner in all poses, in the board's own directions.
+    across = geometry.poses[where[:, 1]].reshape(-1, 12)
+    device = geometry.devices[where[:, 0]]
+    turn = np.einsum("nij,njk->nik", device[:, 9:18].reshape(-1, 3, 3), across[:, :9].reshape(-1, 3, 3))[:, :2, :2]
+    along = np.einsum("nij,ni->nj", turn, z)[good]
+    corner = where[good, 2].astype(np.int64)
+    shifted = np.concatenate([corner, corner + len(geometry.points)])
+    if len(np.unique(where[good, 1])) >= _LEAST_IN_GROUPS:
+        worst = max(worst, _alike(along.T.ravel(), shifted, 6))
+    return worst
+
+
+def _cells(points_px: FloatArray, cells: int) -> IntArray:
+    """(n,) int: the number of the cell, of cells x cells over the extent of the points."""
+    if not len(points_px):
+        return np.zeros(0, dtype=np.int32)
+    least = points_px.min(axis=0)
+    extent = np.maximum(points_px.max(axis=0) - least, 1e-9)
+    cell = np.minimum((points_px - least) / extent * cells, cells - 1).astype(np.int32)
+    return np.asarray(cell[:, 1] * cells + cell[:, 0], dtype=np.int32)
+
+
+def _alike(z: FloatArray, key: IntArray, taken: int) -> float:
+    """Σ over groups (Σ z)² / Σ z², made up for the `taken` numbers that a fit takes of the groups' sums."""
+    if not len(z):
+        return 1.0
+    groups_found, index = np.unique(key, return_inverse=True)
+    sums = np.bincount(index, weights=z)
+    left = len(groups_found) - taken
+    if left < _LEAST_IN_GROUPS:
+        return 1.0
+    return float(np.sum(sums**2) / np.sum(z**2)) * len(groups_found) / left

@@ -1,0 +1,175 @@
+"""Poses that a solve has not seen: what is left there, and which terms of a lens they are better with.
+
+The poses are dealt into folds. For each fold all others are adjusted; then the devices are held, the fold's board poses
+are fitted to the cameras' corners alone, and all residuals of the fold are taken. A term of a lens is kept when the
+loss over all folds falls by more than `margin` per term, in units of a squared deviation: a useless term lowers it by
+nothing, and one that is known to n of its own deviations by about n².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.solving.adjustment import (
+    Deviations,
+    Residuals,
+    Weights,
+    adjusted,
+    kept_of,
+    losses_of,
+    residuals_of,
+)
+from slrig.calibration.solving.deviations import DeviceNoise, deviations_of
+from slrig.calibration.solving.measurements import Measurements
+from slrig.calibration.solving.parameters import Geometry
+from slrig.calibration.solving.problem import Fit, Problem, Terms, fitted, free_of, with_terms
+from slrig.model import FloatArray, IntArray
+
+LADDER: tuple[tuple[str, ...], ...] = (
+    (),
+    ("k1",),
+    ("k1", "k2"),
+    ("k1", "k2", "p1", "p2"),
+    ("k1", "k2", "p1", "p2", "k3"),
+)
+_TRIAL_STEPS = 15
+_HOPELESS = 2.0
+"""Where a lens leaves so many times the loss of the richest on the poses that it has seen, no others are tried."""
+
+LEAST_POSES = 4
+"""With fewer poses none can be held out."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """At poses that were not seen: rms_px by device (cameras: of the distance; the projector: per coordinate), and loss
+    by device, in squared deviations.
+    """
+
+    rms_px: Mapping[str, float]
+    loss: Mapping[str, float]
+
+
+def folds_of(problem: Problem, count: int) -> list[NDArray[np.bool_]]:
+    """(m,) bool per fold: the poses of that fold, each in one; empty where there are too few to hold any out."""
+    used = np.flatnonzero(problem.used)
+    if len(used) < LEAST_POSES:
+        return []
+    folds = []
+    parts = min(count, len(used))
+    for part in range(parts):
+        fold = np.zeros(len(problem.pose_names), dtype=np.bool_)
+        fold[used[part::parts]] = True
+        folds.append(fold)
+    return folds
+
+
+def held_out(
+    problem: Problem, geometry: Geometry, terms: Terms, noise: Sequence[DeviceNoise],
+    folds: Sequence[NDArray[np.bool_]], kept: Weights, /, *, judged: tuple[Measurements, Weights] | None = None,
+) -> HeldOut:  # fmt: skip
+    """What is left at held-out poses, over all folds. geometry : the start, for all poses.
+
+    kept : which observations count (`kept_of`). It is to be the same for all models that are compared: none is to gain
+    by what it fits worst. judged : observations of the same poses that are judged at, instead of the problem's own.
+    """
+    trained_on = problem.measurements
+    m, judged_kept = judged or (trained_on, kept)
+    total = Residuals(np.full_like(m.corner_px, np.nan), np.full_like(m.light_px, np.nan))
+    for fold in folds:
+        rest = problem.without(fold)
+        sigma = deviations_of(rest.measurements, noise, problem.light)
+        corners, light = fold[trained_on.corner_where[:, 1]], fold[trained_on.light_where[:, 1]]
+        trained = adjusted(
+            geometry, rest.measurements, free_of(rest, geometry, terms), sigma, prior=problem.prior,
+            kept=(kept[0][~corners], kept[1][~light]),
+        )  # fmt: skip
+        corners, light = fold[m.corner_where[:, 1]], fold[m.light_where[:, 1]]
+        own = m.of(corners, light)
+        left = residuals_of(_placed(problem, trained.geometry, own, fold, noise, judged_kept[0][corners]), own)
+        total.corners[corners], total.light[light] = left.corners, left.light
+    sigma = deviations_of(m, noise, problem.light)
+    return _summed(problem, m.corner_where[:, 0], total, judged_kept, sigma)
+
+
+def _placed(
+    problem: Problem, geometry: Geometry, own: Measurements, fold: NDArray[np.bool_], noise: Sequence[DeviceNoise],
+    kept: FloatArray,
+) -> Geometry:  # fmt: skip
+    """The fold's board poses, fitted to its corners with the devices held."""
+    corners = own.of(np.ones(len(own.corner_px), dtype=np.bool_), np.zeros(len(own.light_px), dtype=np.bool_))
+    free = np.zeros(geometry.layout.count, dtype=np.bool_)
+    free[geometry.layout.first_pose : geometry.layout.first_offset] = np.repeat(fold, 6)
+    sigma = deviations_of(corners, noise, problem.light)
+    return adjusted(geometry, corners, free, sigma, kept=(kept, np.zeros(0))).geometry
+
+
+def _summed(problem: Problem, camera: IntArray, left: Residuals, kept: Weights, sigma: Deviations) -> HeldOut:
+    corner_loss, light_loss = losses_of(left, sigma)
+    rms, loss = {}, {}
+    for device, name in enumerate(problem.devices):
+        if problem.light and device == len(problem.devices) - 1:
+            mine = (kept[1] > 0) & np.isfinite(light_loss)
+            rms[name] = _rms(left.light[mine])
+            loss[name] = float(np.sum(light_loss[mine]))
+        else:
+            mine = (camera == device) & (kept[0] > 0) & np.isfinite(corner_loss)
+            rms[name] = _rms(np.hypot(*left.corners[mine].T))
+            loss[name] = float(np.sum(corner_loss[mine]))
+    return HeldOut(rms, loss)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
+
+
+def chosen_terms(
+    problem: Problem, fit: Fit, /, *, margin: float, folds: int,
+    tell: Callable[[str, int], None] = lambda _device, _rung: None,
+) -> dict[str, tuple[str, ...]]:  # fmt: skip
+    """The lens terms of each device that held-out poses are better with: cameras first, then the projector.
+
+    The loss is that of all devices: light ties them, and a lens that is wrong in one shows in the others. While one
+    device climbs the ladder, those that have not had their turn have four terms. With too few poses to hold any out: k1
+    for all.
+    """
+    dealt = folds_of(problem, folds)
+    if not dealt:
+        return dict.fromkeys(problem.devices, LADDER[1])
+    terms = dict.fromkeys(problem.devices, LADDER[-2])
+    for device in problem.devices:
+        richest = fitted(problem, fit.geometry, {**terms, device: LADDER[-1]}, rounds=2, alike=True, noise=fit.noise)
+        sigma = deviations_of(problem.measurements, richest.noise, problem.light)
+        kept = kept_of(richest.residuals, sigma)
+        least = _loss(richest.residuals, sigma, kept)
+        losses: list[float] = []
+        for rung, trial in enumerate(LADDER):
+            tell(device, rung)
+            chosen = {**terms, device: trial}
+            start = with_terms(richest.geometry, problem, chosen)
+            free = free_of(problem, start, chosen)
+            tried = adjusted(start, problem.measurements, free, sigma, kept=kept, most_steps=_TRIAL_STEPS)
+            if _loss(tried.residuals, sigma, kept) > _HOPELESS * least:
+                losses.append(np.inf)
+                continue
+            losses.append(sum(held_out(problem, tried.geometry, chosen, richest.noise, dealt, kept).loss.values()))
+        terms[device] = LADDER[climbed(losses, margin)]
+        fit = replace(richest, geometry=with_terms(richest.geometry, problem, terms))
+    return terms
+
+
+def _loss(left: Residuals, sigma: Deviations, kept: Weights) -> float:
+    return sum(float(np.nansum(loss[k > 0])) for loss, k in zip(losses_of(left, sigma), kept, strict=True))
+
+
+def climbed(losses: Sequence[float], margin: float) -> int:
+    """The highest rung that is better, by `margin` per term, than the best one below it."""
+    best = 0
+    for rung in range(1, len(LADDER)):
+        if losses[best] - losses[rung] > margin * (len(LADDER[rung]) - len(LADDER[best])):
+            best = rung
+    return best

@@ -1,0 +1,197 @@
+"""A start for the cameras: each by Zhang's method, the board's poses, and how the cameras stand to one another.
+
+Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, as in OpenCV. The board's pose in one
+camera comes of its corners (IPPE, Collins and Bartoli 2014). Cameras that see the board in the same pose are tied by
+it; of all poses that two share, the tie that most agree with counts. A chessboard of which half a turn looks the same
+may be counted from either end: both are tried, and the one that agrees with the other poses is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.observations import BoardView, Observations
+from slrig.calibration.solving.measurements import LEAST_CORNERS
+from slrig.calibration.solving.parallel import refuse_parallel
+from slrig.calibration.solving.parameters import device_row, pose_row
+from slrig.errors import SolveRefusedError
+from slrig.model import FloatArray, Size
+
+LEAST_POSES = 3
+_MOST_SCATTER = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Devices (c, 21) and poses (m, 12) as rows; NaN where a pose was seen by no camera.
+
+    flipped : by (camera, pose), whether that view is counted from the board's other end.
+    """
+
+    devices: FloatArray
+    poses: FloatArray
+    flipped: Mapping[tuple[int, int], bool] = field(default_factory=dict)
+
+
+def start_of(observations: Observations, /) -> Start:
+    """A start for all cameras and poses.
+
+    Raises
+    ------
+    SolveRefusedError
+        A camera has too few poses, all of them parallel, or shares none with the other cameras.
+    """
+    names = list(observations.cameras)
+    views = [_views(observations, name) for name in names]
+    lenses = [
+        _lens(observations.board, name, observations.cameras[name], views[camera], observations)
+        for camera, name in enumerate(names)
+    ]
+    in_camera = {
+        (camera, number): _seen_from(observations.board, lenses[camera], view)
+        for camera, of_camera in enumerate(views)
+        for number, view in of_camera.items()
+    }
+    return _tied(observations, lenses, in_camera)
+
+
+def _views(observations: Observations, name: str) -> dict[int, BoardView]:
+    found = {}
+    for number, pose in enumerate(observations.poses):
+        view = pose.views.get(name)
+        if view is not None and len(view.corner) >= LEAST_CORNERS and _spans(observations.board, view):
+            found[number] = view
+    return found
+
+
+def _spans(board: Board, view: BoardView) -> bool:
+    """Whether the corners lie on more than one line of the board."""
+    points = board.points_mm[view.corner, :2]
+    return bool(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] > 0.5 * board.square_mm)
+
+
+def _lens(
+    board: Board, name: str, size: Size, views: Mapping[int, BoardView], observations: Observations
+) -> tuple[FloatArray, FloatArray]:
+    """Matrix (3, 3) and distortion (5,) of one camera, its first radial term solved for."""
+    if len(views) < LEAST_POSES:
+        message = (
+            f"camera '{name}' saw the board in {len(views)} of {len(observations.poses)} poses, and a calibration "
+            f"needs {LEAST_POSES} at the very least; shoot 15 to 20, tilted differently, all over its image"
+        )
+        raise SolveRefusedError(message)
+    objects = [board.points_mm[view.corner] for view in views.values()]
+    images = [view.points_px for view in views.values()]
+    shape = (size.width_px, size.height_px)
+    flags = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    found = cv2.calibrateCamera(_single(objects), _single(images), shape, None, None, flags=flags)
+    matrix, distortion = np.asarray(found[1], dtype=np.float64), np.concatenate([np.ravel(found[2]), np.zeros(5)])[:5]
+    refuse_parallel(name, size, (matrix, distortion), found[3:5], objects, images)
+    return matrix, distortion
+
+
+def _seen_from(board: Board, lens: tuple[FloatArray, FloatArray], view: BoardView) -> FloatArray:
+    """(4, 4) float64: board to camera."""
+    objects = board.points_mm[view.corner]
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        objects, view.points_px.astype(np.float64), lens[0], lens[1], flags=cv2.SOLVEPNP_IPPE
+    )
+    seen = np.eye(4)
+    seen[:3, :3] = cv2.Rodrigues(turns[0])[0]
+    seen[:3, 3] = np.ravel(shifts[0])
+    return seen
+
+
+def _half_turn(board: Board) -> FloatArray | None:
+    """(4, 4) float64: from a board counted from its other end to the board; None where the ends look different.
+
+    Half a turn maps a chessboard on itself where its outermost squares opposite each other have one colour.
+    """
+    if board.kind is not BoardKind.CHESSBOARD or (board.columns + board.rows) % 2:
+        return None
+    turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    turn[:3, 3] = board.points_mm[-1]
+    return turn
+
+
+def _tied(
+    observations: Observations,
+    lenses: list[tuple[FloatArray, FloatArray]],
+    in_camera: Mapping[tuple[int, int], FloatArray],
+) -> Start:
+    names = list(observations.cameras)
+    half_turn = _half_turn(observations.board)
+    worlds: dict[int, FloatArray] = {0: np.eye(4)}
+    in_world = {number: seen for (camera, number), seen in in_camera.items() if camera == 0}
+    flipped: dict[tuple[int, int], bool] = {}
+    while len(worlds) < len(names):
+        waiting = [camera for camera in range(len(names)) if camera not in worlds]
+        shared = {camera: [n for (c, n) in in_camera if c == camera and n in in_world] for camera in waiting}
+        camera = max(waiting, key=lambda one: len(shared[one]))
+        if not shared[camera]:
+            message = (
+                f"camera '{names[camera]}' never saw the board in the same pose as "
+                f"{', '.join(repr(names[other]) for other in sorted(worlds))}: where it stands is not determined; "
+                "shoot at least three poses that both see"
+            )
+            raise SolveRefusedError(message)
+        ties = []
+        for number in shared[camera]:
+            seen, known = in_camera[camera, number], in_world[number]
+            ends = [seen] if half_turn is None else [seen, seen @ half_turn]
+            ties.append([end @ np.linalg.inv(known) for end in ends])
+        reach = float(np.median([np.linalg.norm(in_world[n][:3, 3]) for n in shared[camera]]))
+        agreed, chosen = _agreed(ties, reach)
+        worlds[camera] = agreed
+        for number, choice in zip(shared[camera], chosen, strict=True):
+            flipped[camera, number] = choice == 1
+        back = np.linalg.inv(agreed)
+        for (other, number), seen in in_camera.items():
+            if other == camera and number not in in_world:
+                in_world[number] = back @ seen
+    devices = [
+        device_row(lenses[camera][0], lenses[camera][1], worlds[camera][:3, :3], worlds[camera][:3, 3])
+        for camera in range(len(names))
+    ]
+    poses = np.full((len(observations.poses), 12), np.nan)
+    for number, seen in in_world.items():
+        poses[number] = pose_row(seen[:3, :3], seen[:3, 3])
+    return Start(np.array(devices), poses, flipped)
+
+
+def _agreed(ties: list[list[FloatArray]], reach: float) -> tuple[FloatArray, list[int]]:
+    """The tie (4, 4) that lies nearest to most, its mean with those near it, and which end of the board poses took."""
+
+    def distances(of: FloatArray) -> FloatArray:
+        """(poses, ends): by how many mm points as far off as the board come to lie apart."""
+        return np.array([[_apart(of, end, reach) for end in ends] for ends in ties])
+
+    candidates = [end for ends in ties for end in ends]
+    medians = [float(np.median(distances(candidate).min(axis=1))) for candidate in candidates]
+    best = candidates[int(np.argmin(medians))]
+    far = distances(best)
+    chosen = [int(k) for k in np.argmin(far, axis=1)]
+    nearest = far.min(axis=1)
+    near = nearest <= max(_MOST_SCATTER * float(np.median(nearest)), 1e-9)
+    taken = [ends[choice] for ends, choice, kept in zip(ties, chosen, near, strict=True) if kept]
+    mean = np.eye(4)
+    left, _, right = np.linalg.svd(np.sum([tie[:3, :3] for tie in taken], axis=0))
+    mean[:3, :3] = left @ right
+    mean[:3, 3] = np.mean([tie[:3, 3] for tie in taken], axis=0)
+    return mean, chosen
+
+
+def _apart(first: FloatArray, second: FloatArray, reach: float) -> float:
+    turn = first[:3, :3] - second[:3, :3]
+    return float(np.linalg.norm(turn) * reach / np.sqrt(2) + np.linalg.norm(first[:3, 3] - second[:3, 3]))
+
+
+def _single(arrays: list[FloatArray]) -> list[NDArray[np.float32]]:
+    """As OpenCV wants points."""
+    return [each.astype(np.float32) for each in arrays]

@@ -1,0 +1,1 @@
+"""Acceptance tests: their plan, their run, their evaluation and their report."""

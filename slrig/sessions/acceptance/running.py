@@ -1,0 +1,314 @@
+"""An acceptance test, run: each prescribed position captured, reconstructed and evaluated, and the decision.
+
+In the manner of VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from slrig.bundle.storage import refusals_of, write_file
+from slrig.calibration.artefacts import Decision, decision
+from slrig.devices import Rig
+from slrig.errors import (
+    CalibrationError,
+    InvalidInputError,
+    NothingToReconstructError,
+    ScanCancelledError,
+    ScanEvidenceError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Calibration
+from slrig.scan.acquisition import capture_bundle
+from slrig.scan.artefacts import decode_mesh_ply
+from slrig.scan.plan import Progress, ReconstructionPlan, ScanPlan
+from slrig.scan.records import Clock, utc_now
+from slrig.sessions.acceptance.evaluation import Evidence, Reading, reading
+from slrig.sessions.acceptance.plan import AcceptancePlan, Quantity, Step
+
+FORMULA = "U = 2 * sqrt((U_certificate / 2)^2 + s^2)"
+"""Expanded uncertainty, k = 2: the certificate's, and the standard deviation s of repeated captures of one position."""
+
+_BUNDLE, _MESH = "bundle", "mesh"
+
+
+class Place(Protocol):
+    """Brings the artefact of a step to its place, before each capture but those that repeat one without a move."""
+
+    def __call__(self, rig: Rig, step: Step, /) -> None:
+        """Return when it stands there and is still."""
+        ...
+
+
+class ReconstructBundle(Protocol):
+    """`slrig.scan.pipeline.reconstruct_bundle`, or a way to have it done elsewhere."""
+
+    def __call__(
+        self,
+        bundle: Path,
+        output: Path,
+        /,
+        *,
+        plan: ReconstructionPlan,
+        progress: Progress,
+        cancelled: Callable[[], bool],
+    ) -> Mapping[str, Any]:
+        """Write the mesh into `output`."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One quantity over all positions. error_mm, limit_mm : of the reading that comes nearest to its limit, or is
+    furthest beyond, which is that of `step`, `take`. certificate_mm : the artefact's expanded uncertainty, None where
+    it was not told; scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats :
+    captures that tell it. uncertainty_mm : U by `FORMULA`, what is not known left out.
+    """
+
+    quantity: Quantity
+    error_mm: float
+    limit_mm: float
+    step: str
+    take: int
+    certificate_mm: float | None
+    scatter_mm: float
+    repeats: int
+    uncertainty_mm: float
+    decision: Decision
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceResult:
+    """A test that was done. readings : every capture in order. verdicts : by quantity."""
+
+    rig: str
+    begun: datetime
+    ended: datetime
+    plan: AcceptancePlan
+    calibration: Calibration
+    readings: tuple[Reading, ...]
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def decision(self) -> Decision:
+        """Fails if any quantity fails, passes if all pass."""
+        told = {verdict.decision for verdict in self.verdicts}
+        for worst in (Decision.FAILS, Decision.UNDECIDED):
+            if worst in told:
+                return worst
+        return Decision.PASSES
+
+    @property
+    def complete(self) -> bool:
+        """Whether every position was measured as often as planned."""
+        return len(self.readings) == len(self.plan.takes)
+
+
+def run_acceptance(
+    rig: Rig,
+    plan: AcceptancePlan,
+    folder: Path,
+    *,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    place: Place | None = None,
+    again: Callable[[Step, SlrigError], bool] | None = None,
+    reconstruct: ReconstructBundle | None = None,
+    clock: Clock = utc_now,
+) -> AcceptanceResult:
+    """Measure every position of a plan, evaluate, and write report.html, report.json and the points into `folder`.
+
+    `place` None has the rig's positioner move the artefacts: its poses are called as the steps are. `again` is asked
+    where an artefact was not found or a frame contradicted its pattern: whether to place it anew and capture once more.
+    The points of each capture stay in `folder`/points, as they come; the reports appear at the end.
+
+    Raises
+    ------
+    CalibrationError
+        The rig has no calibration.
+    UnsupportedByDeviceError
+        `place` is None, and the rig has no positioner, or one that does not know a position.
+    NothingToReconstructError
+        An artefact is not where it should be. What was measured before is kept.
+    ScanCancelledError
+        `cancelled()` became true.
+    InvalidInputError
+        `folder` holds something else.
+    DeviceError, ScanEvidenceError, StorageError
+        As a scan.
+    """
+    from slrig.sessions.acceptance.report import write_reports
+
+    calibration = required_calibration(rig)
+    mover = by_positioner(rig, plan) if place is None else place
+    _require_free(folder)
+    begun = clock()
+    readings: list[Reading] = []
+    pictures: list[Evidence] = []
+    takes = plan.takes
+    for index, (step, take) in enumerate(takes):
+        told = _part_of(progress, step, take, index, len(takes))
+        if cancelled():
+            message = f"the acceptance test was cancelled before {step.name}; what was measured is in {folder}"
+            raise ScanCancelledError(message)
+        moved = take > 0
+        while True:
+            if not moved:
+                told("place", 0.0, step.words)
+                mover(rig, step)
+            try:
+                found, evidence = measured(
+                    rig, plan, step, take, folder, progress=told, cancelled=cancelled, reconstruct=reconstruct
+                )
+                break
+            except (NothingToReconstructError, ScanEvidenceError) as error:
+                if again is None or not again(step, error):
+                    raise
+                # A repeat is to be without a move between captures, so that it shows the scanner's scatter alone.
+                moved = take > 0
+        readings.append(found)
+        pictures.append(evidence)
+    result = AcceptanceResult(rig.name, begun, clock(), plan, calibration, tuple(readings), verdicts(readings, plan))
+    write_reports(result, pictures, folder)
+    return result
+
+
+def measured(
+    rig: Rig,
+    plan: AcceptancePlan,
+    step: Step,
+    take: int,
+    folder: Path,
+    *,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    reconstruct: ReconstructBundle | None = None,
+) -> tuple[Reading, Evidence]:
+    """Capture and evaluate one position, and keep its points. Raises as `run_acceptance`."""
+    calibration = required_calibration(rig)
+    work = folder / f".{step.name}-{take + 1}"
+    shutil.rmtree(work, ignore_errors=True)
+    try:
+        with refusals_of(work):
+            work.mkdir(parents=True)
+        scan = ScanPlan(exposure_s=plan.exposure_s)
+        # What a rendered rig knows of its scene is no business of the test's; and the noise of a point, by which form
+        # is judged, is to hold nothing of the calibration's own error, which is what form is to show.
+        blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
+        capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)
+        make = _usual_reconstruction() if reconstruct is None else reconstruct
+        make(work / _BUNDLE, work / _MESH, plan=scan.reconstruction, progress=progress, cancelled=cancelled)
+        with refusals_of(work):
+            mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
+        found, evidence = reading(mesh, step, take, plan, calibration)
+        _keep(evidence, folder / "points" / f"{step.name}-{take + 1}.npz")
+        return found, evidence
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def by_positioner(rig: Rig, plan: AcceptancePlan) -> Place:
+    """A `Place` that has the rig's positioner move. Raises UnsupportedByDeviceError if it does not know a position."""
+    poses = () if rig.positioner is None else tuple(rig.positioner.poses)
+    missing = [step.name for step in plan.steps if step.name not in poses]
+    if missing:
+        has = f"a positioner with {', '.join(poses)}" if poses else "no positioner"
+        message = (
+            f"rig '{rig.name}' has {has}, and the test needs the positions {', '.join(missing)}; place the artefacts "
+            "by hand (without --scripted), or name the positioner's poses so"
+        )
+        raise UnsupportedByDeviceError(message)
+
+    def move(rig: Rig, step: Step, /) -> None:
+        if rig.positioner is not None:
+            rig.positioner.move(list(rig.positioner.poses).index(step.name))
+
+    return move
+
+
+def required_calibration(rig: Rig) -> Calibration:
+    """The rig's calibration. Raises CalibrationError if it has none."""
+    if rig.calibration is None:
+        message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
+        raise CalibrationError(message)
+    return rig.calibration
+
+
+def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[Verdict, ...]:
+    """What is decided of each quantity that was measured."""
+    told = {quantity for each in readings for quantity in each.errors_mm}
+    return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in told)
+
+
+def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> Verdict:
+    having = [each for each in readings if quantity in each.errors_mm]
+    worst = max(having, key=lambda each: abs(each.errors_mm[quantity]) - each.limits_mm[quantity])
+    scatter_mm, repeats = _scatter(quantity, having)
+    certificate = plan.artefacts.uncertainty_mm(quantity)
+    uncertainty = 2 * float(np.hypot((certificate or 0.0) / 2, 0.0 if np.isnan(scatter_mm) else scatter_mm))
+    error, limit = worst.errors_mm[quantity], worst.limits_mm[quantity]
+    return Verdict(
+        quantity, error, limit, worst.step, worst.take, certificate, scatter_mm, repeats, uncertainty,
+        decision(error, limit, uncertainty),
+    )  # fmt: skip
+
+
+def _scatter(quantity: Quantity, readings: Sequence[Reading]) -> tuple[float, int]:
+    """Standard deviation of repeated captures of one position, mm, and how many they were; NaN and 0 without any."""
+    by_step: dict[str, list[float]] = {}
+    for each in readings:
+        by_step.setdefault(each.step, []).append(each.errors_mm[quantity])
+    repeated = [np.array(errors) for errors in by_step.values() if len(errors) > 1]
+    if not repeated:
+        return float("nan"), 0
+    count = sum(len(errors) for errors in repeated)
+    squares = sum(float(((errors - errors.mean()) ** 2).sum()) for errors in repeated)
+    return float(np.sqrt(squares / (count - len(repeated)))), count
+
+
+def _part_of(progress: Progress, step: Step, take: int, index: int, count: int) -> Progress:
+    """Progress of one capture, told as a part of the whole test."""
+    name = step.name if take == 0 else f"{step.name}, again"
+
+    def told(stage: str, fraction: float, detail: str, /) -> None:
+        words = f"{stage}, {detail}" if detail else stage
+        progress(name, (index + min(max(fraction, 0.0), 1.0)) / count, words)
+
+    return told
+
+
+def _usual_reconstruction() -> ReconstructBundle:
+    # The process that owns the rig loads the mathematics only if it has to do it itself.
+    from slrig.scan.pipeline import reconstruct_bundle
+
+    return reconstruct_bundle
+
+
+def _keep(evidence: Evidence, path: Path) -> None:
+    packed = BytesIO()
+    np.savez_compressed(
+        packed,
+        points_mm=evidence.points_mm.astype(np.float32),
+        artefact=evidence.artefact,
+        used=evidence.used,
+        distances_mm=evidence.distances_mm,
+        sigma_mm=evidence.sigma_mm.astype(np.float32),
+    )
+    with refusals_of(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, packed.getvalue())
+
+
+def _require_free(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        message = f"{folder}: the results of an acceptance test go into a new folder, and this one is not empty"
+        raise InvalidInputError(message)

@@ -1,0 +1,1 @@
+"""Verifications of a calibration, and their history."""

@@ -1,0 +1,334 @@
+"""Boards found in painted images whose every corner is known, and refused where they are not to be used."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.boards.detection import (
+    blur_sigma_px,
+    board_region,
+    equivalent_views,
+    find_board,
+    light_squares,
+    square_interior,
+)
+from slrig.calibration.observations import BoardView
+from slrig.errors import PoseRefusedError
+from tests.unit.calibration.boards.painted import Eye, Print, as_8_bit, board_points, looking, painted
+
+CHARUCO = Board(BoardKind.CHARUCO, 7, 5, 14.0)
+CHESSBOARD = Board(BoardKind.CHESSBOARD, 8, 5, 14.0)
+CIRCLES = Board(BoardKind.CIRCLES, 4, 7, 11.0)
+EVEN_CIRCLES = Board(BoardKind.CIRCLES, 4, 6, 12.0)
+ALL = [CHARUCO, CHESSBOARD, CIRCLES]
+LENS = (-0.12, 0.06, 0.001, -0.001, 0.0)
+NOISE = 0.01
+
+
+def slow(*values: object) -> Any:
+    """One more case, for the long run."""
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+def title(given: object) -> str:
+    """A short name for a case."""
+    return given.title if isinstance(given, Board) else str(given)[:30]
+
+
+def eye(board: Board, **further: Any) -> Eye:
+    given: dict[str, Any] = {
+        "distance_mm": 205.0,
+        "tilt_deg": (20.0, -25.0),
+        "roll_deg": 12.0,
+        "distortion": LENS,
+    } | further
+    return looking(board, **given)
+
+
+def shot(board: Board, seen_by: Eye | None = None, *, noise: float = NOISE, **look: Any) -> NDArray[np.uint8]:
+    image = painted(board, seen_by or eye(board), **({"samples": 4} | look))
+    return as_8_bit(image + np.random.default_rng(1).normal(0, noise, image.shape))
+
+
+def misses(view: BoardView, board: Board, seen_by: Eye) -> NDArray[np.float64]:
+    return view.points_px - seen_by.seen(board_points(board)[view.corner])
+
+
+@pytest.mark.parametrize("board", ALL, ids=title)
+@pytest.mark.parametrize(
+    ("tilt_deg", "blur_px", "noise", "most_rms_px"),
+    [
+        ((0.0, 0.0), 0.6, 0.0, 0.007),
+        pytest.param((0.0, 0.0), 1.0, 0.01, 0.015, marks=pytest.mark.slow),
+        ((30.0, -35.0), 0.7, 0.01, 0.02),
+        pytest.param((-30.0, 20.0), 1.5, 0.03, 0.07, marks=pytest.mark.slow),
+    ],
+)
+def test_corners_lie_where_they_are_within_what_they_state(
+    board: Board, tilt_deg: tuple[float, float], blur_px: float, noise: float, most_rms_px: float
+) -> None:
+    seen_by = eye(board, tilt_deg=tilt_deg)
+    # Four samples a side leave edges of their own making, of a size with what is measured here.
+    image = shot(board, seen_by, blur_px=blur_px, noise=noise, look=Print(shading=(0.4, -0.3)), samples=7)
+    view = find_board(image, board, full_scale=255)
+    assert len(view.corner) == board.corner_count
+    off = misses(view, board, seen_by)
+    assert np.sqrt((off**2).mean()) < most_rms_px
+    assert np.abs(off.mean(axis=0)).max() < max(0.003, 0.3 * most_rms_px)
+    share = np.sqrt(((off / view.sigma_px[:, None]) ** 2).mean())
+    assert share < 1.35
+    if noise:
+        assert share > 0.6
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD], ids=title)
+def test_corners_are_placed_better_than_opencv_places_them(board: Board) -> None:
+    seen_by = eye(board)
+    image = shot(board, seen_by)
+    ours = misses(find_board(image, board, full_scale=255), board, seen_by)
+    if board.kind is BoardKind.CHESSBOARD:
+        flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
+        _, found = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
+        theirs = found.reshape(-1, 2)
+        truth = seen_by.seen(board_points(board))
+        if np.hypot(*(theirs[0] - truth[0])) > 5:
+            theirs = theirs[::-1]
+        off = theirs - truth
+    else:
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
+        printed = cv2.aruco.CharucoBoard((board.columns + 1, board.rows + 1), 14.0, 10.5, dictionary)
+        found, numbers, *_ = cv2.aruco.CharucoDetector(printed).detectBoard(image)
+        off = found.reshape(-1, 2) - seen_by.seen(board_points(board)[numbers.ravel()])
+    assert np.sqrt((ours**2).mean()) < 0.6 * np.sqrt((off**2).mean())
+
+
+def test_the_centre_of_a_circle_is_not_the_centre_of_its_ellipse() -> None:
+    seen_by = eye(CIRCLES, tilt_deg=(40.0, 0.0), roll_deg=0.0, distance_mm=150.0)
+    image = painted(CIRCLES, seen_by, samples=8)
+    view = find_board(image, CIRCLES, full_scale=1.0)
+    off = misses(view, CIRCLES, seen_by)
+    assert np.sqrt((off**2).mean()) < 0.01
+    # What would be wrong without the correction: the moment of each painted circle, found on its own.
+    dark = (image < 0.4).astype(np.uint8)
+    count, _, _, middles = cv2.connectedComponentsWithStats(dark)
+    truth = seen_by.seen(board_points(CIRCLES))
+    nearest = [middles[np.linalg.norm(middles - place, axis=1).argmin()] for place in truth]
+    assert count > CIRCLES.corner_count
+    assert np.abs(np.mean(np.array(nearest) - truth, axis=0)).max() > 10 * np.abs(off.mean(axis=0)).max()
+
+
+@pytest.mark.parametrize("radius", [0.3, 0.4, 0.6])
+def test_circles_of_any_radius_are_found(radius: float) -> None:
+    seen_by = eye(CIRCLES)
+    view = find_board(shot(CIRCLES, seen_by, look=Print(circle_radius=radius)), CIRCLES, full_scale=255)
+    assert len(view.corner) == CIRCLES.corner_count
+    assert np.sqrt((misses(view, CIRCLES, seen_by) ** 2).mean()) < 0.02
+
+
+@pytest.mark.parametrize("roll_deg", [107.0, 184.0])
+@pytest.mark.parametrize("board", ALL, ids=title)
+def test_a_board_with_one_numbering_has_it_however_it_is_held(board: Board, roll_deg: float) -> None:
+    seen_by = eye(board, roll_deg=roll_deg)
+    view = find_board(shot(board, seen_by), board, full_scale=255)
+    assert np.abs(misses(view, board, seen_by)).max() < 0.1
+
+
+@pytest.mark.parametrize("roll_deg", [10.0, 190.0])
+@pytest.mark.parametrize("board", [Board(BoardKind.CHESSBOARD, 7, 5, 14.0), EVEN_CIRCLES], ids=title)
+def test_a_board_with_two_numberings_has_the_true_one_among_them(board: Board, roll_deg: float) -> None:
+    seen_by = eye(board, roll_deg=roll_deg)
+    view = find_board(shot(board, seen_by), board, full_scale=255)
+    worst = [np.abs(misses(each, board, seen_by)).max() for each in equivalent_views(view, board)]
+    assert min(worst) < 0.1
+    assert max(worst) > 10
+    grid = view.points_px.reshape(board.rows, board.columns, 2)
+    assert (grid[:, -1] - grid[:, 0]).mean(axis=0)[0] > 0
+
+
+@pytest.mark.parametrize("full_scale", [1023.0, 1.0])
+def test_any_depth_of_image_gives_the_same_corners(full_scale: float) -> None:
+    image = painted(CHESSBOARD, eye(CHESSBOARD), samples=3)
+    kind = np.float32 if full_scale == 1.0 else np.uint16
+    view = find_board((image * full_scale).astype(kind), CHESSBOARD, full_scale=full_scale)
+    reference = find_board(image, CHESSBOARD, full_scale=1.0)
+    assert np.abs(view.points_px - reference.points_px).max() < 0.02
+
+
+def test_a_dim_image_is_enough_and_its_corners_say_so() -> None:
+    bright = find_board(shot(CHARUCO, noise=0.002), CHARUCO, full_scale=255)
+    dim = painted(CHARUCO, eye(CHARUCO), samples=4) * 0.08
+    dim_view = find_board(as_8_bit(dim + np.random.default_rng(1).normal(0, 0.002, dim.shape)), CHARUCO, full_scale=255)
+    assert np.median(dim_view.sigma_px) > 2 * np.median(bright.sigma_px)
+
+
+def test_a_part_of_a_charuco_board_is_enough() -> None:
+    seen_by = eye(CHARUCO, shift_mm=(45.0, 20.0))
+    view = find_board(shot(CHARUCO, seen_by), CHARUCO, full_scale=255)
+    assert 8 <= len(view.corner) < CHARUCO.corner_count
+    assert np.abs(misses(view, CHARUCO, seen_by)).max() < 0.06
+    inside = seen_by.seen(board_points(CHARUCO))
+    within = ((inside > 8) & (inside < np.array([639, 511]) - 8)).all(axis=1)
+    assert set(np.flatnonzero(within)) - set(view.corner.tolist()) == set()
+
+
+def refused(image: NDArray[np.uint8], board: Board, words: str) -> None:
+    started = time.process_time()
+    with pytest.raises(PoseRefusedError, match=words):
+        find_board(image, board, full_scale=255)
+    assert time.process_time() - started < 3
+
+
+@pytest.mark.parametrize("board", ALL, ids=title)
+def test_nothing_in_view_is_refused_with_the_likely_cause(board: Board) -> None:
+    random = np.random.default_rng(3)
+    refused(as_8_bit(random.normal(0.4, 0.02, (512, 640))), board, "not in view")
+    refused(as_8_bit(random.normal(0.01, 0.003, (512, 640))), board, "too dark")
+    refused(as_8_bit(random.normal(0.4, 0.001, (512, 640))), board, "no contrast")
+    refused(as_8_bit(20 * painted(board, eye(board), samples=1)), board, "clipped to white")
+
+
+@pytest.mark.parametrize("board", [CHARUCO, CHESSBOARD], ids=title)
+def test_a_board_out_of_focus_is_refused(board: Board) -> None:
+    refused(shot(board, blur_px=11.0), board, "out of focus")
+
+
+@pytest.mark.parametrize(
+    ("asked", "there", "words"),
+    [
+        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 10, 7, 11.0), "another board.*found a chessboard of 10 x 7"),
+        pytest.param(
+            CHESSBOARD,
+            Board(BoardKind.CHESSBOARD, 10, 5, 11.0),
+            "another board.*found a chessboard of 10 x 5",
+            marks=pytest.mark.slow,
+        ),
+        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 6, 4, 16.0), "another board.*found a chessboard of 6 x 4"),
+        pytest.param(
+            CHESSBOARD,
+            Board(BoardKind.CHESSBOARD, 7, 6, 14.0),
+            "another board.*found a chessboard of 7 x 6",
+            marks=pytest.mark.slow,
+        ),
+        (CHESSBOARD, Board(BoardKind.CHARUCO, 8, 5, 14.0), "another board.*ChArUco.*DICT_5X5"),
+        (CHESSBOARD, CIRCLES, "another board.*circles"),
+        (CHARUCO, CHESSBOARD, "another board.*chessboard of 8 x 5"),
+        slow(CHARUCO, CIRCLES, "another board.*circles"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100"), "another board.*DICT_4X4"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 5, 4, 16.0), "another board.*do not stand.*5 corners in a row"),
+        (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, marker_mm=7.7), "another board.*0.5. of a square wide"),
+        (CIRCLES, Board(BoardKind.CIRCLES, 4, 9, 9.0), "another board.*7 rows of 4"),
+        pytest.param(
+            CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4", marks=pytest.mark.slow
+        ),
+        (CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
+    ],
+    ids=title,
+)
+def test_another_board_is_refused_and_named(asked: Board, there: Board, words: str) -> None:
+    refused(shot(there, eye(there)), asked, words)
+
+
+@pytest.mark.parametrize("board", [CHARUCO, EVEN_CIRCLES], ids=title)
+def test_a_mirrored_print_is_refused(board: Board) -> None:
+    refused(shot(board, look=Print(mirrored=True)), board, "mirrored print.*without mirroring")
+
+
+@pytest.mark.parametrize("board", [CHESSBOARD, CIRCLES], ids=title)
+def test_a_mirrored_print_that_is_its_own_mirror_image_does_no_harm(board: Board) -> None:
+    seen_by = eye(board)
+    view = find_board(shot(board, seen_by, look=Print(mirrored=True)), board, full_scale=255)
+    width = 2 * board.columns if board.kind is BoardKind.CIRCLES else board.columns
+    places = board_points(board) * [-1, 1, 1] + [(width - 1) * board.square_mm, 0, 0]
+    truth = seen_by.seen(places)
+    apart = np.linalg.norm(view.points_px[:, None] - truth, axis=2).min(axis=1)
+    assert apart.max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("board", "shift_mm", "side"),
+    [
+        (CHESSBOARD, (55.0, 0.0), "right"),
+        (CHESSBOARD, (0.0, -45.0), "upper"),
+        (CIRCLES, (55.0, 0.0), "right"),
+        (CIRCLES, (0.0, 55.0), "lower"),
+    ],
+    ids=title,
+)
+def test_half_a_board_is_refused_with_the_side_that_cuts_it_off(
+    board: Board, shift_mm: tuple[float, float], side: str
+) -> None:
+    seen_by = eye(board, shift_mm=shift_mm, roll_deg=0.0, tilt_deg=(5.0, 5.0))
+    refused(shot(board, seen_by), board, f"half a board.*{side} side.*fully into view, or use a ChArUco")
+
+
+@pytest.mark.parametrize("board", [CHESSBOARD, CIRCLES], ids=title)
+def test_a_covered_board_is_refused(board: Board) -> None:
+    image = shot(board, eye(board, roll_deg=0.0, tilt_deg=(5.0, 5.0)))
+    image[:, 400:] = 90
+    refused(image, board, "take away what covers")
+
+
+def test_too_little_of_a_charuco_board_is_refused() -> None:
+    image = shot(CHARUCO, eye(CHARUCO, roll_deg=0.0, tilt_deg=(5.0, 5.0)))
+    image[:, 240:] = 90
+    refused(image, CHARUCO, "too little of the charuco")
+
+
+@pytest.mark.parametrize("board", ALL, ids=title)
+def test_masks_follow_the_print(board: Board) -> None:
+    seen_by = eye(board)
+    image = painted(board, seen_by, blur_px=0.0, samples=4, look=Print(paper_squares=0.0, beyond=0.4))
+    view = find_board(painted(board, seen_by, samples=4), board, full_scale=1.0)
+    region = board_region(view, board, (512, 640))
+    light = light_squares(view, board, (512, 640))
+    inner = square_interior(view, board, (512, 640), margin_px=1.5)
+    on_print = np.abs(image - 0.4) > 1e-6
+    assert np.mean(region == on_print) > 0.995
+    # Away from edges each mask is right without an exception.
+    assert inner.any()
+    assert (inner & ~region).sum() == 0
+    assert np.allclose(image[inner & light], Print().white)
+    assert np.allclose(image[inner & ~light], Print().dark)
+    assert not light[~region].any()
+    share = np.isclose(image[on_print], Print().white).mean()
+    assert light[region].mean() == pytest.approx(share, abs=0.05)
+
+
+@pytest.mark.parametrize("board", ALL, ids=title)
+@pytest.mark.parametrize("blur_px", [0.7, 2.0])
+def test_the_blur_is_measured(board: Board, blur_px: float) -> None:
+    image = shot(board, eye(board, distance_mm=170.0, tilt_deg=(5.0, 5.0)), blur_px=blur_px)
+    view = find_board(image, board, full_scale=255)
+    # A pixel's own extent blurs by 1/sqrt(12).
+    expected = np.hypot(blur_px, 12**-0.5)
+    assert blur_sigma_px(image, view, board, full_scale=255) == pytest.approx(expected, rel=0.12)
+
+
+def test_an_image_that_is_none_is_a_fault_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="grey image"):
+        find_board(np.zeros((40, 40, 3)), CHESSBOARD, full_scale=255)
+    with pytest.raises(ValueError, match="finite"):
+        find_board(np.full((40, 40), np.nan), CHESSBOARD, full_scale=255)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("board", ALL, ids=title)
+def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
+    seen_by = eye(board, width=1280, height=1024, focal_px=1600.0)
+    image = shot(board, seen_by)
+    find_board(image, board, full_scale=255)
+    taken = []
+    for _ in range(3):
+        started = time.process_time()
+        view = find_board(image, board, full_scale=255)
+        taken.append(time.process_time() - started)
+    assert len(view.corner) == board.corner_count
+    assert min(taken) < 0.6

@@ -1,0 +1,172 @@
+"""One look at a board after the devices changed: stale, the device named, and the error foretold in mm."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from slrig.calibration.health.drift import Change
+from slrig.calibration.health.look import Look, health_of_scan, look_from_document
+from slrig.calibration.health.looking import look_at_board
+from slrig.calibration.health.verdict import HealthState, judged
+from slrig.calibration.solution import PROJECTOR
+from slrig.errors import CalibrationError
+from slrig.model import Calibration, Pinhole
+from tests.unit.calibration.health.drifting import (
+    BOARD,
+    Bench,
+    bench,
+    further_apart,
+    look_of,
+    moved,
+    true_error_mm,
+    turned,
+    zoomed,
+)
+
+
+def planted(devices: Mapping[str, Pinhole], change: str) -> Mapping[str, Pinhole]:
+    """The rig after a change."""
+    left, lamp = devices["left"], devices[PROJECTOR]
+    return {
+        "camera turned aside": {**devices, "left": turned(left, (0, 0.05, 0))},
+        "camera turned up": {**devices, "left": turned(left, (0.05, 0, 0))},
+        "projector turned aside": {**devices, PROJECTOR: turned(lamp, (0, 0.05, 0))},
+        "projector turned up": {**devices, PROJECTOR: turned(lamp, (0.05, 0, 0))},
+        "baseline": further_apart(devices, 0.1),
+        "camera focal": {**devices, "left": zoomed(left, 5e-4)},
+        "projector focal": {**devices, PROJECTOR: zoomed(lamp, 5e-4)},
+    }[change]
+
+
+def looked(rig: Bench, devices: Mapping[str, Pinhole], seed: int = 0) -> Look:
+    """One verification of it."""
+    return look_at_board([look_of(devices, seed)], BOARD, rig.calibration)
+
+
+@pytest.mark.parametrize(
+    ("change", "device", "kind", "words"),
+    [
+        ("camera turned aside", "left", Change.TURNED, "camera 'left' turned by 0.0"),
+        ("projector turned aside", PROJECTOR, Change.TURNED, "the projector turned by 0.0"),
+        ("camera focal", "left", Change.FOCAL, "camera 'left': its focal length changed by +0.0"),
+        ("projector focal", PROJECTOR, Change.FOCAL, "the projector: its focal length changed by +0.0"),
+    ],
+)
+def test_a_change_is_stale_named_and_foretold_in_mm(change: str, device: str, kind: Change, words: str) -> None:
+    rig = bench()
+    now = planted(rig.devices, change)
+    found = looked(rig, now)
+    assert judged([found]).state is HealthState.STALE
+    first = found.drifts[0]
+    assert (first.device, first.kind) == (device, kind)
+    assert first.words.startswith(words)
+    assert first.weight > 0.9
+    assert found.open is None
+    assert found.expected_mm == pytest.approx(true_error_mm(now, rig.calibration), rel=0.3)
+
+
+@pytest.mark.parametrize("change", ["camera turned up", "projector turned up", "baseline"])
+def test_what_the_geometry_cannot_tell_is_said(change: str) -> None:
+    # A turn about the line between both devices is the same turn of the other, backwards; one that moved is the other
+    # one moved the opposite way, or a board of another size.
+    rig = bench()
+    now = planted(rig.devices, change)
+    found = looked(rig, now)
+    assert judged([found]).state is HealthState.STALE
+    true = PROJECTOR if change in ("projector turned up", "baseline") else "left"
+    likely = {each.device for each in found.drifts if each.evidence > found.evidence - 9}
+    assert likely == {"left", PROJECTOR}
+    assert true in likely
+    assert found.open is not None
+    assert "as well explained by" in found.open
+    if change == "baseline":
+        assert "measure its ruler" in found.open
+    # The calibration's own part of the true error is one draw, of which only the spread can be foretold.
+    true_mm = true_error_mm(now, rig.calibration)
+    assert found.expected_mm == pytest.approx(true_mm, abs=0.3 * true_mm + 0.5 * (found.stated_mm or 0))
+
+
+@pytest.mark.parametrize(
+    ("change", "device"), [("camera turned up", "left"), ("projector turned up", PROJECTOR), ("baseline", PROJECTOR)]
+)
+def test_a_second_camera_tells_them_apart(change: str, device: str) -> None:
+    rig = bench(cameras=2)
+    found = looked(rig, planted(rig.devices, change))
+    assert judged([found]).state is HealthState.STALE
+    assert found.drifts[0].device == device
+    assert found.open is None
+
+
+def test_a_rig_that_did_not_change_is_good() -> None:
+    rig = bench(3)
+    found = looked(rig, rig.devices)
+    assert judged([found]).state is HealthState.GOOD
+    assert not found.drifts
+    assert abs(found.scale_percent or 1) < 4 * (found.scale_sigma_percent or 0)
+    (pair,) = found.pairs
+    assert abs(pair.mean_px) < 4 * pair.mean_sigma_px
+    # The light's outliers and errors that neighbours share are not in the stated deviation.
+    assert pair.rms_px == pytest.approx(np.hypot(0.04, 0.02), rel=0.1)
+
+
+def test_the_size_of_a_change_has_an_honest_deviation() -> None:
+    off = []
+    for seed in range(8):
+        rig = bench(seed)
+        now = {**rig.devices, "left": zoomed(rig.devices["left"], 5e-4)}
+        words = looked(rig, now, seed).drifts[0].words
+        size, sigma = words.split("changed by ")[1].split(" %")[0].split(" ± ")
+        off.append((float(size) - 0.05) / float(sigma))
+    assert np.sqrt(np.mean(np.square(off))) < 1.8
+
+
+def test_a_device_that_was_knocked_is_turned_and_moved() -> None:
+    rig = bench(cameras=2)
+    way = np.array([0.3, 0.2, -0.4])
+    knocked = moved(turned(rig.devices["right"], (0.1, -0.15, 0.05)), way)
+    first = looked(rig, {**rig.devices, "right": knocked}).drifts[0]
+    assert (first.device, first.kind) == ("right", Change.BUMPED)
+    for verb, true in (("turned", np.sqrt(0.1**2 + 0.15**2 + 0.05**2)), ("moved", np.linalg.norm(way))):
+        size, sigma = first.words.split(f"{verb} by ")[1].split(" ± ")[:2]
+        assert abs(float(size) - true) < 3 * float(re.findall(r"^[\d.]+", sigma)[0])
+
+
+def test_a_rig_of_other_cameras_is_refused_with_words() -> None:
+    rig = bench()
+    other = Calibration({"front": rig.calibration.cameras["left"]}, rig.calibration.projector)
+    with pytest.raises(CalibrationError, match="of camera front, the board was seen by left: check the calibration"):
+        look_at_board([look_of(rig.devices, 0)], BOARD, other)
+
+
+def test_a_calibration_that_says_nothing_of_its_error_is_judged_by_the_residuals() -> None:
+    rig = bench()
+    bare = Calibration({"left": rig.devices["left"]}, rig.devices[PROJECTOR])
+    clean = look_at_board([look_of(rig.devices, 0)], BOARD, bare)
+    assert clean.stated_mm is None
+    assert judged([clean]).state is HealthState.GOOD
+    knocked = look_at_board([look_of(planted(rig.devices, "camera turned up"), 0)], BOARD, bare)
+    assert judged([knocked]).state is HealthState.STALE
+
+
+def test_a_look_survives_its_document() -> None:
+    rig = bench()
+    found = looked(rig, planted(rig.devices, "baseline"))
+    assert look_from_document(found.document()).document() == found.document()
+
+
+def test_a_scan_with_two_cameras_is_a_look_too() -> None:
+    # As `redundancy.residual_px` of a report lists it.
+    pair = {"reference": "left", "camera": "right", "pairs": 4000, "outlying": 3, "mean": 0.42, "rms": 0.5,
+            "median_absolute": 0.42, "stated_rms": 0.08, "map": {"mean": [], "rms": [], "pairs": []}}  # fmt: skip
+    found = health_of_scan([pair])
+    assert found is not None
+    verdict = judged([found])
+    assert verdict.state is HealthState.STALE
+    assert "'left' and 'right' disagree by 0.42 px in the mean" in verdict.reasons[0]
+    assert verdict.remedy is not None
+    assert "shoot a verification" in verdict.remedy
+    assert health_of_scan([]) is None

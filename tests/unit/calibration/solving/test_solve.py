@@ -1,0 +1,224 @@
+"""The whole solve: what comes out against the truth, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from slrig.calibration.solution import CELLS, PARAMETERS, PROJECTOR, Solution
+from slrig.calibration.solving.parameters import difference
+from slrig.calibration.solving.solve import SolveOptions, solve
+from slrig.errors import SolveRefusedError
+from slrig.model import Calibration, FloatArray
+from tests.unit.calibration.solving.test_projection import row_of
+from tests.unit.calibration.synthetic import Recipe, made
+
+SMALL = Recipe(poses=8, side=12)
+
+
+@cache
+def solved(recipe: Recipe) -> tuple[Solution, Calibration]:
+    observations, truth = made(recipe)
+    return solve(observations), truth
+
+
+def in_deviations(solution: Solution, truth: Calibration) -> dict[str, float]:
+    """Focal lengths, principal points, turns and baselines of all devices: error over its own stated deviation."""
+    names = [*truth.cameras, *([PROJECTOR] if truth.projector else [])]
+    rows = [
+        np.array([row_of(one) for one in (*rig.cameras.values(), *([rig.projector] if rig.projector else []))])
+        for rig in (solution.calibration, truth)
+    ]
+    off = difference(*rows)
+    found = {}
+    for device, name in enumerate(names):
+        own = slice(15 * device, 15 * device + 15)
+        covariance = solution.covariance[own, own]
+        for k, parameter in enumerate(PARAMETERS[:12]):
+            if parameter[0] in "fct" and covariance[k, k] > 0:
+                found[f"{name} {parameter}"] = float(off[device, k] / np.sqrt(covariance[k, k]))
+        if device:
+            shift = rows[1][device, 18:]
+            along = shift / np.linalg.norm(shift)
+            baseline = float(np.linalg.norm(rows[0][device, 18:]) - np.linalg.norm(shift))
+            found[f"{name} baseline"] = baseline / float(np.sqrt(along @ covariance[12:, 12:] @ along))
+    return found
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        SMALL,
+        replace(SMALL, lens_shift=False, seed=1),
+        replace(SMALL, cameras=2, seed=2),
+        replace(SMALL, cameras=2, projector=False, seed=3),
+        replace(SMALL, projector=False, seed=4),
+    ],
+    ids=["shifted lens", "straight lens", "two cameras", "cameras alone", "one camera alone"],
+)
+def test_every_number_is_within_its_own_deviation(recipe: Recipe) -> None:
+    solution, truth = solved(recipe)
+    found = in_deviations(solution, truth)
+    assert len(found) == 4 * (len(truth.cameras) + recipe.projector) + 4 * (recipe.cameras + recipe.projector - 1)
+    assert max(np.abs(list(found.values()))) < 3.5, found
+    for name, left in solution.residuals.items():
+        assert left.rms_px == pytest.approx(0.0583 if name == PROJECTOR else 0.0707, rel=0.1)
+        assert left.held_out_rms_px <= 1.3 * left.rms_px
+    assert solution.outliers == {}
+    assert set(solution.poses) == {f"pose {number}" for number in range(recipe.poses)}
+
+
+def test_a_principal_point_outside_the_image_needs_no_help() -> None:
+    solution, truth = solved(SMALL)
+    assert truth.projector is not None
+    assert solution.calibration.projector is not None
+    row = solution.calibration.projector.matrix[1, 2]
+    assert truth.projector.matrix[1, 2] > truth.projector.size.height_px
+    assert row == pytest.approx(truth.projector.matrix[1, 2], abs=3 * np.sqrt(solution.covariance[18, 18]))
+    assert np.sqrt(solution.covariance[18, 18]) < 6.0
+
+
+def test_figures_of_a_device_agree_with_one_another() -> None:
+    solution, _ = solved(SMALL)
+    for name, left in solution.residuals.items():
+        squares = left.map_count * np.nan_to_num(left.map_rms_px) ** 2
+        assert left.map_count.shape == (CELLS, CELLS)
+        assert left.map_count.sum() == left.count
+        assert np.sqrt(squares.sum() / left.count) == pytest.approx(left.rms_px)
+        assert set(left.pose_rms_px) == set(solution.poses)
+        assert np.isnan(left.map_rms_px[left.map_count == 0]).all()
+        assert 0 < left.outlying < 0.02 * left.count or name != PROJECTOR
+        assert np.nanmax(np.abs(left.map_mean_px)) < 0.1
+    camera, light = solution.residuals["left"].rms_px, solution.residuals[PROJECTOR].rms_px
+    assert solution.stereo_rms_px == pytest.approx(np.sqrt((camera**2 + 2 * light**2) / 2))
+
+
+def test_the_world_is_the_first_camera() -> None:
+    solution, _ = solved(SMALL)
+    first = solution.calibration.cameras["left"]
+    np.testing.assert_array_equal(first.rotation, np.eye(3))
+    np.testing.assert_array_equal(first.translation_mm, 0)
+    assert not solution.covariance[9:15].any()
+    assert np.linalg.eigvalsh(solution.covariance).min() > -1e-9
+
+
+def test_progress_is_told_and_only_rises() -> None:
+    told: list[tuple[str, float, str]] = []
+    solve(made(replace(SMALL, poses=5, projector=False))[0], progress=lambda *words: told.append(words))
+    shares = [share for _, share, _ in told]
+    assert shares == sorted(shares)
+    assert shares[0] == 0
+    assert shares[-1] == 1
+    assert all(stage and words for stage, _, words in told)
+
+
+def test_the_same_poses_give_the_same_numbers() -> None:
+    first, again = (solve(made(replace(SMALL, poses=5))[0]) for _ in range(2))
+    np.testing.assert_allclose(first.covariance, again.covariance, rtol=1e-3, atol=1e-9)
+    assert first.distortion == again.distortion
+
+
+def test_a_pose_in_which_the_board_moved_is_left_out_by_name() -> None:
+    solution, truth = solved(replace(SMALL, cameras=2, moved_pose=3, seed=5))
+    assert set(solution.outliers) == {"pose 3"}
+    assert "px from where the other poses put it" in solution.outliers["pose 3"]
+    assert "pose 3" not in solution.poses
+    assert max(np.abs(list(in_deviations(solution, truth).values()))) < 4
+
+
+def test_with_next_to_no_noise_no_pose_is_called_off() -> None:
+    """A lens that is not done justice to must not make outliers of the poses at the image's border."""
+    solution, _ = solved(replace(SMALL, cameras=2, corner_px=0.003, light_px=0.01, alike_px=0.0, outlying=0.0, seed=9))
+    assert solution.outliers == {}
+    assert solution.residuals["right"].rms_px < 0.006
+
+
+def test_a_pose_that_no_camera_saw_is_left_out_by_name() -> None:
+    observations, _ = made(replace(SMALL, poses=6))
+    poses = (*observations.poses[:5], replace(observations.poses[5], views={}))
+    solution = solve(replace(observations, poses=poses))
+    assert "no camera saw" in solution.outliers["pose 5"]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "words"),
+    [
+        (
+            replace(SMALL, bumped=(PROJECTOR, 5)),
+            "camera 'left' and the projector .*between pose 'pose 4' and pose 'pose 5'",
+        ),
+        (replace(SMALL, projector=False, cameras=2, bumped=("right", 4)), "'right' .*moved between pose 'pose 3' and"),
+        (replace(SMALL, cameras=2, bumped=("right", 5)), "^camera 'right' moved between pose 'pose 4' and"),
+        (replace(SMALL, cameras=2, bumped=("left", 3)), "^camera 'left' moved between pose 'pose 2' and"),
+        (replace(SMALL, cameras=2, bumped=(PROJECTOR, 5)), "^the projector moved between pose 'pose 4' and"),
+    ],
+)  # fmt: skip
+def test_a_device_that_was_bumped_is_named_with_the_pose(recipe: Recipe, words: str) -> None:
+    with pytest.raises(SolveRefusedError, match=words) as refusal:
+        solve(made(recipe)[0])
+    assert "fasten" in str(refusal.value)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_poses_are_refused(count: int) -> None:
+    observations, _ = made(replace(SMALL, poses=4))
+    with pytest.raises(SolveRefusedError, match="shoot 15 to 20"):
+        solve(replace(observations, poses=observations.poses[:count]))
+
+
+def test_three_poses_solve_and_say_that_none_was_held_out() -> None:
+    solution, _ = solved(replace(SMALL, poses=3, seed=7))
+    assert all(np.isnan(left.held_out_rms_px) for left in solution.residuals.values())
+    assert all(terms == ("k1",) for terms in solution.distortion.values())
+
+
+def test_all_poses_parallel_are_refused() -> None:
+    with pytest.raises(SolveRefusedError, match="parallel"):
+        solve(made(replace(SMALL, most_tilt_deg=0.0))[0])
+
+
+def test_poses_that_all_contradict_one_another_are_refused() -> None:
+    observations, _ = made(replace(SMALL, cameras=2, projector=False))
+    rng = np.random.default_rng(3)
+    poses = []
+    for number, pose in enumerate(observations.poses):
+        views = dict(pose.views)
+        if number % 2:
+            shift = rng.uniform(-30, 30, 2)
+            views["right"] = replace(views["right"], points_px=views["right"].points_px + shift)
+        poses.append(replace(pose, views=views))
+    with pytest.raises(SolveRefusedError, match=r"contradict"):
+        solve(replace(observations, poses=tuple(poses)))
+
+
+@pytest.mark.slow
+def test_a_bowed_board_is_found_where_its_shape_is_asked_for() -> None:
+    observations, truth = made(
+        replace(SMALL, poses=7, side=20, bow_mm=1.0, corner_px=0.02, light_px=0.02, alike_px=0.0)
+    )
+    flat, shaped = solve(observations), solve(observations, options=SolveOptions(board_shape=True, folds=3))
+    assert flat.board_shape_mm is None
+    assert shaped.board_shape_mm is not None
+    height: FloatArray = shaped.board_shape_mm[:, 2]
+    assert np.ptp(height) == pytest.approx(1.0, abs=0.1)
+    assert shaped.residuals["left"].rms_px < 0.04 < flat.residuals["left"].rms_px
+    assert max(np.abs(list(in_deviations(shaped, truth).values()))) < 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cameras", "rigs"), [(1, 40)])
+def test_nearly_all_numbers_of_many_rigs_are_within_three_deviations(cameras: int, rigs: int) -> None:
+    """95 % is asked for; and deviations that are far too large would be no use either."""
+    found = []
+    for seed in range(rigs):
+        solution, truth = solved(Recipe(seed=100 + seed, poses=10, side=12, cameras=cameras))
+        found.append(list(in_deviations(solution, truth).values()))
+        for left in solution.residuals.values():
+            assert left.held_out_rms_px <= 1.3 * left.rms_px
+    off = np.array(found)
+    assert (np.abs(off) <= 3).mean() >= 0.95
+    assert (np.abs(off) <= 3).mean(axis=0).min() >= (0.95 if rigs >= 40 else 0.75)
+    assert 0.6 < np.sqrt(np.mean(off**2)) < 1.25
