@@ -7,6 +7,19 @@ from pathlib import Path
 
 import pytest
 
+# GigE Vision has one port, and a camera on loopback answers whoever asks there.
+_ONE_AT_A_TIME = {
+    "gige-vision": ("tests/unit/drivers/genicam/", "tests/contract/test_contract.py", "tests/contract/test_pairing.py"),
+}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Have several processes share the tests by file, so that what a file sets up once is set up once."""
+    for item in items:
+        path = item.nodeid.partition("::")[0]
+        group = next((name for name, paths in _ONE_AT_A_TIME.items() if path.startswith(paths)), path)
+        item.add_marker(pytest.mark.xdist_group(group))
+
 
 @pytest.fixture(scope="session")
 def shared() -> Path:

@@ -74,6 +74,7 @@ albedo = 0.8
 )
 
 
+@pytest.mark.slow
 def test_holes_are_kept_when_the_request_or_the_command_asks_for_it(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -140,6 +140,7 @@ def require_equal(one: Path, other: Path) -> None:
 PLAN = ScanPlan(PatternPlan(line_shift_period_px=8), exposures_s=EXPOSURES_S)
 
 
+@pytest.mark.slow
 def test_a_bracket_gives_the_same_bytes_live_from_disk_and_replayed(tmp_path: Path) -> None:
     watching = Watching()
     bundle = captured(small_rig(tmp_path), PLAN, tmp_path / "bundle", watching)
@@ -156,6 +157,7 @@ def test_a_bracket_gives_the_same_bytes_live_from_disk_and_replayed(tmp_path: Pa
     require_equal(tmp_path / "new", tmp_path / "read")
 
 
+@pytest.mark.slow
 def test_an_exposure_that_is_of_no_use_is_told_and_the_others_are_used(tmp_path: Path) -> None:
     plan = ScanPlan(exposures_s=(0.015, 1.0, 4.0))
     bundle = captured(small_rig(tmp_path), plan, tmp_path / "bundle")

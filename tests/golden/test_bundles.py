@@ -75,6 +75,7 @@ def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
     assert report["truth"]["nonmanifold_edges"] == 0
 
 
+@pytest.mark.slow
 def test_one_bundle_gives_the_same_bytes_of_mesh_twice(shared: Path, tmp_path: Path) -> None:
     for run in ("first", "second"):
         reconstructed(shared / "bundles" / "vase", tmp_path / run)

@@ -197,6 +197,7 @@ def test_what_is_measured_is_what_was_planted(tmp_path: Path) -> None:
     assert found.exposures["left"].exposure_s == pytest.approx(1 / 60, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_rig_file_that_it_writes_scans_where_the_old_one_did_not(tmp_path: Path) -> None:
     defect = planted(faults="light_delay_s = 0.04", head="exposure_s = 0.08")
     path = written(tmp_path, defect)

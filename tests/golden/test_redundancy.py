@@ -102,6 +102,7 @@ def test_a_camera_turned_by_a_twentieth_of_a_degree_shows_as_projective_geometry
     np.testing.assert_allclose(cells[np.isfinite(cells)], predicted, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_a_first_camera_that_is_turned_shows_in_the_second(recorded: Path, tmp_path: Path) -> None:
     devices: list[dict[str, Any]] = []
     (pair,) = redundancy_of(recorded, tmp_path, lambda file: devices.extend(turned(file, "left")))["residual_px"]
@@ -133,6 +134,7 @@ def test_without_a_calibrated_projector_there_is_no_spare_equation(recorded: Pat
     assert section["points_by_source"]["camera_camera"] > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_the_gauge_of_another_renderer_tells_a_turned_camera_apart(shared: Path, tmp_path: Path) -> None:
     gauge = shared / "bundles" / "gauge"

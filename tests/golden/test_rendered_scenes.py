@@ -17,7 +17,10 @@ _ALL = (Path(__file__).parents[2] / "config" / "rigs").glob("*.toml")
 RIGS = sorted(path for path in _ALL if not path.stem.startswith("rendered-"))
 
 
-@pytest.mark.parametrize("rig_file", RIGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "rig_file",
+    [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem == "demo")) for path in RIGS],
+)
 def test_a_rendered_scene_meets_its_figures(rig_file: Path, tmp_path: Path) -> None:
     with open_rig(read_rig(rig_file)) as rig:
         capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)

@@ -112,6 +112,7 @@ def test_latency_and_line_time_come_out_of_the_rows(latency_s: float, line_s: fl
     assert found.settle_s == 0
 
 
+@pytest.mark.slow
 def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
     for seed in range(40):
         found = World(both_ways(step(0.012)), noise_dn=2.0).measured(count=30, seed=seed)
@@ -119,6 +120,7 @@ def test_a_global_shutter_is_not_taken_for_a_rolling_one() -> None:
         assert not found.scanned
 
 
+@pytest.mark.slow
 def test_the_stated_error_of_the_line_time_is_its_scatter() -> None:
     found = [World(both_ways(step(0.003)), line_s=3e-5, noise_dn=3.0).measured(count=30, seed=s) for s in range(30)]
     scatter = np.std([each.line_time_s for each in found], ddof=1)

@@ -269,7 +269,10 @@ def reports_alike(one: dict[str, object], other: dict[str, object]) -> bool:
     return all(one[part] == other[part] for part in parts)
 
 
-@pytest.mark.parametrize("change", ["none", "repeats", "a bracket", "no line frames"])
+@pytest.mark.parametrize(
+    "change",
+    ["none", *(pytest.param(each, marks=pytest.mark.slow) for each in ("repeats", "a bracket", "no line frames"))],
+)
 def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, tmp_path: Path, change: str) -> None:
     bundle = read_bundle(recorded)
     capture = bundle.capture
@@ -295,6 +298,7 @@ def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, 
     assert reports_alike(live, read)
 
 
+@pytest.mark.slow
 def test_two_cameras_taken_live_give_the_bytes_that_the_bundle_gives(tmp_path: Path) -> None:
     with open_rig(read_rig(RIG.with_name("two_cameras.toml"))) as rig:
         capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)

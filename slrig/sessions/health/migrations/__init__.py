@@ -11,4 +11,4 @@ VERSION_TABLE = "alembic_version_health"
 
 def upgrade(connection: Connection) -> None:
     """Bring the database behind `connection` to the newest tables. Does nothing when it is there already."""
-    run_migrations(connection, "slrig.sessions:health_migrations")
+    run_migrations(connection, "slrig.sessions.health:migrations")

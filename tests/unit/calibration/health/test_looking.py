@@ -113,6 +113,7 @@ def test_a_rig_that_did_not_change_is_good() -> None:
     assert pair.rms_px == pytest.approx(np.hypot(0.04, 0.02), rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_size_of_a_change_has_an_honest_deviation() -> None:
     off = []
     for seed in range(8):
@@ -124,6 +125,7 @@ def test_the_size_of_a_change_has_an_honest_deviation() -> None:
     assert np.sqrt(np.mean(np.square(off))) < 1.8
 
 
+@pytest.mark.slow
 def test_a_device_that_was_knocked_is_turned_and_moved() -> None:
     rig = bench(cameras=2)
     way = np.array([0.3, 0.2, -0.4])

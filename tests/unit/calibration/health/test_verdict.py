@@ -81,6 +81,7 @@ def test_a_creeping_size_is_watched_and_scatter_is_not() -> None:
     assert "measured size has crept by +0.03" in health.reasons[0]
 
 
+@pytest.mark.slow
 def test_clean_captures_raise_no_alarm() -> None:
     rig = bench(4)
     looks: list[Look] = []
