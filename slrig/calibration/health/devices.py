@@ -30,3 +30,8 @@ def block(calibration: Calibration, names: tuple[str, ...], /) -> FloatArray:
     order = list(devices_of(calibration))
     rows = np.concatenate([np.arange(EACH * order.index(name), EACH * (order.index(name) + 1)) for name in names])
     return np.asarray(covariance_of(calibration)[np.ix_(rows, rows)], dtype=np.float64)
+
+
+def device_words(name: str) -> str:
+    """A device as the subject of a sentence."""
+    return "the projector" if name == PROJECTOR else f"camera '{name}'"

@@ -23,7 +23,7 @@ import numpy as np
 
 from slrig.calibration.health.devices import EACH, devices_of
 from slrig.calibration.health.equations import Equations, design, padded
-from slrig.calibration.solution import PARAMETERS, PROJECTOR
+from slrig.calibration.solution import PARAMETERS
 from slrig.model import Calibration, FloatArray
 
 ALIKE = 9.0
@@ -195,8 +195,3 @@ def board_growth(found: Equations, calibration: Calibration, /) -> tuple[float, 
     fitted = _fitted(found, base, left, "", Change.NONE, columns, left - basis @ (basis.T @ left), basis)
     first = int(np.argmax(np.abs(columns)))
     return float(fitted.change[first] / columns[first, 0] * _MOST_GROWTH), fitted.evidence
-
-
-def device_words(name: str) -> str:
-    """A device as the subject of a sentence."""
-    return "the projector" if name == PROJECTOR else f"camera '{name}'"

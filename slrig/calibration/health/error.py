@@ -4,6 +4,9 @@ Each hypothesis h of what changed (`slrig.calibration.health.drift`) gives the p
 calibration a mean m_h and modes P_h. With F what they do to a point along the first camera's ray, the rigid motion
 nearest to it taken out, the expected square of the error is Σ_h w_h mean((F m_h)² + Σ_k (F P_h)_k²) over places in the
 volume. A calibration that nothing changed gives what it stated of itself, less what the look at the board has taught.
+
+Only hypotheses that what was seen makes likelier than no change count. Of a device that the look did not see each is as
+likely as before, and would bring in all that may ever happen to it.
 """
 
 from __future__ import annotations
@@ -50,9 +53,9 @@ def error_now(ranked: Sequence[Hypothesis], calibration: Calibration, volume_mm:
         fields = rigid_free(places, by_parameter @ changes.reshape(len(changes), -1))
         return float(np.sqrt((np.einsum("ni,nik->nk", ray, fields) ** 2).sum(axis=1).mean()))
 
-    square = sum(
-        each.weight * (rms(each.mean) ** 2 + rms(each.modes) ** 2) for each in ranked if each.weight > _LIKELY
-    ) / sum(each.weight for each in ranked if each.weight > _LIKELY)
+    likely = [each for each in ranked if each.weight > _LIKELY and (each.evidence > 0 or each.kind is Change.NONE)]
+    square = sum(each.weight * (rms(each.mean) ** 2 + rms(each.modes) ** 2) for each in likely)
+    square /= sum(each.weight for each in likely)
     best = ranked[0]
     return ErrorNow(
         now_mm=float(np.sqrt(square)),

@@ -48,7 +48,8 @@ class Look:
     scale_percent, scale_mm : by how much the board measures larger than it is, and that over its diagonal; None of a
     scan. expected_mm : of a point along the viewing ray, now; stated_mm : the same as the calibration states it.
     drift_mm : the change's own part. drifts : likeliest first, nothing where nothing changed. open : what the geometry
-    leaves open. remedy : what to do about the first.
+    leaves open. remedy : what to do about the first. unseen : devices that nothing was learned of: cameras that did not
+    see the board, and the projector if no camera saw its light there.
     """
 
     kind: str
@@ -64,6 +65,7 @@ class Look:
     drifts: Sequence[Drift] = field(default=())
     open: str | None = None
     remedy: str | None = None
+    unseen: Sequence[str] = field(default=())
 
     def document(self) -> dict[str, Any]:
         """As JSON values."""
@@ -75,6 +77,8 @@ def look_from_document(document: Mapping[str, Any], /) -> Look:
     given = dict(document)
     given["pairs"] = tuple(PairFigures(**each) for each in given["pairs"])
     given["drifts"] = tuple(Drift(**each) for each in given["drifts"])
+    # Looks on record from before it was told have none.
+    given["unseen"] = tuple(given.get("unseen", ()))
     return Look(**given)
 
 

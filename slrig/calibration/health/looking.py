@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slrig.calibration.board import Board
+from slrig.calibration.health.devices import devices_of
 from slrig.calibration.health.drift import ALIKE, Change, Hypothesis, board_growth, hypotheses, rivals
 from slrig.calibration.health.equations import equations
 from slrig.calibration.health.error import ErrorNow, error_now
@@ -15,7 +16,7 @@ from slrig.calibration.health.look import Drift, Look, PairFigures
 from slrig.calibration.health.residuals import BoardScale, PairResidual, board_scales, pair_residuals
 from slrig.calibration.health.words import change_words, remedy_words, rival_words
 from slrig.calibration.observations import PoseObservation
-from slrig.calibration.solution import BoardPose
+from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import Calibration, FloatArray
 
 _LISTED = 5
@@ -54,7 +55,16 @@ def look_at_board(poses: Sequence[PoseObservation], board: Board, calibration: C
         drifts=tuple(_drift(each) for each in listed),
         open=rival_words(best, rivals(ranked), calibration, growth) if changed else None,
         remedy=remedy_words(best) if changed else None,
+        unseen=_unseen(poses, calibration),
     )
+
+
+def _unseen(poses: Sequence[PoseObservation], calibration: Calibration) -> tuple[str, ...]:
+    """The devices that no pose says anything of."""
+    seen = {name for pose in poses for name in pose.views}
+    if any(len(light.axis) for pose in poses for light in pose.light.values()):
+        seen.add(PROJECTOR)
+    return tuple(name for name in devices_of(calibration) if name not in seen)
 
 
 def _volume(calibration: Calibration, board: Board, standing: Mapping[str, BoardPose]) -> FloatArray:

@@ -13,6 +13,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.stats import t as student
 
+from slrig.calibration.health.devices import device_words
 from slrig.calibration.health.look import Look, PairFigures
 
 
@@ -30,10 +31,11 @@ class Thresholds:
     """From where on a rig is to be watched, and from where its calibration is stale.
 
     mean : of a pair's spare equation, px. rms_ratio : of its rms over that after the calibration. error_ratio : of the
-    expected error over the stated one. sure_error_ratio : from which it is stale if the change is certain too, by
-    sure_sigmas. watch_evidence : of a change that is too small to matter yet. trend_chance : below which the measured
-    size of the board, or a pair's mean, has not crept by chance since the first looks. jump_evidence : of one look that
-    counts at once (100 is 10 σ), jump_mean_sigmas the same of a pair's mean.
+    expected error over the stated one, of a change with watch_evidence. sure_error_ratio : from which it is stale if
+    the change is certain too, by sure_sigmas. watch_evidence : of a change that is too small to matter yet (6 is 20
+    times likelier than none). trend_chance : below which the measured size of the board, or a pair's mean, has not
+    crept by chance since the first looks. jump_evidence : of one look that counts at once (100 is 10 σ),
+    jump_mean_sigmas the same of a pair's mean.
     """
 
     watch_mean_px: float = 0.1
@@ -90,6 +92,7 @@ def judged(looks: Sequence[Look], /, *, thresholds: Thresholds = THRESHOLDS) -> 
     named = measured[-1] if measured else latest
     if named.drifts:
         reasons = (*reasons, named.drifts[0].words, *([named.open] if named.open else []))
+    reasons = (*reasons, *_unseen_words(named))
     if state is HealthState.STALE:
         remedy = named.remedy or "shoot a verification of the board to learn which device changed, and calibrate again"
     else:
@@ -107,7 +110,8 @@ def _of_error(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, 
     now, stated = known[-1].expected_mm, known[-1].stated_mm
     words = f"scans are now expected to be wrong by {now:.3g} mm, {ratio:.1f} times the {stated:.3g} mm that is stated"
     sure = sigmas > at.sure_sigmas
-    if ratio > at.stale_error_ratio or (ratio > at.sure_error_ratio and sure):
+    likely = evidence > at.watch_evidence
+    if (ratio > at.stale_error_ratio and likely) or (ratio > at.sure_error_ratio and sure):
         return [(HealthState.STALE, words)]
     # A ratio alone may come of explanations none of which is likelier than that nothing changed.
     changed = evidence > 0 or ratio > at.sure_error_ratio
@@ -210,7 +214,14 @@ def _pairs(looks: Sequence[Look]) -> list[tuple[str, str]]:
 
 
 def _good_words(look: Look) -> str:
-    if look.expected_mm is not None and look.stated_mm:
-        return f"the calibration holds: expected error {look.expected_mm:.3g} mm, stated {look.stated_mm:.3g} mm"
     worst = max((abs(pair.mean_px) for pair in look.pairs), default=float("nan"))
-    return f"the calibration holds: devices agree within {worst:.2f} px in the mean"
+    words = f"devices agree within {worst:.2f} px in the mean"
+    if look.expected_mm is not None and look.stated_mm:
+        words = f"expected error {look.expected_mm:.3g} mm, stated {look.stated_mm:.3g} mm"
+    return f"the calibration holds: {words}{''.join(f'; {each}' for each in _unseen_words(look))}"
+
+
+def _unseen_words(look: Look) -> list[str]:
+    return [
+        f"{device_words(name)} did not take part in the last look, which says nothing of it" for name in look.unseen
+    ]

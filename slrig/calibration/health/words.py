@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slrig.calibration.health.drift import Change, Hypothesis, device_words
+from slrig.calibration.health.devices import device_words
+from slrig.calibration.health.drift import Change, Hypothesis
 from slrig.calibration.solution import PROJECTOR
 from slrig.model import Calibration, FloatArray
 

@@ -98,16 +98,25 @@ def look_of(devices: Mapping[str, Pinhole], seed: int, *, noise: float = 1.0, gr
 
 
 def true_error_mm(now: Mapping[str, Pinhole], calibration: Calibration) -> float:
-    """Rms along the first camera's rays of what a scan is wrong by, after the best rigid motion, over the volume."""
+    """Rms along the first camera's rays of what a scan is wrong by, after the best rigid motion, over the volume.
+
+    Points of several cameras are averaged, weighted by how far each sees them move along the projector's ray.
+    """
     steps = [low + (high - low) * (np.arange(8) + 0.5) / 8 for low, high in zip(*VOLUME_MM, strict=True)]
     places = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    first, lamp = now["left"], now[PROJECTOR]
+    lamp = now[PROJECTOR]
     if calibration.projector is None:
         raise ValueError(calibration)
-    at, lit = pixels(first, places), pixels(lamp, places)
-    found = met_with_light(calibration.cameras["left"], calibration.projector, at, lit[:, 0], places, 0)
-    off = aligned(found, places) - places
-    ray = places - first.centre_mm
+    lit = pixels(lamp, places)[:, 0]
+    farther = places + 0.01 * (places - lamp.centre_mm) / np.linalg.norm(places - lamp.centre_mm, axis=1, keepdims=True)
+    total, found = np.zeros(len(places)), np.zeros_like(places)
+    for name, stated in calibration.cameras.items():
+        at = pixels(now[name], places)
+        weight = ((pixels(now[name], farther) - at) ** 2).sum(axis=1)
+        found += weight[:, None] * met_with_light(stated, calibration.projector, at, lit, places, 0)
+        total += weight
+    off = aligned(found / total[:, None], places) - places
+    ray = places - now["left"].centre_mm
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     return float(np.sqrt(((off * ray).sum(axis=1) ** 2).mean()))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -114,6 +115,30 @@ def test_a_rig_that_did_not_change_is_good() -> None:
 
 
 @pytest.mark.slow
+def test_a_device_that_takes_no_part_in_a_look_raises_no_alarm_and_is_told() -> None:
+    rig = bench(3, cameras=2)
+    for absent, others in (("left", "right"), ("right", "left")):
+        whole = look_of(rig.devices, 5)
+        one = replace(whole, views={others: whole.views[others]}, light={others: whole.light[others]})
+        found = look_at_board([one], BOARD, rig.calibration)
+        assert found.unseen == (absent,)
+        assert not found.drifts
+        # What is not seen is as good as it was, and not as bad as anything that might have happened to it.
+        assert (found.expected_mm or 0) < 1.05 * (found.stated_mm or 0)
+        health = judged([found])
+        assert health.state is HealthState.GOOD
+        assert f"camera '{absent}' did not take part in the last look" in health.reasons[0]
+        # A change of the others is found all the same.
+        lamp = planted(rig.devices, "projector focal")
+        seen = look_of(lamp, 5)
+        other = replace(seen, views={others: seen.views[others]}, light={others: seen.light[others]})
+        alarm = judged([look_at_board([other], BOARD, rig.calibration)])
+        assert alarm.state is HealthState.STALE
+        assert alarm.reasons[-1].startswith(f"camera '{absent}' did not take part")
+    dark = replace(look_of(rig.devices, 5), light={})
+    assert look_at_board([dark], BOARD, rig.calibration).unseen == (PROJECTOR,)
+
+
 def test_the_size_of_a_change_has_an_honest_deviation() -> None:
     off = []
     for seed in range(8):
@@ -158,6 +183,8 @@ def test_a_look_survives_its_document() -> None:
     rig = bench()
     found = looked(rig, planted(rig.devices, "baseline"))
     assert look_from_document(found.document()).document() == found.document()
+    old = {name: value for name, value in found.document().items() if name != "unseen"}
+    assert look_from_document(old) == look_from_document(found.document())
 
 
 def test_a_scan_with_two_cameras_is_a_look_too() -> None:
