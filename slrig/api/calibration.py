@@ -20,6 +20,7 @@ from slrig.api.calibration_schemas import (
     PoseBody,
     PoseRequestBody,
     ScriptRequest,
+    SolveRequest,
     board_of,
     calibration_body,
     calibration_summary,
@@ -218,9 +219,12 @@ def drop_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> Non
 
 
 @router.post("/{calibration_id}/solve", status_code=202, responses=problems(404, 409, 422, 507))
-def solve_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
+def solve_calibration(
+    service: Serving, calibration_id: UUID, request: Annotated[SolveRequest, Body(default_factory=SolveRequest)]
+) -> CalibrationBody:
     """Solve the calibration from its accepted poses. The answer comes at once; `progress` tells how far it is."""
-    return answered(service, service.calibrations.solves.solve(calibration_id))
+    solves = service.calibrations.solves
+    return answered(service, solves.solve(calibration_id, board_shape=request.board_shape))
 
 
 @router.post("/{calibration_id}/activate", responses=problems(404, 409, 422, 507))

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from slrig.api.problems import fault_problem
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, Strict
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import Comparison, Difference
 from slrig.scan.plan import PatternPlan
 from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
@@ -74,6 +74,16 @@ class ScriptRequest(Strict):
     ] = Field(default_factory=list, description="by number from 0 or by name. Default: all, in their order")
     exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None
     if_busy: IfBusy = "reject"
+
+
+class SolveRequest(Strict):
+    """A solve. An empty request solves from all accepted poses."""
+
+    board_shape: Annotated[BoardShape, Field(strict=False)] = Field(
+        default=BoardShape.AUTO,
+        description="flat: the board is, for certain; bowed: its bend is solved for; auto: it is taken for bowed where "
+        "held-out poses are better with that",
+    )
 
 
 class PoseLinks(BaseModel):
@@ -159,7 +169,7 @@ class CalibrationBody(CalibrationSummary):
     error: FaultBody = Field(description="why the last solve failed")
     result: dict[str, Any] | None = Field(
         description="of the last solve that went well: devices with rms and values, each with its standard deviation; "
-        "the expected error in mm; the verdict and why"
+        "the expected error in mm; how far the board is out of flat; the verdict and why"
     )
     last_event: int = Field(description="to follow `links.events` from here: send it as Last-Event-ID")
 

@@ -32,6 +32,14 @@ class BoardKind(StrEnum):
     CIRCLES = "circles"
 
 
+class BoardShape(StrEnum):
+    """What a solve takes the board for. auto : flat, unless held-out poses are better with a bent one."""
+
+    AUTO = "auto"
+    FLAT = "flat"
+    BOWED = "bowed"
+
+
 @dataclass(frozen=True, slots=True)
 class Board:
     """A board. A frozen value that travels from a request to the solve.

@@ -69,6 +69,18 @@ class DeviceResiduals:
 
 
 @dataclass(frozen=True, slots=True)
+class Bow:
+    """How far out of flat the board is: height_mm from its lowest corner to its highest, sigma_mm its deviation.
+
+    solved : whether the solve took the board for bent; without it, the bow is what the poses would tell of one.
+    """
+
+    height_mm: float
+    sigma_mm: float
+    solved: bool
+
+
+@dataclass(frozen=True, slots=True)
 class ExpectedError:
     """What a scan with this calibration may be wrong by, mm, over the volume in which the board was held.
 
@@ -102,6 +114,7 @@ class Solution:
     poses : by name, those that were used; outliers : those left out, each with the reason in words.
     residuals : by device, PROJECTOR among them.
     board_shape_mm : (n, 3) float64, by how much each corner lies off its place, or None where that was not solved.
+    bow : how far out of flat the board is; None where a person said that it is flat.
     """
 
     calibration: Calibration
@@ -111,6 +124,7 @@ class Solution:
     outliers: Mapping[str, str]
     residuals: Mapping[str, DeviceResiduals]
     board_shape_mm: FloatArray | None = None
+    bow: Bow | None = None
 
     @property
     def stereo_rms_px(self) -> float:

@@ -25,6 +25,14 @@ class BoardName(StrEnum):
     CIRCLES = "circles"
 
 
+class ShapeName(StrEnum):
+    """What a solve takes the board for."""
+
+    AUTO = "auto"
+    FLAT = "flat"
+    BOWED = "bowed"
+
+
 CalibrationId = Annotated[str, typer.Argument(help="Id of the calibration, or the beginning of it that no other has.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Kind = Annotated[BoardName | None, typer.Option("--board", help="What is printed on the board.")]
@@ -40,6 +48,14 @@ MarkerMm = Annotated[
 ]
 Dictionary = Annotated[
     str | None, typer.Option(help="Markers of a ChArUco board, by OpenCV's name. Default DICT_5X5_250.")
+]
+
+Shape = Annotated[
+    ShapeName,
+    typer.Option(
+        "--board-shape",
+        help="flat: it is, for certain, as on glass; bowed: solve for its bend; auto: bowed if held-out poses say so.",
+    ),
 ]
 
 
@@ -70,6 +86,7 @@ def solve(
     square_mm: SquareMm = None,
     marker_mm: MarkerMm = None,
     dictionary: Dictionary = None,
+    board_shape: Shape = ShapeName.AUTO,
     report: Annotated[Path | None, typer.Option(help="Write the report, one HTML page with pictures, as well.")] = None,
     earlier: Annotated[
         Path | None, typer.Option(help="Calibration of the same rig: is the board's size what it was then?")
@@ -77,10 +94,12 @@ def solve(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate from recorded poses. Needs no service and no rig."""
+    from slrig.calibration.board import BoardShape
     from slrig.cli.calibrate_solve import solve_folder
 
     chosen = chosen_board(kind, corners, square_mm, marker_mm, dictionary)
-    solve_folder(folder, chosen, output, report=report, earlier=earlier, as_json=as_json)
+    shape = BoardShape(board_shape.value)
+    solve_folder(folder, chosen, output, report=report, earlier=earlier, board_shape=shape, as_json=as_json)
 
 
 @app.command()
@@ -90,6 +109,7 @@ def run(
     square_mm: SquareMm = None,
     marker_mm: MarkerMm = None,
     dictionary: Dictionary = None,
+    board_shape: Shape = ShapeName.AUTO,
     resume: Annotated[str | None, typer.Option("--id", help="Take up a session again that was left.")] = None,
     scripted: Annotated[
         bool,
@@ -117,7 +137,15 @@ def run(
             if chosen is not None
             else client.get(f"/calibration/{whole_id(client, str(resume))}")
         )
-        walk(client, session, scripted=scripted, positions=position or (), activate=activate, exposure_s=exposure_s)
+        walk(
+            client,
+            session,
+            scripted=scripted,
+            positions=position or (),
+            activate=activate,
+            exposure_s=exposure_s,
+            board_shape=board_shape.value,
+        )
 
 
 @app.command(name="list")

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from slrig.bundle import read_calibration, write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_file
-from slrig.calibration.board import Board
+from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.poses.checks import check_same_devices
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
@@ -47,11 +47,19 @@ class Readings:
 
 
 def solve_folder(
-    folder: Path, board: Board, output: Path, *, report: Path | None, earlier: Path | None, as_json: bool
+    folder: Path,
+    board: Board,
+    output: Path,
+    *,
+    report: Path | None,
+    earlier: Path | None,
+    board_shape: BoardShape,
+    as_json: bool,
 ) -> None:
     """Read the poses, solve, print how good the calibration is, and write it and its report.
 
-    earlier : file of a calibration of the same devices, to compare the scale with.
+    earlier : file of a calibration of the same devices, to compare the scale with. board_shape : whether the board may
+    be bowed.
 
     Raises
     ------
@@ -95,8 +103,9 @@ def solve_folder(
 
         try:
             result = solve_poses(
-                board, setting.cameras, setting.projector, found.poses, progress=solving, earlier=before
-            )
+                board, setting.cameras, setting.projector, found.poses, progress=solving, earlier=before,
+                board_shape=board_shape,
+            )  # fmt: skip
         except SolveRefusedError as error:
             raise SolveRefusedError(_with_refused(str(error), found.refused)) from error
         document = {**summary(result), "refused": found.refused, "remarks": found.remarks}

@@ -48,6 +48,7 @@ def walk(
     positions: Sequence[str],
     activate: bool,
     exposure_s: float | None,
+    board_shape: str = "auto",
 ) -> None:
     """Walk through a session, by a person's hand or by the positioner. Ctrl-C leaves it to be taken up again.
 
@@ -65,7 +66,7 @@ def walk(
         )
         raise CalibrationStateError(message)
     console.print(Text.assemble(("calibration ", "bold"), session["id"], f" · {session['board']['title']}"))
-    walked = Walk(client, session, console, exposure_s=exposure_s)
+    walked = Walk(client, session, console, exposure_s=exposure_s, board_shape=board_shape)
     try:
         walked.await_rig()
         if scripted:
@@ -87,6 +88,7 @@ class Walk:
         console: Console,
         *,
         exposure_s: float | None = None,
+        board_shape: str = "auto",
         ask: Callable[[str], str] | None = None,
         pause: Callable[[float], None] | None = None,
     ) -> None:
@@ -95,6 +97,7 @@ class Walk:
         self._id: str = session["id"]
         self._console = console
         self._exposure = {} if exposure_s is None else {"exposure_s": exposure_s}
+        self._solve = {"board_shape": board_shape}
         self._ask = console.input if ask is None else ask
         self._pause = time.sleep if pause is None else pause
 
@@ -239,7 +242,7 @@ class Walk:
 
     def _solved(self) -> bool:
         """Solve and tell the result; False where the poses do not allow it, which is told."""
-        session = self._client.post(f"{self._path}/solve", None)
+        session = self._client.post(f"{self._path}/solve", self._solve)
         with progress_shown() as display:
             while session["state"] == "solving":
                 progress = session.get("progress") or {"stage": "solving", "fraction": 0.0, "detail": ""}

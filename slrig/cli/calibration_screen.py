@@ -106,6 +106,8 @@ def _figures(document: Mapping[str, Any]) -> Table:
         length = figure_words(pair["length_mm"]["value"], pair["length_mm"]["sigma"])
         names = Text(f"{pair['first']} – {pair['second']}: {length} mm apart, at {pair['angle_deg']['value']:.1f}°")
         table.add_row("baseline", names)
+    if document.get("board"):
+        table.add_row("board", Text(document["board"]["words"].removeprefix("the board ")))
     left_out, refused = len(document["outliers"]), len(document.get("refused", {}))
     table.add_row("poses", f"{len(document['poses'])} used of {len(document['poses']) + left_out + refused}")
     return table

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -57,13 +58,43 @@ def test_light_of_the_real_boards_lies_on_smooth_sheets(poses: list[ReadPose], n
         assert (np.abs(off) > 2).mean() < 0.001
 
 
-def test_the_real_boards_give_the_calibration_that_is_asked_for(result: CalibrationResult) -> None:
+def every_corner_off_px(result: CalibrationResult, poses: list[ReadPose]) -> FloatArray:
+    """(n,) float64: how far every corner that was found lies from where the calibration puts it, by OpenCV, px."""
+    camera, shape_mm = result.calibration.cameras["cam0"], result.solution.board_shape_mm
+    assert shape_mm is not None
+    off = []
+    for pose in poses:
+        stood, view = result.solution.poses[pose.observation.name], pose.observation.views["cam0"]
+        world = (BOARD.points_mm + shape_mm)[view.corner] @ stood.rotation.T + stood.translation_mm
+        seen, _ = cv2.projectPoints(world, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+        off.append(np.linalg.norm(seen.reshape(-1, 2) - view.points_px, axis=1))
+    return np.concatenate(off)
+
+
+def test_the_real_boards_give_the_calibration_that_is_asked_for(
+    result: CalibrationResult, poses: list[ReadPose]
+) -> None:
     camera, projector = result.solution.residuals["cam0"], result.solution.residuals[PROJECTOR]
-    assert camera.rms_px <= 0.22
+    off_px = every_corner_off_px(result, poses)
+    rms_px = float(np.sqrt(np.mean(off_px**2)))
+    # All 252 corners, outlying ones too, count here; the solve's own figure is of those that it did not leave out.
+    assert len(off_px) == len(POSES) * BOARD.corner_count
+    assert rms_px <= 0.22
+    assert camera.rms_px <= rms_px
     assert projector.rms_px <= 0.16
-    # As a stereo calibration counts: all corners of both devices together, two coordinates each.
+    # As a stereo calibration counts: all points of both devices together, two coordinates each.
+    assert np.sqrt((rms_px**2 + 2 * projector.rms_px**2) / 2) <= 0.20
     assert result.solution.stereo_rms_px <= 0.20
     assert result.solution.outliers == {}
+
+
+def test_the_paper_of_the_real_boards_is_found_to_be_bowed(result: CalibrationResult) -> None:
+    bow = result.solution.bow
+    assert bow is not None
+    assert bow.solved
+    # 1.07 ± 0.10 mm over 600 mm was found when this was written; nobody measured it otherwise.
+    assert 0.7 < bow.height_mm < 1.5
+    assert bow.sigma_mm < 0.2
 
 
 def test_the_projectors_lens_is_shifted_and_its_row_is_known_so_well(result: CalibrationResult) -> None:

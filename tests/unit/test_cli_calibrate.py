@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 
 from slrig.bundle import read_calibration, read_opencv_calibration
+from slrig.calibration.board import BoardShape
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import PoseRefusedError, SolveRefusedError
 from slrig.sessions.calibration.pose_judging import summary
@@ -67,7 +68,7 @@ def solving(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def solve_poses(board: object, cameras: object, projector: object, given: Any, **options: Any) -> object:
         asked.update(board=board, cameras=cameras, projector=projector, poses=[each.observation.name for each in given])
-        asked["earlier"] = options["earlier"]
+        asked.update(earlier=options["earlier"], board_shape=options["board_shape"])
         options["progress"]("adjustment", 0.5, "")
         return solved_result()
 
@@ -98,6 +99,8 @@ def test_folder_of_poses_becomes_a_calibration(poses: Path, solving: dict[str, A
     assert written.cameras["left"].matrix[0, 0] == 1810.4
     for words in ("1810.40 ± 0.21", "842.40 ± 0.61", "19 used of 20", f"{BUMPED}  left moved by 1.9 px", str(output)):
         assert words in result.stdout, words
+    assert "flat as far as the poses tell: 0.031 ± 0.012 mm" in result.stdout
+    assert solving["board_shape"] is BoardShape.AUTO
     # Off a terminal every stage is a line of its own.
     stages = [line.split("%  ")[1] for line in result.stderr.splitlines()]
     assert stages[:2] == ["loading", "reading pose_00"]
@@ -114,6 +117,11 @@ def test_json_says_what_the_screen_says(poses: Path, solving: dict[str, Any], tm
     assert list(document["refused"]) == ["pose_20"]
     assert document["output"] == str(tmp_path / "rig.json")
     assert solving["poses"] == list(GIVEN)
+
+
+def test_a_board_may_be_said_to_be_flat(poses: Path, solving: dict[str, Any], tmp_path: Path) -> None:
+    run("solve", poses, *BOARD_OPTIONS, "--board-shape", "flat", "--output", tmp_path / "rig.json")
+    assert solving["board_shape"] is BoardShape.FLAT
 
 
 @pytest.mark.parametrize("ending", [".yml", ".xml"])

@@ -142,10 +142,12 @@ def test_script_shoots_every_position_then_solves(monkeypatch: pytest.MonkeyPatc
     desk = Desk()
     monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", lambda _s: None)
     monkeypatch.setattr(calibrate, "_client", lambda _url, _key: client_of(desk))
-    result = run("run", *BOARD_OPTIONS, "--scripted", "--position", "pose 1", "--activate", "--exposure-s", "0.02")
+    result = run("run", *BOARD_OPTIONS, "--scripted", "--position", "pose 1", "--activate", "--exposure-s", "0.02",
+                 "--board-shape", "bowed")  # fmt: skip
     assert result.exit_code == 0, result.output
     asked = {"positions": ["pose 1"], "exposure_s": 0.02, "if_busy": "queue"}
     assert desk.asked[1] == ("POST", f"/calibration/{ID}/script", asked)
     assert [path.rpartition("/")[2] for _, path, _ in desk.asked[2:]] == ["solve", "activate"]
+    assert desk.asked[2][2] == {"board_shape": "bowed"}
     for number in (1, 2, 3):
         assert f"pose {number} accepted" in result.stdout

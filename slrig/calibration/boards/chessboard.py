@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.calibration.board import Board
 from slrig.calibration.boards.board_map import fitted_map
@@ -23,7 +24,7 @@ _LEAST_FOUND = 0.8
 
 def chessboard_view(grey: Grey, board: Board) -> BoardView:
     """See `slrig.calibration.boards.detection.find_board`."""
-    lattice = _grid(grey, board) or chessboard_lattice(grey)
+    lattice = _lattice(grey, board)
     if lattice is None or not _is_all_of(lattice, board):
         raise PoseRefusedError(_cause(grey, board, lattice))
     if holds_markers(grey.level, lattice):
@@ -40,22 +41,36 @@ def chessboard_view(grey: Grey, board: Board) -> BoardView:
     return placed.view
 
 
-def _grid(grey: Grey, board: Board) -> Lattice | None:
-    """The grid of this size with all that it goes on into, None where there is none.
+def _lattice(grey: Grey, board: Board) -> Lattice | None:
+    """The chessboard in view, of the size asked for if there is one; None where there is none at all."""
+    small, factor = grey.reduced(_QUICK_PX)
+    lattice = _grid(grey, small, factor, board)
+    if lattice is not None:
+        return lattice
+    seen = chessboard_lattice(grey)
+    if factor == 1.0 or (seen is not None and _is_known(grey, board, seen)):
+        return seen
+    # In the whole image the detector takes as long as all that is before it.
+    return _grid(grey, grey.eight, 1.0, board) or seen
+
+
+def _grid(grey: Grey, image: NDArray[np.uint8], scale: float, board: Board) -> Lattice | None:
+    """The grid of this size with all that it goes on into, None where there is none. scale : of `image`.
 
     OpenCV finds a grid of the size asked for in a larger board, and between the markers of a ChArUco board, too.
     """
-    small, factor = grey.reduced(_QUICK_PX)
-    for image, scale in ((small, factor), (grey.eight, 1.0))[: 1 if factor == 1.0 else 2]:
-        found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=0)
-        if found:
-            # A pixel's centre is at a whole number at either scale.
-            points = (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
-            steps = np.argwhere(np.ones((board.rows, board.columns)))[:, ::-1].astype(np.int32)
-            lattice = grown_lattice(grey.level, points, steps)
-            if lattice is not None:
-                return lattice
-    return None
+    found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=0)
+    if not found:
+        return None
+    # A pixel's centre is at a whole number at either scale.
+    points = (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+    steps = np.argwhere(np.ones((board.rows, board.columns)))[:, ::-1].astype(np.int32)
+    return grown_lattice(grey.level, points, steps)
+
+
+def _is_known(grey: Grey, board: Board, lattice: Lattice) -> bool:
+    """Whether a lattice is the board, or without doubt another one."""
+    return _is_all_of(lattice, board) or holds_markers(grey.level, lattice) or lattice.complete(grey.level)
 
 
 def _is_all_of(lattice: Lattice, board: Board) -> bool:

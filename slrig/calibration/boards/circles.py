@@ -77,6 +77,17 @@ def placed_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs:
     return BoardView(corner, centres_px[good], np.hypot(fit.sigma_px[good], FLOOR_PX))
 
 
+def circles_again(grey: Grey, board: Board, view: BoardView) -> BoardView:
+    """See `slrig.calibration.boards.detection.placed_again`."""
+    places = board.points_mm[:, :2] / board.square_mm
+    board_map = fitted_map(places[view.corner], view.points_px)
+    found = None
+    if board_map is not None:
+        blobs = dark_blobs(grey.eight, most=board.corner_count)
+        found = placed_circles(grey.level, board, board_map(places), blobs)
+    return BoardView(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)) if found is None else found
+
+
 def circle_blur_px(level: FloatArray, view: BoardView, board: Board) -> FloatArray:
     """(n,) float64: standard deviation of the blur of each circle's outline."""
     places = board.points_mm[view.corner, :2] / board.square_mm
@@ -207,6 +218,11 @@ def _mirrored(board: Board) -> str:
 
 def _another(board: Board, seen: Lattice) -> str:
     found, wanted = sorted((seen.columns, seen.rows)), sorted((2 * board.columns, board.rows))
+    if found == sorted((2 * board.rows, board.columns)):
+        return (
+            f"another board: expected circles in {board.rows} rows of {board.columns}, found {board.columns} rows of "
+            f"{board.rows}: turn them round, --corners {board.rows}x{board.columns} (circles in a row, then rows)"
+        )
     return (
         f"another board: expected circles in {board.rows} rows of {board.columns}, found a grid of circles over "
         f"{found[1]} by {found[0]} half distances where this one goes over {wanted[1]} by {wanted[0]}: take the other "

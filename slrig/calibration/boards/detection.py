@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.board_masks import blur_sigma_px, board_region, light_squares, square_interior
 from slrig.calibration.boards.chessboard import chessboard_view
-from slrig.calibration.boards.circles import circles_view
+from slrig.calibration.boards.circles import circles_again, circles_view
 from slrig.calibration.boards.grey import Grey
+from slrig.calibration.boards.grid_fit import placed_corners
 from slrig.calibration.boards.markers import charuco_view
 from slrig.calibration.boards.numbering import equivalent_views, turned_half
 from slrig.calibration.observations import BoardView
@@ -25,6 +27,7 @@ __all__ = [
     "equivalent_views",
     "find_board",
     "light_squares",
+    "placed_again",
     "square_interior",
     "turned_half",
 ]
@@ -34,6 +37,20 @@ _FINDERS = {
     BoardKind.CHESSBOARD: chessboard_view,
     BoardKind.CIRCLES: circles_view,
 }
+
+
+def placed_again(image: NDArray[Any], view: BoardView, board: Board, /, *, full_scale: float) -> BoardView:
+    """The corners of a view placed anew in another image, in which the board stands where it stood, all but exactly.
+
+    Those that cannot be placed are left out. image, full_scale : as of `find_board`.
+    """
+    grey = Grey.of(image, full_scale)
+    if board.kind is BoardKind.CIRCLES:
+        return circles_again(grey, board, view)
+    placed = placed_corners(grey.level, board, view.corner, view.points_px)
+    if placed is None:
+        return BoardView(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
+    return placed.view
 
 
 def find_board(image: NDArray[Any], board: Board, /, *, full_scale: float) -> BoardView:

@@ -89,7 +89,7 @@ def _refuse_another(board: Board, printed: Any, ids: IntArray, outlines: FloatAr
         width = fitting_width(ids, outlines)
         message = (
             f"another board: {board.title} has the markers 0 to {most - 1} of {board.dictionary}, and marker "
-            f"{ids.max()} is in view{_said(board, width)}: give that board's --corners, or take the other one"
+            f"{ids.max()} is in view{_remedy(board, width)}"
         )
         raise PoseRefusedError(message)
     if len(ids) < _FEWEST_TO_JUDGE:
@@ -102,7 +102,7 @@ def _refuse_another(board: Board, printed: Any, ids: IntArray, outlines: FloatAr
         width = fitting_width(ids, outlines)
         message = (
             f"another board: the markers of {board.dictionary} in view do not stand in the order of a {board.title}"
-            f"{_said(board, width)}: give that board's --corners, or take the other one"
+            f"{_remedy(board, width)}"
         )
         raise PoseRefusedError(message)
     board_map = fitted_map(places.mean(axis=1), middles)
@@ -125,8 +125,15 @@ def _area(outlines: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1))
 
 
-def _said(board: Board, width: int | None) -> str:
-    return "" if width in (None, board.columns) else f" (they fit a board with {width} corners in a row)"
+def _remedy(board: Board, width: int | None) -> str:
+    """What to do about another board, whose rows have so many corners, None where that is not known."""
+    if width == board.rows != board.columns:
+        return (
+            f": the board in view has {board.rows} corners in a row and {board.columns} rows, not the other way round: "
+            f"turn them round, --corners {board.rows}x{board.columns}"
+        )
+    said = "" if width in (None, board.columns) else f" (they fit a board with {width} corners in a row)"
+    return f"{said}: give that board's --corners, or take the other one"
 
 
 def _few(grey: Grey, board: Board, corners: int, markers: int) -> str:

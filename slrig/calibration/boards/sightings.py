@@ -16,14 +16,15 @@ from slrig.calibration.boards.grey import Grey
 from slrig.calibration.boards.marker_layout import fitting_width
 
 _FAMILIES = (
-    "DICT_4X4_250",
     "DICT_5X5_250",
+    "DICT_4X4_250",
     "DICT_6X6_250",
     "DICT_7X7_250",
     "DICT_ARUCO_MIP_36H12",
     "DICT_APRILTAG_36H11",
 )
-"""One dictionary of each usual family, whose smaller ones begin with the same markers. Each costs time by its size."""
+"""One dictionary of each usual family, whose smaller ones begin with the same markers: the usual ones first. Each costs
+time by its size."""
 _PREFIXED = tuple(f"DICT_{n}X{n}_" for n in (4, 5, 6, 7))
 _FEWEST_MARKERS, _FEWEST_UNORDERED = 4, 12
 _SEARCH_PX = 1280
@@ -39,27 +40,25 @@ class MarkersSeen:
 
 
 def markers_seen(grey: Grey, *, but: str | None = None) -> MarkersSeen | None:
-    """The markers of the dictionary that has the most of them in view. None unless they stand as on a ChArUco board, or
-    are a dozen: single markers are read into anything.
+    """The markers of the first dictionary of which a dozen are in view and stand as on a ChArUco board; otherwise of
+    the one with the most of them. None unless they stand so, or are a dozen: single markers are read into anything.
 
     but : a dictionary that is known not to be the one; its family is left out.
     """
     image, _ = grey.reduced(_SEARCH_PX)
     names = [name for name in _FAMILIES if but is None or family(name) != family(but)]
-    detector = cv2.aruco.ArucoDetector([marker_dictionary(name) for name in names])
-    outlines, numbers, _, which = detector.detectMarkersMultiDict(image)
-    if numbers is None or not len(numbers):
-        return None
-    corners = np.asarray(outlines, dtype=np.float64).reshape(-1, 4, 2)
-    numbers, which = np.asarray(numbers).ravel(), np.asarray(which).ravel()
     best: MarkersSeen | None = None
-    for index, name in enumerate(names):
-        ids = numbers[which == index]
+    for name in names:
+        outlines, numbers, _ = cv2.aruco.ArucoDetector(marker_dictionary(name)).detectMarkers(image)
+        ids = np.zeros(0, dtype=np.int32) if numbers is None else np.asarray(numbers).ravel()
         count = len(np.unique(ids))
         if count < _FEWEST_MARKERS or (best is not None and count <= best.count):
             continue
-        if count >= _FEWEST_UNORDERED or fitting_width(ids, corners[which == index]) is not None:
+        ordered = fitting_width(ids, np.asarray(outlines, dtype=np.float64).reshape(-1, 4, 2)) is not None
+        if count >= _FEWEST_UNORDERED or ordered:
             best = MarkersSeen(name, count, int(ids.max()))
+        if count >= _FEWEST_UNORDERED and ordered:
+            break
     return best
 
 

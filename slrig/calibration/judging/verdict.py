@@ -73,8 +73,8 @@ LIMITS: Mapping[str, Limit] = {
     "border": Limit(0.5, 0.9, _OURS),
 }
 """By figure. border : share of the cells along the image's border without any corner. bias_ratio : mean residual of a
-cell over the device's rms. bend_mm : how far the board is out of flat. outlier_poses : share of all
-poses. stated_ratio : rms over what the observations' own noise predicts."""
+cell over the device's rms. bend_mm : how far the board is out of flat, where that was solved for. outlier_poses : share
+of all poses. stated_ratio : rms over what the observations' own noise predicts."""
 
 POSES = (10, 4)
 """At least so many poses for a good, for a usable calibration (reconstruction.md §6 asks for 20 to 30)."""
@@ -287,14 +287,40 @@ def _knowledge(solution: Solution) -> Iterator[Judgement]:
 
 
 def _bend(solution: Solution) -> Iterator[Judgement]:
-    if solution.board_shape_mm is None:
+    bow = solution.bow
+    if bow is None:
         return
-    out_mm = float(np.ptp(solution.board_shape_mm[:, 2]))
     limit = LIMITS["bend_mm"]
-    grade = limit.grade(out_mm)
-    what = f"the board is {out_mm:.2g} mm out of flat"
-    cure = "it was solved for, but glue the print to glass or aluminium"
-    yield Judgement(grade, "bend_mm", None, out_mm, _told(grade, what, f"up to {limit.good:g} mm is well", cure))
+    # Where it was not solved for, the poses tell of no bow: what they leave open of it is in the covariance.
+    grade = limit.grade(bow.height_mm) if bow.solved else Grade.GOOD
+    cure = "that is taken into account, but glue the print to glass or aluminium"
+    words = _told(grade, board_words(solution), f"up to {limit.good:g} mm is well", cure)
+    yield Judgement(grade, "bend_mm", None, bow.height_mm, words)
+
+
+def board_words(solution: Solution) -> str:
+    """What the solve took the board for, and how far out of flat it is."""
+    bow, shape_mm = solution.bow, solution.board_shape_mm
+    if bow is None:
+        return "the board was taken for flat, as was asked for"
+    height = f"{_figure(bow.height_mm, bow.sigma_mm)} mm from its lowest to its highest corner"
+    if not bow.solved or shape_mm is None:
+        return f"the board is flat as far as the poses tell: {height}"
+    words = f"the board is bowed, {height}"
+    off_mm = float(np.sqrt(np.mean(np.sum(shape_mm[:, :2] ** 2, axis=1))))
+    return f"{words}, and its corners lie {off_mm:.2g} mm off their printed places" if off_mm > 0 else words
+
+
+def _figure(value: float, sigma: float) -> str:
+    """A number and its deviation, both with two digits of the deviation.
+
+    >>> _figure(1.0715, 0.1042), _figure(0.0173, 0.0)
+    ('1.07 ± 0.10', '0.017 ± 0')
+    """
+    if not sigma > 0:
+        return f"{value:.2g} ± 0"
+    digits = max(1 - int(np.floor(np.log10(sigma))), 0)
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
 
 
 def _border(covered: Coverage) -> Iterator[Judgement]:

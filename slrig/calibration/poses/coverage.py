@@ -205,32 +205,6 @@ def tilted(attitudes: Iterable[Attitude], goals: Goals = GOALS) -> tuple[int, in
     return counts[0], counts[1]
 
 
-def coverage_rows(found: Coverage) -> list[str]:
-    """Return lines of text for a terminal: the cells of all devices side by side, then what else was covered.
-
-    A cell shows in how many poses it was covered, from 1 to 9; a dot where in none.
-    """
-    names = list(found.devices)
-    wide = max(2 * CELLS + 4, *(len(name) + 3 for name in names)) if names else 0
-    rows = ["".join(name.ljust(wide) for name in names).rstrip()]
-    for row in range(CELLS):
-        texts = []
-        for name in names:
-            counts = found.devices[name].cells[row]
-            texts.append(" ".join(str(min(int(count), 9)) if count else "·" for count in counts).ljust(wide))
-        rows.append("".join(texts).rstrip())
-    rows.append("".join(f"{round(100 * found.devices[name].share)} % of cells".ljust(wide) for name in names).rstrip())
-    for name in names:
-        if name != PROJECTOR:
-            one = found.devices[name]
-            rows.append(
-                f"{name}: {len(one.attitudes)} poses, {one.depths} depths, {one.tilted[0]} and {one.tilted[1]} tilted "
-                f"about the two axes, {one.turns} turns in its plane"
-            )
-    rows += [f"still wanted: {each}" for each in found.missing] or ["nothing is missing"]
-    return rows
-
-
 def device_title(name: str) -> str:
     """Return a device's name as a sentence has it.
 

@@ -1,4 +1,4 @@
-"""Pictures of a calibration as arrays, (H, W, 3) uint8, red, green, blue: coverage, residuals, a pose's corners."""
+"""Pictures of a calibration as arrays, (H, W, 3) uint8, red, green, blue: coverage, and a pose's corners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from slrig.calibration.board import Board
 from slrig.calibration.observations import BoardView
 from slrig.calibration.poses.coverage import DeviceCoverage
 from slrig.calibration.poses.light_view import within
-from slrig.calibration.solution import CELLS, DeviceResiduals
+from slrig.calibration.solution import CELLS
 from slrig.model import FloatArray, Pixels, Size
 
 Picture = NDArray[np.uint8]
@@ -24,7 +24,6 @@ _LINE = (205, 205, 200)
 _INK = (40, 44, 52)
 _UNREACHABLE = (232, 230, 226)
 _COVERED = ((224, 240, 226), (36, 128, 84))
-_RESIDUAL = ((238, 243, 250), (176, 42, 52))
 _ACCENT = (230, 120, 0)
 _MANY = 6
 _DARK = 330
@@ -65,43 +64,6 @@ def coverage_picture(
         cv2.polylines(picture, [np.array(corners)], True, _ACCENT, 2, cv2.LINE_AA)
         cv2.circle(picture, corners[0], 6, _ACCENT, -1, cv2.LINE_AA)
     return picture
-
-
-def residual_picture(residuals: DeviceResiduals, size: Size, *, width_px: int = WIDTH_PX) -> Picture:
-    """Return the rms residual of each cell as a colour and a number, px, and its mean residual as an arrow.
-
-    The longest arrow is half a cell long; the line at the foot says how long an arrow of so many pixels is.
-    """
-    picture, _ = _sheet(size, width_px)
-    foot = np.full((28, picture.shape[1], 3), _PAPER, dtype=np.uint8)
-    found = residuals.map_rms_px[np.isfinite(residuals.map_rms_px)]
-    most = float(found.max()) if len(found) else 1.0
-    length = np.linalg.norm(residuals.map_mean_px, axis=2)
-    longest = float(np.nanmax(length)) if np.isfinite(length).any() else 0.0
-    reach = 0.5 * min(picture.shape[0], picture.shape[1]) / CELLS
-    zoom = reach / longest if longest > 0 else 0.0
-    for row, column, box in _cell_boxes(picture):
-        value = residuals.map_rms_px[row, column]
-        colour = _between(*_RESIDUAL, float(value) / most) if np.isfinite(value) else _UNREACHABLE
-        cv2.rectangle(picture, *box, colour, -1)
-    _grid(picture)
-    for row, column, (start, end) in _cell_boxes(picture):
-        value, mean = residuals.map_rms_px[row, column], residuals.map_mean_px[row, column]
-        if not np.isfinite(value):
-            _text(picture, "none", (start[0] + 4, start[1] + 13), 0.38)
-            continue
-        _text(picture, f"{value:.2f}", (start[0] + 4, start[1] + 13), 0.4)
-        if np.isfinite(mean).all() and zoom:
-            middle = np.array([start, end]).mean(axis=0)
-            tail, tip = middle - zoom * mean / 2, middle + zoom * mean / 2
-            start, end = _scaled(np.stack([tail, tip]), 1.0)
-            cv2.arrowedLine(picture, start, end, _INK, 2, cv2.LINE_AA, tipLength=0.3)
-    if zoom:
-        shown = _round(longest)
-        cv2.line(foot, (8, 15), (8 + max(1, round(zoom * shown)), 15), _INK, 2, cv2.LINE_AA)
-        words = f"mean residual {shown:g} px; colour and number: rms, px, at most {most:.2f}"
-        _text(foot, words, (18 + round(zoom * shown), 19), 0.42)
-    return np.concatenate([picture, foot])
 
 
 def pose_picture(image: Pixels, view: BoardView | None, board: Board, *, width_px: int = WIDTH_PX) -> Picture:
@@ -179,13 +141,3 @@ def _text(picture: Picture, words: str, place: tuple[int, int], height: float) -
     under = picture[max(place[1] - 6, 0), min(place[0], picture.shape[1] - 1)]
     colour = _PAPER if int(under.sum()) < _DARK else _INK
     cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, height, colour, 1, cv2.LINE_AA)
-
-
-def _round(value: float) -> float:
-    """Return the greatest of 1, 2 and 5 times a power of ten that is not greater than a value.
-
-    >>> _round(0.37), _round(7.0)
-    (0.2, 5.0)
-    """
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(max(step * power for step in (1, 2, 5) if step * power <= value * (1 + 1e-9)))

@@ -66,9 +66,19 @@ class Deviations:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known beforehand of the shape: its deviation, mm. See `NormalEquations`."""
+    """What is known beforehand of a board's shape, where it is solved for: standard deviations, mm.
 
-    shape_sigma_mm: float
+    bend_sigma_mm : of each number of the bend. offset_sigma_mm : of each coordinate of a corner's offset; None where
+    corners lie as printed.
+    """
+
+    bend_sigma_mm: float
+    offset_sigma_mm: float | None = None
+
+    @property
+    def offsets(self) -> bool:
+        """Whether corners may lie off their printed places."""
+        return self.offset_sigma_mm is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +214,8 @@ def normal_equations(
     corners, corner_jacobian = corner_terms(geometry, measurements, jacobian=True)
     light, light_jacobian = light_terms(geometry, measurements, jacobian=True)
     _add_corners(
-        layout, measurements.corner_where, corners, corner_jacobian, weights[0], prior is not None,
-        matrix, gradient,
+        layout, measurements.corner_where, corners, corner_jacobian, weights[0],
+        prior is not None and prior.offsets, matrix, gradient,
     )  # fmt: skip
     _add_light(layout, measurements.light_where, light, light_jacobian, weights[1], matrix, gradient)
     if prior is not None:
@@ -259,22 +269,27 @@ def _add_light(
 
 def _add_prior(geometry: Geometry, prior: Prior, matrix: FloatArray, gradient: FloatArray) -> None:
     """Offsets and bend are about as small as stated, and offsets move, turn and scale the board by nothing."""
-    layout, weight = geometry.layout, 1 / prior.shape_sigma_mm**2
-    shape = np.arange(layout.first_offset, layout.count)
-    values = np.concatenate([geometry.offsets.ravel(), geometry.bend])
-    matrix[shape, shape] += weight
-    gradient[shape] += weight * values
+    layout, bend = geometry.layout, _bend(geometry.layout)
+    matrix[bend, bend] += 1 / prior.bend_sigma_mm**2
+    gradient[bend] += geometry.bend / prior.bend_sigma_mm**2
+    if prior.offset_sigma_mm is None:
+        return
+    weight = 1 / prior.offset_sigma_mm**2
+    offsets = np.arange(layout.first_offset, layout.first_bend)
+    matrix[offsets, offsets] += weight
+    gradient[offsets] += weight * geometry.offsets.ravel()
     x, y = ((geometry.points - geometry.frame[:2]) / geometry.frame[2]).T
     zero, one = np.zeros_like(x), np.ones_like(x)
     for pair in ((one, zero), (zero, one), (-y, x), (x, y)):
         row = np.stack(pair, axis=1).ravel() * np.sqrt(weight) * 1e3 / np.sqrt(len(x))
-        offsets = shape[: 2 * layout.corners]
         matrix[np.ix_(offsets, offsets)] += np.outer(row, row)
         gradient[offsets] += row * (row @ geometry.offsets.ravel())
 
 
 def _prior_cost(geometry: Geometry, prior: Prior) -> float:
-    return float(np.sum(geometry.offsets**2) + np.sum(geometry.bend**2)) / prior.shape_sigma_mm**2 / 2
+    bend = float(np.sum(geometry.bend**2)) / prior.bend_sigma_mm**2
+    offsets = float(np.sum(geometry.offsets**2)) / prior.offset_sigma_mm**2 if prior.offset_sigma_mm else 0.0
+    return (bend + offsets) / 2
 
 
 def _cost(geometry: Geometry, left: Residuals, deviations: Deviations, kept: Weights, prior: Prior | None) -> float:

@@ -5,24 +5,26 @@ err alike (`slrig.calibration.solving.deviations`). The robust weights lose abou
 errors where the estimate itself loses a twentieth, so that deviations are rather a few per cent too large than too
 small.
 
-A lens term that was left out was set to 0, not known to be 0. So the covariance is that of the solve with all terms,
-plus the square of the shift by which leaving some out moved the rest: what an estimate is wrong by is its distance from
-that solve, and what that solve is wrong by.
+A lens term that was left out was set to 0, not known to be 0, and so was the bend of a board that nobody said is flat.
+So the covariance is that of the solve with all of them, plus the square of the shift by which leaving some out moved
+the rest: what an estimate is wrong by is its distance from that solve, and what that solve is wrong by.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from slrig.calibration.solving.adjustment import adjusted, kept_of, normal_equations, weights_of
+from slrig.calibration.solution import Bow
+from slrig.calibration.solving.adjustment import Prior, adjusted, kept_of, normal_equations, weights_of
 from slrig.calibration.solving.deviations import deviations_of
 from slrig.calibration.solving.parameters import LENS_TERMS, difference
 from slrig.calibration.solving.problem import Fit, Problem, Terms, free_of
-from slrig.calibration.solving.projection import DEVICE
+from slrig.calibration.solving.projection import BEND, DEVICE
+from slrig.calibration.solving.shape import bow_of
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray
 
@@ -30,31 +32,46 @@ LEAST_KNOWN = 0.05
 """The greatest deviation of a focal length, over it, with which a calibration still is one."""
 
 
-def covariance_of(problem: Problem, fit: Fit, terms: Terms, /) -> FloatArray:
-    """(15 d, 15 d) float64: covariance of all devices' parameters; 0 for the world's pose.
+@dataclass(frozen=True, slots=True)
+class Known:
+    """How well a solve knows its numbers.
+
+    devices : (15 d, 15 d) float64, covariance of all devices' parameters; 0 for the world's pose. bow : of the board,
+    None where it is known to be flat.
+    """
+
+    devices: FloatArray
+    bow: Bow | None
+
+
+def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, /) -> Known:
+    """How well the numbers are known.
+
+    bend : what is known beforehand of the board's bend; None if it is known to be flat.
 
     Raises
     ------
     SolveRefusedError
         The poses leave a number open, or a focal length all but open.
     """
-    narrow = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
+    narrow, _ = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
     _refuse_open(problem, fit, narrow)
     all_terms = dict.fromkeys(problem.devices, LENS_TERMS)
-    if all(terms[name] == LENS_TERMS for name in problem.devices):
-        return narrow
     sigma = deviations_of(problem.measurements, fit.noise, problem.light)
-    free = free_of(problem, fit.geometry, all_terms)
+    open_problem = problem if problem.prior is not None else replace(problem, prior=bend)
+    free = free_of(open_problem, fit.geometry, all_terms)
     wide = adjusted(
-        fit.geometry, problem.measurements, free, sigma, prior=problem.prior, kept=kept_of(fit.residuals, sigma)
+        fit.geometry, problem.measurements, free, sigma, prior=open_problem.prior, kept=kept_of(fit.residuals, sigma)
     )  # fmt: skip
     shift = difference(wide.geometry.devices, fit.geometry.devices).ravel()
-    return _inverse(problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals), free) + np.outer(
-        shift, shift
-    )
+    devices, bent = _inverse(open_problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals), free)
+    solved = problem.prior is not None
+    bow = None if bend is None else bow_of(fit.geometry if solved else wide.geometry, bent, solved=solved)
+    return Known(devices + np.outer(shift, shift), bow)
 
 
-def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> FloatArray:
+def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Covariance of the devices, (15 d, 15 d), and of the bend, (7, 7), which is 0 where it is held."""
     sigma = deviations_of(problem.measurements, fit.noise, problem.light)
     kept = kept_of(fit.residuals, sigma)
     weights = weights_of(fit.residuals, sigma, kept)
@@ -63,7 +80,6 @@ def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> FloatArray:
     free = free & (np.diagonal(matrix) > 0)
     matrix = matrix[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.diagonal(matrix))
-    devices = np.zeros((DEVICE * len(problem.devices),) * 2)
     try:
         factor = cho_factor(matrix * np.outer(scale, scale))
     except LinAlgError as error:
@@ -72,12 +88,16 @@ def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> FloatArray:
             "shoot more, at several distances, tilted by 20° to 40° to all sides"
         )
         raise SolveRefusedError(message) from error
+    layout = fit.geometry.layout
     place = np.flatnonzero(free)
-    mine = place < len(devices)
+    mine = (place < layout.first_pose) | (place >= layout.first_bend)
     unit = np.eye(len(place))[:, mine]
     found = cho_solve(factor, unit)[mine] * np.outer(scale[mine], scale[mine])
-    devices[np.ix_(place[mine], place[mine])] = (found + found.T) / 2
-    return devices
+    # Devices first, then the bend: poses and offsets lie between them.
+    into = np.where(place < layout.first_pose, place, place - layout.first_bend + layout.first_pose)[mine]
+    covariance = np.zeros((layout.first_pose + BEND,) * 2)
+    covariance[np.ix_(into, into)] = (found + found.T) / 2
+    return covariance[: layout.first_pose, : layout.first_pose], covariance[layout.first_pose :, layout.first_pose :]
 
 
 def _refuse_open(problem: Problem, fit: Fit, covariance: FloatArray) -> None:

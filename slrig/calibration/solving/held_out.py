@@ -36,7 +36,8 @@ LADDER: tuple[tuple[str, ...], ...] = (
     ("k1", "k2", "p1", "p2"),
     ("k1", "k2", "p1", "p2", "k3"),
 )
-_TRIAL_STEPS = 15
+TRIAL_STEPS = 15
+"""Of Levenberg-Marquardt, where a model is only tried."""
 _HOPELESS = 2.0
 """Where a lens leaves so many times the loss of the richest on the poses that it has seen, no others are tried."""
 
@@ -145,15 +146,15 @@ def chosen_terms(
         richest = fitted(problem, fit.geometry, {**terms, device: LADDER[-1]}, rounds=2, alike=True, noise=fit.noise)
         sigma = deviations_of(problem.measurements, richest.noise, problem.light)
         kept = kept_of(richest.residuals, sigma)
-        least = _loss(richest.residuals, sigma, kept)
+        least = loss_of(richest.residuals, sigma, kept)
         losses: list[float] = []
         for rung, trial in enumerate(LADDER):
             tell(device, rung)
             chosen = {**terms, device: trial}
             start = with_terms(richest.geometry, problem, chosen)
             free = free_of(problem, start, chosen)
-            tried = adjusted(start, problem.measurements, free, sigma, kept=kept, most_steps=_TRIAL_STEPS)
-            if _loss(tried.residuals, sigma, kept) > _HOPELESS * least:
+            tried = adjusted(start, problem.measurements, free, sigma, kept=kept, most_steps=TRIAL_STEPS)
+            if loss_of(tried.residuals, sigma, kept) > _HOPELESS * least:
                 losses.append(np.inf)
                 continue
             losses.append(sum(held_out(problem, tried.geometry, chosen, richest.noise, dealt, kept).loss.values()))
@@ -162,7 +163,8 @@ def chosen_terms(
     return terms
 
 
-def _loss(left: Residuals, sigma: Deviations, kept: Weights) -> float:
+def loss_of(left: Residuals, sigma: Deviations, kept: Weights) -> float:
+    """The loss of all that counts, in squared deviations."""
     return sum(float(np.nansum(loss[k > 0])) for loss, k in zip(losses_of(left, sigma), kept, strict=True))
 
 

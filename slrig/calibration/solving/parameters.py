@@ -58,9 +58,12 @@ class Geometry:
 
     def shape_mm(self) -> FloatArray:
         """(corners, 3) float64: by how much each corner lies off its place on a flat board."""
+        return np.column_stack([self.offsets, self.bend_basis() @ self.bend])
+
+    def bend_basis(self) -> FloatArray:
+        """(corners, 7) float64: what each number of the bend adds to the height of each corner."""
         a, b = ((self.points + self.offsets - self.frame[:2]) / self.frame[2]).T
-        basis = np.stack([a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3], axis=1)
-        return np.column_stack([self.offsets, basis @ self.bend])
+        return np.stack([a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +95,13 @@ class Layout:
         return self.first_bend + BEND
 
     def free(
-        self, terms: Sequence[tuple[str, ...]], poses: NDArray[np.bool_], /, *, shape: bool = False
-    ) -> NDArray[np.bool_]:
+        self, terms: Sequence[tuple[str, ...]], poses: NDArray[np.bool_], /, *, bend: bool = False,
+        offsets: bool = False,
+    ) -> NDArray[np.bool_]:  # fmt: skip
         """(count,) bool: what may move. terms : lens terms of each device; poses : (m,) bool.
 
-        The first device's pose is the world's and stays. Without `shape` the board is flat and as printed.
+        The first device's pose is the world's and stays. Without `bend` the board is flat, without `offsets` its
+        corners lie as printed.
         """
         free = np.zeros(self.count, dtype=np.bool_)
         devices = free[: self.first_pose].reshape(-1, DEVICE)
@@ -105,7 +110,8 @@ class Layout:
             devices[device, [PARAMETERS.index(term) for term in chosen]] = True
         devices[1:, _FIRST_TURN:] = True
         free[self.first_pose : self.first_offset] = np.repeat(poses, POSE)
-        free[self.first_offset :] = shape
+        free[self.first_offset : self.first_bend] = offsets
+        free[self.first_bend :] = bend
         return free
 
 

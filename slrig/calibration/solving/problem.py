@@ -70,17 +70,23 @@ def flat_geometry(board: Board, devices: FloatArray, poses: FloatArray) -> Geome
 def free_of(problem: Problem, geometry: Geometry, terms: Terms, /) -> NDArray[np.bool_]:
     """(N,) bool over the whole vector: what may move."""
     chosen = [terms[name] for name in problem.devices]
-    return geometry.layout.free(chosen, problem.used, shape=problem.prior is not None)
+    prior = problem.prior
+    return geometry.layout.free(
+        chosen, problem.used, bend=prior is not None, offsets=prior is not None and prior.offsets
+    )
 
 
 def with_terms(geometry: Geometry, problem: Problem, terms: Terms, /) -> Geometry:
-    """The same geometry, those lens terms set to 0 that are not in `terms`."""
+    """The same geometry, those lens terms set to 0 that are not in `terms`, and of the shape what is not solved for."""
     devices = geometry.devices.copy()
     for device, name in enumerate(problem.devices):
         for k, term in enumerate(("k1", "k2", "p1", "p2", "k3")):
             if term not in terms[name]:
                 devices[device, 4 + k] = 0.0
-    return replace(geometry, devices=devices)
+    bend = geometry.bend if problem.prior is not None else np.zeros_like(geometry.bend)
+    keeps = problem.prior is not None and problem.prior.offsets
+    offsets = geometry.offsets if keeps else np.zeros_like(geometry.offsets)
+    return replace(geometry, devices=devices, offsets=offsets, bend=bend)
 
 
 def fitted(

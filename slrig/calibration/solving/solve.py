@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.calibration.board import BoardShape
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import PROJECTOR, Solution
 from slrig.calibration.solving.adjustment import Prior, kept_of
@@ -22,6 +23,7 @@ from slrig.calibration.solving.leftovers import residuals_of_devices
 from slrig.calibration.solving.measurements import LEAST_CORNERS, measured
 from slrig.calibration.solving.parameters import Geometry, to_board_pose, to_pinhole
 from slrig.calibration.solving.problem import Fit, Problem, Terms, fitted, flat_geometry, free_of
+from slrig.calibration.solving.shape import bend_of, chosen_shape, shapes_of
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, Size
 
@@ -34,15 +36,15 @@ class SolveOptions:
     """light_per_view, trial_light_per_view : at most as many correspondences of each camera, pose and axis, spread over
     its image, go into the result, and into what is tried on the way. folds : of held-out poses. margin : what a
     lens term must take off the loss at held-out poses, in squared deviations (`slrig.calibration.solving.held_out`).
-    board_shape : solve for the corners' places and the board's bend, too; shape_sigma_mm : how large these are.
+    board_shape : whether the board may be bent and its corners off their printed places
+    (`slrig.calibration.solving.shape`).
     """
 
     light_per_view: int = 3000
     trial_light_per_view: int = 300
     folds: int = 5
     margin: float = 4.0
-    board_shape: bool = False
-    shape_sigma_mm: float = 0.2
+    board_shape: BoardShape = BoardShape.AUTO
 
 
 _DEFAULT = SolveOptions()
@@ -77,8 +79,9 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
     # Poses are compared under a lens that can be right: with one that cannot, those at the image's border are off.
     terms = dict.fromkeys([*names, PROJECTOR], LADDER[-2] if int(seen.sum()) >= LEAST_HELD_OUT else LADDER[1])
     geometry = flat_geometry(observations.board, start.devices, start.poses)
+    shapes = shapes_of(observations.board, options.board_shape)
     if observations.projector is None:
-        corners_only, fit = _agreeing(corners_only, geometry, terms, outliers)
+        corners_only, fit = _agreeing_in_shape(corners_only, geometry, terms, outliers, shapes, options)
     else:
         # Light tells which of two cameras moved; until then all poses stay in.
         fit = fitted(corners_only, geometry, terms)
@@ -93,8 +96,8 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
         trial = replace(problem, measurements=light.thinned(options.trial_light_per_view))
         beam = projector_start(fit.geometry.devices, fit.geometry.poses, trial.measurements, observations.projector)
         joined = replace(fit.geometry, devices=np.vstack([fit.geometry.devices, beam]))
-        trial, fit = _agreeing(trial, joined, terms, outliers)
-        problem = problem.without(~trial.used)
+        trial, fit = _agreeing_in_shape(trial, joined, terms, outliers, shapes, options)
+        problem = replace(problem.without(~trial.used), prior=trial.prior)
 
     def tell(device: str, rung: int) -> None:
         done = (trial.devices.index(device) + rung / len(LADDER)) / len(trial.devices)
@@ -109,27 +112,26 @@ def _finished(
     observations: Observations, problem: Problem, fit: Fit, terms: Terms, outliers: dict[str, str],
     sizes: dict[str, Size], options: SolveOptions, progress: Progress,
 ) -> Solution:  # fmt: skip
-    if options.board_shape:
-        problem = replace(problem, prior=Prior(options.shape_sigma_mm))
     progress("adjustment", 0.7, "devices, poses and light together")
     fit = fitted(problem, fit.geometry, terms, alike=True)
     refuse_bump(problem, fit, free_of(problem, fit.geometry, terms))
     progress("held out", 0.85, "poses that the solve has not seen")
     held = _held_out_px(problem, fit, terms, options)
     progress("covariance", 0.95, "how well each number is known")
-    covariance = covariance_of(problem, fit, terms)
+    known = covariance_of(problem, fit, terms, bend_of(observations.board, options.board_shape))
     devices = {
         name: to_pinhole(row, sizes[name]) for name, row in zip(problem.devices, fit.geometry.devices, strict=True)
     }
     used = [int(number) for number in np.flatnonzero(problem.used)]
     solution = Solution(
         calibration=Calibration({name: devices[name] for name in observations.cameras}, devices.get(PROJECTOR)),
-        covariance=covariance,
+        covariance=known.devices,
         distortion={name: terms[name] for name in problem.devices},
         poses={problem.pose_names[number]: to_board_pose(fit.geometry.poses[number]) for number in used},
         outliers=outliers,
         residuals=residuals_of_devices(problem, fit, sizes, held),
-        board_shape_mm=fit.geometry.shape_mm() if options.board_shape else None,
+        board_shape_mm=None if problem.prior is None else fit.geometry.shape_mm(),
+        bow=known.bow,
     )
     progress("done", 1.0, f"{len(used)} poses used, {len(outliers)} left out")
     return solution
@@ -145,6 +147,24 @@ def _held_out_px(problem: Problem, fit: Fit, terms: Terms, options: SolveOptions
     counted = kept_of(fit.residuals, deviations_of(problem.measurements, fit.noise, problem.light))
     judged = (problem.measurements, counted)
     return dict(held_out(trial, start.geometry, terms, fit.noise, dealt, kept, judged=judged).rms_px)
+
+
+def _agreeing_in_shape(
+    problem: Problem, geometry: Geometry, terms: Terms, outliers: dict[str, str], shapes: Sequence[Prior | None],
+    options: SolveOptions,
+) -> tuple[Problem, Fit]:  # fmt: skip
+    """The same as `_agreeing`, of a board of the shape that held-out poses are best with."""
+    chosen = {name: terms[name] for name in problem.devices}
+    fit = None if len(shapes) == 1 else fitted(problem, geometry, chosen)
+    while True:
+        if fit is not None:
+            shape = chosen_shape(problem, fit, chosen, shapes, margin=options.margin, folds=options.folds)
+            problem = replace(problem, prior=shape)
+        before = len(outliers)
+        problem, fit = _agreeing(problem, geometry, terms, outliers)
+        # A pose that contradicts the others may have had its say in the choice.
+        if len(shapes) == 1 or len(outliers) == before:
+            return problem, fit
 
 
 def _agreeing(problem: Problem, geometry: Geometry, terms: Terms, outliers: dict[str, str]) -> tuple[Problem, Fit]:

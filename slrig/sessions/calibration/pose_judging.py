@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from slrig.bundle.storage import write_file
+from slrig.calibration.judging.verdict import board_words
 from slrig.calibration.poses.checks import judge_pose
 from slrig.calibration.poses.coverage import Coverage, coverage
 from slrig.calibration.poses.next_move import Advice, next_move
@@ -68,7 +69,7 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
             "values": {name: [figure.value, figure.sigma] for name, figure in each.values.items()},
             "centre_mm": [[figure.value, figure.sigma] for figure in each.centre_mm],
         }
-    expected = result.expected
+    expected, bow = result.expected, result.solution.bow
     figures = {
         "devices": devices,
         "baselines": baselines(result),
@@ -85,6 +86,11 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
             "reasons": result.verdict.reasons,
         },
         "scale": result.scale,
+        "board": {
+            "bowed": result.solution.board_shape_mm is not None,
+            "bow_mm": None if bow is None else [bow.height_mm, bow.sigma_mm],
+            "words": board_words(result.solution),
+        },
         "poses": list(result.solution.poses),
         "outliers": result.solution.outliers,
     }

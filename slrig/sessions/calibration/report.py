@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 
 from slrig.calibration.board import Board
+from slrig.calibration.judging.verdict import board_words
 from slrig.calibration.poses.pictures import Picture, pose_picture
 from slrig.calibration.solution import PROJECTOR
 from slrig.model import Calibration, Pinhole, Pixels
@@ -219,6 +220,7 @@ def _rig(result: CalibrationResult, board: Board) -> Markup:
     ]
     return joined(
         tag("h2", "The rig, to scale"),
+        tag("p", f"{_begun(board_words(result.solution))}.", class_="lead", data_figure="board"),
         tag("p", f"{MEANINGS['baseline']} {MEANINGS['angle']}", class_="lead") if pairs else None,
         tag("ul", *pairs) if pairs else None,
         tag(

@@ -10,6 +10,7 @@ from uuid import UUID
 import structlog
 
 from slrig.bundle.calibration_file import check_calibration, write_calibration
+from slrig.calibration.board import BoardShape
 from slrig.errors import CalibrationError, CalibrationStateError, SlrigError, SolveRefusedError
 from slrig.model import Calibration
 from slrig.scan.faults import fault_of
@@ -46,8 +47,10 @@ class SolveDesk:
         self._earlier = earlier
         self._solving = threading.Lock()
 
-    def solve(self, session_id: UUID) -> SessionRecord:
+    def solve(self, session_id: UUID, *, board_shape: BoardShape = BoardShape.AUTO) -> SessionRecord:
         """Begin to solve a session from its accepted poses. Returns at once.
+
+        board_shape : whether the board may be bowed.
 
         Raises
         ------
@@ -82,13 +85,13 @@ class SolveDesk:
             record = self._register.change(
                 session_id, lambda found: replace(found, state=SessionState.SOLVING, fault=None, progress=begun)
             )
-        threading.Thread(target=self._run, args=(record,), name="slrig-solve", daemon=True).start()
+        threading.Thread(target=self._run, args=(record, board_shape), name="slrig-solve", daemon=True).start()
         return record
 
-    def _run(self, record: SessionRecord) -> None:
+    def _run(self, record: SessionRecord, board_shape: BoardShape) -> None:
         try:
             with self._solving:
-                self._solved(record)
+                self._solved(record, board_shape)
         except Exception as error:  # noqa: BLE001 - whatever goes wrong, the session gets out of SOLVING
             fault = fault_of(error)
             if isinstance(error, SlrigError):
@@ -101,7 +104,7 @@ class SolveDesk:
                 must_last=False,
             )
 
-    def _solved(self, record: SessionRecord) -> None:
+    def _solved(self, record: SessionRecord, board_shape: BoardShape) -> None:
         def progress(stage: str, fraction: float, detail: str) -> None:
             self._register.progress(record.id, stage, fraction, detail)
 
@@ -114,6 +117,7 @@ class SolveDesk:
             poses,
             progress=progress,
             earlier=self._comparable(record),
+            board_shape=board_shape,
         )
         number = record.solve + 1
         if result.calibration.solved is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from uuid import uuid4
 
-from slrig.calibration.board import Board
+from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.judging.scale_check import check_scale
 from slrig.calibration.judging.verdict import Verdict, verdict
 from slrig.calibration.observations import Observations, PoseObservation
@@ -55,12 +55,13 @@ def solve_poses(
     *,
     progress: Progress = lambda _stage, _fraction, _detail: None,
     earlier: Calibration | None = None,
+    board_shape: BoardShape = BoardShape.AUTO,
     clock: Callable[[], datetime] = utc_now,
 ) -> CalibrationResult:
     """Solve the poses, say how far the result may be trusted, and give it an identity.
 
     cameras : the first one's frame becomes the world. projector : None where no light was captured. earlier : a
-    calibration of the same devices, to compare the scale with.
+    calibration of the same devices, to compare the scale with. board_shape : whether the board may be bowed.
 
     Raises
     ------
@@ -69,7 +70,7 @@ def solve_poses(
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
     from slrig.calibration.judging.expected_error import expected_error
-    from slrig.calibration.solving.solve import solve
+    from slrig.calibration.solving.solve import SolveOptions, solve
 
     observed = tuple(pose.observation for pose in poses)
     if projector is None and len(cameras) < 2:
@@ -82,6 +83,7 @@ def solve_poses(
     solution = solve(
         observations,
         progress=lambda stage, fraction, detail: progress(stage, _SOLVE_SHARE * fraction, detail),
+        options=SolveOptions(board_shape=board_shape),
     )
     progress("expected error", _SOLVE_SHARE, "")
     try:

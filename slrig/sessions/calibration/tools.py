@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from slrig.calibration.board import Board
+from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
 from slrig.model import Calibration, Size
@@ -77,6 +77,7 @@ class SolvePoses(Protocol):
         *,
         progress: Progress,
         earlier: Calibration | None = None,
+        board_shape: BoardShape = BoardShape.AUTO,
     ) -> CalibrationResult:
         """Return the calibration. Raises SolveRefusedError."""
         ...

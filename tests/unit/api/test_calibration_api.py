@@ -127,6 +127,16 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient) -> 
     assert (refused.status_code, refused.json()["type"]) == (409, "/problems/calibration-state")
 
 
+def test_solve_is_told_what_the_board_is_taken_for(calibrating: TestClient, served: ServedBench) -> None:
+    made = opened(calibrating)
+    shot(calibrating, made["id"])
+    for request, shape in ((None, "auto"), ({"board_shape": "bowed"}, "bowed"), ({"board_shape": "flat"}, "flat")):
+        assert calibrating.post(made["links"]["solve"], json=request).status_code == 202
+        assert settled(calibrating, made["id"])["state"] == "solved"
+        assert served.tame.board_shapes[-1] == shape
+    assert calibrating.post(made["links"]["solve"], json={"board_shape": "round"}).status_code == 422
+
+
 def test_refused_pose_keeps_its_cause_and_its_picture(calibrating: TestClient, served: ServedBench) -> None:
     made = opened(calibrating)
     served.tame.refusals = ("no camera sees the board: move it into the picture.",)

@@ -15,7 +15,7 @@ from slrig.model import FloatArray, Pinhole, Size
 
 CHESSBOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
 CHARUCO = Board(BoardKind.CHARUCO, 11, 8, 12.0)
-SHARP = ViewFigures(moved_px=0.05, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
+SHARP = ViewFigures(moved_px=0.02, saturated=0.0, contrast=0.5, sharpness_px=0.8, decoded=0.9)
 
 
 def looking(

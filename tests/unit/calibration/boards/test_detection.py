@@ -17,6 +17,7 @@ from slrig.calibration.boards.detection import (
     equivalent_views,
     find_board,
     light_squares,
+    placed_again,
     square_interior,
 )
 from slrig.calibration.observations import BoardView
@@ -178,6 +179,15 @@ def test_a_part_of_a_charuco_board_is_enough() -> None:
     assert set(np.flatnonzero(within)) - set(view.corner.tolist()) == set()
 
 
+@pytest.mark.parametrize("board", ALL, ids=title)
+def test_corners_are_placed_again_after_a_small_movement(board: Board) -> None:
+    before, after = eye(board), eye(board, shift_mm=(0.1, -0.05))
+    view = find_board(shot(board, before), board, full_scale=255)
+    again = placed_again(shot(board, after), view, board, full_scale=255)
+    assert again.corner.tolist() == view.corner.tolist()
+    assert np.abs(misses(again, board, after).mean(axis=0)).max() < 0.02 < np.abs(misses(again, board, before)).max()
+
+
 def refused(image: NDArray[np.uint8], board: Board, words: str) -> None:
     started = time.process_time()
     with pytest.raises(PoseRefusedError, match=words):
@@ -234,6 +244,28 @@ def test_a_board_out_of_focus_is_refused(board: Board) -> None:
 )
 def test_another_board_is_refused_and_named(asked: Board, there: Board, words: str) -> None:
     refused(shot(there, eye(there)), asked, words)
+
+
+@pytest.mark.parametrize("there", [CHARUCO, CIRCLES], ids=title)
+def test_corners_that_were_given_the_wrong_way_round_are_named(there: Board) -> None:
+    asked = Board(there.kind, there.rows, there.columns, there.square_mm)
+    words = f"another board.*turn them round, --corners {there.columns}x{there.rows}"
+    refused(shot(there, eye(there)), asked, words)
+
+
+def test_a_chessboard_is_the_same_whichever_way_round_its_corners_are_given() -> None:
+    seen_by = eye(CHESSBOARD)
+    turned = Board(BoardKind.CHESSBOARD, CHESSBOARD.rows, CHESSBOARD.columns, CHESSBOARD.square_mm)
+    view = find_board(shot(CHESSBOARD, seen_by), turned, full_scale=255)
+    truth = seen_by.seen(board_points(CHESSBOARD))
+    nearest = np.linalg.norm(view.points_px[:, None] - truth, axis=2)
+    assert nearest.min(axis=1).max() < 0.1
+    # A turned board, and no mirrored one: the print's neighbours are neighbours, in right-handed order.
+    row, column = np.divmod(nearest.argmin(axis=1), CHESSBOARD.columns)
+    places = np.stack([column, row], axis=-1).reshape(turned.rows, turned.columns, 2)
+    across, down = places[0, 1] - places[0, 0], places[1, 0] - places[0, 0]
+    assert abs(across).sum() == abs(down).sum() == 1
+    assert across[0] * down[1] - across[1] * down[0] == 1
 
 
 @pytest.mark.parametrize("board", [CHARUCO, EVEN_CIRCLES], ids=title)
@@ -332,3 +364,23 @@ def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
         taken.append(time.process_time() - started)
     assert len(view.corner) == board.corner_count
     assert min(taken) < 0.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", [*ALL, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100")], ids=title)
+@pytest.mark.parametrize("there", [*ALL, None], ids=title)
+def test_another_board_is_refused_within_a_second_and_a_half_of_one_core(asked: Board, there: Board | None) -> None:
+    """A pose is answered within two seconds; half a second of them goes by while its frames are read."""
+    if there is None:
+        image = as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
+    else:
+        # A larger or smaller one of its kind, too.
+        other = Board(there.kind, there.columns + 2, there.rows + 2, 0.8 * there.square_mm)
+        image = shot(other, eye(other, width=1280, height=1024, focal_px=1600.0))
+    taken = []
+    for _ in range(2):
+        started = time.process_time()
+        with pytest.raises(PoseRefusedError):
+            find_board(image, asked, full_scale=255)
+        taken.append(time.process_time() - started)
+    assert min(taken) < 1.5

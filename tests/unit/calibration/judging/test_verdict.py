@@ -10,7 +10,15 @@ import pytest
 from slrig.calibration.judging.scale_check import check_scale
 from slrig.calibration.judging.verdict import LIMITS, Grade, Verdict, verdict
 from slrig.calibration.poses.coverage import coverage
-from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, DeviceResiduals, ExpectedError, Solution
+from slrig.calibration.solution import (
+    PARAMETERS,
+    PROJECTOR,
+    BoardPose,
+    Bow,
+    DeviceResiduals,
+    ExpectedError,
+    Solution,
+)
 from slrig.model import Calibration, FloatArray, Pinhole
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, held, two_cameras_and_projector
 
@@ -183,8 +191,20 @@ def test_a_border_that_no_corner_reached_leaves_the_distortion_open_there() -> N
 
 def test_a_bent_board_is_told() -> None:
     shape = np.zeros((88, 3))
-    shape[:44, 2] = 0.4
-    assert _says(verdict(replace(_solution(), board_shape_mm=shape), EXPECTED), "0.4 mm out of flat", "glass")
+    shape[:, 0] = 0.06
+    bowed = replace(_solution(), board_shape_mm=shape, bow=Bow(0.412, 0.021, solved=True))
+    found = verdict(bowed, EXPECTED)
+    assert _says(found, "bowed, 0.412 ± 0.021 mm", "0.06 mm off their printed places", "up to 0.2 mm is well", "glass")
+    assert found.grade is Grade.USABLE
+
+
+def test_a_bow_that_chance_explains_is_told_and_held_against_nothing() -> None:
+    found = verdict(replace(_solution(), bow=Bow(0.5, 0.4, solved=False)), EXPECTED)
+    assert found.grade is Grade.GOOD
+    (judged,) = (each for each in found.judged if each.figure == "bend_mm")
+    assert "flat as far as the poses tell: 0.50 ± 0.40 mm" in judged.words
+    # Where a person said that the board is flat, nobody looked.
+    assert not [each for each in verdict(_solution(), EXPECTED).judged if each.figure == "bend_mm"]
 
 
 def test_every_limit_has_a_source_and_grades_in_order() -> None:

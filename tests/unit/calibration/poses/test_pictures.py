@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from slrig.calibration.poses.coverage import coverage
-from slrig.calibration.poses.pictures import coverage_picture, pose_picture, residual_picture
-from slrig.calibration.solution import DeviceResiduals
+from slrig.calibration.poses.pictures import coverage_picture, pose_picture
 from slrig.model import Size
 from tests.unit.calibration.posed_boards import CHESSBOARD, Shooting, held, two_cameras_and_projector
 
@@ -50,43 +49,6 @@ def test_a_coverage_picture_fills_covered_cells_and_shows_where_to_go(shooting: 
     assert changed[:, 1].max() == pytest.approx(600, abs=8)
     assert changed[:, 0].min() == pytest.approx(350, abs=8)
     assert changed[:, 0].max() == pytest.approx(450, abs=8)
-
-
-def _residuals() -> DeviceResiduals:
-    rms = np.full((6, 6), 0.1)
-    rms[5, 5] = 0.4
-    rms[0, 0] = np.nan
-    mean = np.zeros((6, 6, 2))
-    mean[2, 3] = (0.2, 0.0)
-    mean[0, 0] = np.nan
-    return DeviceResiduals(0.15, 0.1, 0.16, 900, 0, {}, rms, mean, np.full((6, 6), 25, dtype=np.int32))
-
-
-def test_a_residual_picture_darkens_with_rms_and_draws_the_mean_as_an_arrow() -> None:
-    picture = residual_picture(_residuals(), SIZE)
-    assert picture.shape == (540, 640, 3)
-    worst, usual, none = _cell(picture, 5, 5), _cell(picture, 1, 1), _cell(picture, 0, 0)
-    assert worst[1] < usual[1] - 80
-    assert none[0] == pytest.approx(none[2], abs=8)  # grey: nothing was seen there
-    # The arrow of the cell at row 2, column 3, points to the right: dark along its middle, half a cell long.
-    middle = picture[round(2.5 * 512 / 6), round(3 * 640 / 6) + 2 : round(4 * 640 / 6) - 2]
-    dark = np.flatnonzero(middle.sum(axis=1) < 250)
-    assert 30 <= dark.max() - dark.min() <= 60
-
-
-def test_residuals_that_are_all_nothing_still_make_a_picture() -> None:
-    nothing = DeviceResiduals(
-        0.0,
-        0.0,
-        float("nan"),
-        0,
-        0,
-        {},
-        np.full((6, 6), np.nan),
-        np.full((6, 6, 2), np.nan),
-        np.zeros((6, 6), np.int32),
-    )
-    assert residual_picture(nothing, SIZE).shape == (540, 640, 3)
 
 
 @pytest.mark.parametrize("colour", [False, True])

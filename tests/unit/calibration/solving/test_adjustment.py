@@ -37,7 +37,7 @@ def unit(seen: Measurements, sigma_px: float = 0.05) -> Deviations:
 
 def all_free(geometry: Geometry, *, shape: bool = False) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     count = len(geometry.poses)
-    return geometry.layout.free([FOUR] * len(geometry.devices), np.ones(count, np.bool_), shape=shape)
+    return geometry.layout.free([FOUR] * len(geometry.devices), np.ones(count, np.bool_), bend=shape, offsets=shape)
 
 
 def aside(geometry: Geometry, seed: int = 0) -> Geometry:
@@ -100,7 +100,7 @@ def test_the_board_s_shape_is_found_where_it_is_asked_for() -> None:
     recipe = Recipe(poses=10, side=20, corner_px=0.02, light_px=0.02, alike_px=0.0, outlying=0.0, bow_mm=1.0)
     geometry, seen = true_geometry(replace(recipe, offsets_mm=offsets))
     flat = adjusted(geometry, seen, all_free(geometry), unit(seen, 0.02))
-    shaped = adjusted(geometry, seen, all_free(geometry, shape=True), unit(seen, 0.02), prior=Prior(0.2))
+    shaped = adjusted(geometry, seen, all_free(geometry, shape=True), unit(seen, 0.02), prior=Prior(0.2, 0.2))
 
     def rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(values**2)))

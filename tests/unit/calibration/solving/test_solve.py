@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from slrig.calibration.solution import CELLS, PARAMETERS, PROJECTOR, Solution
-from slrig.calibration.solving.parameters import difference
+from slrig.calibration.board import BoardShape
+from slrig.calibration.solution import CELLS, PROJECTOR, Solution
 from slrig.calibration.solving.solve import SolveOptions, solve
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray
-from tests.unit.calibration.solving.test_projection import row_of
-from tests.unit.calibration.synthetic import Recipe, made
+from tests.unit.calibration.solving.against_truth import in_deviations
+from tests.unit.calibration.synthetic import CHESSBOARD, Recipe, made
 
 SMALL = Recipe(poses=8, side=12)
 
@@ -23,29 +23,6 @@ SMALL = Recipe(poses=8, side=12)
 def solved(recipe: Recipe) -> tuple[Solution, Calibration]:
     observations, truth = made(recipe)
     return solve(observations), truth
-
-
-def in_deviations(solution: Solution, truth: Calibration) -> dict[str, float]:
-    """Focal lengths, principal points, turns and baselines of all devices: error over its own stated deviation."""
-    names = [*truth.cameras, *([PROJECTOR] if truth.projector else [])]
-    rows = [
-        np.array([row_of(one) for one in (*rig.cameras.values(), *([rig.projector] if rig.projector else []))])
-        for rig in (solution.calibration, truth)
-    ]
-    off = difference(*rows)
-    found = {}
-    for device, name in enumerate(names):
-        own = slice(15 * device, 15 * device + 15)
-        covariance = solution.covariance[own, own]
-        for k, parameter in enumerate(PARAMETERS[:12]):
-            if parameter[0] in "fct" and covariance[k, k] > 0:
-                found[f"{name} {parameter}"] = float(off[device, k] / np.sqrt(covariance[k, k]))
-        if device:
-            shift = rows[1][device, 18:]
-            along = shift / np.linalg.norm(shift)
-            baseline = float(np.linalg.norm(rows[0][device, 18:]) - np.linalg.norm(shift))
-            found[f"{name} baseline"] = baseline / float(np.sqrt(along @ covariance[12:, 12:] @ along))
-    return found
 
 
 @pytest.mark.parametrize(
@@ -194,18 +171,58 @@ def test_poses_that_all_contradict_one_another_are_refused() -> None:
         solve(replace(observations, poses=tuple(poses)))
 
 
-@pytest.mark.slow
-def test_a_bowed_board_is_found_where_its_shape_is_asked_for() -> None:
-    observations, truth = made(
-        replace(SMALL, poses=7, side=20, bow_mm=1.0, corner_px=0.02, light_px=0.02, alike_px=0.0)
-    )
-    flat, shaped = solve(observations), solve(observations, options=SolveOptions(board_shape=True, folds=3))
-    assert flat.board_shape_mm is None
+@pytest.mark.parametrize("bow_mm", [0.2, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_a_bowed_board_is_found_and_does_no_harm(bow_mm: float) -> None:
+    recipe = replace(SMALL, poses=7, bow_mm=bow_mm)
+    (shaped, truth), (observations, _) = solved(recipe), made(recipe)
     assert shaped.board_shape_mm is not None
+    assert shaped.bow is not None
+    assert shaped.bow.solved
+    # The outermost corners stand a twelfth within the board's half extent; a parabola's height is the same there.
+    assert abs(shaped.bow.height_mm - bow_mm) < 3.5 * shaped.bow.sigma_mm + 0.02 * bow_mm
+    assert shaped.bow.sigma_mm < 0.02
     height: FloatArray = shaped.board_shape_mm[:, 2]
-    assert np.ptp(height) == pytest.approx(1.0, abs=0.1)
-    assert shaped.residuals["left"].rms_px < 0.04 < flat.residuals["left"].rms_px
+    assert np.ptp(height) == pytest.approx(shaped.bow.height_mm, rel=0.2)
     assert max(np.abs(list(in_deviations(shaped, truth).values()))) < 4
+    flat = solve(observations, options=SolveOptions(board_shape=BoardShape.FLAT))
+    assert flat.board_shape_mm is None
+    assert flat.bow is None
+    assert flat.residuals["left"].rms_px > shaped.residuals["left"].rms_px
+    # A lens that makes up for the bow is off by many deviations.
+    assert max(np.abs(list(in_deviations(flat, truth).values()))) > 4
+
+
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        replace(SMALL, poses=4, seed=508),
+        *(pytest.param(replace(SMALL, poses=5, seed=600 + seed), marks=pytest.mark.slow) for seed in range(12)),
+    ],
+)
+def test_a_flat_board_stays_flat(recipe: Recipe) -> None:
+    solution, truth = solved(recipe)
+    assert solution.board_shape_mm is None
+    assert solution.bow is not None
+    assert not solution.bow.solved
+    assert solution.bow.height_mm < 6 * solution.bow.sigma_mm < 0.5
+    assert max(np.abs(list(in_deviations(solution, truth).values()))) < 4
+
+
+@pytest.mark.slow
+def test_corners_that_lie_off_their_printed_places_are_found() -> None:
+    offsets = np.zeros((88, 3))
+    offsets[:, :2] = np.random.default_rng(4).normal(0, 0.08, (88, 2))
+    observations, truth = made(replace(SMALL, poses=6, side=8, offsets_mm=offsets))
+    solution = solve(observations)
+    assert solution.board_shape_mm is not None
+    found, placed = solution.board_shape_mm[:, :2], CHESSBOARD.points_mm[:, :2]
+    # By the solve, offsets move, turn and scale the board by nothing.
+    x, y = (placed - placed.mean(axis=0)).T
+    zero, one = np.zeros(88), np.ones(88)
+    moves = np.stack([np.stack(pair, axis=1).ravel() for pair in ((one, zero), (zero, one), (-y, x), (x, y))], axis=1)
+    left = offsets[:, :2].ravel() - moves @ np.linalg.lstsq(moves, offsets[:, :2].ravel(), rcond=None)[0]
+    assert np.sqrt(np.mean((found.ravel() - left) ** 2)) < 0.25 * 0.08
+    assert max(np.abs(list(in_deviations(solution, truth).values()))) < 4
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from uuid import UUID
 
 import numpy as np
 
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.observations import BoardView, PoseObservation
 from slrig.calibration.poses.figures import ViewFigures
 from slrig.devices import Rig
@@ -91,6 +91,7 @@ class TameCalibrating:
         self.judged: list[list[str]] = []
         self.solved: list[list[str]] = []
         self.earlier: list[Calibration | None] = []
+        self.board_shapes: list[BoardShape] = []
         self.calibration = tame_calibration()
 
     def tools(self) -> CalibrationTools:
@@ -153,6 +154,7 @@ class TameCalibrating:
         *,
         progress: Progress,
         earlier: Calibration | None = None,
+        board_shape: BoardShape = BoardShape.AUTO,
     ) -> CalibrationResult:
         assert (board, dict(cameras), projector) == (BOARD, {"cam0": Size(64, 48)}, Size(64, 40))
         progress("adjust", 0.5, "turn 3")
@@ -161,6 +163,7 @@ class TameCalibrating:
             raise self.solve_error
         self.solved.append([each.observation.name for each in poses])
         self.earlier.append(earlier)
+        self.board_shapes.append(board_shape)
         return cast("CalibrationResult", TameResult(self.calibration))
 
 

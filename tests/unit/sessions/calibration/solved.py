@@ -19,6 +19,7 @@ from slrig.calibration.solution import (
     PARAMETERS,
     PROJECTOR,
     BoardPose,
+    Bow,
     DeviceResiduals,
     ExpectedError,
     Solution,
@@ -171,6 +172,7 @@ def solved_result() -> CalibrationResult:
         poses={name: pose for name, pose in board_poses().items() if name != BUMPED},
         outliers={BUMPED: BUMP},
         residuals={"left": _residuals("left", 3), PROJECTOR: _residuals(PROJECTOR, 4)},
+        bow=Bow(0.031, 0.012, solved=False),
     )
     sizes = {"left": rig["left"].size, PROJECTOR: rig[PROJECTOR].size}
     used = [pose.observation for name, pose in read_poses().items() if name != BUMPED]

@@ -12,7 +12,7 @@ from slrig.bundle import write_bundle
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.detection import board_region, find_board
 from slrig.calibration.observations import COLUMN, ROW, Correspondences
-from slrig.calibration.poses.checks import check_same_devices
+from slrig.calibration.poses.checks import LIMITS, check_same_devices
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError, PatternError, PoseRefusedError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Size, White
@@ -140,6 +140,34 @@ def test_a_board_in_no_camera_is_refused_by_camera_and_cause() -> None:
 def test_another_board_is_refused(pose: Capture) -> None:
     with pytest.raises(PoseRefusedError, match="camera 'left'"):
         read_captured(pose, Board(BoardKind.CHESSBOARD, 6, 9, 18.0), "wrong")
+
+
+def moved_at_ends(shift_mm: tuple[float, float, float], seed: int = 1) -> float:
+    """What is told of a board that moved between the first and the last pair of white and black frames, px."""
+    standing = Standing()
+    ends = patterns_for(Size(384, 240))[:2]
+    seen = shot(standing, then=standing.shifted(shift_mm), patterns=(*ends, *ends), seed=seed)
+    return read_captured(seen, BOARD, "moving").figures["left"].moved_px
+
+
+def test_a_board_that_stands_still_does_not_move() -> None:
+    # Chance makes one of ten thousand poses move.
+    assert [moved_at_ends((0.0, 0.0, 0.0), seed) for seed in range(4)] == [0.0] * 4
+
+
+@pytest.mark.parametrize(
+    ("shift_mm", "warned"),
+    [((0.03, 0.0, 0.0), False), ((0.0, 0.06, 0.0), True), ((0.0, 0.0, 0.15), False), ((0.0, 0.0, 0.3), True)],
+)
+def test_a_movement_is_warned_of_from_so_much_on(shift_mm: tuple[float, float, float], warned: bool) -> None:
+    """There are 0.94 px to a millimetre here; 0.04 px of all corners is where the warning begins.
+
+    A board that comes nearer by a millimetre moves its corners by 0.19 px.
+    """
+    moved = moved_at_ends(shift_mm)
+    x, y, z = shift_mm
+    assert moved == pytest.approx(np.hypot(0.94 * np.hypot(x, y), 0.19 * z), abs=0.006)
+    assert (moved > LIMITS.moved_px[0]) == warned
 
 
 @pytest.mark.parametrize("shift_mm", [0.4, 3.0])
