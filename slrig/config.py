@@ -213,7 +213,8 @@ class ServiceSettings(BaseSettings):
     `require_key` False opens the service to everyone who reaches it, so it is refused beyond this machine.
     `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
     environment they are separated by commas. `webhook_url` is told when a scheduled run was missed or failed, and when
-    the rig's health changes; without it nothing is sent anywhere.
+    the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
+    are removed with their poses, but for the one in use and those that a scan or an acceptance test names.
     """
 
     model_config = SettingsConfigDict(
@@ -234,6 +235,7 @@ class ServiceSettings(BaseSettings):
     shutdown_s: Annotated[float, Field(gt=0)] = 3.0
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
+    keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] = 100
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     webhook_url: Annotated[str, Field(max_length=2000)] | None = None
 

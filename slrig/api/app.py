@@ -27,11 +27,11 @@ from slrig.api import (
 )
 from slrig.api.body_limits import BodyLimits
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
-from slrig.api.events import OpenStreams
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
 from slrig.api.security import LOCAL_NAMES, KeyCheck
 from slrig.api.service import Service
+from slrig.api.streams import OpenStreams
 
 _TITLE = "slrig"
 _SUMMARY = "Structured-light scans over HTTP: from POST /scan to a triangle mesh in millimetres"

@@ -68,6 +68,7 @@ class VerificationFigures(BaseModel):
     drift_mm: float | None
     drifts: list[DriftBody]
     open: str | None = Field(description="what the geometry leaves open")
+    unseen: list[str] = Field(description="devices that took no part, of which nothing was learned")
 
 
 class HealthBody(BaseModel):

@@ -12,9 +12,9 @@ from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
 from starlette.responses import StreamingResponse
 
-from slrig.api.events import OpenStreams
 from slrig.api.openapi import problems
 from slrig.api.service import Serving
+from slrig.api.streams import OpenStreams
 from slrig.errors import SlrigError
 from slrig.scan.preview import Light, Watch
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from slrig.scheduling.tasks import Tasks
 from slrig.sessions.acceptance.desk import AcceptanceDesk
 from slrig.sessions.acceptance.running import ReconstructBundle
 from slrig.sessions.calibration.calibrating import Calibrations
+from slrig.sessions.calibration.retention import Retention
 from slrig.sessions.calibration.tools import CalibrationTools
 from slrig.sessions.health.verification import VerificationDesk, VerificationTools
 
@@ -49,12 +51,15 @@ class Service:
     tasks: Tasks
     scheduler: Scheduler
     notices: Notices
+    retention: Retention
     refuse_when_stale: bool = False
 
     def start(self) -> None:
-        """Open the rig, and look at the clock."""
+        """Open the rig, look at the clock, and remove what is old."""
         self.runner.start()
         self.scheduler.start()
+        # It reads the report of every scan, and nobody waits for it.
+        threading.Thread(target=self.retention, name="slrig-retention", daemon=True).start()
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""
@@ -104,10 +109,14 @@ def assembled_service(
     health = NoticedHealth(folder.database, notices)
     verifications = VerificationDesk(folder, lender, health, tools=verification_tools, spare_bytes=spare_bytes)
     runner.watch_health(verifications)
-    acceptance = AcceptanceDesk(
-        folder.root / "acceptance", lender, reconstruct=None if worker is None else _elsewhere(worker)
+    acceptance = AcceptanceDesk(folder, lender, reconstruct=None if worker is None else _elsewhere(worker))
+    retention = Retention(
+        calibrations,
+        folder,
+        keep=settings.keep_calibrations,
+        named=lambda: {test.calibration for test in acceptance.latest()},
     )
-    tasks = Tasks(lender, calibrations, verifications, acceptance)
+    tasks = Tasks(lender, calibrations, verifications, acceptance, tidy=retention)
     # The folder's lock keeps every other process out.
     scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)
     return Service(
@@ -123,6 +132,7 @@ def assembled_service(
         tasks=tasks,
         scheduler=scheduler,
         notices=notices,
+        retention=retention,
         refuse_when_stale=refuse_when_stale,
     )
 

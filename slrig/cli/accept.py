@@ -30,9 +30,10 @@ from slrig.sessions.acceptance.plan import (
     usual_limits,
 )
 from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance.report import HTML, document
+from slrig.sessions.acceptance.report import document
 from slrig.sessions.acceptance.running import AcceptanceResult, Place, required_calibration, run_acceptance
 from slrig.sessions.acceptance.scene import scripted_config
+from slrig.sessions.acceptance.store import HTML, JSON
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 
@@ -123,7 +124,7 @@ def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_jso
             plan = asked.plan(rig)
             result = _tested(rig, plan, output, scripted=scripted, console=console)
     if as_json:
-        typer.echo((output / "report.json").read_text(encoding="utf-8"), nl=False)
+        typer.echo((output / JSON).read_text(encoding="utf-8"), nl=False)
     else:
         tell(result, console)
         console.print(f"report: {output / HTML}", markup=False, style="dim")

@@ -11,7 +11,9 @@ import typer
 
 from slrig.cli.options import USUAL_URL, KeyFile, Url
 
-app = typer.Typer(no_args_is_help=True, help="Work for the rig at set times: add, list, runs, pause, resume, remove.")
+app = typer.Typer(
+    no_args_is_help=True, help="Work for the rig at set times: add, list, runs, pause, resume, cancel, remove."
+)
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 ScheduleId = Annotated[str, typer.Argument(help="Id of the schedule, or the beginning of it that no other has.")]
@@ -121,6 +123,14 @@ def resume(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None)
     """Go on after a pause."""
     with _client(url, key_file) as client:
         _tell_schedule(client.post(f"/schedule/{_whole_id(client, schedule)}/resume", None), as_json=False)
+
+
+@app.command()
+def cancel(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+    """Have the run that is under way end early. The schedule stays as it is."""
+    with _client(url, key_file) as client:
+        client.post(f"/schedule/{_whole_id(client, schedule)}/cancel", None)
+    typer.echo("the run was asked to end")
 
 
 @app.command()

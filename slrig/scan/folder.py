@@ -4,6 +4,7 @@ DATA/lock            held by the one process that owns the folder; holds its pro
 DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
 DATA/calibrations/   calibrations and their sessions: see `slrig.sessions.calibration.store`
+DATA/acceptance/     acceptance tests: see `slrig.sessions.acceptance.store`
 DATA/.incoming/ID/   a scan, a pose or a solve being made; swept at the next start
 DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work
 DATA/cache/          compiled kernels, where the package's own folder cannot be written

@@ -89,11 +89,6 @@ class ScanEvent:
     kind: str
     data: Mapping[str, Any]
 
-    @property
-    def last(self) -> bool:
-        """True for the event that closes a scan."""
-        return self.kind == "state" and ScanState(self.data["state"]).final
-
 
 def plan_json(plan: ScanPlan) -> dict[str, Any]:
     """The plan as JSON values.

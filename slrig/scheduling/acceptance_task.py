@@ -8,10 +8,12 @@ from typing import Any
 from slrig.scan.faults import fault_of
 from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
-from slrig.scheduling.task_options import AcceptanceOptions, checked
+from slrig.scheduling.task_options import checked
 from slrig.scheduling.waiting import error_of, until
-from slrig.sessions.acceptance.asking import plan_asked
-from slrig.sessions.acceptance.desk import AcceptanceDesk, AcceptanceState
+from slrig.sessions.acceptance.asking import AcceptanceRequest
+from slrig.sessions.acceptance.desk import AcceptanceDesk
+from slrig.sessions.acceptance.records import AcceptanceState
+from slrig.sessions.acceptance.running import verdicts
 
 
 class AcceptanceTask:
@@ -28,7 +30,7 @@ class AcceptanceTask:
     def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. A rig that fails the test is a run that succeeded."""
         asked = _options(options)
-        test = self._desk.open(lambda calibration: plan_asked(asked, calibration)).id
+        test = self._desk.open(asked.plan).id
         try:
             with self._lender.named(holder):
                 self._desk.measure(test, wait=False, scripted=True)
@@ -41,12 +43,12 @@ class AcceptanceTask:
             cancel=lambda: self._desk.cancel(test),
         )
         record = self._desk.get(test)
-        if record.result is None:
+        if record.decision is None:
             self._desk.cancel(test)
-            raise error_of(fault_of(record.error or RuntimeError("the test ended without a result")))
+            raise error_of(record.fault or fault_of(RuntimeError("the test ended without a result")))
         return {
             "acceptance": str(test),
-            "decision": str(record.result.decision),
+            "decision": str(record.decision),
             "quantities": {
                 str(each.quantity): {
                     "error_mm": each.error_mm,
@@ -55,10 +57,10 @@ class AcceptanceTask:
                     "position": each.step,
                     "decision": str(each.decision),
                 }
-                for each in record.result.verdicts
+                for each in verdicts(record.readings, record.plan)
             },
         }
 
 
-def _options(given: Mapping[str, Any]) -> AcceptanceOptions:
-    return checked(AcceptanceOptions, given, task="acceptance")
+def _options(given: Mapping[str, Any]) -> AcceptanceRequest:
+    return checked(AcceptanceRequest, given, task="acceptance")

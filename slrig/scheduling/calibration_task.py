@@ -18,11 +18,15 @@ from slrig.sessions.calibration.records import PoseState, SessionRecord, Session
 
 
 class CalibrationTask:
-    """Implements `slrig.scheduling.tasks.Task`. Scans may come between two poses; a pose waits in line behind them."""
+    """Implements `slrig.scheduling.tasks.Task`. Scans may come between two poses; a pose waits in line behind them.
 
-    def __init__(self, lender: NamedLender, calibrations: Calibrations) -> None:
+    tidy : called after each, so that they do not pile up.
+    """
+
+    def __init__(self, lender: NamedLender, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
         self._lender = lender
         self._calibrations = calibrations
+        self._tidy = tidy
 
     def check(self, options: Mapping[str, Any], /) -> None:
         """See `Task`."""
@@ -43,7 +47,9 @@ class CalibrationTask:
             self._await_rig(session, cancelled)
             self._shoot(session, holder, asked, position, wait=True)
         self._await_poses(session, cancelled)
-        return self._told(self._solved(session, cancelled), asked)
+        told = self._told(self._solved(session, cancelled), asked)
+        self._tidy()
+        return told
 
     def _positions(self, asked: CalibrationOptions) -> list[int | str]:
         facts = self._lender.status().facts

@@ -10,13 +10,10 @@ from pydantic import Field, ValidationError
 from slrig.bundle.faults import Strict, explain, keys_of
 from slrig.calibration.board import Board, BoardKind
 from slrig.errors import CalibrationError, ScheduleError
+from slrig.sessions.acceptance.asking import AcceptanceRequest
 
 ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
-Length = Annotated[float, Field(gt=0, le=100_000)]
-Uncertainty = Annotated[float, Field(ge=0, le=1000)]
 Position = Annotated[int, Field(ge=0, le=10_000)]
-Coordinate = Annotated[float, Field(ge=-100_000, le=100_000)]
-Corner = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 
 
 class BoardOptions(Strict):
@@ -53,47 +50,7 @@ class CalibrationOptions(Strict):
     activate: bool = False
 
 
-class CertifiedOptions(Strict):
-    """A certified value and its expanded uncertainty (k = 2), mm."""
-
-    value_mm: Length
-    uncertainty_mm: Uncertainty
-
-
-class ArtefactOptions(Strict):
-    """The artefacts, as POST /acceptance has them."""
-
-    sphere: CertifiedOptions
-    bar: CertifiedOptions
-    plane_mm: Annotated[tuple[Length, Length], Field(strict=False)]
-    sphere_form_mm: Uncertainty
-    plane_form_mm: Uncertainty
-    ball_mm: Length | None = None
-    certificate: Annotated[str, Field(max_length=200)] = ""
-    temperature_c: Annotated[float, Field(ge=-50, le=100)] | None = None
-
-
-class LimitOptions(Strict):
-    """Limits, as POST /acceptance has them."""
-
-    spacing_mm: Length | None = None
-    form_mm: Length | None = None
-    size_mm: Length | None = None
-    flatness_mm: Length | None = None
-
-
-class AcceptanceOptions(Strict):
-    """Of an acceptance test. artefacts None : those of a rendered rig, which are exact. volume_mm : two corners."""
-
-    artefacts: ArtefactOptions | None = None
-    volume_mm: Annotated[tuple[Corner, Corner], Field(strict=False)] | None = None
-    limits: LimitOptions = LimitOptions()
-    repeats: Annotated[int, Field(ge=1, le=50)] = 3
-    exposure_s: ExposureSeconds | None = None
-    notes: Annotated[str, Field(max_length=1000)] = ""
-
-
-Options = TypeVar("Options", VerificationOptions, CalibrationOptions, AcceptanceOptions)
+Options = TypeVar("Options", VerificationOptions, CalibrationOptions, AcceptanceRequest)
 
 
 def checked(model: type[Options], given: Mapping[str, Any], *, task: str) -> Options:

@@ -43,7 +43,8 @@ class Task(Protocol):
 class Tasks:
     """Every kind of work: a `slrig.scheduling.scheduler.Work`. Any thread may call.
 
-    The desks have to borrow the rig by way of `lender`: it is by it that a refusal names the schedule.
+    The desks have to borrow the rig by way of `lender`: it is by it that a refusal names the schedule. tidy : called
+    after each calibration, see `slrig.sessions.calibration.retention`.
     """
 
     def __init__(
@@ -52,11 +53,13 @@ class Tasks:
         calibrations: Calibrations,
         verifications: VerificationDesk,
         acceptance: AcceptanceDesk,
+        *,
+        tidy: Callable[[], object] = lambda: None,
     ) -> None:
         self._lender = lender
         self._of: Mapping[TaskKind, Task] = {
             TaskKind.VERIFICATION: VerificationTask(lender, calibrations, verifications),
-            TaskKind.CALIBRATION: CalibrationTask(lender, calibrations),
+            TaskKind.CALIBRATION: CalibrationTask(lender, calibrations, tidy),
             TaskKind.ACCEPTANCE: AcceptanceTask(lender, acceptance),
         }
         self._lock = threading.Lock()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from uuid import UUID
 
 import httpx2
 import pytest
+from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
@@ -96,6 +99,18 @@ def test_list_runs_pause_resume_and_remove(service: TestClient) -> None:
     assert f"{made['id']}: verification at '0 2 * * *' in UTC\n" in done("resume", beginning)
     assert done("remove", beginning) == "removed\n"
     assert kept(service) == []
+
+
+def test_cancel_ends_the_run_and_leaves_the_schedule(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = json.loads(done("add", "0 2 * * *", "verification", "--json"))
+    assert "has no run under way" in refused(run("cancel", made["id"][:8]))
+    stopped = threading.Event()
+    # As a run under way leaves it there.
+    tasks = cast("FastAPI", service.app).state.service.tasks
+    monkeypatch.setitem(tasks._stops, UUID(made["id"]), stopped)
+    assert done("cancel", made["id"][:8]) == "the run was asked to end\n"
+    assert stopped.is_set()
+    assert kept(service) == [made]
 
 
 def test_what_cannot_be_is_refused_in_words() -> None:

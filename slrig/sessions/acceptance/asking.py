@@ -1,14 +1,17 @@
-"""From what is asked of an acceptance test, over HTTP or by a schedule, to its plan."""
+"""What is asked of an acceptance test, over HTTP or by a schedule, and the plan that it comes to."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
+from slrig.bundle.faults import Strict
 from slrig.errors import InvalidInputError
 from slrig.model import Calibration
 from slrig.sessions.acceptance.plan import (
+    USUAL_REPEATS,
     AcceptancePlan,
     Artefacts,
     Certified,
@@ -18,94 +21,83 @@ from slrig.sessions.acceptance.plan import (
 )
 from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
 
-Corner = tuple[float, float, float]
+Length = Annotated[float, Field(gt=0, le=100_000)]
+Uncertainty = Annotated[float, Field(ge=0, le=1000)]
+Coordinate = Annotated[float, Field(ge=-100_000, le=100_000)]
+Corner = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+"""x, y, z in the world, mm."""
 
 
-class AskedValue(Protocol):
+class CertifiedRequest(Strict):
     """A certified value and its expanded uncertainty (k = 2), mm."""
 
-    value_mm: float
-    uncertainty_mm: float
+    value_mm: Length
+    uncertainty_mm: Uncertainty
 
 
-class AskedArtefacts(Protocol):
-    """The artefacts, as their certificates have them, mm."""
+class ArtefactsRequest(Strict):
+    """The artefacts, as their certificates have them."""
 
-    @property
-    def sphere(self) -> AskedValue:
-        """Diameter."""
-        ...
+    sphere: CertifiedRequest = Field(description="diameter")
+    bar: CertifiedRequest = Field(description="distance of the balls' centres")
+    plane_mm: tuple[Length, Length] = Field(strict=False, description="length and width")
+    sphere_form_mm: Uncertainty = Field(description="by how much the sphere itself is out of round")
+    plane_form_mm: Uncertainty = Field(description="by how much the plane itself is out of flat")
+    ball_mm: Length | None = Field(default=None, description="diameter of the bar's balls; absent, the sphere's")
+    certificate: Annotated[str, Field(max_length=200)] = ""
+    temperature_c: Annotated[float, Field(ge=-50, le=100)] | None = None
 
-    @property
-    def bar(self) -> AskedValue:
-        """Distance of the balls' centres."""
-        ...
-
-    plane_mm: tuple[float, float]
-    ball_mm: float | None
-    sphere_form_mm: float
-    plane_form_mm: float
-    certificate: str
-    temperature_c: float | None
-
-
-class AskedLimits(Protocol):
-    """Limits, mm; None for the usual one."""
-
-    spacing_mm: float | None
-    form_mm: float | None
-    size_mm: float | None
-    flatness_mm: float | None
+    def artefacts(self) -> Artefacts:
+        """The artefacts that are meant."""
+        return Artefacts(
+            Certified(self.sphere.value_mm, self.sphere.uncertainty_mm),
+            Certified(self.bar.value_mm, self.bar.uncertainty_mm),
+            self.plane_mm,
+            self.ball_mm,
+            self.sphere_form_mm,
+            self.plane_form_mm,
+            self.certificate,
+            self.temperature_c,
+        )
 
 
-class AskedTest(Protocol):
-    """A test. artefacts None : the exact ones of a rendered rig. volume_mm : two corners; None, the calibration's."""
+class LimitsRequest(Strict):
+    """Limits in mm; absent ones are the usual: 1/10000 of the diagonal for spacing, 6.5 σ of a point for the others."""
 
-    @property
-    def artefacts(self) -> AskedArtefacts | None:
-        """What is measured."""
-        ...
-
-    @property
-    def limits(self) -> AskedLimits:
-        """What is allowed."""
-        ...
-
-    volume_mm: tuple[Corner, Corner] | None
-    repeats: int
-    exposure_s: float | None
-    notes: str
+    spacing_mm: Length | None = None
+    form_mm: Length | None = None
+    size_mm: Length | None = None
+    flatness_mm: Length | None = None
 
 
-def plan_asked(asked: AskedTest, calibration: Calibration) -> AcceptancePlan:
-    """The plan for a rig so calibrated. Raises InvalidInputError."""
-    rendered = asked.artefacts is None
-    volume = rig_volume_mm(calibration) if asked.volume_mm is None else np.array(asked.volume_mm, np.float64)
-    if not (volume[0] < volume[1]).all():
-        message = f"volume_mm: expected the least corner and then the greatest, found {volume.tolist()}"
-        raise InvalidInputError(message)
-    given = asked.limits
-    usual_mm = usual_limits(volume, rendered=rendered).spacing_mm
-    return acceptance_plan(
-        calibration,
-        volume,
-        exact_artefacts(volume) if asked.artefacts is None else _artefacts(asked.artefacts),
-        rendered=rendered,
-        limits=Limits(given.spacing_mm or usual_mm, given.form_mm, given.size_mm, given.flatness_mm),
-        repeats=asked.repeats,
-        exposure_s=asked.exposure_s,
-        notes=asked.notes,
+class AcceptanceRequest(Strict):
+    """What to test with. Without artefacts: the exact ones of a rendered rig."""
+
+    artefacts: ArtefactsRequest | None = None
+    volume_mm: tuple[Corner, Corner] | None = Field(
+        default=None, strict=False, description="least and greatest corner in the world; absent, the calibration's"
     )
+    limits: LimitsRequest = LimitsRequest()
+    repeats: Annotated[int, Field(ge=1, le=50)] = USUAL_REPEATS
+    exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
+    notes: Annotated[str, Field(max_length=1000)] = ""
 
-
-def _artefacts(given: AskedArtefacts) -> Artefacts:
-    return Artefacts(
-        Certified(given.sphere.value_mm, given.sphere.uncertainty_mm),
-        Certified(given.bar.value_mm, given.bar.uncertainty_mm),
-        given.plane_mm,
-        given.ball_mm,
-        given.sphere_form_mm,
-        given.plane_form_mm,
-        given.certificate,
-        given.temperature_c,
-    )
+    def plan(self, calibration: Calibration) -> AcceptancePlan:
+        """The plan for a rig so calibrated. Raises InvalidInputError."""
+        rendered = self.artefacts is None
+        volume = rig_volume_mm(calibration) if self.volume_mm is None else np.array(self.volume_mm, np.float64)
+        if not (volume[0] < volume[1]).all():
+            message = f"volume_mm: expected the least corner and then the greatest, found {volume.tolist()}"
+            raise InvalidInputError(message)
+        given = self.limits
+        usual_mm = usual_limits(volume, rendered=rendered).spacing_mm
+        return acceptance_plan(
+            calibration,
+            volume,
+            exact_artefacts(volume) if self.artefacts is None else self.artefacts.artefacts(),
+            rendered=rendered,
+            limits=Limits(given.spacing_mm or usual_mm, given.form_mm, given.size_mm, given.flatness_mm),
+            repeats=self.repeats,
+            exposure_s=self.exposure_s,
+            notes=self.notes,
+        )

@@ -1,119 +1,121 @@
-"""Acceptance tests on a running service: opened, measured position by position or by script, and kept. No HTTP here.
-
-DATA/acceptance/ID/points/   what each capture gave
-DATA/acceptance/ID/report.html, report.json   when every position is measured
-
-A test under way lives in memory: one that is cut off by the end of the service keeps its points and is not taken up.
-"""
+"""Acceptance tests on a running service: opened, measured position by position or by script, and kept. No HTTP here."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from datetime import datetime
-from enum import StrEnum
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from uuid import UUID, uuid4
+
+import structlog
 
 from slrig.devices import Rig
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,
+    CalibrationStateError,
     DeviceBusyError,
+    IdempotencyError,
     InvalidInputError,
     ScanCancelledError,
     ScanNotFoundError,
     ScanStateError,
+    StorageError,
 )
 from slrig.model import Calibration
-from slrig.scan.records import Clock, utc_now
+from slrig.scan.faults import ScanInterruptedError, fault_of
+from slrig.scan.folder import DataFolder
+from slrig.scan.records import Clock, ScanProgress, utc_now
 from slrig.scan.work import Holder
-from slrig.sessions.acceptance.evaluation import Evidence, Reading
-from slrig.sessions.acceptance.plan import AcceptancePlan, Step
-from slrig.sessions.acceptance.running import AcceptanceResult, ReconstructBundle, by_positioner, measured, verdicts
+from slrig.sessions.acceptance.plan import AcceptancePlan
+from slrig.sessions.acceptance.records import AcceptanceRecord, AcceptanceState, RequestKey
+from slrig.sessions.acceptance.running import (
+    AcceptanceResult,
+    ReconstructBundle,
+    by_positioner,
+    measured,
+    required_calibration,
+    verdicts,
+)
+from slrig.sessions.acceptance.store import AcceptanceStore, interruption_fault
 from slrig.sessions.calibration.pose_shooting import RigLender
+from slrig.sessions.health.verification import solve_id
 
-
-class AcceptanceState(StrEnum):
-    """How far a test is. OPEN: it waits for its next position."""
-
-    OPEN = "open"
-    MEASURING = "measuring"
-    FINISHED = "finished"
-    CANCELLED = "cancelled"
-
-
-@dataclass(frozen=True, slots=True)
-class AcceptanceRecord:
-    """One test. error : why the last position was not measured, None where it was; it may be measured again.
-
-    progress : stage, fraction and detail of what is under way.
-    """
-
-    id: UUID
-    created_at: datetime
-    plan: AcceptancePlan
-    state: AcceptanceState = AcceptanceState.OPEN
-    readings: tuple[Reading, ...] = ()
-    error: Exception | None = None
-    progress: tuple[str, float, str] | None = None
-    result: AcceptanceResult | None = None
-
-    @property
-    def next_take(self) -> tuple[Step, int] | None:
-        """The position to measure next, and how many times it was measured before; None when all are."""
-        takes = self.plan.takes
-        return takes[len(self.readings)] if len(self.readings) < len(takes) else None
+_log = structlog.get_logger(__name__)
 
 
 @dataclass(slots=True)
 class _Held:
-    """What only the desk knows of a test."""
+    """A test, and by which loan it has the rig."""
 
     record: AcceptanceRecord
-    evidence: list[Evidence] = field(default_factory=list)
     loan: UUID | None = None
 
 
 class AcceptanceDesk:
-    """The tests of one service. Any thread may call. `folder` : where they are kept, a folder of the data folder."""
+    """The tests of one service, those of earlier runs among them. Any thread may call.
+
+    Raises
+    ------
+    StorageError
+        The disk refused.
+    """
 
     def __init__(
         self,
-        folder: Path,
+        folder: DataFolder,
         lender: RigLender,
         *,
         clock: Clock = utc_now,
         reconstruct: ReconstructBundle | None = None,
     ) -> None:
-        self._folder = folder
+        self._store = AcceptanceStore(folder)
         self._lender = lender
         self._clock = clock
         self._reconstruct = reconstruct
         self._lock = threading.RLock()
-        self._tests: dict[UUID, _Held] = {}
+        self._tests = {record.id: _Held(record) for record in self._store.load()}
 
-    def open(self, plan_of: Callable[[Calibration], AcceptancePlan]) -> AcceptanceRecord:
-        """Open a test of the rig as it is calibrated now. Touches no device.
+    def open(
+        self, plan_of: Callable[[Calibration], AcceptancePlan], *, key: RequestKey | None = None
+    ) -> AcceptanceRecord:
+        """Open a test of the rig as it is calibrated now, or return the one that a request with this key opened before.
+
+        Touches no device.
 
         Raises
         ------
+        IdempotencyError
+            The key was sent before with another request.
         DeviceBusyError
             The rig is not open yet.
         CalibrationError, InvalidInputError
             It has no calibration, or the plan cannot be done.
+        StorageError
+            The disk refused.
         """
-        status = self._lender.status()
-        if status.facts is None:
-            message = "The rig is being opened. Ask again in a moment."
-            raise DeviceBusyError(message)
-        calibration = status.facts.calibration if status.active is None else status.active.calibration
-        if calibration is None:
-            message = f"rig '{status.rig}' has no calibration, and nothing can be measured; calibrate it first"
-            raise CalibrationError(message)
-        record = AcceptanceRecord(uuid4(), self._clock(), plan_of(calibration))
         with self._lock:
+            if key is not None:
+                for held in self._tests.values():
+                    opened = held.record.opened_by
+                    if opened is not None and opened.key == key.key:
+                        _require_same(opened.fingerprint, key)
+                        return held.record
+            status = self._lender.status()
+            if status.facts is None:
+                message = "The rig is being opened. Ask again in a moment."
+                raise DeviceBusyError(message)
+            calibration = status.facts.calibration if status.active is None else status.active.calibration
+            if calibration is None:
+                message = f"rig '{status.rig}' has no calibration, and nothing can be measured; calibrate it first"
+                raise CalibrationError(message)
+            number = 1 + max((held.record.number for held in self._tests.values()), default=0)
+            record = AcceptanceRecord(
+                number, uuid4(), self._clock(), status.rig, solve_id(calibration), plan_of(calibration), opened_by=key
+            )
+            self._store.save(record)
             self._tests[record.id] = _Held(record)
         return record
 
@@ -122,32 +124,44 @@ class AcceptanceDesk:
         return self._held(test_id).record
 
     def latest(self) -> tuple[AcceptanceRecord, ...]:
-        """Return all tests of this run of the service, newest first."""
+        """Return all tests, newest first."""
         with self._lock:
             return tuple(held.record for held in reversed(self._tests.values()))
 
-    def measure(self, test_id: UUID, *, wait: bool, scripted: bool) -> AcceptanceRecord:
+    def measure(self, test_id: UUID, *, wait: bool, scripted: bool, key: RequestKey | None = None) -> AcceptanceRecord:
         """Have the next position measured, or, scripted, all that are left; return at once.
 
-        By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work.
+        By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. A request with
+        a key that came before changes nothing.
 
         Raises
         ------
         ScanNotFoundError, ScanStateError
             There is no such test, or it is being measured, or it is over.
+        IdempotencyError
+            The key was sent before with another request.
         RigBusyError, QueueFullError, DeviceError
             As a scan.
         """
         with self._lock:
             held = self._held(test_id)
-            if held.record.state is not AcceptanceState.OPEN:
+            if key is not None and key.key in held.record.measured_by:
+                _require_same(held.record.measured_by[key.key], key)
+                return held.record
+            if not held.record.state.waiting:
                 message = f"Acceptance test {test_id} is {held.record.state}; a position is measured while it is open."
                 raise ScanStateError(message)
             words = f"acceptance test {test_id}"
+            keys = {} if key is None else {key.key: key.fingerprint}
 
             def begun(loan: UUID) -> None:
                 held.loan = loan
-                held.record = replace(held.record, state=AcceptanceState.MEASURING, error=None)
+                held.record = replace(
+                    held.record,
+                    state=AcceptanceState.MEASURING,
+                    fault=None,
+                    measured_by={**held.record.measured_by, **keys},
+                )
 
             self._lender.borrow(
                 lambda rig, cancelled: self._measure(held, rig, cancelled, scripted=scripted),
@@ -159,20 +173,30 @@ class AcceptanceDesk:
             return held.record
 
     def cancel(self, test_id: UUID) -> AcceptanceRecord:
-        """End a test. Returns at once; one that is over stays so. Raises ScanNotFoundError."""
+        """End a test. Returns at once; one that is over stays so. Raises ScanNotFoundError, StorageError."""
         with self._lock:
             held = self._held(test_id)
             loan = held.loan
-            if held.record.state is AcceptanceState.OPEN:
-                held.record = replace(held.record, state=AcceptanceState.CANCELLED)
+            if held.record.state.waiting:
+                self._change(held, state=AcceptanceState.CANCELLED)
         if loan is not None:
             self._lender.recall(loan)
         return held.record
 
+    def delete(self, test_id: UUID) -> None:
+        """Forget a test and remove its files. Raises ScanNotFoundError, ScanStateError, StorageError."""
+        with self._lock:
+            held = self._held(test_id)
+            if held.record.state is AcceptanceState.MEASURING:
+                message = f"Acceptance test {test_id} is being measured. Cancel it, then delete it."
+                raise ScanStateError(message)
+            self._store.delete(test_id)
+            del self._tests[test_id]
+
     def file(self, test_id: UUID, name: str) -> Path:
         """Return where a report lies. Raises ScanNotFoundError, ArtefactNotReadyError."""
         record = self.get(test_id)
-        path = self._folder / str(test_id) / name
+        path = self._store.folder(test_id) / name
         if record.state is not AcceptanceState.FINISHED or not path.is_file():
             message = (
                 f"Acceptance test {test_id} is {record.state}, and has no {name} before every position is measured."
@@ -184,7 +208,7 @@ class AcceptanceDesk:
         with self._lock:
             held = self._tests.get(test_id)
         if held is None:
-            message = f"There is no acceptance test {test_id} under way here; finished ones lie in {self._folder}."
+            message = f"No acceptance test {test_id} is on record here. GET /acceptance lists those that are."
             raise ScanNotFoundError(message)
         return held
 
@@ -192,12 +216,15 @@ class AcceptanceDesk:
         """On the rig's thread: measure one position, or all that are left."""
         from slrig.sessions.acceptance.report import write_reports
 
+        with self._lock:
+            self._change(held, readings=held.record.from_first_take().readings)
         plan = held.record.plan
+        calibration = _same_calibration(held.record, rig)
         if plan.rendered and rig.truth() is None:
             message = "exact artefacts are those of a rendered rig, and this one is not; send the certificates' values"
             raise InvalidInputError(message)
         place = by_positioner(rig, plan) if scripted else None
-        folder = self._folder / str(held.record.id)
+        folder = self._store.folder(held.record.id)
         count = len(plan.takes)
         while (following := held.record.next_take) is not None:
             step, take = following
@@ -205,46 +232,73 @@ class AcceptanceDesk:
 
             def told(stage: str, fraction: float, detail: str, /, name: str = step.name, done: int = done) -> None:
                 share = (done + min(max(fraction, 0.0), 1.0)) / count
-                self._change(held, progress=(f"{name}: {stage}", share, detail))
+                with self._lock:
+                    held.record = replace(held.record, progress=ScanProgress(f"{name}: {stage}", share, detail))
 
             if cancelled():
                 message = f"the acceptance test was cancelled before {step.name}"
                 raise ScanCancelledError(message)
             if place is not None and take == 0:
                 place(rig, step)
-            found, evidence = measured(
+            found = measured(
                 rig, plan, step, take, folder, progress=told, cancelled=cancelled, reconstruct=self._reconstruct
             )
-            held.evidence.append(evidence)
             self._change(held, readings=(*held.record.readings, found))
             following = held.record.next_take
             # A repeat goes with its first: nothing is moved between them.
             if place is None and (following is None or following[1] == 0):
                 break
         if held.record.next_take is None:
-            calibration = rig.calibration
-            if calibration is None:
-                message = f"rig '{rig.name}' has lost its calibration; calibrate it, and test again"
-                raise CalibrationError(message)
             record = held.record
             result = AcceptanceResult(
                 rig.name, record.created_at, self._clock(), plan, calibration, record.readings,
                 verdicts(record.readings, plan),
             )  # fmt: skip
-            write_reports(result, held.evidence, folder)
-            self._change(held, result=result)
+            write_reports(result, folder)
+            self._change(held, state=AcceptanceState.FINISHED, decision=result.decision, progress=None)
 
-    def _change(self, held: _Held, **changes: object) -> None:
+    def _change(self, held: _Held, **changes: Any) -> None:
+        """Put a change on record. Raises StorageError, and changes nothing then."""
         with self._lock:
-            held.record = replace(held.record, **changes)  # type: ignore[arg-type]
+            changed = replace(held.record, **changes)
+            self._store.save(changed)
+            held.record = changed
 
     def _ended(self, held: _Held, error: Exception | None) -> None:
         """The rig is free."""
-        state = AcceptanceState.OPEN
-        if held.record.result is not None:
+        state, fault = AcceptanceState.OPEN, None if error is None else fault_of(error)
+        if held.record.state is AcceptanceState.FINISHED:
             state = AcceptanceState.FINISHED
         elif isinstance(error, ScanCancelledError):
             state = AcceptanceState.CANCELLED
+        elif isinstance(error, ScanInterruptedError):
+            state, fault = AcceptanceState.INTERRUPTED, interruption_fault()
         with self._lock:
             held.loan = None
-            held.record = replace(held.record, state=state, error=error, progress=None)
+            held.record = replace(held.record, state=state, fault=fault, progress=None)
+            try:
+                self._store.save(held.record)
+            except StorageError:
+                # Whoever waits is told by the record in memory.
+                _log.exception("the end of a measurement could not be put on record", acceptance=str(held.record.id))
+
+
+def _require_same(fingerprint: str, key: RequestKey) -> None:
+    if fingerprint != key.fingerprint:
+        message = (
+            "This Idempotency-Key was sent before with another request body. "
+            "Use a new key for a new request, or repeat the first body unchanged."
+        )
+        raise IdempotencyError(message)
+
+
+def _same_calibration(record: AcceptanceRecord, rig: Rig) -> Calibration:
+    """The rig's calibration. Raises CalibrationStateError unless it is the one that the test began with."""
+    calibration = required_calibration(rig)
+    if solve_id(calibration) != record.calibration:
+        message = (
+            f"Acceptance test {record.id} is of calibration {record.calibration}, and the rig now uses "
+            f"{solve_id(calibration)}. Activate the first again, or open a new test."
+        )
+        raise CalibrationStateError(message)
+    return calibration

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +16,14 @@ from slrig.scan.report import calibration_id
 from slrig.sessions.acceptance.charts import error_map, volume_view
 from slrig.sessions.acceptance.evaluation import BORDER_RINGS, Evidence, Reading
 from slrig.sessions.acceptance.plan import Artefact, Quantity
+from slrig.sessions.acceptance.points import kept_points, points_file
 from slrig.sessions.acceptance.running import FORMULA, AcceptanceResult, Verdict
+from slrig.sessions.acceptance.store import HTML, JSON
 from slrig.sessions.calibration.charts import legend
 from slrig.sessions.markup import Markup, joined, picture_uri, tag
 from slrig.sessions.report_style import STYLE
 
 FORMAT = "slrig-acceptance"
-HTML, JSON = "report.html", "report.json"
 MANNER = "In the manner of VDI/VDE 2634 part 2 and ISO 10360-13. No conformity with either is claimed."
 RULE = "passes if |error| <= MPE - U, fails if |error| > MPE + U, undecided between"
 _UM = 1000.0
@@ -31,9 +32,10 @@ _WORDS = {Decision.PASSES: "Passes", Decision.UNDECIDED: "Undecided", Decision.F
 _TITLES = {Artefact.SPHERE: "Sphere", Artefact.BAR: "Ball bar", Artefact.PLANE: "Plane"}
 
 
-def write_reports(result: AcceptanceResult, evidence: Sequence[Evidence], folder: Path) -> None:
-    """Write report.html and, when that is there, report.json. Raises StorageError."""
-    write_file(folder / HTML, report_html(result, evidence).encode())
+def write_reports(result: AcceptanceResult, folder: Path) -> None:
+    """Write report.html and, when that is there, report.json, beside the captures' points. Raises StorageError."""
+    page = report_html(result, lambda reading: kept_points(folder, reading.step, reading.take))
+    write_file(folder / HTML, page.encode())
     write_report(document(result), folder / JSON)
 
 
@@ -108,19 +110,19 @@ def _capture(reading: Reading) -> dict[str, object]:
         "points_at_border": reading.at_border,
         "points_used": reading.used,
         "rejected_share": reading.rejected_share,
-        "points_file": f"points/{reading.step}-{reading.take + 1}.npz",
+        "points_file": points_file(reading.step, reading.take),
     }
 
 
-def report_html(result: AcceptanceResult, evidence: Sequence[Evidence]) -> str:
-    """The page. evidence : of each reading, in their order."""
+def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evidence]) -> str:
+    """The page. `evidence_of` is asked for the points of one reading at a time: all at once are large."""
     title = f"Acceptance test of {result.rig}"
     sections = [
         _head(result, title),
         _verdict(result),
         tag("div", *(_tile(each, result) for each in result.verdicts), class_="tiles"),
         _rules(result),
-        *(_artefact(artefact, result, evidence) for artefact in Artefact),
+        *(_artefact(artefact, result, evidence_of) for artefact in Artefact),
         tag("footer", f"Written by slrig. {MANNER} Calibration {calibration_id(result.calibration)}."),
     ]
     head = tag(
@@ -218,20 +220,26 @@ def _rules(result: AcceptanceResult) -> Markup:
     )
 
 
-def _artefact(artefact: Artefact, result: AcceptanceResult, evidence: Sequence[Evidence]) -> Markup | None:
+def _artefact(
+    artefact: Artefact, result: AcceptanceResult, evidence_of: Callable[[Reading], Evidence]
+) -> Markup | None:
     steps = {step.name: step for step in result.plan.steps if step.artefact is artefact}
-    chosen = [(each, seen) for each, seen in zip(result.readings, evidence, strict=True) if each.step in steps]
+    chosen = [each for each in result.readings if each.step in steps]
     if not chosen:
         return None
     camera = next(iter(result.calibration.cameras.values()))
-    most_mm = 3 * float(np.median([reading.sigma_mm for reading, _ in chosen]))
+    most_mm = 3 * float(np.median([reading.sigma_mm for reading in chosen]))
+
+    def _map(reading: Reading) -> bytes:
+        return error_map(evidence_of(reading), camera, most_mm=most_mm)
+
     figures = [
         tag(
             "figure",
-            tag("img", src=picture_uri(error_map(seen, camera, most_mm=most_mm)), alt=reading.step, loading="lazy"),
+            tag("img", src=picture_uri(_map(reading)), alt=reading.step, loading="lazy"),
             tag("figcaption", tag("b", f"{reading.step}. "), steps[reading.step].words, " ", _errors(reading)),
         )
-        for reading, seen in chosen
+        for reading in chosen
         if reading.take == 0
     ]
     views = [
@@ -241,8 +249,8 @@ def _artefact(artefact: Artefact, result: AcceptanceResult, evidence: Sequence[E
             (True, "From the side: the rig is to the left."),
         )
     ]
-    quantities = list(chosen[0][0].errors_mm)
-    rows = [_row(reading, quantities) for reading, _ in chosen]
+    quantities = list(chosen[0].errors_mm)
+    rows = [_row(reading, quantities) for reading in chosen]
     names = (
         "position",
         *(f"{each}, µm" for each in quantities),

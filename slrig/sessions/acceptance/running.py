@@ -9,13 +9,12 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from slrig.bundle.storage import refusals_of, write_file
+from slrig.bundle.storage import refusals_of
 from slrig.calibration.artefacts import Decision, decision
 from slrig.devices import Rig
 from slrig.errors import (
@@ -32,8 +31,9 @@ from slrig.scan.acquisition import capture_bundle
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import Progress, ReconstructionPlan, ScanPlan
 from slrig.scan.records import Clock, utc_now
-from slrig.sessions.acceptance.evaluation import Evidence, Reading, reading
+from slrig.sessions.acceptance.evaluation import Reading, reading
 from slrig.sessions.acceptance.plan import AcceptancePlan, Quantity, Step
+from slrig.sessions.acceptance.points import keep_points
 
 FORMULA = "U = 2 * sqrt((U_certificate / 2)^2 + s^2)"
 """Expanded uncertainty, k = 2: the certificate's, and the standard deviation s of repeated captures of one position."""
@@ -153,7 +153,6 @@ def run_acceptance(
     _require_free(folder)
     begun = clock()
     readings: list[Reading] = []
-    pictures: list[Evidence] = []
     takes = plan.takes
     for index, (step, take) in enumerate(takes):
         told = _part_of(progress, step, take, index, len(takes))
@@ -166,7 +165,7 @@ def run_acceptance(
                 told("place", 0.0, step.words)
                 mover(rig, step)
             try:
-                found, evidence = measured(
+                found = measured(
                     rig, plan, step, take, folder, progress=told, cancelled=cancelled, reconstruct=reconstruct
                 )
                 break
@@ -176,9 +175,8 @@ def run_acceptance(
                 # A repeat is to be without a move between captures, so that it shows the scanner's scatter alone.
                 moved = take > 0
         readings.append(found)
-        pictures.append(evidence)
     result = AcceptanceResult(rig.name, begun, clock(), plan, calibration, tuple(readings), verdicts(readings, plan))
-    write_reports(result, pictures, folder)
+    write_reports(result, folder)
     return result
 
 
@@ -192,7 +190,7 @@ def measured(
     progress: Progress,
     cancelled: Callable[[], bool],
     reconstruct: ReconstructBundle | None = None,
-) -> tuple[Reading, Evidence]:
+) -> Reading:
     """Capture and evaluate one position, and keep its points. Raises as `run_acceptance`."""
     calibration = required_calibration(rig)
     work = folder / f".{step.name}-{take + 1}"
@@ -210,8 +208,8 @@ def measured(
         with refusals_of(work):
             mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
         found, evidence = reading(mesh, step, take, plan, calibration)
-        _keep(evidence, folder / "points" / f"{step.name}-{take + 1}.npz")
-        return found, evidence
+        keep_points(evidence, folder, step.name, take)
+        return found
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
@@ -291,21 +289,6 @@ def _usual_reconstruction() -> ReconstructBundle:
     from slrig.scan.pipeline import reconstruct_bundle
 
     return reconstruct_bundle
-
-
-def _keep(evidence: Evidence, path: Path) -> None:
-    packed = BytesIO()
-    np.savez_compressed(
-        packed,
-        points_mm=evidence.points_mm.astype(np.float32),
-        artefact=evidence.artefact,
-        used=evidence.used,
-        distances_mm=evidence.distances_mm,
-        sigma_mm=evidence.sigma_mm.astype(np.float32),
-    )
-    with refusals_of(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, packed.getvalue())
 
 
 def _require_free(folder: Path) -> None:

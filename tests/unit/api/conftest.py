@@ -28,10 +28,12 @@ KEY = "the key of the tests"
 class ServedBench(TameBench):
     """A service over a tame bench."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, *, keep_calibrations: int = 100) -> None:
         super().__init__()
         self.free_bytes = 10**12
-        settings = ServiceSettings(data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096)
+        settings = ServiceSettings(
+            data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, keep_calibrations=keep_calibrations
+        )
         folder = DataFolder(root, free=lambda _: self.free_bytes)
         store = ScanStore(folder.database)
         self.worker = ReconstructionWorker("tests.unit.scan.fake_pipeline:reconstruct_bundle")

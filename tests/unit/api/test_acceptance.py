@@ -12,11 +12,12 @@ from fastapi.testclient import TestClient
 from slrig.api import acceptance as router_module
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
+from slrig.sessions.acceptance.asking import AcceptanceRequest
 from slrig.sessions.acceptance.desk import AcceptanceDesk
-from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, lender
+from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, desks, lender
 from tests.unit.sessions.acceptance.test_running import RIG
 
-__all__ = ["desk", "lender"]
+__all__ = ["desk", "desks", "lender"]
 
 EXACT = {
     "sphere": {"value_mm": 30, "uncertainty_mm": 0.001},
@@ -100,3 +101,34 @@ def test_exact_artefacts_are_refused_on_metal(client: TestClient) -> None:
     error = client.get(f"/acceptance/{opened['id']}").json()["error"]
     assert error["status"] == 422
     assert "exact artefacts are those of a rendered rig" in error["detail"]
+
+
+def test_a_repeated_request_opens_and_measures_nothing_anew(
+    client: TestClient, desk: AcceptanceDesk, lender: TameLender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
+    key = {"Idempotency-Key": "once"}
+    first = client.post("/acceptance", headers=key)
+    path = first.headers["location"]
+    measured = client.post(f"{path}/position", headers=key)
+    assert (measured.status_code, measured.json()["captures_done"]) == (202, PLAN.repeats)
+    again = client.post("/acceptance", headers=key)
+    assert (again.status_code, again.headers["location"], again.json()) == (201, path, first.json())
+    assert client.post(f"{path}/position", headers=key).json() == client.get(path).json()
+    assert (len(lender.holders), len(desk.latest())) == (1, 1)
+    for where in ("/acceptance", f"{path}/position"):
+        other = {"repeats": 2} if where == "/acceptance" else {"scripted": True}
+        answer = client.post(where, headers=key, json=other)
+        assert (answer.status_code, answer.json()["type"]) == (422, "/problems/idempotency"), where
+
+
+def test_tests_are_listed_and_deleted(client: TestClient, desk: AcceptanceDesk) -> None:
+    first, second = desk.open(lambda _: PLAN), desk.open(lambda _: PLAN)
+    desk.measure(second.id, wait=False, scripted=True)
+    listed = client.get("/acceptance").json()["tests"]
+    assert [each["id"] for each in listed] == [str(second.id), str(first.id)]
+    assert (listed[0]["decision"], listed[1]["decision"]) == ("passes", None)
+    assert client.get(listed[0]["files"]["report.html"]).status_code == 200
+    assert client.get("/acceptance?limit=1").json()["tests"] == listed[:1]
+    assert client.delete(f"/acceptance/{second.id}").status_code == 204
+    assert client.get(f"/acceptance/{second.id}").status_code == 404

@@ -50,7 +50,6 @@ def test_life_of_a_scan_is_told_by_its_events_in_order(store: ScanStore, clock: 
     events = store.events(scan.id, after=0)
     assert [event.number for event in events] == [1, 2, 3, 4]
     assert [event.data["state"] for event in events] == ["queued", "capturing", "capturing", "failed"]
-    assert [event.last for event in events] == [False, False, False, True]
     assert store.events(scan.id, after=3) == events[3:]
     record = store.get(scan.id)
     assert record.fault == ScanFault("BundleError", "Frame 3 is cut.")

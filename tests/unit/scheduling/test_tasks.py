@@ -33,16 +33,17 @@ from slrig.scheduling.scheduler import Scheduler
 from slrig.scheduling.store import ScheduleStore
 from slrig.scheduling.tasks import Tasks, holder_of
 from slrig.scheduling.waiting import error_of
+from slrig.sessions.acceptance.asking import AcceptanceRequest
 from slrig.sessions.acceptance.desk import AcceptanceDesk
 from slrig.sessions.calibration.calibrating import CalibratedRig, Calibrations
 from slrig.sessions.health.store import HealthStore
 from slrig.sessions.health.verification import VerificationDesk, VerificationTools
 from tests.unit.scan.fakes import WAIT_S, SetClock
-from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, lender
+from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, desks, lender
 from tests.unit.sessions.calibration.calibration_bench import CalibrationBench
 from tests.unit.sessions.health.health_bench import a_look
 
-__all__ = ["desk", "lender"]
+__all__ = ["desk", "desks", "lender"]
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
 
@@ -58,8 +59,12 @@ class TaskBench(CalibrationBench):
         tools = self.tame.tools()
         verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_look())
         self.verifications = VerificationDesk(self.folder, self.lender, self.health, tools=verifying)
-        self.acceptance = AcceptanceDesk(self.folder.root / "acceptance", self.lender)
-        self.tasks = Tasks(self.lender, self.calibrations, self.verifications, self.acceptance)
+        self.acceptance = AcceptanceDesk(self.folder, self.lender)
+        self.tidied: list[int] = []
+        self.tasks = Tasks(
+            self.lender, self.calibrations, self.verifications, self.acceptance,
+            tidy=lambda: self.tidied.append(len(self.calibrations.latest())),
+        )  # fmt: skip
         self.clock = SetClock()
         self.schedules = ScheduleStore(self.folder.database)
         self.scheduler = Scheduler(self.schedules, self.tasks, clock=self.clock, execute=lambda call: call())
@@ -138,6 +143,7 @@ def test_calibration_takes_every_pose_solves_and_is_used_only_if_asked(bench: Ta
     told = bench.do(TaskKind.CALIBRATION, board=BOARD)
     assert bench.tame.visited == [0, 1, 2]
     assert bench.tame.solved == [["pose 1", "pose 2", "pose 3"]]
+    assert bench.tidied == [1]
     assert (told["poses"], told["accepted"], told["refused"], told["activated"]) == (3, 3, {}, False)
     assert bench.calibrations.active is None
     told = bench.do(TaskKind.CALIBRATION, board=BOARD, positions=["far", 0], activate=True)
@@ -299,7 +305,7 @@ def test_schedule_that_is_removed_during_its_run_is_forgotten(bench: TaskBench) 
 def test_acceptance_is_measured_by_script_and_tells_its_decision(
     desk: AcceptanceDesk, lender: TameLender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("slrig.scheduling.acceptance_task.plan_asked", lambda *_: PLAN)
+    monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
     named = NamedLender(cast("CalibratedRig", lender))
     desk._lender = named

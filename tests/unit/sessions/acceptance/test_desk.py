@@ -16,20 +16,27 @@ from slrig.devices import Rig
 from slrig.errors import (
     ArtefactNotReadyError,
     CalibrationError,
+    CalibrationStateError,
     DeviceBusyError,
+    IdempotencyError,
     InvalidInputError,
     NothingToReconstructError,
     RigBusyError,
     ScanNotFoundError,
     ScanStateError,
+    StorageError,
     UnsupportedByDeviceError,
 )
 from slrig.model import Calibration
 from slrig.scan.artefacts import encode_mesh_ply
+from slrig.scan.faults import ScanInterruptedError, interruption
+from slrig.scan.folder import DataFolder
 from slrig.scan.work import Holder
 from slrig.sessions.acceptance import running as acceptance
-from slrig.sessions.acceptance.desk import AcceptanceDesk, AcceptanceState
+from slrig.sessions.acceptance.desk import AcceptanceDesk
 from slrig.sessions.acceptance.plan import AcceptancePlan
+from slrig.sessions.acceptance.records import AcceptanceState, RequestKey, record_from_json, record_json
+from slrig.sessions.acceptance.store import interruption_fault
 from tests.unit.sessions.acceptance.test_running import RIG, SHORT, TamePositioner, scan_of
 
 PLAN = replace(SHORT, rendered=False)
@@ -81,8 +88,13 @@ def lender() -> TameLender:
     return TameLender(Rig("tame", {}, None, {}, RIG, positioner=positioner))  # type: ignore[arg-type]
 
 
+Desks = Callable[[], AcceptanceDesk]
+
+
 @pytest.fixture
-def desk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lender: TameLender) -> AcceptanceDesk:
+def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lender: TameLender) -> Desks:
+    """Makes the desk of a service, and of one after it over the same folder."""
+    folder = DataFolder(tmp_path)
     monkeypatch.setattr(acceptance, "capture_bundle", lambda _rig, _plan, folder, **_: folder.mkdir())
 
     def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
@@ -92,7 +104,17 @@ def desk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lender: TameLender) ->
         (output / "mesh.ply").write_bytes(encode_mesh_ply(scan_of(step)))
         return {}
 
-    return AcceptanceDesk(tmp_path / "acceptance", lender, reconstruct=reconstruct)
+    return lambda: AcceptanceDesk(folder, lender, reconstruct=reconstruct)
+
+
+@pytest.fixture
+def desk(desks: Desks) -> AcceptanceDesk:
+    return desks()
+
+
+def fault_kind(desk: AcceptanceDesk, test_id: UUID) -> str | None:
+    fault = desk.get(test_id).fault
+    return None if fault is None else fault.kind
 
 
 def the_plan(_: Calibration) -> AcceptancePlan:
@@ -110,9 +132,7 @@ def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Accep
         desk.measure(test.id, wait=False, scripted=False)
     assert done == ["sphere-1", "sphere-2", "bar-1", "plane-1"]
     assert lender.rig.positioner.moves == []  # type: ignore[union-attr]
-    result = desk.get(test.id).result
-    assert result is not None
-    assert result.decision is Decision.PASSES
+    assert desk.get(test.id).decision is Decision.PASSES
     assert desk.get(test.id).state is AcceptanceState.FINISHED
     assert desk.file(test.id, "report.html").is_file()
     assert set(lender.holders) == {f"acceptance test {test.id}"}
@@ -143,10 +163,11 @@ def test_a_position_that_went_wrong_may_be_measured_again(
         desk.measure(test.id, wait=False, scripted=False)
     record = desk.get(test.id)
     assert record.state is AcceptanceState.OPEN
-    assert isinstance(record.error, NothingToReconstructError)
+    assert record.fault is not None
+    assert record.fault.kind == NothingToReconstructError.__name__
     assert record.readings == ()
     desk.measure(test.id, wait=False, scripted=False)
-    assert desk.get(test.id).error is None
+    assert desk.get(test.id).fault is None
     assert len(desk.get(test.id).readings) == PLAN.repeats
 
 
@@ -171,18 +192,165 @@ def test_a_held_rig_is_refused_and_the_test_stays_open(desk: AcceptanceDesk, len
 
 
 def test_what_cannot_be_tested_is_refused(desk: AcceptanceDesk, lender: TameLender) -> None:
-    with pytest.raises(ScanNotFoundError, match="no acceptance test"):
+    with pytest.raises(ScanNotFoundError, match="No acceptance test"):
         desk.get(uuid4())
     exact = desk.open(lambda _: replace(PLAN, rendered=True))
     desk.measure(exact.id, wait=False, scripted=True)
-    assert isinstance(desk.get(exact.id).error, InvalidInputError)
+    assert fault_kind(desk, exact.id) == InvalidInputError.__name__
     lender.rig.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=True)
-    assert isinstance(desk.get(test.id).error, UnsupportedByDeviceError)
+    assert fault_kind(desk, test.id) == UnsupportedByDeviceError.__name__
     lender.facts = SimpleNamespace(calibration=None)
     with pytest.raises(CalibrationError, match="has no calibration"):
         desk.open(the_plan)
     lender.facts = None
     with pytest.raises(DeviceBusyError, match="being opened"):
         desk.open(the_plan)
+
+
+def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks) -> None:
+    before = desks()
+    waiting, test = before.open(the_plan), before.open(the_plan)
+    before.measure(waiting.id, wait=False, scripted=False)
+    before.measure(test.id, wait=False, scripted=True)
+    after = desks()
+    for each in (waiting.id, test.id):
+        assert record_json(after.get(each)) == record_json(before.get(each))
+    assert [each.id for each in after.latest()] == [test.id, waiting.id]
+    assert after.get(test.id).decision is Decision.PASSES
+    assert after.file(test.id, "report.html").is_file()
+    # One that waits for its next position goes on.
+    assert after.get(waiting.id).state is AcceptanceState.OPEN
+    after.measure(waiting.id, wait=False, scripted=True)
+    assert after.get(waiting.id).state is AcceptanceState.FINISHED
+    third = after.open(the_plan)
+    assert third.number == 3
+    after.delete(test.id)
+    assert [each.id for each in desks().latest()] == [third.id, waiting.id]
+
+
+def cut_off(desk: AcceptanceDesk, test_id: UUID, lender: TameLender, *, after_captures: int) -> None:
+    """Have the service end, as it were, in the middle of a capture: nothing is told of how it ended."""
+
+    class PowerCut(BaseException):
+        """Nobody catches it."""
+
+    def cancelled() -> bool:
+        if len(desk.get(test_id).readings) == after_captures:
+            raise PowerCut
+        return False
+
+    lender.cancelled = cancelled
+    with pytest.raises(PowerCut):
+        desk.measure(test_id, wait=False, scripted=True)
+    lender.cancelled = lambda: False
+
+
+def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks, lender: TameLender) -> None:
+    before = desks()
+    test = before.open(the_plan)
+    cut_off(before, test.id, lender, after_captures=1)
+    stray = before._store.folder(test.id) / ".sphere-1-2"
+    stray.mkdir()
+    after = desks()
+    record = after.get(test.id)
+    assert record.state is AcceptanceState.INTERRUPTED
+    assert fault_kind(after, test.id) == ScanInterruptedError.__name__
+    assert not stray.exists()
+    with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
+        after.file(test.id, "report.json")
+    assert desks().get(test.id).state is AcceptanceState.INTERRUPTED
+    lender.rig.positioner.moves.clear()  # type: ignore[union-attr]
+    after.measure(test.id, wait=False, scripted=True)
+    # Between repeats nothing may be moved: the first position begins anew.
+    assert lender.rig.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    assert after.get(test.id).state is AcceptanceState.FINISHED
+    assert [each.take for each in after.get(test.id).readings if each.step == "sphere-1"] == [0, 1]
+
+
+def test_a_service_that_ends_in_good_order_interrupts_a_test_too(desks: Desks, lender: TameLender) -> None:
+    before = desks()
+    test = before.open(the_plan)
+
+    def ending() -> bool:
+        raise interruption()
+
+    lender.cancelled = ending
+    before.measure(test.id, wait=False, scripted=True)
+    for desk in (before, desks()):
+        assert desk.get(test.id).state is AcceptanceState.INTERRUPTED
+        assert desk.get(test.id).fault == interruption_fault()
+
+
+def test_a_test_that_was_cut_off_after_its_report_is_finished(desks: Desks, tmp_path: Path) -> None:
+    before = desks()
+    test = before.open(the_plan)
+    before.measure(test.id, wait=False, scripted=True)
+    finished = before.get(test.id)
+    kept = tmp_path / "acceptance" / str(test.id) / "test.json"
+    kept.write_bytes(record_json(replace(finished, state=AcceptanceState.MEASURING, decision=None)))
+    assert record_json(desks().get(test.id)) == record_json(finished)
+
+
+def test_what_cannot_be_read_is_put_aside(desks: Desks, tmp_path: Path) -> None:
+    test = desks().open(the_plan)
+    kept = tmp_path / "acceptance" / str(test.id) / "test.json"
+    text = kept.read_text()
+    with pytest.raises(StorageError, match="not an acceptance test as this version"):
+        record_from_json(text.replace("slrig-acceptance-test", "letter").encode(), "x")
+    kept.write_text(text[:-30])
+    assert desks().latest() == ()
+    assert (tmp_path / ".orphans" / f"acceptance-{test.id}" / "test.json").is_file()
+
+
+def test_a_request_with_a_key_that_came_before_changes_nothing(desks: Desks, lender: TameLender) -> None:
+    before, key = desks(), RequestKey("a", "body")
+    test = before.open(the_plan, key=key)
+    before.measure(test.id, wait=False, scripted=False, key=key)
+    for desk in (before, desks()):
+        assert desk.open(the_plan, key=key).id == test.id
+        assert len(desk.measure(test.id, wait=False, scripted=False, key=key).readings) == PLAN.repeats
+        with pytest.raises(IdempotencyError, match="another request body"):
+            desk.open(the_plan, key=RequestKey("a", "other"))
+        with pytest.raises(IdempotencyError, match="another request body"):
+            desk.measure(test.id, wait=False, scripted=True, key=RequestKey("a", "other"))
+    assert len(lender.holders) == 1
+    assert len(before.latest()) == 1
+    # A refused request may be tried again with its key.
+    lender.busy, again = True, RequestKey("b", "body")
+    with pytest.raises(RigBusyError):
+        before.measure(test.id, wait=False, scripted=False, key=again)
+    lender.busy = False
+    before.measure(test.id, wait=False, scripted=False, key=again)
+    assert len(lender.holders) == 2
+
+
+def test_positions_of_one_test_are_measured_with_one_calibration(desk: AcceptanceDesk, lender: TameLender) -> None:
+    test = desk.open(the_plan)
+    desk.measure(test.id, wait=False, scripted=False)
+    camera = RIG.cameras["left"]
+    other = replace(camera, translation_mm=camera.translation_mm + 1)
+    lender.rig = replace(lender.rig, calibration=Calibration({"left": other}, RIG.projector))
+    desk.measure(test.id, wait=False, scripted=False)
+    assert fault_kind(desk, test.id) == CalibrationStateError.__name__
+    assert len(desk.get(test.id).readings) == PLAN.repeats
+    assert desk.cancel(test.id).state is AcceptanceState.CANCELLED
+
+
+def test_a_test_under_way_is_not_deleted(desk: AcceptanceDesk, lender: TameLender) -> None:
+    test = desk.open(the_plan)
+    refused: list[str] = []
+
+    def cancelled() -> bool:
+        with pytest.raises(ScanStateError, match="Cancel it, then delete it"):
+            desk.delete(test.id)
+        refused.append("refused")
+        return True
+
+    lender.cancelled = cancelled
+    desk.measure(test.id, wait=False, scripted=True)
+    assert refused
+    desk.delete(test.id)
+    with pytest.raises(ScanNotFoundError):
+        desk.get(test.id)

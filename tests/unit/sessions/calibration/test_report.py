@@ -169,6 +169,11 @@ def test_expected_error_is_the_results() -> None:
     assert page().number("length_mm_per_m") == pytest.approx(1000 * expected.length_share, rel=5e-3)
 
 
+def test_what_the_board_was_taken_for_is_told() -> None:
+    told = "The board is flat as far as the poses tell: 0.031 ± 0.012 mm from its lowest to its highest corner."
+    assert told in page().words
+
+
 def test_every_number_of_every_device_is_the_results() -> None:
     seen = 0
     for device in device_figures(result()):

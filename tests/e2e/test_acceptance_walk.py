@@ -1,0 +1,119 @@
+"""An acceptance test over HTTP to its report, cut off, and by schedule, through the real service, on a rendered rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from slrig.config import read_rig
+from slrig.discovery import open_rig
+from slrig.sessions.acceptance.asking import AcceptanceRequest
+from slrig.sessions.acceptance.scene import SCENE, scripted_config
+from tests.e2e.conftest import Start, write_rig
+from tests.e2e.schedules import at_once, awaited, newest
+from tests.e2e.test_calibration_walk import Caller
+
+REPEATS = 2
+
+
+def acceptance_rig(folder: Path) -> Path:
+    """The small rig with the artefacts in place of its scene, and a pose for each prescribed position."""
+    config = read_rig(write_rig(folder))
+    with open_rig(config) as rig:
+        assert rig.calibration is not None
+        plan = AcceptanceRequest(repeats=REPEATS).plan(rig.calibration)
+    head = scripted_config(config, plan, folder).head
+    assert head is not None
+    poses = "".join(
+        f'[[head.pose]]\nname = "{each["name"]}"\nobject = "{each["object"]}"\n'
+        f"position_mm = {each['position_mm']}\nrotation_deg = {each['rotation_deg']}\n"
+        for each in head.model_dump()["pose"]
+    )
+    return write_rig(folder, scene=(folder / SCENE).read_text(), head=poses)
+
+
+def settled(caller: Caller, test: dict[str, Any]) -> dict[str, Any]:
+    """The test once nothing is measured any more."""
+
+    def over() -> dict[str, Any] | None:
+        found = caller.get(f"/acceptance/{test['id']}")
+        return None if found["state"] == "measuring" else found
+
+    found: dict[str, Any] = awaited(over, "the end of the acceptance test")
+    return found
+
+
+@pytest.mark.slow
+def test_acceptance_over_http_to_its_report_which_outlives_the_service(start: Start, tmp_path: Path) -> None:
+    rig = acceptance_rig(tmp_path / "rig")
+    service = start(rig)
+    with Caller(service) as caller:
+        caller.ready()
+        key = {"Idempotency-Key": "one test"}
+        opened = caller.http.post("/acceptance", json={"repeats": REPEATS}, headers=key)
+        assert opened.status_code == 201, opened.text
+        test = opened.json()
+        assert caller.http.post("/acceptance", json={"repeats": REPEATS}, headers=key).json() == test
+        assert (test["captures"], test["next"]["name"]) == (23 + 3 * (REPEATS - 1), "sphere-1")
+        path = f"/acceptance/{test['id']}"
+        caller.post(f"{path}/position", 202, scripted=True)
+        busy = caller.post("/scan", 409)
+        assert busy["holder"] == f"acceptance test {test['id']}"
+        found = settled(caller, test)
+        assert (found["state"], found["error"]) == ("finished", None)
+        report = caller.get(found["files"]["report.json"])
+        assert (report["complete"], report["rendered"]) == (True, True)
+        assert report["decision"] == found["decision"]
+        assert [each["quantity"] for each in report["quantities"]] == ["PF", "PS", "SD", "F"]
+        captures = [capture for each in report["positions"] for capture in each["captures"]]
+        assert len(captures) == len(found["readings"]) == found["captures"]
+        # A small picture has a large error, but a wrong scale would have a larger one.
+        spacing = next(each for each in report["quantities"] if each["quantity"] == "SD")
+        assert abs(spacing["error_mm"]) < report["volume_diagonal_mm"] / 5000
+        page = caller.http.get(found["files"]["report.html"]).text
+        assert page.count("data:image/jpeg;base64,") == 23
+
+        second = caller.post("/acceptance", 201)
+        caller.post(f"/acceptance/{second['id']}/position", 202, scripted=True)
+        awaited(lambda: caller.get(f"/acceptance/{second['id']}")["captures_done"], "the first capture")
+        service.kill()
+    service = start(rig)
+    with Caller(service) as caller:
+        caller.ready()
+        listed = caller.get("/acceptance")["tests"]
+        assert [(each["id"], each["state"]) for each in listed] == [
+            (second["id"], "interrupted"),
+            (test["id"], "finished"),
+        ]
+        assert caller.get(path) == found
+        assert caller.get(found["files"]["report.json"]) == report
+        assert caller.http.get(found["files"]["report.html"]).text == page
+        cut_off = caller.get(f"/acceptance/{second['id']}")
+        assert cut_off["error"]["type"] == "/problems/scan-interrupted"
+        assert cut_off["captures_done"] >= 1
+        assert caller.post(f"/acceptance/{second['id']}/cancel", 202)["state"] == "cancelled"
+        assert caller.http.delete(f"/acceptance/{second['id']}").status_code == 204
+    assert service.stop() == 0
+
+
+@pytest.mark.slow
+def test_acceptance_by_schedule_has_a_row_with_its_figures(start: Start, tmp_path: Path) -> None:
+    service = start(acceptance_rig(tmp_path / "rig"))
+    with Caller(service) as caller:
+        caller.ready()
+        options = {"repeats": 1, "notes": "monthly"}
+        made = caller.post("/schedule", 201, cron="* * * * *", task="acceptance", enabled=False, options=options)
+        at_once(caller, service, made)
+        name = awaited(lambda: caller.get("/rig")["holder"], "the run")
+        assert name.startswith(f"schedule {made['id'][:8]}, acceptance due ")
+        assert caller.post("/scan", 409)["holder"] == name
+        run = awaited(lambda: newest(caller, made, "succeeded", "failed"), "the end of the run")
+        assert run["state"] == "succeeded", run["reason"]
+        told = run["result"]
+        assert set(told["quantities"]) == {"PF", "PS", "SD", "F"}
+        test = caller.get(f"/acceptance/{told['acceptance']}")
+        assert (test["state"], test["decision"]) == ("finished", told["decision"])
+        assert caller.get(test["files"]["report.json"])["notes"] == "monthly"
+    assert service.stop() == 0
