@@ -13,8 +13,12 @@ _ONE_AT_A_TIME = {
 }
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have several processes share the tests by file, so that what a file sets up once is set up once."""
+    """Have several processes share the tests by file, so that what a file sets up once is set up once.
+
+    First of all such hooks, since xdist reads the groups in its own.
+    """
     for item in items:
         path = item.nodeid.partition("::")[0]
         group = next((name for name, paths in _ONE_AT_A_TIME.items() if path.startswith(paths)), path)
