@@ -6,23 +6,27 @@ import os
 from pathlib import Path
 
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 # GigE Vision has one port, and a camera on loopback answers whoever asks there.
 _ONE_AT_A_TIME = {
-    "gige-vision": ("tests/unit/drivers/genicam/", "tests/contract/test_contract.py", "tests/contract/test_pairing.py"),
+    "gige-vision": ("tests/unit/drivers/genicam/", "tests/contract/test_contract.py"),
 }
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have several processes share the tests by file, so that what a file sets up once is set up once.
+class ByFile(LoadScopeScheduling):  # type: ignore[misc] # xdist is untyped
+    """Has several processes share the tests by file: what a file sets up once is set up once."""
 
-    First of all such hooks, since xdist reads the groups in its own.
-    """
-    for item in items:
-        path = item.nodeid.partition("::")[0]
-        group = next((name for name, paths in _ONE_AT_A_TIME.items() if path.startswith(paths)), path)
-        item.add_marker(pytest.mark.xdist_group(group))
+    def _split_scope(self, nodeid: str) -> str:
+        path = nodeid.partition("::")[0]
+        return next((name for name, paths in _ONE_AT_A_TIME.items() if path.startswith(paths)), path)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
+    """How `-n` shares the tests out."""
+    return ByFile(config, log)
 
 
 @pytest.fixture(scope="session")
