@@ -24,7 +24,7 @@ from tests.unit.drivers.screen.conftest import LEFT, OPEN, RIGHT, SIZE
 FAR_S = 20.0
 WHITE, BLACK = 0, 1
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 PROGRAM = """
 import sys
