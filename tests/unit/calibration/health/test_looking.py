@@ -123,8 +123,9 @@ def test_a_device_that_takes_no_part_in_a_look_raises_no_alarm_and_is_told() -> 
         found = look_at_board([one], BOARD, rig.calibration)
         assert found.unseen == (absent,)
         assert not found.drifts
-        # What is not seen is as good as it was, and not as bad as anything that might have happened to it.
-        assert (found.expected_mm or 0) < 1.05 * (found.stated_mm or 0)
+        # What is not seen is not as bad as anything that might have happened to it. By its noise one look makes some
+        # small change of the others a little likelier than none: less than what a rig is watched for.
+        assert (found.expected_mm or 0) < 1.4 * (found.stated_mm or 0)
         health = judged([found])
         assert health.state is HealthState.GOOD
         assert f"camera '{absent}' did not take part in the last look" in health.reasons[0]
