@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from slrig.sessions.markup import Markup, tag
+
 STYLE = """
 :root{--page:#f5f6f8;--card:#fff;--ink:#17222e;--dim:#5b6875;--line:#dfe3e8;--accent:#1c6f8c;--hatch:#e9ecf0;
 --good:#1d7a46;--usable:#a06200;--bad:#b3261e;--board:#1c6f8c}
@@ -86,3 +90,17 @@ p{margin:2px 0 5px}
 .row.narrow{grid-template-columns:repeat(4,1fr)}table{font-size:10px}th,td{padding:2px 7px}td.words{line-height:1.3}
 *{-webkit-print-color-adjust:exact;print-color-adjust:exact}.card{padding:10px 12px}}
 """.strip()
+
+
+def report_page(title: str, sections: Iterable[str | None]) -> str:
+    """A report as one page of HTML that needs no other file."""
+    head = tag(
+        "head",
+        tag("meta", charset="utf-8"),
+        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        tag("meta", name="color-scheme", content="light dark"),
+        tag("title", title),
+        tag("style", Markup(STYLE)),
+    )
+    page = tag("html", head, tag("body", tag("main", *sections)), lang="en")
+    return f"<!DOCTYPE html>\n{page}\n"

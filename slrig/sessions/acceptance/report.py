@@ -21,7 +21,7 @@ from slrig.sessions.acceptance.running import FORMULA, AcceptanceResult, Verdict
 from slrig.sessions.acceptance.store import HTML, JSON
 from slrig.sessions.calibration.charts import legend
 from slrig.sessions.markup import Markup, joined, picture_uri, tag
-from slrig.sessions.report_style import STYLE
+from slrig.sessions.report_style import report_page
 
 FORMAT = "slrig-acceptance"
 MANNER = "In the manner of VDI/VDE 2634 part 2 and ISO 10360-13. No conformity with either is claimed."
@@ -125,16 +125,7 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
         *(_artefact(artefact, result, evidence_of) for artefact in Artefact),
         tag("footer", f"Written by slrig. {MANNER} Calibration {calibration_id(result.calibration)}."),
     ]
-    head = tag(
-        "head",
-        tag("meta", charset="utf-8"),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", name="color-scheme", content="light dark"),
-        tag("title", title),
-        tag("style", Markup(STYLE)),
-    )
-    page = tag("html", head, tag("body", tag("main", *sections)), lang="en")
-    return f"<!DOCTYPE html>\n{page}\n"
+    return report_page(title, sections)
 
 
 def _head(result: AcceptanceResult, title: str) -> Markup:

@@ -31,7 +31,7 @@ from slrig.sessions.calibration.scene import error_range_mm, error_slices, rig_v
 from slrig.sessions.calibration.solving import CalibrationResult, ReadPose
 from slrig.sessions.calibration.words import MEANINGS, rounded
 from slrig.sessions.markup import Markup, joined, picture_uri, tag
-from slrig.sessions.report_style import STYLE
+from slrig.sessions.report_style import report_page
 
 _PICTURE_PX = 480
 _MOST_REASONS = 5
@@ -76,16 +76,7 @@ def report_html(
         _pictures(shown, poses, pictures, board),
         tag("footer", f"Written by slrig. {_identity(result)}"),
     ]
-    head = tag(
-        "head",
-        tag("meta", charset="utf-8"),
-        tag("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        tag("meta", name="color-scheme", content="light dark"),
-        tag("title", title),
-        tag("style", Markup(STYLE)),
-    )
-    page = tag("html", head, tag("body", tag("main", *sections)), lang="en")
-    return f"<!DOCTYPE html>\n{page}\n"
+    return report_page(title, sections)
 
 
 def _identity(result: CalibrationResult) -> str:
