@@ -12,6 +12,7 @@ from uuid import UUID
 
 from pydantic import TypeAdapter
 
+from slrig.errors import IdempotencyError
 from slrig.scan.faults import ScanFault
 from slrig.scan.plan import ScanPlan
 
@@ -125,3 +126,13 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def require_same_body(first: str, again: str, *, made: str) -> None:
+    """Raise IdempotencyError unless both requests with one key have one fingerprint. made : what a request makes."""
+    if first != again:
+        message = (
+            "This Idempotency-Key was sent before with another request body. "
+            f"Use a new key for a new {made}, or repeat the first body unchanged."
+        )
+        raise IdempotencyError(message)

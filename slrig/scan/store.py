@@ -13,7 +13,7 @@ from uuid import UUID, uuid4
 from sqlalchemy import delete, select, text
 from sqlalchemy.orm import Session
 
-from slrig.errors import IdempotencyError, ScanNotFoundError
+from slrig.errors import ScanNotFoundError
 from slrig.scan.database import Database
 from slrig.scan.faults import KeyInFlightError, ScanFault
 from slrig.scan.migrations import upgrade
@@ -26,6 +26,7 @@ from slrig.scan.records import (
     ScanState,
     plan_from_json,
     plan_json,
+    require_same_body,
     utc_now,
 )
 from slrig.scan.tables import EventRow, KeyRow, ScanRow
@@ -197,12 +198,7 @@ class ScanStore:
             if held is None:
                 session.add(KeyRow(key=key, fingerprint=fingerprint, scan_id=None, created_at=self._now()))
                 return None
-            if held.fingerprint != fingerprint:
-                message = (
-                    "This Idempotency-Key was sent before with another request body. "
-                    "Use a new key for a new scan, or repeat the first body unchanged."
-                )
-                raise IdempotencyError(message)
+            require_same_body(held.fingerprint, fingerprint, made="scan")
             if held.scan_id is None:
                 message = "The first request with this Idempotency-Key is still being answered. Ask again in a second."
                 raise KeyInFlightError(message)

@@ -17,7 +17,6 @@ from slrig.errors import (
     CalibrationError,
     CalibrationStateError,
     DeviceBusyError,
-    IdempotencyError,
     InvalidInputError,
     ScanCancelledError,
     ScanNotFoundError,
@@ -27,7 +26,7 @@ from slrig.errors import (
 from slrig.model import Calibration
 from slrig.scan.faults import ScanInterruptedError, fault_of
 from slrig.scan.folder import DataFolder
-from slrig.scan.records import Clock, ScanProgress, utc_now
+from slrig.scan.records import Clock, ScanProgress, require_same_body, utc_now
 from slrig.scan.work import Holder
 from slrig.sessions.acceptance.plan import AcceptancePlan
 from slrig.sessions.acceptance.records import AcceptanceRecord, AcceptanceState, RequestKey
@@ -101,7 +100,7 @@ class AcceptanceDesk:
                 for held in self._tests.values():
                     opened = held.record.opened_by
                     if opened is not None and opened.key == key.key:
-                        _require_same(opened.fingerprint, key)
+                        require_same_body(opened.fingerprint, key.fingerprint, made="request")
                         return held.record
             status = self._lender.status()
             if status.facts is None:
@@ -146,7 +145,7 @@ class AcceptanceDesk:
         with self._lock:
             held = self._held(test_id)
             if key is not None and key.key in held.record.measured_by:
-                _require_same(held.record.measured_by[key.key], key)
+                require_same_body(held.record.measured_by[key.key], key.fingerprint, made="request")
                 return held.record
             if not held.record.state.waiting:
                 message = f"Acceptance test {test_id} is {held.record.state}; a position is measured while it is open."
@@ -281,15 +280,6 @@ class AcceptanceDesk:
             except StorageError:
                 # Whoever waits is told by the record in memory.
                 _log.exception("the end of a measurement could not be put on record", acceptance=str(held.record.id))
-
-
-def _require_same(fingerprint: str, key: RequestKey) -> None:
-    if fingerprint != key.fingerprint:
-        message = (
-            "This Idempotency-Key was sent before with another request body. "
-            "Use a new key for a new request, or repeat the first body unchanged."
-        )
-        raise IdempotencyError(message)
 
 
 def _same_calibration(record: AcceptanceRecord, rig: Rig) -> Calibration:

@@ -15,14 +15,13 @@ from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
     CalibrationStateError,
-    IdempotencyError,
     SlrigError,
     UnsupportedByDeviceError,
 )
 from slrig.scan.folder import DataFolder
 from slrig.scan.holding import RigFacts, check_plan
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import Clock
+from slrig.scan.records import Clock, require_same_body
 from slrig.scan.work import Holder, RunnerStatus
 from slrig.sessions.calibration.pose_answering import PoseAnswers, board_of, opened
 from slrig.sessions.calibration.records import KeptKey, PoseRecord, PoseState, SessionRecord, SessionState
@@ -277,12 +276,7 @@ def _kept(record: SessionRecord, request: PoseRequest) -> int | None:
     kept = None if request.key is None else record.keys.get(request.key)
     if kept is None:
         return None
-    if kept.fingerprint != request.fingerprint:
-        message = (
-            "This Idempotency-Key was sent before with another request body. "
-            "Use a new key for a new pose, or repeat the first body unchanged."
-        )
-        raise IdempotencyError(message)
+    require_same_body(kept.fingerprint, request.fingerprint, made="pose")
     return kept.pose
 
 
