@@ -11,7 +11,7 @@ from slrig.calibration.boards.blobs import neighbours_in_steps
 from slrig.calibration.boards.board_map import BoardMap, fitted_map
 from slrig.calibration.boards.grey import Grey
 from slrig.calibration.boards.grid_fit import PlacedCorners, placed_corners
-from slrig.calibration.boards.lattice import Lattice
+from slrig.calibration.boards.lattice import Lattice, levels_at
 from slrig.model import FloatArray, IntArray
 
 _SEARCHES_PX = (640, 1280)
@@ -125,7 +125,7 @@ def _crossing(level: FloatArray, board_map: BoardMap, corner: IntArray) -> Float
     varies within the squares. All have one sign at a crossing. NaN where a square lies out of view.
     """
     centres = _places(corner)[:, None] + _MIDDLES
-    squares = _at(level, board_map(centres[:, :, None] + _WITHIN))
+    squares = levels_at(level, board_map(centres[:, :, None] + _WITHIN))
     middle, spread = squares.mean(axis=-1), squares.std(axis=-1).mean(axis=-1)
     row, column = np.divmod(corner, _SIDE)
     sign = np.where((row + column) % 2 == 0, 1.0, -1.0)[:, None]
@@ -136,23 +136,14 @@ def _crossing(level: FloatArray, board_map: BoardMap, corner: IntArray) -> Float
 def _round(level: FloatArray, board_map: BoardMap, corner: IntArray) -> bool:
     """Whether the dark squares are light at their tips: then they are circles."""
     centres = _places(corner) + 0.5
-    middles = _at(level, board_map(centres))
-    tips = _at(level, board_map(centres[:, None] + _TIPS)).mean(axis=1)
+    middles = levels_at(level, board_map(centres))
+    tips = levels_at(level, board_map(centres[:, None] + _TIPS)).mean(axis=1)
     good = np.isfinite(middles) & np.isfinite(tips)
     if good.sum() < 4:
         return False
     threshold = (np.percentile(middles[good], 90) + np.percentile(middles[good], 10)) / 2
     dark = good & (middles < threshold)
     return bool(dark.any() and np.median(tips[dark]) > threshold)
-
-
-def _at(level: FloatArray, places_px: FloatArray) -> FloatArray:
-    """(...) float64: grey levels at places (..., 2) by the nearest pixel, NaN outside the image."""
-    x, y = np.round(places_px[..., 0]), np.round(places_px[..., 1])
-    height, width = level.shape
-    inside: NDArray[np.bool_] = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    found = level[np.where(inside, y, 0).astype(np.int64), np.where(inside, x, 0).astype(np.int64)]
-    return np.asarray(np.where(inside, found, np.nan))
 
 
 def holds_markers(level: FloatArray, lattice: Lattice) -> bool:
@@ -162,7 +153,7 @@ def holds_markers(level: FloatArray, lattice: Lattice) -> bool:
         return False
     x, y = np.meshgrid(np.arange(lattice.columns - 1) + 0.5, np.arange(lattice.rows - 1) + 0.5)
     centres = np.stack([x.ravel(), y.ravel()], axis=-1)
-    squares = _at(level, board_map(centres[:, None] + _WITHIN))
+    squares = levels_at(level, board_map(centres[:, None] + _WITHIN))
     odd = (np.floor(x) + np.floor(y)).ravel() % 2 == 1
     spread, high = squares.std(axis=1), squares.max(axis=1)
     light, dark = (odd, ~odd) if np.nanmedian(high[odd]) > np.nanmedian(high[~odd]) else (~odd, odd)

@@ -98,10 +98,9 @@ def right_handed(grid: FloatArray) -> FloatArray:
 
 
 def levels_at(level: FloatArray, places_px: FloatArray) -> FloatArray:
-    """(n,) float64: grey levels at places (n, 2), NaN outside the image."""
-    place = np.round(places_px).astype(np.int64)
+    """(...) float64: grey levels at places (..., 2) by the nearest pixel, NaN outside the image."""
+    x, y = np.round(places_px[..., 0]), np.round(places_px[..., 1])
     height, width = level.shape
-    inside = (place >= 0).all(axis=1) & (place[:, 0] < width) & (place[:, 1] < height)
-    found = np.full(len(place), np.nan)
-    found[inside] = level[place[inside, 1], place[inside, 0]]
-    return found
+    inside: NDArray[np.bool_] = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    found = level[np.where(inside, y, 0).astype(np.int64), np.where(inside, x, 0).astype(np.int64)]
+    return np.asarray(np.where(inside, found, np.nan))
