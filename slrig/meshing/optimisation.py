@@ -203,8 +203,9 @@ def _scanned(points: Any, faces: Any, across: Any, among: Any, cosine: float, si
                 other = across[face, k]
                 if other > face and (among[face] or among[other]):
                     p, q = faces[face, k + 1 if k < 2 else 0], faces[face, k - 1 if k else 2]
-                    # Which corner cannot be foreseen: reckoned without a jump.
-                    w = faces[other, (across[other, 1] == face) + 2 * (across[other, 2] == face)]
+                    # The corner that p and q leave over. Found by the edge, not by the neighbour: two triangles back
+                    # to back share three edges.
+                    w = faces[other, 0] + faces[other, 1] + faces[other, 2] - p - q
                     for axis in range(3):
                         corners[axis * BLOCK + count] = points[p, axis]
                         corners[(3 + axis) * BLOCK + count] = points[q, axis]
