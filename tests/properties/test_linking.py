@@ -73,7 +73,10 @@ def _take(curve: Growing, number: int, stripe: Stripe, centroid: complex) -> Non
         for theirs in (0, -1):
             line = stripe[theirs] - curve.points[mine]
             facing = direction_of_end(stripe if theirs == 0 else stripe[::-1])
-            joins.append((angle(curve.directions[mine], line) + angle(facing, -line), mine, theirs))
+            # Between ends that touch there is no line: the turn from one direction into the other, which the two angles
+            # add up to for the best of lines.
+            bend = angle(curve.directions[mine], line) + angle(facing, -line)
+            joins.append((bend if line else angle(curve.directions[mine], -facing), mine, theirs))
     best = unique_least([(bend,) for bend, _, _ in joins])
     _, mine, theirs = joins[best]
     u, v = len(curve.points), len(stripe)
@@ -117,6 +120,11 @@ def stripes(draw: st.DrawFn) -> list[Stripe]:
     return found
 
 
+# Ends that touch, of which one is in line with the other and far from the rest.
+@example(
+    [[0j, -1 + 1.2246467991473532e-16j, -1.9761823382088286 - 0.21695170561473867j], [0j, 1 + 0j],
+     [100 + 0j, 101 + 0j, 101.97618233820883 + 0.2169517056147391j, 102.93169360911546 + 0.5119062973240536j]]
+)  # fmt: skip
 # Ends a denormal number apart: the square of their distance underflows, the distance does not.
 @example(
     [[200j, 1 + 200j], [0j, 1 + 0j], [0j, 1.4 + 0j], [0j, 1 + 0j, 1.9761823382088286 + 0.2169517056147391j],
