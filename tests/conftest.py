@@ -6,9 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
+
+# The same draws every time, so that a run fails by the change it tests; --hypothesis-profile=default draws afresh.
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")
 
 # GigE Vision has one port, and a camera on loopback answers whoever asks there.
 _ONE_AT_A_TIME = {
