@@ -89,6 +89,7 @@ class Board:
         self._controls: dict[str, Any] = {}
         self._users: set[str] = set()
         self._closing = threading.Event()
+        self._listener: threading.Thread | None = None
         self._gone: str | None = None
         self._refusal: str | None = None
 
@@ -192,7 +193,10 @@ class Board:
             if self._refusal is not None:
                 raise UnsupportedByDeviceError(self._refusal)
             self._running = dict(self._links)
-            threading.Thread(target=self._listen, args=(queue,), name=f"oak-{self.device_id}", daemon=True).start()
+            self._listener = threading.Thread(
+                target=self._listen, args=(queue,), name=f"oak-{self.device_id}", daemon=True
+            )
+            self._listener.start()
             self._darken()
 
     def _refused(self, cause: Exception) -> None:
@@ -307,6 +311,9 @@ class Board:
             self._shut_down()
         else:
             closing.join(_CLOSE_S)
+        if self._listener is not None:
+            # A thread that comes back from the library when the interpreter has ended takes the program down.
+            self._listener.join(_CLOSE_S)
 
     def _shut_down(self) -> None:
         with suppress(Exception):

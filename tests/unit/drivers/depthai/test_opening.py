@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from drivers.depthai import find_devices, open_camera
+from drivers.depthai.board import Board
 from slrig.devices import CameraSettings, FoundDevice, Trigger
 from slrig.errors import (
     ConfigError,
@@ -110,6 +112,25 @@ def test_a_program_that_leaves_a_camera_open_ends() -> None:
         [sys.executable, "-c", LEAVES_IT_OPEN], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
     )
     assert (ended.returncode, ended.stdout.strip()) == (0, "0.005"), ended.stderr
+
+
+def test_closing_waits_for_the_thread_that_listens(monkeypatch: pytest.MonkeyPatch) -> None:
+    # One that comes back from the library after the interpreter has ended aborts the program.
+    ended = threading.Event()
+    end = Board._end
+
+    def slowly(board: Board, reason: str) -> None:
+        threading.Event().wait(0.3)
+        end(board, reason)
+        ended.set()
+
+    monkeypatch.setattr(Board, "_end", slowly)
+    oak = FakeOak(small_stage())
+    with oak.connected():
+        camera = open_camera("left", {"device": DEVICE, "socket": "CAM_B"}, Path())
+        camera.configure(CameraSettings(0.005))
+        camera.close()
+    assert ended.is_set()
 
 
 def test_a_device_is_known_by_its_address_too() -> None:
