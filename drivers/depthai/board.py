@@ -66,7 +66,7 @@ class Board:
         self._vendor = vendor
         self.device_id: str = info.deviceId or info.name
         self.address: str = info.name
-        _require_one_clock(vendor)
+        require_one_clock(vendor)
         with _told(self.device_id, vendor):
             self._device = vendor.Device(info)
         try:
@@ -342,9 +342,12 @@ def _told(device_id: str, vendor: Any) -> Iterator[None]:
         raise DeviceError(message) from cause
 
 
-def _require_one_clock(vendor: Any) -> None:
-    """Make sure that the library's time stamps count in CLOCK_MONOTONIC."""
-    offset_ns = nanoseconds(vendor.Clock.now()) - time.monotonic_ns()
+def require_one_clock(vendor: Any) -> None:
+    """Make sure that the library's time stamps count in CLOCK_MONOTONIC. Raises DeviceError."""
+    before_ns = time.monotonic_ns()
+    now_ns = nanoseconds(vendor.Clock.now())
+    # On a busy machine this thread may rest between two readings: what lies between them agrees with both.
+    offset_ns = now_ns - min(max(now_ns, before_ns), time.monotonic_ns())
     if abs(offset_ns) > _MOST_CLOCK_OFFSET_NS:
         message = (
             f"the clock of depthai {vendor.__version__} is {offset_ns / 1e6:.0f} ms off CLOCK_MONOTONIC, in which "

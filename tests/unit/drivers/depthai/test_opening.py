@@ -5,14 +5,16 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from drivers.depthai import find_devices, open_camera
-from drivers.depthai.board import Board
+from drivers.depthai.board import Board, require_one_clock
 from slrig.devices import CameraSettings, FoundDevice, Trigger
 from slrig.errors import (
     ConfigError,
@@ -92,6 +94,29 @@ def test_an_unplugged_device_can_be_plugged_in_and_opened_again() -> None:
         camera.arm(1, Trigger.FREE)
         assert camera.read(0, 2.0).image.size
         camera.close()
+
+
+class SlowClock:
+    """Answers with CLOCK_MONOTONIC and an offset; a busy machine lets the thread rest before and after."""
+
+    __version__ = "3.12.0"
+
+    def __init__(self, offset: timedelta) -> None:
+        self.Clock = self
+        self._offset = offset
+
+    def now(self) -> timedelta:
+        threading.Event().wait(0.02)
+        found = timedelta(microseconds=time.monotonic_ns() // 1000) + self._offset
+        threading.Event().wait(0.02)
+        return found
+
+
+@pytest.mark.parametrize("offset_s", [-1.0, 1.0])
+def test_a_clock_of_another_kind_is_refused_however_slow_the_machine(offset_s: float) -> None:
+    require_one_clock(SlowClock(timedelta()))
+    with pytest.raises(DeviceError, match=r"is -?(1000|9\d\d) ms off CLOCK_MONOTONIC"):
+        require_one_clock(SlowClock(timedelta(seconds=offset_s)))
 
 
 LEAVES_IT_OPEN = f"""
