@@ -311,9 +311,6 @@ class Board:
             self._shut_down()
         else:
             closing.join(_CLOSE_S)
-        if self._listener is not None:
-            # A thread that comes back from the library when the interpreter has ended takes the program down.
-            self._listener.join(_CLOSE_S)
 
     def _shut_down(self) -> None:
         with suppress(Exception):
@@ -323,6 +320,9 @@ class Board:
             self._pipeline.wait()
         with suppress(Exception):
             self._device.close()
+        if self._listener is not None:
+            # A thread that comes back from the library when the interpreter has ended takes the program down.
+            self._listener.join()
 
 
 @contextmanager
@@ -344,10 +344,9 @@ def _told(device_id: str, vendor: Any) -> Iterator[None]:
 
 def require_one_clock(vendor: Any) -> None:
     """Make sure that the library's time stamps count in CLOCK_MONOTONIC. Raises DeviceError."""
-    before_ns = time.monotonic_ns()
-    now_ns = nanoseconds(vendor.Clock.now())
-    # On a busy machine this thread may rest between two readings: what lies between them agrees with both.
-    offset_ns = now_ns - min(max(now_ns, before_ns), time.monotonic_ns())
+    # On a busy machine this thread may rest between two readings: what lies between before and after is no offset.
+    before_ns, now_ns, after_ns = time.monotonic_ns(), nanoseconds(vendor.Clock.now()), time.monotonic_ns()
+    offset_ns = now_ns - min(max(now_ns, before_ns), after_ns)
     if abs(offset_ns) > _MOST_CLOCK_OFFSET_NS:
         message = (
             f"the clock of depthai {vendor.__version__} is {offset_ns / 1e6:.0f} ms off CLOCK_MONOTONIC, in which "
