@@ -71,6 +71,10 @@ class UnsupportedByDeviceError(DeviceError):
     """The device understood the request and cannot do it (an exposure out of range, a pattern of another size)."""
 
 
+class WrongSystemError(UnsupportedByDeviceError):
+    """A driver is installed and speaks to its devices by what only another operating system has. Name that system."""
+
+
 class FrameTimeoutError(DeviceError):
     """No frame that qualifies came in time. The device may be well: a late frame is not a lost device."""
 

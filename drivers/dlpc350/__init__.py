@@ -29,12 +29,11 @@ would serve it, the rest would not. The DLPC347x speak I²C.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from drivers.linux import require_linux
 from slrig.devices import FoundDevice, Projector
-from slrig.errors import UnsupportedByDeviceError
 
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
@@ -56,13 +55,13 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceBusyError
         Another program holds it.
     UnsupportedByDeviceError
-        Its flash does not hold what the list says, it does not take a setting, or this is not Linux.
+        Its flash does not hold what the list says, or it does not take a setting.
+    WrongSystemError
+        This is not Linux.
     DeviceError
         It may not be opened, or failed.
     """
-    if sys.platform != "linux":
-        message = f"asked for a light engine on {sys.platform}; this driver needs Linux' /dev/hidraw"
-        raise UnsupportedByDeviceError(message)
+    _require_system()
     from drivers.dlpc350.finding import engines, resolved
     from drivers.dlpc350.flash import read_flash
     from drivers.dlpc350.link import open_link
@@ -76,12 +75,21 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Return the light engines that are plugged in. None of them is opened."""
-    if sys.platform != "linux":
-        return ()
+    """Return the light engines that are plugged in. None of them is opened.
+
+    Raises
+    ------
+    WrongSystemError
+        This is not Linux.
+    """
+    _require_system()
     from drivers.dlpc350.finding import engines, found_devices
 
     return found_devices(engines())
+
+
+def _require_system() -> None:
+    require_linux("dlpc350", through="the kernel's /dev/hidraw*", instead="run slrig on Linux for it")
 
 
 __all__ = ["find_devices", "open_projector"]

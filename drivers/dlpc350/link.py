@@ -14,7 +14,6 @@ What does not fit goes on in further reports without a header. One command is un
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import select
 import struct
@@ -186,6 +185,9 @@ def open_link(path: Path, *, answer_s: float = ANSWER_S) -> Link:
     DeviceError
         It may not be opened.
     """
+    # Late, so that what looks at this module on another system is not refused.
+    import fcntl
+
     try:
         handle = os.open(path, os.O_RDWR | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
@@ -213,6 +215,8 @@ def open_link(path: Path, *, answer_s: float = ANSWER_S) -> Link:
 
 def _require_engine(handle: int, path: Path) -> None:
     """Compare vendor and product of an open node: numbers of nodes are given again after an unplug."""
+    import fcntl
+
     answer = bytearray(8)
     try:
         fcntl.ioctl(handle, _RAW_INFO, answer)

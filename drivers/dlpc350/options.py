@@ -26,38 +26,49 @@ class Colour(IntEnum):
     WHITE = 7
 
 
-class EngineOptions(Strict):
-    """The keys of a `[projector]` table with `driver = "dlpc350"`.
-
-    patterns : a folder with the list of the pictures in the engine's flash (`images.json`) and these pictures, from the
-        rig file's own. There need not be one yet: `load` writes the pictures that it lacks into `to_flash` there.
-    device : what `slrig devices` lists, or a path (`/dev/hidraw0`); else the only engine that is plugged in.
-    led : white, red, green, blue, yellow, cyan or magenta.
-    led_current : current of these LEDs, as a share of the board's most. led_current_limit : no more than this, whatever
-        led_current says. duty_limit : light is on for no more than this share of the time while a sequence is played.
-    led_current_inverted : True where 255 switches an LED off and 0 gives it the most current, with the polarity
-        register at "normal": so it was found on the LightCrafter 4500 (TI forum, thread 451589), unlike in the manual.
-    hold_s : a shown pattern goes dark after this long by itself.
-    image_load_s : from the command to start until light, at the most: the engine loads a picture from its flash.
-    light_margin_s : in a played sequence, light lasts this much longer than the exposure.
-    trigger_polarity : "high" where TRIG_OUT_1 rises as the pattern's light begins. trigger_delay_us : how much later it
-        does; -20.05 to +2.78 µs.
-    standby : put the engine into standby when it is closed; it is woken when opened, in any case.
-    """
+class EngineOptions(Strict, use_attribute_docstrings=True):
+    """The keys of a `[projector]` table with `driver = "dlpc350"`."""
 
     patterns: Annotated[str, Field(min_length=1)]
+    """A folder with the list of the pictures in the engine's flash (`images.json`) and these pictures, from the rig
+    file's own. There need not be one yet: a scan then writes the pictures that it lacks into `to_flash` there."""
+
     device: Annotated[str, Field(min_length=1)] | None = None
+    """What `slrig devices` lists, or a path (`/dev/hidraw0`); else the only engine that is plugged in."""
+
     led: Literal["white", "red", "green", "blue", "yellow", "cyan", "magenta"] = "white"
+    """The LEDs that patterns are lit with."""
+
     led_current: Share = 0.3
+    """Current of these LEDs, as a share of the board's most."""
+
     led_current_limit: Share = 0.5
+    """No more current than this, whatever led_current says."""
+
     led_current_inverted: bool = True
+    """True where 255 switches an LED off and 0 gives it the most current, with the polarity register at "normal": so it
+    was found on the LightCrafter 4500 (TI forum, thread 451589), unlike in the manual."""
+
     duty_limit: Share = 1.0
+    """Light is on for no more than this share of the time while a sequence is played."""
+
     hold_s: Annotated[float, Field(ge=2, le=200)] = 30.0
+    """A shown pattern goes dark after this long by itself."""
+
     image_load_s: Annotated[float, Field(ge=0, le=5)] = 0.2
+    """From the command to start until light, at the most: the engine loads a picture from its flash."""
+
     light_margin_s: Annotated[float, Field(ge=0, le=1)] = 0.0005
+    """In a played sequence, light lasts this much longer than the exposure."""
+
     trigger_polarity: Literal["high", "low"] = "high"
+    """Which way TRIG_OUT_1 goes as the pattern's light begins: high, it rises; low, it falls."""
+
     trigger_delay_us: Annotated[float, Field(ge=-20.05, le=2.78)] = 0.0
+    """How much later than the light TRIG_OUT_1 changes."""
+
     standby: bool = False
+    """Put the engine into standby when it is closed; it is woken when opened, in any case."""
 
     @model_validator(mode="after")
     def _within_limits(self) -> Self:

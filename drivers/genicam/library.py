@@ -45,22 +45,27 @@ def library() -> Library:
     except (ImportError, ValueError, AttributeError) as cause:
         install = install_command()
         message = (
-            f"the genicam driver needs Aravis 0.8 and PyGObject, found: {cause}; on Debian or Ubuntu: {install} (other "
-            "systems: install Aravis with its introspection data, then the extra)"
+            f"the genicam driver needs Aravis 0.8 and PyGObject, found: {cause}; on Debian or Ubuntu: "
+            f"{install_command(system='linux')} (other systems: install Aravis with its introspection data, then the "
+            "extra)"
         )
         raise LibraryMissingError(message, install=install) from cause
     return Library(aravis, error)
 
 
-def install_command(python: tuple[int, int] = sys.version_info[:2]) -> str:
-    """Return the command that installs what is missing, for a version of Python.
+def install_command(python: tuple[int, int] = sys.version_info[:2], system: str = sys.platform) -> str:
+    """Return the command that installs what is missing, for a version of Python and a system as `sys.platform` has it.
 
     PyGObject from 3.51 on builds against girepository 2.0, which came after the systems with Python 3.11 and 3.12;
     the extra asks for an older PyGObject there.
 
     >>> "libgirepository1.0-dev" in install_command((3, 11)), "libgirepository-2.0-dev" in install_command((3, 13))
     (True, True)
+    >>> install_command(system="win32")
+    "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
     """
+    if system != "linux":
+        return "pip install 'slrig[genicam]' (Aravis with its introspection data first)"
     introspection = "libgirepository-2.0-dev" if python >= (3, 13) else "libgirepository1.0-dev"
     return f"sudo apt install gir1.2-aravis-0.8 {introspection} {_BUILDS} && pip install 'slrig[genicam]'"
 

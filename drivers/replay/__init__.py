@@ -25,15 +25,14 @@ __all__ = ["ReplayCamera", "ReplayClock", "ReplayHead", "ReplayOptions", "Replay
 _SPEEDS = (0.05, 1000.0)
 
 
-class ReplayOptions(Strict):
-    """The `[head]` table of a replayed rig.
-
-    bundle : the folder, from the rig file's own.
-    speed : 1 takes as long as the recording did, 2 half of that; 0, or none, goes as fast as the machine can.
-    """
+class ReplayOptions(Strict, use_attribute_docstrings=True):
+    """The `[head]` table of a replayed rig."""
 
     bundle: str = Field(min_length=1)
+    """The folder of the recording, from the rig file's own."""
+
     speed: float = 0.0
+    """1 takes as long as the recording did, 2 half of that, 0.05 to 1000; 0 goes as fast as the machine can."""
 
     @field_validator("speed")
     @classmethod

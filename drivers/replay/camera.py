@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings
+from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings
 from slrig.devices import Trigger as TriggerKind
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Black, Frame, Pattern, Shot
@@ -43,6 +43,7 @@ class ReplayCamera:
             # A recording that does not tell its exposure agrees with every one.
             exposure_range_s=(exposures[0], exposures[-1]) if exposures else (1e-6, 3600.0),
             gain_range=(1.0, 1.0),
+            limits=COMPUTED,
         )
         self._applied = AppliedSettings(exposures[0] if exposures else 0.01, 1.0)
         self._clock = clock

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import ProjectorInfo, Shown
+from slrig.devices import COMPUTED, ProjectorInfo, Shown
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, White
 
@@ -23,6 +23,7 @@ class ReplayProjector:
             size=bundle.capture.projector,
             plays=False,
             latency_s=0.0,
+            limits=COMPUTED,
         )
         self._recorded = tuple(dict.fromkeys(bundle.capture.patterns))
         self._cameras = cameras

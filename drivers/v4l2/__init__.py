@@ -5,12 +5,11 @@ Linux only. Free-running: V4L2 has no software trigger. Needs no library beyond 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from drivers.linux import require_linux
 from slrig.devices import Camera, FoundDevice
-from slrig.errors import UnsupportedByDeviceError
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
@@ -34,13 +33,13 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     DeviceBusyError
         Another program streams from it.
     UnsupportedByDeviceError
-        It cannot do what the options ask, or this is not Linux.
+        It cannot do what the options ask.
+    WrongSystemError
+        This is not Linux.
     DeviceError
         It may not be opened, or failed.
     """
-    if sys.platform != "linux":
-        message = f"camera '{name}': asked for V4L2 on {sys.platform}, which only Linux has; use the driver 'opencv'"
-        raise UnsupportedByDeviceError(message)
+    _require_system()
     from drivers.v4l2.camera import V4L2Camera
     from drivers.v4l2.options import checked
 
@@ -49,12 +48,21 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Return the cameras that are plugged in, each under a name that stays the same and that no other has."""
-    if sys.platform != "linux":
-        return ()
+    """Return the cameras that are plugged in, each under a name that stays the same and that no other has.
+
+    Raises
+    ------
+    WrongSystemError
+        This is not Linux.
+    """
+    _require_system()
     from drivers.v4l2.finding import found_devices, nodes
 
     return found_devices(nodes())
+
+
+def _require_system() -> None:
+    require_linux("v4l2", through="the kernel's video interface", instead="use the driver 'opencv'")
 
 
 __all__ = ["find_devices", "open_camera"]

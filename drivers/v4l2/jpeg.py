@@ -174,9 +174,9 @@ def _lookup(lengths: bytes, values: bytes) -> NDArray[np.uint16]:
 @cache
 def _walker() -> Callable[..., int]:
     # Imported here: most cameras send no JPEG, and numba takes its time.
-    import numba
+    from slrig.kernels import kernel
 
-    walker: Callable[..., int] = numba.njit(cache=True, nogil=True)(_walk)
+    walker: Callable[..., int] = kernel(_walk, in_every_scan=False)
     return walker
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import errno
-import fcntl
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -264,6 +263,9 @@ def open_node(node: Path) -> int:
 
 def ask(handle: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
     """Send a request; the answer is written into `argument`. Raises OSError."""
+    # Late, so that what looks at this module on another system is not refused.
+    import fcntl
+
     while True:
         try:
             fcntl.ioctl(handle, request, argument)

@@ -15,36 +15,48 @@ from slrig.model import Size
 Extent = Annotated[int, Field(ge=1, le=65_536)]
 
 
-class V4L2Options(Strict):
-    """The keys of a `[[camera]]` table with `driver = "v4l2"` (beside name, exposure_s and gain).
-
-    device : what `slrig devices` lists, or a path (`/dev/video0`, `/dev/v4l/by-path/…`).
-    pixel_format : four characters as `v4l2-ctl --list-formats` writes them; else the best that the device offers
-        (`formats.PREFERRED`). size_px : [width, height]; else the largest. frame_rate_hz : else as the device is set.
-    bit_depth : how many low bits of a 16-bit sample the sensor fills (Y16 and 16-bit Bayer only); else all of them.
-    limited_luma : True where the camera sends luma as 16 to 235 (YUV formats): it is spread to 0 to 255.
-    buffers : frames that the kernel may hold; a frame waits there for at most so many frame periods.
-    settle_frames : frames discarded after the stream starts, until the settings have taken effect.
-    gain_unity : the value of the gain control at which the sensor's gain is 1, where gain grows in proportion to it.
-    focus : value of the focus control; autofocus is off in any case.
-    controls : further controls by the name that `v4l2-ctl --list-ctrls` gives them.
-    readout_s : from the first row's end of exposure to the last one's arrival; else a frame period, the most it can be.
-    stamp_delay_s : how much later than it says the camera stamps its frames, where that was measured.
-    """
+class V4L2Options(Strict, use_attribute_docstrings=True):
+    """The keys of a `[[camera]]` table with `driver = "v4l2"` (beside name, exposure_s and gain)."""
 
     device: Annotated[str, Field(min_length=1)]
+    """What `slrig devices` lists, or a path (`/dev/video0`, `/dev/v4l/by-path/…`)."""
+
     pixel_format: Annotated[str, Field(min_length=3, max_length=4)] | None = None
+    """Four characters as `v4l2-ctl --list-formats` writes them; else the best that the device offers: linear before
+    encoded, grey before colour, deep before shallow."""
+
     size_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
+    """[width, height]; else the largest."""
+
     frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)] | None = None
+    """Frames per second; else as the device is set."""
+
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
+    """How many low bits of a 16-bit sample the sensor fills (Y16 and 16-bit Bayer only); else all of them."""
+
     limited_luma: bool = False
+    """True where the camera sends luma as 16 to 235 (YUV formats): it is spread to 0 to 255."""
+
     buffers: Annotated[int, Field(ge=2, le=32)] = 4
+    """Frames that the kernel may hold; a frame waits there for at most so many frame periods."""
+
     settle_frames: Annotated[int, Field(ge=1, le=1000)] = 5
+    """Frames discarded after the stream starts, until the settings have taken effect."""
+
     gain_unity: Annotated[int, Field(ge=1)] | None = None
+    """The value of the gain control at which the sensor's gain is 1, where gain grows in proportion to it."""
+
     focus: int | None = None
+    """Value of the focus control; autofocus is off in any case."""
+
     controls: dict[str, int] = Field(default_factory=dict)
+    """Further controls by the name that `v4l2-ctl --list-ctrls` gives them."""
+
     readout_s: Annotated[float, Field(ge=0, le=60)] | None = None
+    """From the first row's end of exposure to the last one's arrival; else a frame period, the most it can be."""
+
     stamp_delay_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    """How much later than it says the camera stamps its frames, where that was measured."""
 
     @field_validator("pixel_format")
     @classmethod

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from slrig.errors import StorageError
 
+_WINDOWS = os.name == "nt"
 _REMEDIES = {
     errno.ENOSPC: "free some space there",
     errno.EDQUOT: "free some space there",
@@ -48,8 +49,18 @@ def write_durably(path: Path, data: bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to disk."""
-    handle = os.open(folder, os.O_RDONLY)
+    """Bring the names in a folder to disk. Windows opens no folder, and keeps a journal of its names."""
+    if not _WINDOWS:
+        _sync(folder, os.O_RDONLY)
+
+
+def sync_file(file: Path) -> None:
+    """Bring a file to disk. Windows does that only for who may write it."""
+    _sync(file, os.O_RDWR if _WINDOWS else os.O_RDONLY)
+
+
+def _sync(path: Path, flags: int) -> None:
+    handle = os.open(path, flags)
     try:
         os.fsync(handle)
     finally:

@@ -35,6 +35,10 @@ class Session:
         """How long to wait for a frame of this camera."""
         return self.timeout_s + self.applied[name].exposure_s if name in self.applied else self.timeout_s
 
+    def computed(self, name: str) -> bool:
+        """Whether this camera's frames are rendered or replayed: it has no cable."""
+        return self.rig.cameras[name].info.limits.computed
+
     def stop_if_cancelled(self, index: int) -> None:
         """Raise ScanCancelledError if somebody asked for it."""
         if self.cancelled():

@@ -88,7 +88,8 @@ def _taken(session: Session, name: str, shown: Shown, after_ns: int, last: dict[
     except FrameTimeoutError as error:
         cause = (
             f"no frame came within {timeout_s:.3f} s of its light, visible since {shown.t_visible_ns} ns "
-            f"± {shown.t_err_ns} ns ({error}); check the camera's cable, bandwidth and trigger"
+            f"± {shown.t_err_ns} ns ({error}); "
+            + ("is the machine busy?" if session.computed(name) else "check the camera's cable, bandwidth and trigger")
         )
         return _Taken(shown.index, name, None, cause)
     fault = session.own_fault(frame, after_ns, last.get(name))

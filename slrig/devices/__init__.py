@@ -2,12 +2,16 @@
 
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
+from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
 from slrig.devices.positioner import Positioner, Positions
 from slrig.devices.projector import Projector, ProjectorInfo, Shown
 from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
 __all__ = [
+    "COMPUTED",
+    "USUAL",
     "AppliedSettings",
+    "CallLimits",
     "Camera",
     "CameraInfo",
     "CameraSettings",
@@ -24,4 +28,6 @@ __all__ = [
     "Synchronisation",
     "SystemClock",
     "Trigger",
+    "progress_heard",
+    "progress_reporter",
 ]

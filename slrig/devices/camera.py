@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
+from slrig.devices.limits import USUAL, CallLimits
 from slrig.model import CameraFormat, Frame
 
 
@@ -19,7 +20,10 @@ class Trigger(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """Declared data about a camera. `triggers` are the ways in which an exposure can be started."""
+    """Declared data about a camera. `triggers` are the ways in which an exposure can be started.
+
+    `limits` say how long its calls may take.
+    """
 
     name: str
     model: str
@@ -28,6 +32,7 @@ class CameraInfo:
     triggers: frozenset[Trigger]
     exposure_range_s: tuple[float, float]
     gain_range: tuple[float, float]
+    limits: CallLimits = USUAL
 
 
 @dataclass(frozen=True, slots=True)

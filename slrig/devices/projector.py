@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from slrig.devices.limits import USUAL, CallLimits
 from slrig.model import PatternSequence, Size
 
 
@@ -14,7 +15,7 @@ class ProjectorInfo:
 
     `plays` says whether it can step through a loaded sequence by itself, triggering the cameras by wire.
     `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
-    is steady over whole ones only; None where exposures may have any length.
+    is steady over whole ones only; None where exposures may have any length. `limits` say how long its calls may take.
     """
 
     name: str
@@ -24,6 +25,7 @@ class ProjectorInfo:
     plays: bool
     latency_s: float
     refresh_s: float | None = None
+    limits: CallLimits = USUAL
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import structlog
@@ -27,6 +28,7 @@ from slrig.devices import (
     Rig,
     Shown,
     Trigger,
+    progress_heard,
 )
 from slrig.errors import (
     DeviceBusyError,
@@ -43,13 +45,7 @@ OPEN = "open"
 """The step of opening a whole rig."""
 
 OPEN_LIMIT_S = 60.0
-"""How long opening a rig may take: network cameras are looked for, some projectors boot."""
-
-CALL_LIMIT_S = 30.0
-"""How long a call may take: a sequence is sent over a slow wire, a camera's streams are set up."""
-
-READ_SLACK_S = 5.0
-"""How much longer than twice its time-out a read may take."""
+"""How long opening a rig may take without telling of progress: network cameras are looked for, some projectors boot."""
 
 LOOK_S = 0.5
 """How often the watchdog looks."""
@@ -63,21 +59,32 @@ _Value = TypeVar("_Value")
 
 @dataclass(slots=True)
 class Call:
-    """A call of a device that is under way. `late` : how often it was found to be; `given_up` : nobody waits for it."""
+    """A call of a device that is under way. `since_s` : when it was begun, or last told how far it is; `doing` : what
+    it told; `late` : how often it was found to be; `given_up` : nobody waits for it.
+    """
 
     device: str
     step: str
     limit_s: float
     since_s: float
+    computed: bool = False
+    doing: str = ""
     late: int = 0
     given_up: bool = False
 
     def hangs(self) -> str:
         """What to tell of a call that does not return."""
+        what = f"{self.device}: its driver has not come back from {self.step} for {self.limit_s:.0f} s"
+        if self.computed:
+            return f"{what}, nor told how far it is; restart the service, and report this to the driver's maintainer"
+        if self.step == OPEN:
+            return (
+                f"{what}, nor told how far it is; restart the service, after unplugging and plugging in again what of "
+                "the rig is on a cable, and report this to the driver's maintainer"
+            )
         return (
-            f"{self.device}: its driver has not come back from {self.step} for {self.limit_s:.0f} s and does not keep "
-            "its time-out; unplug the device, plug it in again and scan again; if that is refused, restart the "
-            "service, and report this to the driver's maintainer"
+            f"{what} and does not keep its time-out; unplug the device, plug it in again and scan again; if that is "
+            "refused, restart the service, and report this to the driver's maintainer"
         )
 
 
@@ -90,8 +97,10 @@ class Calls:
         self.failure: DeviceError | None = None
         """The last error of a device that leaves its state unknown, also where whoever called passed over it."""
 
-    def make(self, device: str, step: str, limit_s: float, function: Callable[[], _Value]) -> _Value:
-        """Call a device.
+    def make(
+        self, device: str, step: str, limit_s: float, function: Callable[[], _Value], *, computed: bool = False
+    ) -> _Value:
+        """Call a device. It may take limit_s without telling how far it is. computed : see `CallLimits`.
 
         Raises
         ------
@@ -104,14 +113,19 @@ class Calls:
         DeviceError
             The call took so long that it was given up; nobody waits for its result any more.
         """
-        call = self._current = Call(device, step, limit_s, self._now_s())
+        call = self._current = Call(device, step, limit_s, self._now_s(), computed)
+
+        def heard(doing: str) -> None:
+            call.doing, call.since_s, call.late = doing, self._now_s(), 0
+
         try:
-            value = function()
+            with progress_heard(heard):
+                value = function()
         except SlrigError as error:
             self._note(_placed(error, device, step))
             raise
         except OSError as error:
-            told = _of_the_system(error, device, step)
+            told = _of_the_system(error, call)
             self._note(told)
             raise told from error
         except Exception as error:
@@ -141,6 +155,12 @@ class Calls:
         call.late += 1
         call.given_up = call.late > 1
         return call if call.given_up else None
+
+    @property
+    def doing(self) -> str:
+        """What the call under way has told that it is at; "" where it has told nothing."""
+        call = self._current
+        return "" if call is None else call.doing
 
     @property
     def stuck(self) -> Call | None:
@@ -207,8 +227,10 @@ class _GuardedCamera:
         self._made("trigger", self._camera.trigger)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        limit_s = 2 * timeout_s + READ_SLACK_S
-        return self._calls.make(self._device, "read", limit_s, lambda: self._camera.read(after_ns, timeout_s))
+        limits = self._camera.info.limits
+        limit_s = 2 * timeout_s + limits.read_slack_s
+        read = partial(self._camera.read, after_ns, timeout_s)
+        return self._calls.make(self._device, "read", limit_s, read, computed=limits.computed)
 
     def disarm(self) -> None:
         self._made("disarm", self._camera.disarm)
@@ -217,7 +239,8 @@ class _GuardedCamera:
         self._made("close", self._camera.close)
 
     def _made(self, step: str, function: Callable[[], _Value]) -> _Value:
-        return self._calls.make(self._device, step, CALL_LIMIT_S, function)
+        limits = self._camera.info.limits
+        return self._calls.make(self._device, step, limits.call_s, function, computed=limits.computed)
 
 
 class _GuardedProjector:
@@ -250,7 +273,9 @@ class _GuardedProjector:
         self._made("close", self._projector.close)
 
     def _made(self, step: str, function: Callable[[], _Value]) -> _Value:
-        return self._calls.make(f"projector '{self._projector.info.name}'", step, CALL_LIMIT_S, function)
+        info = self._projector.info
+        device = f"projector '{info.name}'"
+        return self._calls.make(device, step, info.limits.call_s, function, computed=info.limits.computed)
 
 
 def _placed(error: SlrigError, device: str, step: str) -> SlrigError:
@@ -264,8 +289,13 @@ def _placed(error: SlrigError, device: str, step: str) -> SlrigError:
     return error
 
 
-def _of_the_system(error: OSError, device: str, step: str) -> DeviceError:
+def _of_the_system(error: OSError, call: Call) -> DeviceError:
     """What the system told a driver, in words that a person can act on."""
+    device, step = call.device, call.step
+    if call.computed:
+        return DeviceError(
+            f"{device} failed in {step}: {error}; check its files and their permissions, then scan again"
+        )
     if error.errno == errno.EBUSY:
         return DeviceBusyError(
             f"{device} is held by another program (in {step}: {error}); end that program, then scan again"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -13,10 +13,11 @@ from slrig.bundle.calibration_file import check_calibration
 from slrig.bundle.description import MOST_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
-from slrig.model import Calibration, PatternSequence, Size
+from slrig.model import Axis, Calibration, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.scan.faults import UNEXPECTED, ScanFault, fault_of
 from slrig.scan.guarding import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
+from slrig.scan.light_axis import played_axes
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.positioning import GuardedPositioner
 
@@ -66,7 +67,7 @@ def driver_errors(rig: str) -> Iterator[None]:
 
 
 class HeldRig:
-    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `active`, `misfit`,
+    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `active`, `calibration`, `misfit`,
     `refuse_misfit`, `give_up` and `darken_from_outside` belong to it.
 
     Whoever sets `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
@@ -102,9 +103,15 @@ class HeldRig:
             self.calls.failure = None
             self.fault = None
         active = self.active
-        if active is None:
-            return self._rig
-        return replace(self._rig, calibration=None if self.misfit(active) else active.calibration)
+        return self._rig if active is None else replace(self._rig, calibration=self._fitting(active))
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What work that is begun now uses: the active one, or else the rig's own; None before the rig was open."""
+        active = self.active
+        if active is not None:
+            return self._fitting(active)
+        return None if self.facts is None else self.facts.calibration
 
     def misfit(self, active: ActiveCalibration) -> CalibrationError | None:
         """Why a calibration cannot be used with the devices of this rig; None if it can, or before it was open."""
@@ -116,6 +123,9 @@ class HeldRig:
         except CalibrationError as error:
             return error
         return None
+
+    def _fitting(self, active: ActiveCalibration) -> Calibration | None:
+        return None if self.misfit(active) else active.calibration
 
     def refuse_misfit(self) -> None:
         """Raise CalibrationError if the calibration in use is for other devices."""
@@ -212,8 +222,11 @@ def _guarded(rig: Rig, calls: Calls) -> Rig:
     return replace(guarded(rig, calls), positioner=positioner)
 
 
-def pattern_sequence(plan: PatternPlan, size: Size) -> PatternSequence:
-    """The patterns that a plan means on a projector of this size. Raises PatternError."""
+def pattern_sequence(
+    plan: PatternPlan, size: Size, calibration: Calibration | None = None, cameras: Iterable[str] = ()
+) -> PatternSequence:
+    """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError."""
+    axes = played_axes(plan.rows, calibration, cameras)
     patterns = scan_patterns(
         size,
         line_shift=plan.line_shift,
@@ -221,23 +234,25 @@ def pattern_sequence(plan: PatternPlan, size: Size) -> PatternSequence:
         line_width_px=plan.line_width_px,
         gray_cell_px=plan.gray_cell_px,
         gray_offset_px=plan.gray_offset_px,
-        rows=plan.rows,
+        rows=Axis.ROW in axes,
+        columns=Axis.COLUMN in axes,
     )
     return encode(patterns, size)
 
 
-def check_plan(plan: ScanPlan, facts: RigFacts) -> int:
-    """Return the bytes that the frames of a scan take on this rig, uncompressed.
+def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
+    """Return the bytes that the frames of a scan take on this rig, uncompressed. calibration : that it is to use.
 
     Raises
     ------
     PatternError
-        The patterns do not fit the projector.
+        The patterns do not fit the projector, or by the calibration they tell no depth.
     UnsupportedByDeviceError
         A camera cannot expose that long, or that briefly, or the frames are more than a bundle holds.
     """
     exposures_s = plan.rising_exposures_s
-    count = len(pattern_sequence(plan.patterns, facts.projector.size)) * max(len(exposures_s), 1)
+    sequence = pattern_sequence(plan.patterns, facts.projector.size, calibration, facts.cameras)
+    count = len(sequence) * max(len(exposures_s), 1)
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0
     for name, camera in facts.cameras.items():

@@ -132,6 +132,7 @@ def play_session(seed: int, engine: Engine, scene: Scene, tallied: Tallied, *, r
         tallied.wrong.append(f"session {seed}: {scene.shown}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interpreter", "sessions"), [("CPython", 8), ("MicroPython", 3)])
 def test_sessions_over_a_bad_line_are_exact(interpreter: str, sessions: int) -> None:
     tallied = Tallied()

@@ -50,7 +50,7 @@ def test_read_that_does_not_return_ends_the_scan(service: ServiceProcess, desk: 
             assert words in record["error"]["detail"]
         assert desk.light[-1] == ("blank", False)
         assert client.get("/rig")["error"] == record["error"]["detail"]
-        assert client.checks() is not None
+        assert client.readiness() is not None
         with pytest.raises(ServiceError, match="has not come back from read"):
             client.start({"if_busy": "queue"})
         hold.go.set()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from slrig.bundle import storage
 from slrig.bundle.storage import write_file
 from slrig.errors import StorageError
 
@@ -49,3 +50,22 @@ def test_an_interruption_leaves_no_partial_file(tmp_path: Path, monkeypatch: pyt
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match=r"nowhere.*create the folder first"):
         write_file(tmp_path / "nowhere" / "a.bin", b"x")
+
+
+def test_windows_is_not_asked_to_open_folders_or_to_sync_what_it_may_not_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[tuple[Path, int]] = []
+    system_open = os.open
+
+    def as_windows(path: Path, flags: int) -> int:
+        assert not path.is_dir()
+        opened.append((path, flags))
+        return system_open(path, flags)
+
+    monkeypatch.setattr(storage, "_WINDOWS", True)
+    monkeypatch.setattr(os, "open", as_windows)
+    (tmp_path / "mesh.ply").write_bytes(b"ply")
+    storage.sync_file(tmp_path / "mesh.ply")
+    storage.sync_folder(tmp_path)
+    assert opened == [(tmp_path / "mesh.ply", os.O_RDWR)]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import errno
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.devices import CameraSettings, Rig, Trigger
+from slrig.devices import CallLimits, CameraSettings, Rig, Trigger, progress_reporter
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -124,6 +124,53 @@ def test_call_is_given_up_at_the_second_look_and_raises_when_it_returns() -> Non
     assert calls.failure is not None
 
 
+def test_a_call_that_tells_how_far_it_is_is_not_hung() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    shown: list[str] = []
+    overdue: list[Call | None] = []
+
+    def opening() -> None:
+        tell = progress_reporter()
+        for share in ("10 %", "60 %", "90 %"):
+            time_s.now_s += 50.0
+            overdue.extend((calls.overdue(), calls.overdue()) if share == "90 %" else (calls.overdue(),))
+            tell(f"tracing light, {share}")
+            shown.append(calls.doing)
+
+    calls.make("rig 'demo'", OPEN, 60.0, opening)
+    assert overdue == [None, None, None, None]
+    assert shown == ["tracing light, 10 %", "tracing light, 60 %", "tracing light, 90 %"]
+    assert calls.doing == ""
+    # Nobody listens outside of a call.
+    progress_reporter()("nothing")
+
+
+def test_limits_are_those_that_a_device_declares_and_nothing_computed_is_unplugged() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    camera = TameCamera()
+    camera.info = replace(camera.info, limits=CallLimits(call_s=200.0, read_slack_s=90.0, computed=True))
+    found: list[Call | None] = []
+
+    def slow(*_: object) -> None:
+        for seconds in (91.0, 2.0):
+            time_s.now_s += seconds
+            found.append(calls.overdue())
+            found.append(calls.overdue())
+
+    camera.read = slow  # type: ignore[assignment, method-assign]
+    rig = guarded(Rig("bench", {"cam0": camera}, TameProjector(), {}), calls)
+    with pytest.raises(DeviceError) as told:
+        rig.cameras["cam0"].read(0, 1.0)
+    assert [call is not None for call in found] == [False, False, False, True]
+    assert "restart the service" in str(told.value)
+    assert "plug" not in str(told.value)
+    with pytest.raises(DeviceError, match="check its files") as refused:
+        calls.make("camera 'cam0'", "read", 1.0, failing(OSError(errno.EIO, "bad")), computed=True)
+    assert "cable" not in str(refused.value)
+
+
 def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
     time_s = Time()
     calls = Calls(now_s=time_s)
@@ -153,9 +200,11 @@ def test_every_call_of_a_device_is_guarded(monkeypatch: pytest.MonkeyPatch) -> N
     made: list[str] = []
     real = calls.make
 
-    def make(device: str, step: str, limit_s: float, function: Callable[[], object]) -> object:
+    def make(
+        device: str, step: str, limit_s: float, function: Callable[[], object], *, computed: bool = False
+    ) -> object:
         made.append(f"{device} {step}")
-        return real(device, step, limit_s, function)
+        return real(device, step, limit_s, function, computed=computed)
 
     monkeypatch.setattr(calls, "make", make)
     rig = guarded(Rig("bench", {"cam0": camera}, projector, {}), calls)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import selectors
-import shutil
 import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,11 +16,11 @@ import pytest
 
 from drivers.serial_projector.device.box import Description, Hardware, HardwareError
 from drivers.serial_projector.device.protocol import Device
+from tests.npm import npm_package
 
 FIRMWARE = Path(__file__).resolve().parents[4] / "drivers" / "serial_projector" / "device"
 RUNNER = Path(__file__).with_name("micropython_box.mjs")
 PACKAGE = "@micropython/micropython-webassembly-pyscript@1.27.0"
-_FETCH_LIMIT_S = 40.0
 LIGHT_US, GAP_US, HOLD_US, LEAST_US = 3000, 2000, 500, 100
 
 
@@ -261,33 +258,5 @@ class MicroPythonEngine:
 
 
 def micropython_package() -> Path:
-    """The folder of MicroPython's interpreter for Node, fetched once into a cache.
-
-    Skips where Node is not installed, which fails on CI, and where the registry cannot be reached.
-    """
-    cache = Path(os.environ.get("SLRIG_TEST_CACHE") or Path(tempfile.gettempdir()) / "slrig-test-micropython")
-    package = cache / "node_modules" / PACKAGE.rpartition("@")[0]
-    if not shutil.which("node") or not shutil.which("npm"):
-        reason = "needs Node 18 or newer with npm, to run MicroPython: apt install nodejs npm"
-        if os.environ.get("CI") == "true":
-            pytest.fail(reason)
-        pytest.skip(reason)
-    if not (package / "micropython.mjs").is_file():
-        refusal = _fetched(cache)
-        if refusal is not None:
-            pytest.skip(f"needs {PACKAGE} from the npm registry, which could not be fetched: {refusal}")
-    return package
-
-
-@functools.cache
-def _fetched(cache: Path) -> str | None:
-    """Fetch the package, once however many tests ask; return why that cannot be done."""
-    cache.mkdir(parents=True, exist_ok=True)
-    command = ["npm", "install", "--no-audit", "--no-fund", "--prefix", str(cache), PACKAGE]
-    try:
-        fetched = subprocess.run(  # noqa: S603 - a program of the system
-            command, capture_output=True, text=True, check=False, timeout=_FETCH_LIMIT_S
-        )
-    except subprocess.TimeoutExpired:
-        return f"no answer in {_FETCH_LIMIT_S:g} s"
-    return fetched.stderr[-300:] if fetched.returncode else None
+    """The folder of MicroPython's interpreter for Node, fetched once into a cache. Skips where it cannot be had."""
+    return npm_package(PACKAGE, "to run MicroPython")

@@ -1,0 +1,28 @@
+"""The check of drivers that speak to a device through the kernel of Linux."""
+
+from __future__ import annotations
+
+import sys
+
+from slrig.errors import WrongSystemError
+
+_NAMES = {"win32": "Windows", "darwin": "macOS"}
+
+
+def require_linux(driver: str, *, through: str, instead: str) -> None:
+    """Raise unless this is Linux and Python has the module `fcntl`, by which it speaks to the kernel.
+
+    Raises
+    ------
+    WrongSystemError
+        It is another system.
+    """
+    found = _NAMES.get(sys.platform, sys.platform)
+    try:
+        import fcntl  # noqa: F401 - it is there, or it is not
+    except ImportError:
+        found += " without fcntl"
+    if found == "linux":
+        return
+    message = f"{driver}: Linux only: it needs {through}, and this is {found}; {instead}"
+    raise WrongSystemError(message)
