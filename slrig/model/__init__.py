@@ -15,6 +15,7 @@ from slrig.model.frames import (
     bracket_fault,
     exposure_groups,
 )
+from slrig.model.light_axis import share_across, triangulated_axis
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, White
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, Pinhole, Size, Solved
 from slrig.model.surfaces import CameraTruth, FlipRule, Mesh, PointCurves, Refusal, Source, Surface, Truth
@@ -51,4 +52,6 @@ __all__ = [
     "White",
     "bracket_fault",
     "exposure_groups",
+    "share_across",
+    "triangulated_axis",
 ]

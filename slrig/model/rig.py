@@ -74,7 +74,7 @@ class Pinhole:
         for name, shape in (("matrix", (3, 3)), ("distortion", (5,)), ("rotation", (3, 3)), ("translation_mm", (3,))):
             array: FloatArray = getattr(self, name)
             if array.shape != shape:
-                message = f"{name}: expected shape {shape}, found {array.shape}; write it as DEVICE in the design"
+                message = f"{name}: expected shape {shape}, found {array.shape}; see slrig.model.Pinhole for a device"
                 raise CalibrationError(message)
             if not np.isfinite(array).all():
                 message = f"{name}: every number must be finite, found {array.tolist()}; calibrate again"

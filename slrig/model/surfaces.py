@@ -52,7 +52,11 @@ class Truth:
 
 
 class Refusal(IntEnum):
-    """Why a camera pixel gave no surface point, one cause each: the first in the walk that refused it."""
+    """Why a camera pixel gave no surface point, one cause each: the first in the walk that refused it.
+
+    The last three say what became of a ray on its way to the light sheet: they meet where the projector has no pixel,
+    behind the camera or the projector, or nowhere that Newton's method finds.
+    """
 
     NONE = 0
     NOT_LIT = 1
@@ -65,6 +69,8 @@ class Refusal(IntEnum):
     SHADOW_EDGE = 8
     DEPTH_EDGE = 9
     OFF_PROJECTOR = 10
+    BEHIND_DEVICE = 11
+    NO_INTERSECTION = 12
 
 
 class FlipRule(StrEnum):

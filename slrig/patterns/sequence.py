@@ -22,12 +22,13 @@ def scan_patterns(
     gray_cell_px: int | None,
     gray_offset_px: int,
     rows: bool,
+    columns: bool = True,
 ) -> tuple[Pattern, ...]:
     """List the patterns of one scan in the order of play.
 
-    White, black; for columns, then for rows if asked: the Gray bits, most significant first, each followed by its
-    inverse, and the n line frames; white, black again. The two pairs of white and black bracket everything that can
-    drift.
+    White, black; for columns, then for rows, as far as they are asked for: the Gray bits, most significant first, each
+    followed by its inverse, and the n line frames; white, black again. The two pairs of white and black bracket
+    everything that can drift.
 
     Parameters
     ----------
@@ -41,8 +42,8 @@ def scan_patterns(
         None stands for ⌊n/2⌋, or 1 without line shift.
     gray_offset_px
         Added to a position before it is cut into cells: moves the cell edges.
-    rows
-        Play the row axis as well.
+    rows, columns
+        The axes to play.
 
     Raises
     ------
@@ -63,7 +64,7 @@ def scan_patterns(
         raise PatternError(message)
     bracket: tuple[Pattern, ...] = (White(), Black())
     middle: list[Pattern] = []
-    for axis in (Axis.COLUMN, Axis.ROW) if rows else (Axis.COLUMN,):
+    for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
         middle.extend(_gray_patterns(axis, size.along(axis), cell_px, gray_offset_px))
         if line_shift:
             middle.extend(LineShift(axis, shift, period_px, line_width_px) for shift in range(period_px))

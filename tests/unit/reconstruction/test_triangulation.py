@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.model import Axis, FloatArray, Source
+from slrig.model import Axis, FloatArray, Pinhole, Refusal, Source
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.triangulation import SheetCurves, camera_projector
 from tests.unit.reconstruction.builders import (
@@ -41,7 +41,7 @@ def one_point_each(points_mm: FloatArray, *, axis: Axis = Axis.COLUMN) -> tuple[
 @pytest.mark.parametrize("axis", list(Axis))
 def test_points_seen_through_two_distorted_lenses_come_back(axis: Axis) -> None:
     ensemble, truth = one_point_each(scattered_points(), axis=axis)
-    curves = camera_projector(ensemble, CAMERA, PROJECTOR, axis)
+    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, axis)
     assert len(curves.points_mm) == len(truth)
     np.testing.assert_allclose(curves.points_mm, truth, rtol=0, atol=1e-6)
     along = opencv_pixels(PROJECTOR, truth)[:, 1 if axis is Axis.COLUMN else 0]
@@ -56,9 +56,9 @@ def test_a_strongly_distorted_projector_is_met_exactly() -> None:
     lit = opencv_pixels(strong, points)
     order = np.argsort(lit[:, 0])
     ensemble = ensemble_of(list(opencv_pixels(CAMERA, points)[order][:, None, :]), lit[order, 0].tolist())
-    curves = camera_projector(ensemble, CAMERA, strong, Axis.COLUMN)
+    curves, _ = camera_projector(ensemble, CAMERA, strong, Axis.COLUMN)
     np.testing.assert_allclose(curves.points_mm, points[order], rtol=0, atol=1e-6)
-    plain = camera_projector(ensemble, CAMERA, replace(strong, distortion=np.zeros(5)), Axis.COLUMN)
+    plain, _ = camera_projector(ensemble, CAMERA, replace(strong, distortion=np.zeros(5)), Axis.COLUMN)
     assert np.abs(plain.points_mm - points[order][: len(plain.points_mm)]).max() > 1.0
 
 
@@ -73,7 +73,7 @@ def on_ball(
 def test_curves_on_a_ball_lie_on_the_ball_in_order_of_rows() -> None:
     rows = np.arange(60.0, 180.0, 1.7)
     columns = [100.0, 131.5, 160.0, 190.25]
-    curves = camera_projector(on_ball(columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = camera_projector(on_ball(columns, rows), CAMERA, PROJECTOR, Axis.COLUMN)
     assert np.abs(BALL.distance_mm(curves.points_mm)).max() < 1e-6
     assert curves.position_px.tolist() == columns
     assert np.diff(curves.offsets).tolist() == [len(rows)] * 4
@@ -91,11 +91,11 @@ def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
         normals=np.stack([np.cos(angle), np.sin(angle)], axis=1),
         sigma_px=rng.uniform(0.01, 0.05, len(ensemble.points_px)),
     )
-    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     moved = []
     for sign in (1, -1):
         aside = ensemble.points_px + sign * ensemble.sigma_px[:, None] * ensemble.normals
-        moved.append(camera_projector(replace(ensemble, points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN).points_mm)
+        moved.append(camera_projector(replace(ensemble, points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN)[0].points_mm)
     np.testing.assert_allclose(curves.deviation_mm, (moved[0] - moved[1]) / 2, rtol=1e-3, atol=1e-7)
     # Depth resolution of the rig: Z²/(f b) per pixel.
     assert 0.5 < np.linalg.norm(curves.deviation_mm, axis=1).mean() / (0.03 * 520**2 / (1400 * 150)) < 2.0
@@ -107,41 +107,74 @@ def test_the_scatter_of_points_is_what_the_deviation_says() -> None:
     rng = np.random.default_rng(3)
     noisy = clean.points_px + rng.normal(0, 0.02, len(rows))[:, None] * clean.normals
     ensemble = replace(clean, points_px=noisy, sigma_px=np.full(len(rows), 0.02))
-    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
-    truth = camera_projector(clean, CAMERA, PROJECTOR, Axis.COLUMN).points_mm
+    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    truth = camera_projector(clean, CAMERA, PROJECTOR, Axis.COLUMN)[0].points_mm
     shift = np.linalg.norm(curves.points_mm - truth, axis=1)
     stated = np.linalg.norm(curves.deviation_mm, axis=1)
     assert np.sqrt(np.mean((shift / stated) ** 2)) == pytest.approx(1.0, rel=0.05)
 
 
-def test_points_behind_a_device_are_left_out() -> None:
+def test_points_behind_a_device_are_left_out_and_say_so() -> None:
+    straight = replace(PROJECTOR, distortion=np.zeros(5))
     ahead = scattered_points(count=20)
-    pixels, lit = opencv_pixels(CAMERA, ahead), opencv_pixels(PROJECTOR, ahead)
-    order = np.argsort(lit[:, 0])
-    # A column far to the wrong side: the ray and the sheet part before the camera and meet behind it.
-    behind = ensemble_of([pixels[order], pixels[order]], [-2500.0, 150.0])
-    curves = camera_projector(behind, CAMERA, PROJECTOR, Axis.COLUMN)
-    assert np.diff(curves.offsets)[0] == 0
+    pixels = opencv_pixels(CAMERA, ahead)
+    # Of a column far to the wrong side the plane is met where the ray is followed backwards.
+    edge = (2500.0 - straight.matrix[0, 2]) / straight.matrix[0, 0]
+    normal = np.array([1.0, 0.0, -edge]) @ straight.rotation
+    rays = opencv_rays(CAMERA, pixels)
+    assert ((straight.centre_mm - CAMERA.centre_mm) @ normal / (rays @ normal) < 0).all()
+    behind = ensemble_of([pixels, pixels], [150.0, 2500.0])
+    curves, cause = camera_projector(behind, CAMERA, straight, Axis.COLUMN)
+    assert np.diff(curves.offsets)[1] == 0
+    assert set(cause[20:].tolist()) == {Refusal.BEHIND_DEVICE}
+    assert np.count_nonzero(cause[:20] == Refusal.NONE) == len(curves.points_mm) > 0
     depth = curves.points_mm @ CAMERA.rotation[2] + CAMERA.translation_mm[2]
     assert (depth > 0).all()
-    turned = replace(PROJECTOR, rotation=np.diag([-1.0, 1.0, -1.0]) @ PROJECTOR.rotation)
-    away = replace(turned, translation_mm=-turned.rotation @ PROJECTOR.centre_mm)
-    assert len(camera_projector(behind, CAMERA, away, Axis.COLUMN).points_mm) == 0
+
+
+def test_points_behind_the_projector_are_left_out_and_say_so() -> None:
+    straight = replace(PROJECTOR, distortion=np.zeros(5))
+    turned = replace(straight, rotation=np.diag([-1.0, 1.0, -1.0]) @ straight.rotation)
+    away = replace(turned, translation_mm=-turned.rotation @ straight.centre_mm)
+    points = scattered_points(count=20)
+    x, _, z = away.rotation @ points.T + away.translation_mm[:, None]
+    # Behind it, but on the plane of a column all the same.
+    column = away.matrix[0, 0] * x / z + away.matrix[0, 2]
+    order = np.argsort(column)
+    ensemble = ensemble_of(list(opencv_pixels(CAMERA, points)[order][:, None, :]), column[order].tolist())
+    curves, cause = camera_projector(ensemble, CAMERA, away, Axis.COLUMN)
+    assert len(curves.points_mm) == 0
+    assert set(cause.tolist()) == {Refusal.BEHIND_DEVICE}
+
+
+def test_a_ray_that_runs_along_its_light_sheet_meets_it_nowhere() -> None:
+    # Both without distortion, and the projector straight ahead of the camera: the baseline lies in the sheet.
+    straight = Pinhole(CAMERA.size, np.array([[1000.0, 0, 320], [0, 1000.0, 240], [0, 0, 1]]), np.zeros(5), np.eye(3),
+                       np.array([0.0, 0.0, 400.0]))  # fmt: skip
+    ahead = replace(straight, translation_mm=np.array([0.0, 0.0, 300.0]))
+    ensemble = ensemble_of([np.array([[320.0, 200.0], [320.0, 300.0], [350.0, 240.0]])], [320.0])
+    curves, cause = camera_projector(ensemble, straight, ahead, Axis.COLUMN)
+    # The third ray leaves the sheet at the camera's own centre.
+    assert cause.tolist() == [Refusal.NO_INTERSECTION, Refusal.NO_INTERSECTION, Refusal.BEHIND_DEVICE]
+    assert len(curves.points_mm) == 0
 
 
 def test_points_lit_by_no_row_of_the_projector_are_left_out() -> None:
     # A projector half as high would not have lit rows below its last.
     rows = np.arange(60.0, 180.0, 5.0)
     cut = replace(PROJECTOR, size=replace(PROJECTOR.size, height_px=121))
-    curves = camera_projector(on_ball([140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
+    curves, cause = camera_projector(on_ball([140.0, 160.0], rows), CAMERA, cut, Axis.COLUMN)
     kept = rows[rows < 120 + 2]
     np.testing.assert_allclose(curves.along_px, np.tile(kept, 2), atol=1e-6)
+    expected = np.where(rows < 120 + 2, Refusal.NONE, Refusal.OFF_PROJECTOR)
+    assert cause.tolist() == np.tile(expected, 2).tolist()
 
 
 def test_unmeasured_pixels_give_no_points() -> None:
     ensemble = on_ball([140.0], np.arange(60.0, 180.0, 5.0))
     ensemble.points_px[3] = np.nan
-    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, cause = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    assert cause.tolist() == [Refusal.NO_INTERSECTION if index == 3 else Refusal.NONE for index in range(24)]
     assert len(curves.points_mm) == 23
     assert np.isfinite(curves.points_mm).all()
 
@@ -149,7 +182,7 @@ def test_unmeasured_pixels_give_no_points() -> None:
 def test_bridges_are_kept_and_stripes_follow_by_row() -> None:
     rows = np.concatenate([np.arange(60.0, 80.0), np.arange(120.0, 150.0), np.arange(95.0, 110.0)])
     ensemble = on_ball([140.0], rows, breaks={0: (19, 49)})
-    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     np.testing.assert_allclose(curves.along_px, np.sort(rows), atol=1e-6)
     assert curves.stripe.tolist() == [0] * 20 + [2] * 15 + [1] * 30
     assert np.flatnonzero(curves.bridge_after).tolist() == [19, 34]
@@ -157,7 +190,7 @@ def test_bridges_are_kept_and_stripes_follow_by_row() -> None:
 
 def test_no_curves_give_no_points() -> None:
     empty = ensemble_of([], [])
-    curves = camera_projector(empty, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = camera_projector(empty, CAMERA, PROJECTOR, Axis.COLUMN)
     assert isinstance(curves, SheetCurves)
     assert len(curves.points_mm) == len(curves.bridge_after) == 0
 

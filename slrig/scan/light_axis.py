@@ -1,0 +1,75 @@
+"""The axis of light that a scan plays and is triangulated by, and what is said where it tells little of depth."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from math import asin, degrees
+
+from slrig.errors import PatternError
+from slrig.model import Axis, Calibration, Pinhole, share_across, triangulated_axis
+
+_NEXT_TO_NONE = 0.01
+LEAST_SHARE = 0.2
+"""A baseline that lies across the stripes by less than this share of it (12°) makes errors five times as large as they
+need be, and what is seen of depth is mostly errors."""
+FAIR_SHARE = 0.5
+"""By this share of it (30°), errors are twice as large as they need be."""
+
+_BOTH = 'Scan with both axes: "rows": true in a request\'s patterns, --rows on the command line'
+
+
+def played_axes(rows: bool | None, calibration: Calibration | None, names: Iterable[str]) -> tuple[Axis, ...]:
+    """The axes that a scan with the cameras `names` plays.
+
+    rows : True plays both, False columns alone; None the one that the calibration asks for, and columns without one.
+
+    Raises
+    ------
+    PatternError
+        Columns alone were asked for, and by the calibration they tell no depth.
+    """
+    if rows:
+        return tuple(Axis)
+    cameras = _known(calibration, names)
+    if calibration is None or not cameras:
+        return (Axis.COLUMN,)
+    if rows is None:
+        return (triangulated_axis(cameras, calibration.projector),)
+    return (chosen_axis((Axis.COLUMN,), cameras, calibration.projector),)
+
+
+def chosen_axis(shown: Collection[Axis], cameras: Sequence[Pinhole], projector: Pinhole | None) -> Axis:
+    """The axis to triangulate by, of those that were shown.
+
+    Raises
+    ------
+    PatternError
+        The only one shown tells no depth. Without a projector the stripes have to be seen before that can be said.
+    """
+    if len(shown) != 1:
+        return triangulated_axis(cameras, projector)
+    (axis,) = shown
+    if projector is not None and share_across(axis, cameras, projector) < LEAST_SHARE:
+        where = "above or below" if axis is Axis.COLUMN else "beside"
+        message = (
+            f"expected patterns across the baseline, found those of {axis}s alone: the camera stands {where} the "
+            f"projector, and light of one {axis} is seen edge on there and tells no depth. {_BOTH}"
+        )
+        raise PatternError(message)
+    return axis
+
+
+def weakness(axis: Axis, shown: Collection[Axis], share: float) -> str | None:
+    """What to say of a scan whose stripes cross the baseline by so small a share; None where that is well."""
+    if share >= FAIR_SHARE:
+        return None
+    cure = _BOTH if len(shown) == 1 else "Both axes were played: turn the projector about its view by 45°"
+    times = f"{1 / share:.1f}" if share > _NEXT_TO_NONE else f"more than {1 / _NEXT_TO_NONE:.0f}"
+    return (
+        f"the light of the {axis}s crosses the baseline at {degrees(asin(share)):.0f}° only, and depth is {times} "
+        f"times as uncertain as it would be across it. {cure}"
+    )
+
+
+def _known(calibration: Calibration | None, names: Iterable[str]) -> list[Pinhole]:
+    return [] if calibration is None else [calibration.cameras[n] for n in names if n in calibration.cameras]
