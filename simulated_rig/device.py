@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script, Staging
 from simulated_rig.tables import checked
 from simulated_rig.world import Flicker, VirtualClock
-from slrig.devices import Camera, Clock, Head, SystemClock
+from slrig.devices import Camera, Clock, Head, SystemClock, progress_reporter
+from slrig.kernels import compilations_told
 from slrig.model import Calibration, Surface, Truth
 
 
@@ -90,6 +92,13 @@ class SimulatedHead:
         """What the options say of the devices, whether or not the head carries it."""
         return self._calibration
 
+    def prepare(self) -> None:
+        """Do what takes long the first time, telling of it: compile kernels, trace the light of what stands there."""
+        tell = progress_reporter()
+        with compilations_told(lambda kernel: tell(f"preparing kernels, first time only: {kernel}")):
+            for name, view in self._views.items():
+                view.prepare(told=partial(_tell_traced, tell, name))
+
     @property
     def positioner(self) -> Staging | None:
         """See `slrig.devices.Positions`. None where the options have no poses."""
@@ -109,6 +118,10 @@ class SimulatedHead:
         return known
 
 
+def _tell_traced(tell: Callable[[str], None], camera: str, share: float) -> None:
+    tell(f"tracing light for camera '{camera}', {share:.0%}")
+
+
 def open_head(options: Mapping[str, object], folder: Path) -> Head:
     """Open the rendered rig described by a rig file's `[head]` table (without its `driver`).
 
@@ -119,7 +132,9 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
     ConfigError
         The options or the scene have faults: all of them, in one message.
     """
-    return simulated_head(options, folder)
+    head = simulated_head(options, folder)
+    head.prepare()
+    return head
 
 
 def simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:

@@ -18,24 +18,27 @@ PROJECTOR = "projector"
 Index = Annotated[int, Field(ge=0)]
 
 
-class Push(Table):
-    """A device's change of pose, in its own frame: X' = turn (X + shift). The stated calibration does not follow.
-
-    device : a camera's name, or "projector". turn_deg : about its x, y and z axis.
-    """
+class Push(Table, use_attribute_docstrings=True):
+    """A device's change of pose, in its own frame: X' = turn (X + shift). The stated calibration does not follow."""
 
     device: Annotated[str, Field(min_length=1)]
+    """A camera's name, or "projector"."""
+
     turn_deg: Triple = (0.0, 0.0, 0.0)
+    """About its x, y and z axis."""
+
     shift_mm: Triple = (0.0, 0.0, 0.0)
+    """Along its x, y and z axis."""
 
 
 class Bump(Push):
-    """A device is bumped when pose number `pose`, from 0, is taken, and stays so: `[[head.faults.bump]]`.
+    """A device is bumped when a pose is taken, and stays so: `[[head.faults.bump]]`.
 
     Whoever goes back to an earlier pose finds it as it was before the bump.
     """
 
     pose: Index
+    """Number of the pose, from 0."""
 
 
 class Drift(Push):
@@ -46,7 +49,10 @@ class Drift(Push):
     """
 
     settle_s: Positive | None = None
+    """Settling time of a drift by time."""
+
     settle_captures: Positive | None = None
+    """How many captures settling takes, of a drift by captures."""
 
     @model_validator(mode="after")
     def _one_clock(self) -> Drift:
@@ -62,17 +68,20 @@ class Drift(Push):
         return 1 - math.exp(-captures / (self.settle_captures or 1.0))
 
 
-class Moving(Table):
-    """What is moved does not stand still while pose number `pose`, from 0, is captured: `[[head.faults.moving]]`.
-
-    shift_mm, turn_deg : from the capture's first pattern to its last one, in `steps` equal steps; the turn is about the
-    world's axes at the object's own origin. pose : absent, every one.
-    """
+class Moving(Table, use_attribute_docstrings=True):
+    """What is moved does not stand still while a pose is captured: `[[head.faults.moving]]`."""
 
     pose: Index | None = None
+    """Number of the pose, from 0; else every one."""
+
     shift_mm: Triple = (0.0, 0.0, 0.0)
+    """From the capture's first pattern to its last one."""
+
     turn_deg: Triple = (0.0, 0.0, 0.0)
+    """The same, about the world's axes at the object's own origin."""
+
     steps: Annotated[int, Field(ge=2, le=200)] = 6
+    """In how many equal steps."""
 
 
 def pushed(device: Pinhole, push: Push, *, share: float = 1.0) -> Pinhole:

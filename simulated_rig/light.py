@@ -12,12 +12,12 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from simulated_rig.transport import Paths
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, Pixels, Size
 
 Float32Array = NDArray[np.float32]
@@ -154,7 +154,7 @@ def _spread(light: FloatArray, blur_px: float) -> Float32Array:
     return np.asarray(upfirdn(_spread_of_one_pixel(blur_px), light, up=NODES_PER_PX), np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _looked_up(table: Float32Array, position: np.float32, margin: np.float32) -> np.float32:
     at = (position + margin) * np.float32(NODES_PER_PX)
     if not (at >= 0) or at >= len(table) - 1:
@@ -185,7 +185,7 @@ def _mirrored(length_px: int, shape: tuple[int, ...]) -> NDArray[np.intp]:
     return around.reshape(-1, per_axis)
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _gather(
     column: Float32Array,
     row: Float32Array,
@@ -228,7 +228,7 @@ def _gather(
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _collected(across: Float32Array, shares: Float32Array, source: NDArray[np.intp]) -> Float32Array:
     """(H, W): rows of samples, filtered down the columns at the pixels."""
     taps, per_axis = shares.shape

@@ -7,9 +7,9 @@ x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, Pinhole
 
 LensArray = NDArray[np.float64]
@@ -26,7 +26,7 @@ def lens_array(device: Pinhole) -> LensArray:
     return np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *device.distortion], np.float64)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def distorted(x: float, y: float, lens: LensArray) -> tuple[float, float]:
     """Where the lens sends the undistorted normalised point (x, y)."""
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
@@ -38,7 +38,7 @@ def distorted(x: float, y: float, lens: LensArray) -> tuple[float, float]:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def undistorted(xd: float, yd: float, lens: LensArray) -> tuple[float, float]:
     """The normalised point that the lens sends to (xd, yd), by Newton's method on the two equations."""
     k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
@@ -62,7 +62,7 @@ def undistorted(xd: float, yd: float, lens: LensArray) -> tuple[float, float]:
     return x, y
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def world_directions(
     u: NDArray[np.float64], v: NDArray[np.float64], lens: LensArray, rotation: NDArray[np.float64]
 ) -> NDArray[np.float64]:

@@ -23,7 +23,7 @@ PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 Row = Triple
 
 
-class Device(Table):
+class Device(Table, use_attribute_docstrings=True):
     """Lens and pose of a camera or the projector.
 
     The pose is either position_mm and target_mm (a look-at, `down` pointing down in the image), or rotation and
@@ -31,15 +31,34 @@ class Device(Table):
     """
 
     size_px: Annotated[tuple[PixelExtent, PixelExtent], Field(strict=False)]
+    """[width, height] of the image."""
+
     focal_px: Annotated[tuple[Positive, Positive], Field(strict=False)]
+    """Focal lengths along x and y."""
+
     principal_px: Pair | None = None
+    """Where the optical axis meets the image; else its middle."""
+
     distortion: Annotated[tuple[float, float, float, float, float], Field(strict=False)] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 as OpenCV has them."""
+
     position_mm: Triple | None = None
+    """Centre of the lens; with target_mm."""
+
     target_mm: Triple | None = None
+    """A point on the optical axis."""
+
     down: Triple = (0.0, 1.0, 0.0)
+    """What points down in the image of a device with position_mm and target_mm."""
+
     rotation: Annotated[tuple[Row, Row, Row], Field(strict=False)] | None = None
+    """From the world to the device, three rows; with translation_mm."""
+
     translation_mm: Triple | None = None
+    """The world's origin, in the device's frame."""
+
     blur_px: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Standard deviation of the lens's Gaussian spread."""
 
     @model_validator(mode="after")
     def _posed(self) -> Device:
@@ -74,24 +93,37 @@ class Device(Table):
 
 
 class ProjectorOptions(Device):
-    """The projector: `[head.projector]`.
-
-    gamma, leak, signal_blur_px : response (see `light.Response`). working_distance_mm : where a white diffuser has
-    unit brightness; absent, the distance from the projector to the world's origin. latency_s : from `show` to light,
-    each time off by at most visible_error_s; then at the next refresh, if the projector has a refresh_hz.
-    flicker_hz, flicker_depth : its light swings about its mean by that fraction, as under a colour wheel.
-    """
+    """The projector: `[head.projector]`. Its response is that of `light.Response`."""
 
     gamma: Annotated[float, Field(gt=0, le=5)] = 1.0
+    """Light grows with the grey value to the power of this."""
+
     leak: Fraction = 0.001
+    """Light of black, as a fraction of white's."""
+
     signal_blur_px: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Standard deviation of the grey values' spread on their way to the pixels (a scaler, an analogue cable)."""
+
     working_distance_mm: Positive | None = None
+    """Where a white diffuser has unit brightness; else the distance from the projector to the world's origin."""
+
     latency_s: NotNegative = 0.02
+    """From `show` to light."""
+
     visible_error_s: NotNegative = 0.0005
+    """Each time, light comes off that by this at most."""
+
     refresh_hz: Positive | None = None
+    """Then light changes at the next refresh only; else at any time."""
+
     flicker_hz: Positive = 120.0
+    """How often its light swings about its mean, as under a colour wheel."""
+
     flicker_depth: Fraction = 0.0
+    """How far it swings, as a fraction of the mean."""
+
     max_patterns: Annotated[int, Field(ge=1)] = 1024
+    """The longest sequence that it takes."""
 
     def response(self) -> Response:
         """Return how grey values become light."""
@@ -99,31 +131,55 @@ class ProjectorOptions(Device):
 
 
 class CameraOptions(Device):
-    """One camera: `[[head.camera]]`.
-
-    exposure_s : what the camera uses until it is configured. Noise and response: see `sensor.Sensor`.
-    trigger_latency_s : from `trigger` to the exposure's start. readout_s : from its end to the delivered frame.
-    period_s : between the starts of free-running exposures; absent, exposure and readout. stamp_error_s : how well
-    the times of a frame are known. buffers : how many finished frames a free-running camera keeps.
-    line_time_s : a rolling shutter's: each row is exposed this much later than the row above it; 0 is a global shutter.
-    """
+    """One camera: `[[head.camera]]`. Its noise is that of `sensor.Sensor`."""
 
     name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_-]+$")]
+    """The rig's name for it."""
+
     bit_depth: Annotated[int, Field(ge=8, le=16)] = 8
+    """Of a sample."""
+
     exposure_s: Positive = 0.0167
+    """What the camera uses until it is configured."""
+
     exposure_min_s: Positive = 1e-5
+    """The shortest exposure that it takes."""
+
     exposure_max_s: Positive = 10.0
+    """The longest exposure that it takes."""
+
     gain_max: Annotated[float, Field(ge=1)] = 16.0
+    """The largest gain that it takes."""
+
     saturation_s: Positive = 0.025
+    """The exposure at which a white diffuser at the working distance, facing a white projector, fills the well."""
+
     full_well_e: Positive = 10000.0
+    """Electrons that a pixel holds."""
+
     read_noise_e: NotNegative = 8.0
+    """Standard deviation of reading a pixel."""
+
     pedestal_dn: NotNegative = 0.0
+    """The value of a dark sample."""
+
     trigger_latency_s: NotNegative = 0.0002
+    """From `trigger` to the exposure's start."""
+
     readout_s: NotNegative = 0.005
+    """From the end of an exposure to the delivered frame."""
+
     period_s: Positive | None = None
+    """Between the starts of free-running exposures; else exposure and readout."""
+
     stamp_error_s: NotNegative = 0.0
+    """How well the times of a frame are known."""
+
     buffers: Annotated[int, Field(ge=1, le=1000)] = 4
+    """How many finished frames a free-running camera keeps."""
+
     line_time_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
+    """A rolling shutter's: each row is exposed this much later than the row above it; 0 is a global shutter."""
 
     @property
     def shutter_skew_s(self) -> float:
@@ -157,69 +213,117 @@ class CameraOptions(Device):
         )
 
 
-class Faults(Table):
-    """What goes wrong, on demand: `[head.faults]`. Frames count from 0 for each camera, from its opening.
-
-    cameras : whom it befalls; absent, all. drop_* : the frame is made and lost. late_frames : delivered late_s late.
-    stale_* : the image of the frame before, under fresh time stamps. corrupt_* : a third of the rows garbled.
-    *_probability : of each frame. jitter_s : each exposure starts, and each frame comes, up to this much later.
-    unplug_camera_at_frame, unplug_projector_at_show : gone from then on. lamp_off : the projector answers and stays
-    dark. light_delay_s : light comes this much later than the projector says. picture : how the patterns lie on the
-    projector; "rotated" is by half a turn. other_display : patterns go to another display, and the projector lights the
-    scene with a desktop; other_display_glow of white is what that display sends to the scene, as a fraction of the
-    projector's. bump : a device is moved at a pose (see `disturbing.Bump`). moving : the object of a pose does not
-    stand still (see `disturbing.Moving`).
-    """
+class Faults(Table, use_attribute_docstrings=True):
+    """What goes wrong, on demand: `[head.faults]`. Frames count from 0 for each camera, from its opening."""
 
     cameras: Names | None = None
+    """Whom it befalls; else all."""
+
     drop_frames: Counts = ()
+    """Frames that are made and lost."""
+
     drop_probability: Fraction = 0.0
+    """That a frame is lost."""
+
     late_frames: Counts = ()
+    """Frames that are delivered late_s late."""
+
     late_s: Positive = 1.0
+    """How late they come."""
+
     stale_frames: Counts = ()
+    """Frames with the image of the frame before, under fresh time stamps."""
+
     stale_probability: Fraction = 0.0
+    """That a frame is stale."""
+
     corrupt_frames: Counts = ()
+    """Frames of which a third of the rows is garbled."""
+
     corrupt_probability: Fraction = 0.0
+    """That a frame is garbled."""
+
     jitter_s: NotNegative = 0.0
+    """Each exposure starts, and each frame comes, up to this much later."""
+
     unplug_camera_at_frame: Count | None = None
+    """The camera is gone from then on."""
+
     unplug_projector_at_show: Count | None = None
+    """The projector is gone from then on."""
+
     lamp_off: bool = False
+    """The projector answers and stays dark."""
+
     light_delay_s: NotNegative = 0.0
+    """Light comes this much later than the projector says."""
+
     picture: Literal["upright", "mirrored", "upside_down", "rotated"] = "upright"
+    """How the patterns lie on the projector; rotated is by half a turn."""
+
     other_display: bool = False
+    """Patterns go to another display, and the projector lights the scene with a desktop."""
+
     other_display_glow: Fraction = 0.0
+    """White that the other display sends to the scene, as a fraction of the projector's."""
+
     bump: Annotated[tuple[Bump, ...], Field(strict=False)] = ()
+    """Devices that are moved at a pose."""
+
     moving: Annotated[tuple[Moving, ...], Field(strict=False)] = ()
+    """Poses of which the object does not stand still."""
 
 
-class HeadOptions(Table):
-    """The `[head]` table without its `driver`.
-
-    scene : a scene file, from the rig file's folder. seed : of all noise. realtime : run by CLOCK_MONOTONIC instead of
-    as fast as possible. samples_per_axis, jitter : sub-pixel samples (see `transport.paths`). ambient : light of the
-    room, as a fraction of the projector's white at the working distance; ambient_flicker_hz, ambient_flicker_depth : it
-    swings about its mean by that fraction (lamps on mains of 50 Hz flicker at 100 Hz). workers : threads that trace.
-    carries_calibration : whether the head knows its own calibration, exactly, but for what `faults.bump` and `drift`
-    do to it. pose, poses : a script for the scene's board, or another object, listed, made up, or both, in this order;
-    the first is taken at the start. drift : devices that move slowly (see `disturbing.Drift`).
-    """
+class HeadOptions(Table, use_attribute_docstrings=True):
+    """The `[head]` table of a rendered rig without its `driver`."""
 
     scene: Annotated[str, Field(min_length=1)]
+    """A scene file, from the rig file's folder."""
+
     seed: Count = 1
+    """Of all noise."""
+
     realtime: bool = False
+    """Run by the clock instead of as fast as possible."""
+
     samples_per_axis: Annotated[int, Field(ge=1, le=16)] = 2
+    """Sub-pixel samples along x and along y."""
+
     jitter: bool = False
+    """Samples lie anywhere in their cells instead of in the middles."""
+
     ambient: NotNegative = 0.0
+    """Light of the room, as a fraction of the projector's white at the working distance."""
+
     ambient_flicker_hz: Positive = 100.0
+    """How often it swings about its mean (lamps on mains of 50 Hz: 100 Hz)."""
+
     ambient_flicker_depth: Fraction = 0.0
+    """How far it swings, as a fraction of the mean."""
+
     workers: Annotated[int, Field(ge=1, le=64)] = 2
+    """Threads that trace."""
+
     projector: ProjectorOptions
+    """The projector."""
+
     camera: Annotated[tuple[CameraOptions, ...], Field(strict=False), AfterValidator(at_least_one)]
+    """The cameras, one or more."""
+
     faults: Faults = Faults()
+    """What goes wrong, on demand."""
+
     carries_calibration: bool = True
+    """Whether the head knows its own calibration, exactly, but for what faults.bump and drift do to it."""
+
     pose: Annotated[tuple[Pose, ...], Field(strict=False)] = ()
+    """A script for the scene's board, or another object, listed; the first pose is taken at the start."""
+
     poses: PoseSeries | None = None
+    """The same, made up; after those that are listed."""
+
     drift: Annotated[tuple[Drift, ...], Field(strict=False)] = ()
+    """Devices that move slowly."""
 
     @field_validator("camera")
     @classmethod

@@ -29,35 +29,46 @@ _SIDES = (1, 5, 3, 7, 0, 4, 2, 6)
 """Eighths of a turn: corners are odd."""
 
 
-class Pose(Table):
-    """One pose: `[[head.pose]]`.
-
-    object : the name of what is moved; absent, the scene's board. position_mm, rotation_deg : as of an object of a
-    scene. name : absent, "pose N" counted from 1.
-    """
+class Pose(Table, use_attribute_docstrings=True):
+    """One pose: `[[head.pose]]`. Position and rotation are as of an object of a scene."""
 
     name: str = ""
+    """What it is called; else "pose N" counted from 1."""
+
     object: str | None = None
+    """The name of what is moved; else the scene's board."""
+
     position_mm: Triple
+    """Where its origin is."""
+
     rotation_deg: Triple = (0.0, 0.0, 0.0)
+    """How it is turned."""
 
 
-class PoseSeries(Table):
-    """Poses of the scene's board, made up from a seed: `[head.poses]`.
-
-    tilt_deg : least and most angle between the board and the plane across the line from it to the devices, about axes
-    all round. roll_deg : most turn in its own plane to either side. centre_mm : about what point the board is held,
-    depth_mm : least and most distance from there along the line away from the devices. edge_px : the paper stays so
-    far inside every image, the projector's too.
-    """
+class PoseSeries(Table, use_attribute_docstrings=True):
+    """Poses of the scene's board, made up from a seed: `[head.poses]`."""
 
     count: Annotated[int, Field(ge=1, le=200)] = 20
+    """How many."""
+
     seed: Annotated[int, Field(ge=0)] = 1
+    """What they are made up from."""
+
     tilt_deg: Pair = (15.0, 40.0)
+    """Least and most angle between the board and the plane across the line from it to the devices, about axes all
+    round."""
+
     roll_deg: NotNegative = 25.0
+    """Most turn in its own plane to either side."""
+
     centre_mm: Triple = (0.0, 0.0, 0.0)
+    """About what point the board is held."""
+
     depth_mm: Pair = (-60.0, 60.0)
+    """Least and most distance from there along the line away from the devices."""
+
     edge_px: NotNegative = 6.0
+    """The paper stays so far inside every image, the projector's too."""
 
     @model_validator(mode="after")
     def _rising(self) -> PoseSeries:

@@ -7,12 +7,12 @@ is dark follows from clipping it at the lines of the print, so that no edge lies
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from simulated_rig.boards import Print
 from simulated_rig.optics import LensArray, lens_array, undistorted
 from simulated_rig.scene import SceneSurface
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray, Pinhole
 
 _REACH = 0.9
@@ -72,7 +72,7 @@ def _numbers(
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _along(x: float, curvature: float) -> float:
     """Length along the sheet z = c x² from 0 to x."""
     if curvature == 0.0:
@@ -81,7 +81,7 @@ def _along(x: float, curvature: float) -> float:
     return float(x * np.sqrt(1.0 + steep * steep) / 2.0 + np.arcsinh(steep) / (4.0 * curvature))
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _clipped(polygon: FloatArray, count: int, a: float, b: float, limit: float, out: FloatArray) -> int:
     """Keep of a convex polygon what has a x + b y <= limit (Sutherland and Hodgman 1974). Returns its corner count."""
     kept = 0
@@ -100,7 +100,7 @@ def _clipped(polygon: FloatArray, count: int, a: float, b: float, limit: float, 
     return kept
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _moments(polygon: FloatArray, count: int) -> tuple[float, float, float]:
     """Area of a polygon and its first moments in x and y; the area's sign is that of the way round."""
     area, mx, my = 0.0, 0.0, 0.0
@@ -113,7 +113,7 @@ def _moments(polygon: FloatArray, count: int) -> tuple[float, float, float]:
     return area / 2.0, mx / 6.0, my / 6.0
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _dark_in_rectangles(
     cell: FloatArray,
     x0: float,
@@ -147,7 +147,7 @@ def _dark_in_rectangles(
     return area, mx, my
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _nearest(x: float, y: float, centres: FloatArray) -> tuple[int, float]:
     best, least = 0, np.inf
     for k in range(len(centres)):
@@ -157,7 +157,7 @@ def _nearest(x: float, y: float, centres: FloatArray) -> tuple[int, float]:
     return best, np.sqrt(least)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _at_point(
     x: float,
     y: float,
@@ -180,7 +180,7 @@ def _at_point(
     return dark[i, j] == 1, same
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _fill(
     out: FloatArray,
     points: FloatArray,

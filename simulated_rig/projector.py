@@ -11,7 +11,7 @@ from simulated_rig.light import LightTable, desktop_light, light_table, no_light
 from simulated_rig.options import Faults, ProjectorOptions
 from simulated_rig.staging import Staging
 from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
-from slrig.devices import Clock, ProjectorInfo, Shown
+from slrig.devices import COMPUTED, Clock, ProjectorInfo, Shown
 from slrig.errors import DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -51,6 +51,7 @@ class SimulatedProjector:
             plays=False,
             latency_s=self._options.latency_s,
             refresh_s=None if self._options.refresh_hz is None else 1 / self._options.refresh_hz,
+            limits=COMPUTED,
         )
 
     @property

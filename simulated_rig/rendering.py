@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,11 +121,11 @@ class View:
             self._newest = _Seen(setting, camera)
         return self._newest
 
-    def prepare(self) -> Paths:
-        """Trace the light paths, unless that is done, and return them."""
-        return self._traced_paths(self._seen)
+    def prepare(self, *, told: Callable[[float], None] = lambda _: None) -> Paths:
+        """Trace the light paths, unless that is done, and return them. `told` hears the share that is done."""
+        return self._traced_paths(self._seen, told)
 
-    def _traced_paths(self, seen: _Seen) -> Paths:
+    def _traced_paths(self, seen: _Seen, told: Callable[[float], None] = lambda _: None) -> Paths:
         if seen.paths is None:
             seen.paths = transport.paths(
                 seen.camera,
@@ -137,6 +137,7 @@ class View:
                 seed=self._seed,
                 working_distance_mm=self._stage.working_distance_mm,
                 workers=self._workers,
+                told=told,
             )
         return seen.paths
 

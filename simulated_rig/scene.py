@@ -171,6 +171,7 @@ class Turned(Placed):
 class MeshFile(Placed):
     """A triangle mesh from a file (STL, PLY, OBJ, GLB), in units of `unit_mm`, in its own frame.
 
+    A GLB's frame is glTF's: metres, y up. unit_mm = 1000 and rotation_deg = [180, 0, 0] bring a scan's mesh.glb back.
     Edges sharper than `crease_deg` stay sharp in the shading.
     """
 

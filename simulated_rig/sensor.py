@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel
 from slrig.model import Pixels
 
 
@@ -60,7 +60,7 @@ class Sensor:
         return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _digitise(
     electrons: NDArray[np.float32],
     draws: NDArray[np.float32],

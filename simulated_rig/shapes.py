@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from slrig.errors import ConfigError
+from slrig.kernels import kernel
 from slrig.model import FloatArray, IntArray
 
 FACET_ERROR_MM = 0.003
@@ -190,7 +190,7 @@ def _smooth(vertices: FloatArray, faces: IntArray, *, crease_rad: float) -> Part
     return Part(vertices, faces, normals)
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _corner_normals(
     faces: IntArray,
     first: NDArray[np.int64],

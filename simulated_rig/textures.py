@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from slrig.kernels import kernel_part
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _hash01(x: int, y: int, z: int) -> float:
     """A number in 0..1 that looks random, the same for the same lattice point."""
     # 64-bit arithmetic cut to 32 bits after each product: the same under numba and in plain Python.
@@ -16,7 +17,7 @@ def _hash01(x: int, y: int, z: int) -> float:
     return float(h ^ (h >> 16)) / 4294967295.0
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def texture_value(kind: int, x: float, y: float, z: float) -> float:
     """Darkness 0..1 of a texture at (x, y, z), in grains. 0 uniform, 1 checker, 2 smooth value noise, two octaves."""
     if kind == 1:

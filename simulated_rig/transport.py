@@ -6,12 +6,11 @@ Only direct light is traced: no light from one surface to another, no defocus wi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from simulated_rig.casting import Caster
@@ -19,6 +18,7 @@ from simulated_rig.optics import LensArray, distorted, field_radius, lens_array,
 from simulated_rig.printing import pigment
 from simulated_rig.scene import SceneSurface
 from simulated_rig.textures import texture_value
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray, Pinhole
 
 SHADOW_BIAS_MM = 0.05
@@ -142,8 +142,12 @@ def paths(
     seed: int,
     working_distance_mm: float,
     workers: int,
+    told: Callable[[float], None] = lambda _: None,
 ) -> Paths:
-    """Trace samples_per_axis² samples per pixel: at the middles of equal cells, or, jittered, anywhere in each cell."""
+    """Trace samples_per_axis² samples per pixel: at the middles of equal cells, or, jittered, anywhere in each cell.
+
+    `told` hears the share that is done, block by block.
+    """
     rows, columns = camera.size.shape
     count = samples_per_axis**2
     out = Paths(
@@ -177,13 +181,10 @@ def paths(
         out.albedo[first:last] = hits.albedo.reshape(shape).mean(axis=2)
 
     starts = range(0, rows, block_rows)
-    if workers == 1:
-        for start in starts:
-            fill(start)
-    else:
-        with ThreadPoolExecutor(workers, thread_name_prefix="trace") as pool:
-            # Each block writes rows of its own; the list makes a failure in any of them surface here.
-            list(pool.map(fill, starts))
+    with ThreadPoolExecutor(workers, thread_name_prefix="trace") as pool:
+        # Each block writes rows of its own; going over them makes a failure in any of them surface here.
+        for done, _ in enumerate(pool.map(fill, starts), start=1):
+            told(done / len(starts))
     return out
 
 
@@ -215,7 +216,7 @@ def _sample_positions(
     return u.ravel(), v.ravel()
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _plane_distance(
     origin: FloatArray, direction: FloatArray, face: IntArray, vertices: FloatArray
 ) -> tuple[float, float, float, float]:
@@ -231,7 +232,7 @@ def _plane_distance(
     return height / along, n0, n1, n2
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _hit_points(
     origin: FloatArray,
     directions: FloatArray,
@@ -297,7 +298,7 @@ def _hit_points(
     return points, normals
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _light_points(
     points: FloatArray,
     normals: FloatArray,

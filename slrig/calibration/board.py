@@ -112,3 +112,19 @@ class Board:
         'chessboard 11x8, 12 mm'
         """
         return f"{self.kind} {self.columns}x{self.rows}, {self.square_mm:g} mm"
+
+    @property
+    def description(self) -> str:
+        """What it is, in full.
+
+        >>> Board(BoardKind.CHARUCO, 11, 8, 12.0).description
+        'charuco, 11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250'
+        """
+        if self.kind is BoardKind.CIRCLES:
+            return f"circles, {self.columns} in each of {self.rows} rows, rows {self.square_mm:g} mm apart"
+        markers = f", markers of {self.marker_mm:g} mm from {self.dictionary}" if self.marker_mm is not None else ""
+        return f"{self.kind}, {self.columns} x {self.rows} inner corners, squares of {self.square_mm:g} mm{markers}"
+
+
+USUAL_BOARD = Board(BoardKind.CHARUCO, 11, 8, 12.0)
+"""The board that is meant where none is named: 12 x 9 squares, which fit on A4 and letter paper with their rulers."""

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.solution import PARAMETERS
-from slrig.model import Axis, FloatArray, Pinhole
+from slrig.model import Axis, FloatArray, Pinhole, triangulated_axis
 
 _EACH = len(PARAMETERS)
 
@@ -61,7 +61,7 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
     if projector is None:
         return _by_two_cameras(cameras, views, points_mm)
     light = _projected(projector, points_mm)
-    coordinate = 0 if triangulated_axis(cameras[0], projector) is Axis.COLUMN else 1
+    coordinate = 0 if triangulated_axis(cameras, projector) is Axis.COLUMN else 1
     ray = points_mm - projector.centre_mm
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     weights = np.stack([np.where(view.inside, _squares(view.by_point, ray), 0.0) for view in views])
@@ -78,12 +78,6 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
         by_parameter[:, :, -_EACH:] -= inverse[:, :, 2:] @ light.by_parameter[:, coordinate, None]
         noises.append(inverse[:, :, 2])
     return Moved(by_parameter, np.stack(noises, axis=2), light.inside & (total > 0))
-
-
-def triangulated_axis(camera: Pinhole, projector: Pinhole) -> Axis:
-    """The axis of patterns that a scan triangulates by: the one that the camera stands to the side of."""
-    beside, above, _ = projector.rotation @ camera.centre_mm + projector.translation_mm
-    return Axis.COLUMN if abs(beside) >= abs(above) else Axis.ROW
 
 
 def rigid_free(points_mm: FloatArray, fields: FloatArray, /) -> FloatArray:

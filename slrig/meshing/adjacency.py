@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
 
+from slrig.kernels import in_bands, kernel
 from slrig.model import IntArray
 
 _CROWDED, _REPEATED = 1, 2
@@ -61,7 +61,7 @@ def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
     around = incidence(faces, vertex_count=vertex_count)
     across = np.full(faces.shape, -1, dtype=np.int32)
     fault = np.zeros(len(faces), dtype=np.uint8)
-    _neighbours(faces, around.starts, around.corners, across, fault)
+    in_bands(_neighbours, len(faces), faces, around.starts, around.corners, across, fault)
     if fault.any():
         face = int(np.flatnonzero(fault)[0])
         named = faces[face].tolist()
@@ -75,7 +75,7 @@ def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
     return across
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _incidence(faces: Any, starts: Any, corners: Any) -> bool:
     count = len(starts) - 1
     for face in range(len(faces)):
@@ -98,9 +98,9 @@ def _incidence(faces: Any, starts: Any, corners: Any) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _neighbours(faces: Any, starts: Any, corners: Any, across: Any, fault: Any) -> None:
-    for face in prange(len(faces)):
+@kernel(in_every_scan=False)
+def _neighbours(first: int, last: int, faces: Any, starts: Any, corners: Any, across: Any, fault: Any) -> None:
+    for face in range(first, last):
         for corner in range(3):
             after = corner + 1 if corner < 2 else 0
             # The edge from a to b, opposite the third corner; a neighbour runs from b to a.

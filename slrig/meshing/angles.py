@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray
 
 _HALF_PI, _QUARTER_PI = math.pi / 2, math.pi / 4
@@ -27,7 +27,7 @@ def angles_rad(sines: FloatArray, cosines: FloatArray) -> FloatArray:
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel_part(inline="always")
 def angle_rad(sine: float, cosine: float) -> float:
     """atan2(sine, cosine) for sine >= 0, to two units in the last place: in [0, π]; 0 where both are 0."""
     across = abs(cosine)
@@ -44,7 +44,7 @@ def angle_rad(sine: float, cosine: float) -> float:
     return angle if high > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(in_every_scan=False)
 def _angles(sines: Any, cosines: Any, found: Any) -> None:
-    for at in prange(len(found)):
+    for at in range(len(found)):
         found[at] = angle_rad(sines[at], cosines[at])

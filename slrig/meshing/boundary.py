@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel, kernel_part
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary_rules import (
     add,
@@ -35,7 +35,6 @@ PSI = math.pi / 2
 LONGEST_MM = 5.0
 _SPACINGS = 4.0
 _MOST_TRIANGLES_OF_A_SPIKE = 6
-_FACES = 16384  # that one thread takes at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +97,9 @@ def longest_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> Float
 
 def boundary_point_count(faces: IntArray, adjacency: IntArray, /) -> int:
     """Number of vertices on the boundary; adjacency as `neighbours` gives it."""
-    return int(_boundary_point_count(np.ascontiguousarray(faces), np.ascontiguousarray(adjacency)))
+    face, corner = np.nonzero(adjacency < 0)
+    # Every boundary vertex has a half-edge that runs into it.
+    return int(np.count_nonzero(np.bincount(faces[face, (corner + 2) % 3])))
 
 
 def shrunk(
@@ -181,14 +182,7 @@ def smoothed(
     return Smoothed(kept, across, added, removed, rounds)
 
 
-@njit(cache=True, nogil=True)
-def _boundary_point_count(faces: Any, adjacency: Any) -> int:
-    # Every boundary vertex has a half-edge that runs into it.
-    heads = np.array([faces[into // 3, (into + 2) % 3] for into in boundary_half_edges(adjacency)])
-    return len(np.unique(heads))
-
-
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_long_edges(points: Any, faces: Any, longest_mm: float, near: Any) -> bool:
     """Mark both ends of every edge longer than longest_mm; whether there is one."""
     found = False
@@ -200,7 +194,7 @@ def _mark_long_edges(points: Any, faces: Any, longest_mm: float, near: Any) -> b
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shrink(points: Any, faces: Any, adjacency: Any, longest_mm: Any, alive: Any) -> int:
     stack = boundary_half_edges(adjacency)
     removed = 0
@@ -221,44 +215,35 @@ def _shrink(points: Any, faces: Any, adjacency: Any, longest_mm: Any, alive: Any
     return removed
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _kept(faces: Any, adjacency: Any, alive: Any) -> Any:
     """The faces that are alive, in their order, and their neighbours in the new numbering."""
-    blocks = (len(faces) + _FACES - 1) // _FACES
-    first = np.zeros(blocks + 1, dtype=np.int32)
-    for block in prange(blocks):
-        first[block + 1] = np.count_nonzero(alive[block * _FACES : (block + 1) * _FACES])
-    first = np.cumsum(first).astype(np.int32)
+    # Across a boundary lies face -1: the last number is its own.
     number = np.full(len(faces) + 1, -1, dtype=np.int32)
-    for block in prange(blocks):
-        place = first[block]
-        for face in range(block * _FACES, min(len(faces), (block + 1) * _FACES)):
-            if alive[face]:
-                number[face] = place
-                place += 1
-    kept, across = np.zeros((first[-1], 3), dtype=np.int32), np.zeros((first[-1], 3), dtype=np.int32)
-    for block in prange(blocks):
-        place = first[block]
-        for face in range(block * _FACES, min(len(faces), (block + 1) * _FACES)):
-            if alive[face]:
-                for corner in range(3):
-                    kept[place, corner] = faces[face, corner]
-                    # -1 reads the last entry, which is -1.
-                    across[place, corner] = number[adjacency[face, corner]]
-                place += 1
+    count = 0
+    for face in range(len(faces)):
+        if alive[face]:
+            number[face] = count
+            count += 1
+    kept, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
+    for face in range(len(faces)):
+        if alive[face]:
+            for corner in range(3):
+                kept[number[face], corner] = faces[face, corner]
+                across[number[face], corner] = number[adjacency[face, corner]]
     return kept, across
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel_part
 def _lengthened(rows: Any, length: int) -> Any:
     longer = np.zeros((length, 3), dtype=rows.dtype)
-    for row in prange(len(rows)):
+    for row in range(len(rows)):
         for k in range(3):
             longer[row, k] = rows[row, k]
     return longer
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smooth(
     points: Any,
     given: Any,

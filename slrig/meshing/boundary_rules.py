@@ -15,7 +15,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from slrig.kernels import kernel_part
 
 # Of an added triangle: no sliver, no fold against the triangles that it is put beside.
 _COS_SMALLEST_ANGLE = math.cos(math.radians(10.0))
@@ -24,7 +25,7 @@ _COS_LARGEST_FOLD = math.cos(math.radians(60.0))
 _STEPS_ASIDE = 4
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def corner_of(faces: Any, face: int, vertex: int) -> int:
     """Which corner of the face the vertex is."""
     if faces[face, 0] == vertex:
@@ -32,7 +33,7 @@ def corner_of(faces: Any, face: int, vertex: int) -> int:
     return 1 if faces[face, 1] == vertex else 2
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def boundary_half_edges(adjacency: Any) -> Any:
     """All of them, a list, rising."""
     return [
@@ -43,19 +44,19 @@ def boundary_half_edges(adjacency: Any) -> Any:
     ]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def following(faces: Any, adjacency: Any, half_edge: int) -> int:
     """The boundary half-edge that leaves the corner which `half_edge` runs into."""
-    return int(_round_the_corner(faces, adjacency, half_edge, 2))
+    return int(_round_the_corner(faces, adjacency, half_edge, np.int64(2)))
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def preceding(faces: Any, adjacency: Any, half_edge: int) -> int:
     """The boundary half-edge that runs into the corner which `half_edge` leaves."""
-    return int(_round_the_corner(faces, adjacency, half_edge, 1))
+    return int(_round_the_corner(faces, adjacency, half_edge, np.int64(1)))
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _round_the_corner(faces: Any, adjacency: Any, half_edge: int, side: int) -> int:
     """From face to face round the vertex at one end of `half_edge`, to the boundary on the other side of it.
 
@@ -69,29 +70,29 @@ def _round_the_corner(faces: Any, adjacency: Any, half_edge: int, side: int) -> 
     return 3 * face + (corner + side) % 3
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _difference(points: Any, a: int, b: int) -> Any:
     return points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _cross(u: Any, v: Any) -> Any:
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _dot(u: Any, v: Any) -> float:
     return float(u[0] * v[0] + u[1] * v[1] + u[2] * v[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def length_mm(points: Any, a: int, b: int) -> float:
     """Distance of two points."""
     u = _difference(points, a, b)
     return math.sqrt(_dot(u, u))
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def cosine_at(points: Any, a: int, b: int, c: int) -> float:
     """The cosine of ∠abc, -1 where a side has no length: such a corner is never sharp."""
     u, v = _difference(points, a, b), _difference(points, c, b)
@@ -99,7 +100,7 @@ def cosine_at(points: Any, a: int, b: int, c: int) -> float:
     return _dot(u, v) / math.sqrt(squares) if squares > 0.0 else -1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _unit_normal(points: Any, a: int, b: int, c: int) -> Any:
     """Of triangle abc; zero where it has no area."""
     n = _cross(_difference(points, b, a), _difference(points, c, a))
@@ -109,7 +110,7 @@ def _unit_normal(points: Any, a: int, b: int, c: int) -> Any:
     return n[0] / size, n[1] / size, n[2] / size
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def is_notch(points: Any, faces: Any, adjacency: Any, into: int, out: int) -> bool:
     """True for Fig. 8(a) at the corner between half-edges `into` (a to b) and `out` (b to c), False for Fig. 8(b).
 
@@ -131,7 +132,7 @@ def is_notch(points: Any, faces: Any, adjacency: Any, into: int, out: int) -> bo
     return bool(_dot(_cross(_difference(points, c, b), _difference(points, a, b)), (x, y, z)) < 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _has_edge(faces: Any, adjacency: Any, degree: Any, into: int, other: int) -> Any:
     """Whether the corner's fan has an edge to the vertex `other`, and whether the fan is all its vertex has.
 
@@ -150,7 +151,7 @@ def _has_edge(faces: Any, adjacency: Any, degree: Any, into: int, other: int) ->
         count += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _lies_inside(points: Any, p: int, a: int, b: int, c: int, normal: Any) -> bool:
     """Whether p, seen along the normal of triangle abc, lies in it or on its edge."""
     for u, v in ((a, b), (b, c), (c, a)):
@@ -159,7 +160,7 @@ def _lies_inside(points: Any, p: int, a: int, b: int, c: int, normal: Any) -> bo
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _is_clear(points: Any, faces: Any, adjacency: Any, into: int, out: int, normal: Any) -> bool:
     """Whether the boundary on either side keeps out of the triangle between two half-edges, `normal` its normal."""
     a, b, c = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3], faces[out // 3, (out + 2) % 3]
@@ -173,7 +174,7 @@ def _is_clear(points: Any, faces: Any, adjacency: Any, into: int, out: int, norm
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def may_add(points: Any, faces: Any, adjacency: Any, degree: Any, allowed_mm: Any, into: int, out: int) -> bool:
     """Whether triangle (c, b, a) may fill the notch at b between half-edges `into` (a to b) and `out` (b to c).
 
@@ -205,7 +206,7 @@ def may_add(points: Any, faces: Any, adjacency: Any, degree: Any, allowed_mm: An
     return not found and _is_clear(points, faces, adjacency, into, out, normal)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def may_remove(faces: Any, adjacency: Any, corners: Any, into: int, out: int, most_triangles: int) -> bool:
     """Whether the spike at b between half-edges `into` (a to b) and `out` (b to c) may go with its triangles.
 
@@ -245,7 +246,7 @@ def may_remove(faces: Any, adjacency: Any, corners: Any, into: int, out: int, mo
         corner = corner_of(faces, face, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def side_towards(adjacency: Any, face: int, other: int) -> int:
     """The corner of `face` whose opposite edge has `other` beyond it."""
     if adjacency[face, 0] == other:
@@ -253,7 +254,7 @@ def side_towards(adjacency: Any, face: int, other: int) -> int:
     return 1 if adjacency[face, 1] == other else 2
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def add(faces: Any, adjacency: Any, degree: Any, corners: Any, face: int, into: int, out: int) -> None:
     """Put triangle (c, b, a) between half-edges `into` (a to b) and `out` (b to c), as number `face`."""
     third = following(faces, adjacency, out)
@@ -273,7 +274,7 @@ def add(faces: Any, adjacency: Any, degree: Any, corners: Any, face: int, into: 
         corners[c] -= 1
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def remove(
     faces: Any, adjacency: Any, degree: Any, corners: Any, alive: Any, into: int, out: int, laid_bare: Any
 ) -> None:

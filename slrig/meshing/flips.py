@@ -13,8 +13,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from numba import njit
-
+from slrig.kernels import kernel_part
 from slrig.model import FlipRule
 
 GAMMA = math.pi / 6
@@ -46,7 +45,7 @@ def constraint(rule: FlipRule, gamma: float = GAMMA) -> Constraint:
     return Constraint(math.cos(gamma), math.sin(gamma))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _angle(ax: Any, ay: Any, az: Any, bx: Any, by: Any, bz: Any, cx: Any, cy: Any, cz: Any) -> Any:
     """∠abc in [0, π] as (cosine, sine) times a common positive factor."""
     ux, uy, uz = ax - bx, ay - by, az - bz
@@ -55,14 +54,14 @@ def _angle(ax: Any, ay: Any, az: Any, bx: Any, by: Any, bz: Any, cx: Any, cy: An
     return ux * vx + uy * vy + uz * vz, math.sqrt(x * x + y * y + z * z)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _larger(c1: float, s1: float, c2: float, s2: float) -> Any:
     # sin(first - second) > 0 for angles in [0, π]. Which is larger cannot be foreseen: chosen without a jump.
     first = s1 * c2 - c1 * s2 > 0
     return c1 if first else c2, s1 if first else s2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _prefers(
     px: float, py: float, pz: float, qx: float, qy: float, qz: float,
     fx: float, fy: float, fz: float, wx: float, wy: float, wz: float, cos_gamma: float, sin_gamma: float,
@@ -90,7 +89,7 @@ def _prefers(
     return (forced & (imaginary > 0)) | ((not forced) & wider)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def prefers_flip(
     points: Any, p: int, q: int, f: int, w: int, cos_gamma: float = _COS_GAMMA, sin_gamma: float = _SIN_GAMMA
 ) -> bool:
@@ -102,7 +101,7 @@ def prefers_flip(
     return bool(wanted)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def prefer_flips(count: int, corners: Any, cos_gamma: float, sin_gamma: float, flips: Any) -> None:
     """`prefers_flip` of up to BLOCK edges at once: flips, (BLOCK,) bool.
 

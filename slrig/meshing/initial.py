@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.strips import neighbouring_curves, strip_neighbours, strips, to_drop
 from slrig.meshing.topology import component_sizes
@@ -70,7 +70,7 @@ def initial_mesh(
     connected = ~drop.any
     kept = component_sizes(everything, connected) >= max(smallest_component, 1)
     areas_mm2 = np.zeros(-(-len(everything) // _BLOCK))
-    _facing_areas(np.ascontiguousarray(points_mm), everything, kept, eye_mm, areas_mm2)
+    in_bands(_facing_areas, len(areas_mm2), np.ascontiguousarray(points_mm), everything, kept, eye_mm, areas_mm2)
     count = int(np.count_nonzero(kept))
     faces, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
     _gathered(everything, adjacency, kept, bool(areas_mm2.sum() < 0), faces, across)
@@ -87,11 +87,11 @@ def initial_mesh(
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _facing_areas(points: Any, faces: Any, kept: Any, eye: Any, areas: Any) -> None:
+@kernel
+def _facing_areas(first: int, last: int, points: Any, faces: Any, kept: Any, eye: Any, areas: Any) -> None:
     """For each block of faces, twice the area that faces the eye less the area that faces away."""
     # Blocks of one size, added up in order: the same sum for any number of threads.
-    for block in prange(len(areas)):
+    for block in range(first, last):
         total = 0.0
         for face in range(block * _BLOCK, min((block + 1) * _BLOCK, len(faces))):
             if not kept[face]:
@@ -105,17 +105,17 @@ def _facing_areas(points: Any, faces: Any, kept: Any, eye: Any, areas: Any) -> N
         areas[block] = total
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _gathered(faces: Any, across: Any, kept: Any, turn_over: bool, to_faces: Any, to_across: Any) -> None:
     """Copy the kept faces and who lies across their edges, under new numbers."""
+    # Across a boundary lies face -1: the last number is its own.
     numbers = np.full(len(faces) + 1, -1, dtype=np.int32)
     count = 0
     for face in range(len(faces)):
         if kept[face]:
             numbers[face] = count
             count += 1
-    # Across a boundary lies face -1: the last number is its own.
-    for face in prange(len(faces)):
+    for face in range(len(faces)):
         if kept[face]:
             for corner in range(3):
                 to = 2 - corner if turn_over else corner

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import config
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing.angles import angle_rad
 from slrig.model import IntArray
 
@@ -24,11 +25,13 @@ def vertex_normals(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> N
     points = np.ascontiguousarray(vertices_mm, dtype=np.float64)
     sums = np.zeros((len(points), 3))
     normals = np.full((len(points), 3), np.nan, dtype=np.float32)
-    _vertex_normals(points, np.ascontiguousarray(faces), get_num_threads(), sums, normals)
+    parts = config.NUMBA_NUM_THREADS
+    in_bands(_add_normals, parts, points, np.ascontiguousarray(faces), parts, sums)
+    in_bands(_unit_normals, len(points), sums, normals)
     return normals
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel_part
 def _weigh(count: int, work: Any) -> None:
     """From normals as long as twice the area, (0, 1, 2), and the dots of the edges at a and b, (3, 4), of up to _BLOCK
     triangles, their unit normals and their angles at a, b and c, (3, 4, 5).
@@ -45,11 +48,11 @@ def _weigh(count: int, work: Any) -> None:
         work[3 * _BLOCK + at], work[4 * _BLOCK + at], work[5 * _BLOCK + at] = at_a, at_b, np.pi - at_a - at_b
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _vertex_normals(points: Any, faces: Any, parts: int, sums: Any, normals: Any) -> None:
+@kernel
+def _add_normals(begin: int, end: int, points: Any, faces: Any, parts: int, sums: Any) -> None:
     # Each part owns a range of vertices, goes over all faces and adds to its own vertices only: every vertex has its
     # sum taken in the order of the faces, so the result is the same for any number of threads.
-    for part in prange(parts):
+    for part in range(begin, end):
         low, high = len(points) * part // parts, len(points) * (part + 1) // parts
         work, mine = np.zeros(6 * _BLOCK), np.zeros(_BLOCK, dtype=np.int32)
         face = 0
@@ -81,7 +84,11 @@ def _vertex_normals(points: Any, faces: Any, parts: int, sums: Any, normals: Any
                         sums[vertex, 0] += angle * x
                         sums[vertex, 1] += angle * y
                         sums[vertex, 2] += angle * z
-    for vertex in prange(len(points)):
+
+
+@kernel
+def _unit_normals(first: int, last: int, sums: Any, normals: Any) -> None:
+    for vertex in range(first, last):
         x, y, z = sums[vertex, 0], sums[vertex, 1], sums[vertex, 2]
         length = np.sqrt(x * x + y * y + z * z)
         if length > 0.0:

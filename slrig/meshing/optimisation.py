@@ -28,9 +28,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.flips import BLOCK, GAMMA, constraint, prefer_flips, prefers_flip
 from slrig.model import FlipRule, FloatArray, IntArray
@@ -103,7 +103,10 @@ def optimised(
     faces, across = faces.copy(order="C"), across.copy(order="C")
     everyone = np.ones(len(faces), dtype=np.bool_) if among is None else among
     flagged = np.zeros(len(faces), dtype=np.uint8)
-    units, flat = _scanned(points, faces, across, everyone, cosine, sine, flagged)
+    counted = in_bands(
+        _scanned, len(faces), points, faces, across, everyone, cosine, sine, flagged, rows_at_least=_FACES_AT_ONCE
+    )
+    units, flat = (sum(each) for each in zip(*counted, strict=True)) if counted else (0, 0)
     before = _mean_index(len(faces), units, flat)
     stamps = np.zeros((2, len(faces)), dtype=np.int32)
     queue = _both_sides(flagged, across, stamps[0])
@@ -143,7 +146,7 @@ def _mean_index(count: int, units: int, flat: int) -> float:
     return units / _UNITS_PER_INDEX / (count - flat) if count > flat else math.nan
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _index_units(points: Any, a: int, b: int, c: int) -> int:
     """4 (cot α + cot β + cot η) = (a² + b² + c²) / area in units of 2⁻²⁰, -1 for a triangle too flat to have one."""
     ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
@@ -156,7 +159,7 @@ def _index_units(points: Any, a: int, b: int, c: int) -> int:
     return -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _indices_of(points: Any, faces: Any, queue: Any) -> Any:
     """(m,) float64: harmonic indices of the queued triangles, infinite where flat."""
     found = np.zeros(len(queue))
@@ -167,7 +170,7 @@ def _indices_of(points: Any, faces: Any, queue: Any) -> Any:
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _valences(faces: Any, vertex_count: int) -> Any:
     """(n,) int32: triangles at each vertex."""
     valence = np.zeros(vertex_count, dtype=np.int32)
@@ -177,7 +180,7 @@ def _valences(faces: Any, vertex_count: int) -> Any:
     return valence
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _corner_across(across: Any, face: int, other: int) -> int:
     """The corner of `face` that lies opposite its edge with `other`."""
     if across[face, 0] == other:
@@ -185,44 +188,44 @@ def _corner_across(across: Any, face: int, other: int) -> int:
     return 1 if across[face, 1] == other else 2
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _scanned(points: Any, faces: Any, across: Any, among: Any, cosine: float, sine: float, flagged: Any) -> Any:
+@kernel
+def _scanned(
+    first: int, last: int, points: Any, faces: Any, across: Any, among: Any, cosine: float, sine: float, flagged: Any
+) -> Any:
     """Flag edges to flip, bit k of the lower-numbered face; return the sum of the indices in units, and flat faces."""
-    units, flat = 0, 0
-    for part in prange(-(-len(faces) // _FACES_AT_ONCE)):
-        corners, wanted = np.zeros(12 * BLOCK), np.zeros(BLOCK, dtype=np.bool_)
-        edges = np.zeros(BLOCK, dtype=np.int32)
-        count, last = 0, min((part + 1) * _FACES_AT_ONCE, len(faces))
-        for face in range(part * _FACES_AT_ONCE, last):
-            index = _index_units(points, faces[face, 0], faces[face, 1], faces[face, 2])
-            if index >= 0:
-                units += index
-            else:
-                flat += 1
-            for k in range(3):
-                other = across[face, k]
-                if other > face and (among[face] or among[other]):
-                    p, q = faces[face, k + 1 if k < 2 else 0], faces[face, k - 1 if k else 2]
-                    # The corner that p and q leave over. Found by the edge, not by the neighbour: two triangles back
-                    # to back share three edges.
-                    w = faces[other, 0] + faces[other, 1] + faces[other, 2] - p - q
-                    for axis in range(3):
-                        corners[axis * BLOCK + count] = points[p, axis]
-                        corners[(3 + axis) * BLOCK + count] = points[q, axis]
-                        corners[(6 + axis) * BLOCK + count] = points[faces[face, k], axis]
-                        corners[(9 + axis) * BLOCK + count] = points[w, axis]
-                    edges[count] = 4 * face + k
-                    count += 1
-            if count > BLOCK - 3 or face + 1 == last:
-                prefer_flips(count, corners, cosine, sine, wanted)
-                for at in range(count):
-                    if wanted[at]:
-                        flagged[edges[at] >> 2] |= 1 << (edges[at] & 3)
-                count = 0
+    units, flat, count = 0, 0, np.int64(0)
+    corners, wanted = np.zeros(12 * BLOCK), np.zeros(BLOCK, dtype=np.bool_)
+    edges = np.zeros(BLOCK, dtype=np.int32)
+    for face in range(first, last):
+        index = _index_units(points, faces[face, 0], faces[face, 1], faces[face, 2])
+        if index >= 0:
+            units += index
+        else:
+            flat += 1
+        for k in range(3):
+            other = across[face, k]
+            if other > face and (among[face] or among[other]):
+                p, q = faces[face, k + 1 if k < 2 else 0], faces[face, k - 1 if k else 2]
+                # The corner that p and q leave over. Found by the edge, not by the neighbour: two triangles back
+                # to back share three edges.
+                w = faces[other, 0] + faces[other, 1] + faces[other, 2] - p - q
+                for axis in range(3):
+                    corners[axis * BLOCK + count] = points[p, axis]
+                    corners[(3 + axis) * BLOCK + count] = points[q, axis]
+                    corners[(6 + axis) * BLOCK + count] = points[faces[face, k], axis]
+                    corners[(9 + axis) * BLOCK + count] = points[w, axis]
+                edges[count] = 4 * face + k
+                count += 1
+        if count > BLOCK - 3 or face + 1 == last:
+            prefer_flips(count, corners, cosine, sine, wanted)
+            for at in range(count):
+                if wanted[at]:
+                    flagged[edges[at] >> 2] |= 1 << (edges[at] & 3)
+            count = np.int64(0)
     return units, flat
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _both_sides(flagged: Any, across: Any, queued: Any) -> Any:
     """The triangles on both sides of flagged edges, rising."""
     for face in range(len(flagged)):
@@ -234,7 +237,7 @@ def _both_sides(flagged: Any, across: Any, queued: Any) -> Any:
     return np.flatnonzero(queued).astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _may_be_joined(faces: Any, across: Any, valence: Any, start: int, vertex: int, sought: int) -> bool:
     """False when the triangles round `vertex`, one of them `start`, are all of its triangles and none has `sought`."""
     seen = 1
@@ -254,7 +257,7 @@ def _may_be_joined(faces: Any, across: Any, valence: Any, start: int, vertex: in
     return bool(seen != valence[vertex])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(
     points: Any, faces: Any, across: Any, valence: Any, queue: Any, pass_number: int, stamps: Any,
     cosine: float, sine: float, must_fall: bool, log: Any, following: Any,
@@ -326,7 +329,7 @@ def _turn(
     return tested, flips, waiting, more_units, more_flat
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _taken_back(faces: Any, across: Any, valence: Any, log: Any) -> None:
     """Undo the flips of a turn, the last one first."""
     for at in range(len(log) - 1, -1, -1):

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.meshing.angles import angle_rad
 from slrig.meshing.search_tree import SearchTree
 from slrig.meshing.topology import degenerate_faces, topology_counts
@@ -81,7 +81,7 @@ def mesh_figures(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> dic
     area_mm2, angle_deg = np.zeros(len(faces)), np.zeros(len(faces))
     # A row of sums per block, added up in order: the same for any number of threads.
     sums = np.zeros((-(-len(faces) // _BLOCK), 3))
-    _shapes(points, faces, area_mm2, angle_deg, sums)
+    in_bands(_shapes, len(sums), points, faces, area_mm2, angle_deg, sums)
     total_mm2, total_index, measured = (float(total) for total in sums.sum(axis=0))
     counts = topology_counts(faces)
     p1, p5, p50 = weighted_percentiles(angle_deg, area_mm2, (1.0, 5.0, 50.0))
@@ -282,7 +282,7 @@ def weighted_percentiles(values: FloatArray, weights: FloatArray, percents: tupl
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _weight_of_classes(values: Any, weights: Any, low: float, per_unit: float, classes: Any) -> Any:
     """The weight in each of _CLASSES equal classes of values; which class each value is in, in `classes`."""
     total = np.zeros(_CLASSES)
@@ -293,10 +293,10 @@ def _weight_of_classes(values: Any, weights: Any, low: float, per_unit: float, c
     return total
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _shapes(points: Any, faces: Any, area_mm2: Any, angle_deg: Any, sums: Any) -> None:
+@kernel
+def _shapes(first: int, last: int, points: Any, faces: Any, area_mm2: Any, angle_deg: Any, sums: Any) -> None:
     """Area and smallest angle of each triangle; per block of them: area, harmonic indices, triangles with an area."""
-    for block in prange(len(sums)):
+    for block in range(first, last):
         for face in range(block * _BLOCK, min((block + 1) * _BLOCK, len(faces))):
             a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
             ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel
 from slrig.model import FloatArray, IntArray, Size
 
 
@@ -47,7 +47,7 @@ def rasterised(
     return View(z, n, front)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _z_buffer(
     pixels: FloatArray, depth: FloatArray, normals: FloatArray, faces: IntArray, height: int, width: int
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
@@ -87,5 +87,6 @@ def _z_buffer(
             x, y, z = normal[row, column]
             length = np.sqrt(x * x + y * y + z * z)
             if length > 0.0:
-                normal[row, column] /= length
+                for axis in range(3):
+                    normal[row, column, axis] /= length
     return nearest, normal, front

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
 _TRIANGLES_PER_LEAF = 4
@@ -93,7 +93,7 @@ def _morton_codes(points: FloatArray) -> NDArray[np.uint64]:
     return np.asarray(_interleaved(steps.astype(np.uint64)))
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _interleaved(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
     codes = np.zeros(len(steps), dtype=np.uint64)
     one = np.uint64(1)
@@ -106,7 +106,7 @@ def _interleaved(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return codes
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _boxes(corners: FloatArray, leaf_count: int) -> FloatArray:
     """(2 leaf_count - 1, 6): leaves from their triangles, then every parent from its two children."""
     boxes = np.full((2 * leaf_count - 1, 6), np.inf)
@@ -126,7 +126,7 @@ def _boxes(corners: FloatArray, leaf_count: int) -> FloatArray:
     return boxes
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _box_gap(x: float, y: float, z: float, boxes: FloatArray, node: int) -> float:
     """Squared distance from a point to a box, 0 inside."""
     dx = max(boxes[node, 0] - x, 0.0, x - boxes[node, 3])
@@ -136,7 +136,7 @@ def _box_gap(x: float, y: float, z: float, boxes: FloatArray, node: int) -> floa
     return gap
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _squared_distances(
     points: FloatArray, order: NDArray[np.intp], corners: FloatArray, boxes: FloatArray
 ) -> FloatArray:
@@ -180,7 +180,7 @@ def _squared_distances(
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _triangle_gap(x: float, y: float, z: float, triangle: FloatArray) -> float:
     """Squared distance from a point to a triangle, exact for slivers and collapsed triangles too.
 
@@ -211,7 +211,7 @@ def _triangle_gap(x: float, y: float, z: float, triangle: FloatArray) -> float:
     return nearest
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _segment_gap(px: float, py: float, pz: float, dx: float, dy: float, dz: float) -> float:
     """Squared distance from the origin to the segment from p to p + d."""
     square = dx * dx + dy * dy + dz * dz
@@ -222,7 +222,7 @@ def _segment_gap(px: float, py: float, pz: float, dx: float, dy: float, dz: floa
     return qx * qx + qy * qy + qz * qz
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _ray_hits(
     origin: FloatArray, directions: FloatArray, corners: FloatArray, boxes: FloatArray, first_only: bool
 ) -> tuple[FloatArray, IntArray]:
@@ -258,7 +258,7 @@ def _ray_hits(
     return reach, crossings
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _box_entry(origin: FloatArray, direction: FloatArray, box: FloatArray) -> float:
     """How far along the ray the box begins, infinite if it is missed: slab test.
 
@@ -277,7 +277,7 @@ def _box_entry(origin: FloatArray, direction: FloatArray, box: FloatArray) -> fl
     return enter if enter <= leave else np.inf
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _ray_meets_triangle(origin: FloatArray, direction: FloatArray, triangle: FloatArray) -> float:
     """How far along the ray it meets the triangle, infinite if it does not (Möller and Trumbore 1997)."""
     ux, uy, uz = triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.meshing.flips import prefers_flip
 from slrig.model import FloatArray, IntArray
 
@@ -47,7 +47,7 @@ def strips(points_mm: FloatArray, offsets: IntArray, pairs: IntArray, /) -> IntA
     """
     firsts = _firsts(offsets, pairs)
     faces = np.zeros((int(firsts[-1]), 3), dtype=np.int32)
-    _strips_kernel(np.ascontiguousarray(points_mm), offsets, pairs, firsts, faces)
+    in_bands(_strips_kernel, len(pairs), np.ascontiguousarray(points_mm), offsets, pairs, firsts, faces)
     return faces
 
 
@@ -59,7 +59,9 @@ def strip_neighbours(faces: IntArray, offsets: IntArray, pairs: IntArray, /) -> 
     """
     after_first, after_second = np.full((2, int(offsets[-1])), -1, dtype=np.int32)
     across = np.zeros(faces.shape, dtype=np.int32)
-    _strip_neighbours(faces, offsets, pairs, _firsts(offsets, pairs), after_first, after_second, across)
+    given = faces, offsets, pairs, _firsts(offsets, pairs), after_first, after_second
+    in_bands(_note_steps, len(pairs), *given)
+    in_bands(_strip_neighbours, len(pairs), *given, across)
     return across
 
 
@@ -81,8 +83,8 @@ def to_drop(
     """
     depth_edge = np.zeros(len(faces), dtype=np.bool_)
     bridge = np.zeros(len(faces), dtype=np.bool_)
-    _to_drop(
-        np.ascontiguousarray(points_mm), np.ascontiguousarray(faces), bridge_after, sampling_mm,
+    in_bands(
+        _to_drop, len(faces), np.ascontiguousarray(points_mm), np.ascontiguousarray(faces), bridge_after, sampling_mm,
         depth_edge_ratio, keep_holes, depth_edge, bridge,
     )  # fmt: skip
     return DroppedTriangles(depth_edge=depth_edge, bridge=bridge)
@@ -95,11 +97,12 @@ def _firsts(offsets: IntArray, pairs: IntArray) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _strips_kernel(points: Any, offsets: Any, pairs: Any, firsts: Any, faces: Any) -> None:
-    for s in prange(len(pairs)):
-        i, last_i = offsets[pairs[s, 0]], offsets[pairs[s, 0] + 1] - 1
-        j, last_j = offsets[pairs[s, 1]], offsets[pairs[s, 1] + 1] - 1
+@kernel
+def _strips_kernel(begin: int, end: int, points: Any, offsets: Any, pairs: Any, firsts: Any, faces: Any) -> None:
+    for s in range(begin, end):
+        # Of one type from the start, so that the rule is compiled once.
+        i, last_i = np.int64(offsets[pairs[s, 0]]), offsets[pairs[s, 0] + 1] - 1
+        j, last_j = np.int64(offsets[pairs[s, 1]]), offsets[pairs[s, 1] + 1] - 1
         at = firsts[s]
         while i < last_i or j < last_j:
             if i == last_i:
@@ -120,19 +123,26 @@ def _strips_kernel(points: Any, offsets: Any, pairs: Any, firsts: Any, faces: An
             at += 1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _strip_neighbours(
-    faces: Any, offsets: Any, pairs: Any, firsts: Any, after_first: Any, after_second: Any, across: Any
+@kernel
+def _note_steps(
+    begin: int, end: int, faces: Any, offsets: Any, pairs: Any, firsts: Any, after_first: Any, after_second: Any
 ) -> None:
-    # Who stands on each step, as a strip's first curve and as its second: a curve is either at most once.
-    for s in prange(len(pairs)):
+    """Note who stands on each step, as a strip's first curve and as its second: a curve is either at most once."""
+    for s in range(begin, end):
         last_of_first = offsets[pairs[s, 0] + 1]
         for face in range(firsts[s], firsts[s + 1]):
             if faces[face, 1] < last_of_first:
                 after_first[faces[face, 0]] = face
             else:
                 after_second[faces[face, 2]] = face
-    for s in prange(len(pairs)):
+
+
+@kernel
+def _strip_neighbours(
+    begin: int, end: int, faces: Any, offsets: Any, pairs: Any, firsts: Any, after_first: Any, after_second: Any,
+    across: Any,
+) -> None:  # fmt: skip
+    for s in range(begin, end):
         last_of_first = offsets[pairs[s, 0] + 1]
         for face in range(firsts[s], firsts[s + 1]):
             before = face - 1 if face > firsts[s] else -1
@@ -145,12 +155,13 @@ def _strip_neighbours(
                 across[face, 0], across[face, 1], across[face, 2] = after_first[faces[face, 2]], before, after
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _to_drop(
-    points: Any, faces: Any, bridge_after: Any, sampling: Any, ratio: float, keep_holes: bool, depth_edge: Any,
+    first: int, last: int, points: Any, faces: Any, bridge_after: Any, sampling: Any, ratio: float,
+    keep_holes: bool, depth_edge: Any,
     bridge: Any,
 ) -> None:  # fmt: skip
-    for face in prange(len(faces)):
+    for face in range(first, last):
         longest, allowed, over = 0.0, 0.0, False
         for corner in range(3):
             a, b = faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]

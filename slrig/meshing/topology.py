@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import IntArray
 
 
@@ -100,7 +100,8 @@ def duplicate_face_count(faces: IntArray) -> int:
     if not len(faces):
         return 0
     faces = np.ascontiguousarray(faces)
-    return int(_duplicates(faces, *_faces_by_lowest_vertex(faces, _vertex_bound(faces))))
+    bound = _vertex_bound(faces)
+    return sum(in_bands(_duplicates, bound, faces, *_faces_by_lowest_vertex(faces, bound)))
 
 
 def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
@@ -133,7 +134,8 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
     border = np.zeros(bound, dtype=np.bool_)
-    edges, boundary, nonmanifold, misoriented = _edge_counts(faces, *_halves_by_lower_vertex(faces, bound), border)
+    counted = in_bands(_edge_counts, bound, faces, *_halves_by_lower_vertex(faces, bound), border)
+    edges, boundary, nonmanifold, misoriented = (sum(each) for each in zip(*counted, strict=True))
     vertices, components = _used_and_roots(faces, _joined(faces, np.ones(len(faces), dtype=np.bool_), bound))
     return TopologyCounts(
         vertices=vertices,
@@ -153,9 +155,7 @@ def compact(faces: IntArray, *, vertex_count: int) -> CompactIndex:
     """How to leave out the vertices that no face uses, keeping the order of the others."""
     faces = np.ascontiguousarray(faces)
     renumbered, kept = _renumbered(faces, vertex_count)
-    found = np.zeros(faces.shape, dtype=np.int32)
-    _gathered(faces, renumbered, found)
-    return CompactIndex(kept, found)
+    return CompactIndex(kept, renumbered[faces])
 
 
 def _directed_edges(faces: IntArray) -> IntArray:
@@ -195,7 +195,7 @@ def _marked_count(indices: IntArray) -> int:
     return int(marked.sum())
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _halves_by_lower_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArray, IntArray]:
     """Where each vertex's half-edges begin; half-edges, 4 * face + first corner, sorted by the lower of their ends."""
     starts = np.zeros(vertex_bound + 2, dtype=np.int32)
@@ -214,17 +214,19 @@ def _halves_by_lower_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArra
     return starts, halves
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _far_end(faces: IntArray, half: int, vertex: int) -> int:
     face, corner = half >> 2, half & 3
     return int(faces[face, corner] + faces[face, corner + 1 if corner < 2 else 0] - vertex)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _edge_counts(faces: IntArray, starts: IntArray, halves: IntArray, border: Any) -> tuple[int, int, int, int]:
+@kernel
+def _edge_counts(
+    first: int, last: int, faces: IntArray, starts: IntArray, halves: IntArray, border: Any
+) -> tuple[int, int, int, int]:
     """Edges; those of one triangle, marking their ends; those of more than two; directions run along more than once."""
     edges, boundary, nonmanifold, misoriented = 0, 0, 0, 0
-    for vertex in prange(len(border)):
+    for vertex in range(first, last):
         for at in range(starts[vertex], starts[vertex + 1]):
             other, known, uses, outward = _far_end(faces, halves[at], vertex), False, 0, 0
             for each in range(starts[vertex], starts[vertex + 1]):
@@ -243,7 +245,7 @@ def _edge_counts(faces: IntArray, starts: IntArray, halves: IntArray, border: An
     return edges, boundary, nonmanifold, misoriented
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _faces_by_lowest_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArray, IntArray]:
     """Where the faces of each lowest vertex begin, and the faces in that order."""
     starts = np.zeros(vertex_bound + 2, dtype=np.int32)
@@ -260,10 +262,10 @@ def _faces_by_lowest_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArra
     return starts, order
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _duplicates(faces: IntArray, starts: IntArray, order: IntArray) -> int:
+@kernel
+def _duplicates(first: int, last: int, faces: IntArray, starts: IntArray, order: IntArray) -> int:
     count = 0
-    for vertex in prange(len(starts) - 2):
+    for vertex in range(first, last):
         for at in range(starts[vertex], starts[vertex + 1]):
             a, b, c = faces[order[at]]
             middle, high = a + b + c - vertex - max(a, b, c), max(a, b, c)
@@ -275,7 +277,7 @@ def _duplicates(faces: IntArray, starts: IntArray, order: IntArray) -> int:
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _used_and_roots(faces: IntArray, roots: IntArray) -> tuple[int, int]:
     """Number of vertices that a face uses, and of those among them that stand for their piece."""
     used = np.zeros(len(roots), dtype=np.bool_)
@@ -289,7 +291,7 @@ def _used_and_roots(faces: IntArray, roots: IntArray) -> tuple[int, int]:
     return vertices, pieces
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _renumbered(faces: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
     """The new number of each vertex, and the old number of each that stays."""
     used = np.zeros(vertex_count, dtype=np.bool_)
@@ -308,14 +310,7 @@ def _renumbered(faces: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]
     return renumbered, kept
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _gathered(faces: IntArray, renumbered: IntArray, found: IntArray) -> None:
-    for face in prange(len(faces)):
-        for corner in range(3):
-            found[face, corner] = renumbered[faces[face, corner]]
-
-
-@njit(cache=True, nogil=True)
+@kernel_part
 def _root(parents: IntArray, vertex: int) -> int:
     while parents[vertex] != vertex:
         parents[vertex] = parents[parents[vertex]]
@@ -323,7 +318,7 @@ def _root(parents: IntArray, vertex: int) -> int:
     return vertex
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
     """The lowest vertex of each vertex's piece, by union-find with path halving, the lower index always the root."""
     parents = np.arange(vertex_bound).astype(np.int32)
@@ -346,7 +341,7 @@ def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
     return parents
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _component_labels(faces: IntArray, roots: IntArray) -> IntArray:
     numbers = np.full(len(roots), -1, dtype=np.int32)
     labels = np.zeros(len(faces), dtype=np.int32)
@@ -360,7 +355,7 @@ def _component_labels(faces: IntArray, roots: IntArray) -> IntArray:
     return labels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _component_sizes(faces: IntArray, among: Any, roots: IntArray) -> IntArray:
     counts = np.zeros(len(roots), dtype=np.int32)
     for face in range(len(faces)):

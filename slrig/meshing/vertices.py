@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.meshing.topology import compact
 from slrig.model import FloatArray, IntArray, Mesh, Pixels
 
@@ -21,7 +21,7 @@ def brightness(
     """
     grey = np.zeros(len(pixels_px), dtype=np.uint8)
     for index, (white, full_scale) in enumerate(zip(whites, full_scales, strict=True)):
-        _brightness(pixels_px, camera, index, white, 255 / full_scale, grey)
+        in_bands(_brightness, len(grey), pixels_px, camera, index, white, 255 / full_scale, grey)
     return grey
 
 
@@ -46,8 +46,9 @@ def compact_mesh(
     vertices, turned = np.zeros((count, 3), dtype=np.float32), np.zeros((count, 3), dtype=np.float32)
     shade, sigma = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.float32)
     stripe = np.zeros(count, dtype=np.int32)
-    _gather(
-        index.kept, np.searchsorted(index.kept, offsets), np.floor(position_px).astype(np.int32),
+    in_bands(
+        _gather, len(position_px), index.kept, np.searchsorted(index.kept, offsets),
+        np.floor(position_px).astype(np.int32),
         points_mm, normals, grey, sigma_mm, vertices, turned, shade, sigma, stripe,
     )  # fmt: skip
     return Mesh(
@@ -55,20 +56,22 @@ def compact_mesh(
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _brightness(pixels: Any, camera: Any, index: int, white: Any, factor: float, grey: Any) -> None:
-    for point in prange(len(grey)):
+@kernel
+def _brightness(
+    first: int, last: int, pixels: Any, camera: Any, index: int, white: Any, factor: float, grey: Any
+) -> None:
+    for point in range(first, last):
         if camera[point] == index:
             column, row = int(np.rint(pixels[point, 0])), int(np.rint(pixels[point, 1]))
             grey[point] = int(min(max(np.rint(white[row, column] * factor), 0.0), 255.0))
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _gather(
-    kept: Any, firsts: Any, columns: Any, points: Any, normals: Any, grey: Any, sigma: Any,
+    first: int, last: int, kept: Any, firsts: Any, columns: Any, points: Any, normals: Any, grey: Any, sigma: Any,
     to_points: Any, to_normals: Any, to_grey: Any, to_sigma: Any, to_stripe: Any,
 ) -> None:  # fmt: skip
-    for curve in prange(len(columns)):
+    for curve in range(first, last):
         for to in range(firsts[curve], firsts[curve + 1]):
             point = kept[to]
             for axis in range(3):

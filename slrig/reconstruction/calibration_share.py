@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from slrig.errors import CalibrationError
+from slrig.kernels import in_bands, kernel
 from slrig.model import DEVICE_PARAMETERS, Axis, Calibration, FloatArray, IntArray, Source
 from slrig.reconstruction.optics import packed
 from slrig.reconstruction.sensitivity import across, add_row, pixel_squares, shares_of_mean
@@ -32,7 +32,6 @@ _EACH = DEVICE_PARAMETERS
 _NODES = 10  # along each side of the volume
 _FEWEST_NODES = 8
 _DROPPED = 0.002  # of the variance, at any place in the volume
-_BLOCK = 4096
 _REACH = 2
 _CAMERA_CAMERA, _ALL = int(Source.CAMERA_CAMERA), int(Source.ALL)
 
@@ -127,8 +126,8 @@ def calibration_sigma(
     deviation along the viewing ray stands, which is an upper bound but for a small part.
     """
     sigma = np.zeros(len(points_mm))
-    _sigma_kernel(
-        modes.devices, modes.sizes_px, modes.modes, modes.middle_mm, modes.row, modes.second,
+    in_bands(
+        _sigma_kernel, len(sigma), modes.devices, modes.sizes_px, modes.modes, modes.middle_mm, modes.row, modes.second,
         points_mm, normals, source, camera, tangents, sigma,
     )  # fmt: skip
     return sigma
@@ -140,7 +139,7 @@ def stripe_tangents(points_mm: FloatArray, offsets: IntArray, bridge_after: NDAr
     NaN for a point that no step but bridges joins to another one.
     """
     tangents = np.full((len(points_mm), 3), np.nan)
-    _tangent_kernel(points_mm, offsets, bridge_after, tangents)
+    in_bands(_tangent_kernel, len(offsets) - 1, points_mm, offsets, bridge_after, tangents)
     return tangents
 
 
@@ -171,7 +170,7 @@ def _sampled(modes: CalibrationModes, volume_mm: FloatArray) -> tuple[FloatArray
     return places[seen], moves[seen]
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _sample_kernel(
     devices: Any, sizes: Any, row: bool, second: int, projector: bool, places: Any, moves: Any, seen: Any
 ) -> None:
@@ -207,64 +206,63 @@ def _sample_kernel(
                     seen[i] &= add_row(devices, camera, last, a, b, shares[camera], point, axis, g, moves[i, k])
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(in_every_scan=False)
 def _sigma_kernel(
-    devices: Any, sizes: Any, modes: Any, middle: Any, row: bool, second: int,
+    begin: int, end: int, devices: Any, sizes: Any, modes: Any, middle: Any, row: bool, second: int,
     points: Any, normals: Any, source: Any, camera: Any, tangents: Any, sigma: Any,
 ) -> None:  # fmt: skip
     last = len(devices) - 1
     parameters = _EACH * len(devices)
-    for block in prange((len(points) + _BLOCK - 1) // _BLOCK):
-        g = np.zeros((3, 3))
-        ray = np.zeros(3)
-        shares = np.zeros(last)
-        normal = np.zeros(3)
-        line = np.zeros(parameters + 6)
-        total = np.zeros(modes.shape[1])
-        for i in range(block * _BLOCK, min(len(points), (block + 1) * _BLOCK)):
-            point = points[i]
-            d = devices[camera[i]]
-            length = 0.0
+    g = np.zeros((3, 3))
+    ray = np.zeros(3)
+    shares = np.zeros(last)
+    normal = np.zeros(3)
+    line = np.zeros(parameters + 6)
+    total = np.zeros(modes.shape[1])
+    for i in range(begin, end):
+        point = points[i]
+        d = devices[camera[i]]
+        length = 0.0
+        for k in range(3):
+            normal[k] = normals[i, k]
+            ray[k] = point[k] + d[10 + k] * d[19] + d[13 + k] * d[20] + d[16 + k] * d[21]
+            length += ray[k] * ray[k]
+        if not np.isfinite(normal[0] + normal[1] + normal[2]):
             for k in range(3):
-                normal[k] = normals[i, k]
-                ray[k] = point[k] + d[10 + k] * d[19] + d[13 + k] * d[20] + d[16 + k] * d[21]
-                length += ray[k] * ray[k]
-            if not np.isfinite(normal[0] + normal[1] + normal[2]):
-                for k in range(3):
-                    normal[k] = ray[k] / np.sqrt(length)
-            line[:] = 0.0
-            good = True
-            if source[i] == _CAMERA_CAMERA:
-                a, b = across(devices, second, point, tangents[i], g)
-                good = add_row(devices, 0, second, a, b, 1.0, point, normal, g, line)
+                normal[k] = ray[k] / np.sqrt(length)
+        line[:] = 0.0
+        good = True
+        if source[i] == _CAMERA_CAMERA:
+            a, b = across(devices, second, point, tangents[i], g)
+            good = add_row(devices, 0, second, a, b, 1.0, point, normal, g, line)
+        else:
+            a, b = 0.0 if row else 1.0, 1.0 if row else 0.0
+            if source[i] == _ALL and shares_of_mean(devices, sizes, point, ray, g, shares) > 0:
+                for index in range(last):
+                    if shares[index] > 0:
+                        good &= add_row(devices, index, last, a, b, shares[index], point, normal, g, line)
             else:
-                a, b = 0.0 if row else 1.0, 1.0 if row else 0.0
-                if source[i] == _ALL and shares_of_mean(devices, sizes, point, ray, g, shares) > 0:
-                    for index in range(last):
-                        if shares[index] > 0:
-                            good &= add_row(devices, index, last, a, b, shares[index], point, normal, g, line)
-                else:
-                    good = add_row(devices, camera[i], last, a, b, 1.0, point, normal, g, line)
-            x, y, z = point[0] - middle[0], point[1] - middle[1], point[2] - middle[2]
-            for k in range(3):
-                line[parameters + k] = normal[k]
-            line[parameters + 3] = y * normal[2] - z * normal[1]
-            line[parameters + 4] = z * normal[0] - x * normal[2]
-            line[parameters + 5] = x * normal[1] - y * normal[0]
-            total[:] = 0.0
-            for p in range(parameters + 6):
-                if line[p] != 0:
-                    for k in range(len(total)):
-                        total[k] += line[p] * modes[p, k]
-            squares = 0.0
-            for k in range(len(total)):
-                squares += total[k] * total[k]
-            sigma[i] = np.sqrt(squares) if good else np.nan
+                good = add_row(devices, camera[i], last, a, b, 1.0, point, normal, g, line)
+        x, y, z = point[0] - middle[0], point[1] - middle[1], point[2] - middle[2]
+        for k in range(3):
+            line[parameters + k] = normal[k]
+        line[parameters + 3] = y * normal[2] - z * normal[1]
+        line[parameters + 4] = z * normal[0] - x * normal[2]
+        line[parameters + 5] = x * normal[1] - y * normal[0]
+        total[:] = 0.0
+        for p in range(parameters + 6):
+            if line[p] != 0:
+                for k in range(len(total)):
+                    total[k] += line[p] * modes[p, k]
+        squares = 0.0
+        for k in range(len(total)):
+            squares += total[k] * total[k]
+        sigma[i] = np.sqrt(squares) if good else np.nan
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _tangent_kernel(points: Any, offsets: Any, bridge: Any, tangents: Any) -> None:
-    for curve in prange(len(offsets) - 1):
+@kernel(in_every_scan=False)
+def _tangent_kernel(first: int, last: int, points: Any, offsets: Any, bridge: Any, tangents: Any) -> None:
+    for curve in range(first, last):
         for i in range(offsets[curve], offsets[curve + 1]):
             before = after = i
             for _ in range(_REACH):

@@ -68,7 +68,8 @@ class Limits:
 class CameraCurves:
     """What one camera gives. refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking.
 
-    refined : the points are those of `phase.refined`; disagreement_px : see there, empty where there was no phase.
+    refined : the points are those of `refinement.refined`; disagreement_px : as of `refinement.Refinement`, empty where
+    there was no phase.
     """
 
     ensemble: StripeEnsemble

@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.reconstruction.phase import PositionMap
 
 _FLAT_PX = 1.0
@@ -32,26 +32,28 @@ def at_pixel_centres(
     beside a border or a step both are plain central differences. Gradients g of ln L that noise may have made count
     little, g³/(g² + 4 σ²). A pixel that lacks a neighbour along an axis stays as it is along that axis.
     """
-    brightness = _log_kernel(contrast)
-    return PositionMap(_moved_kernel(seen.position, brightness, contrast, deviation, blur_px**2), seen.sigma)
+    brightness = np.full_like(contrast, np.nan)
+    in_bands(_log_kernel, len(contrast), contrast, brightness)
+    moved = seen.position.copy()
+    in_bands(_moved_kernel, len(moved), seen.position, brightness, contrast, deviation, blur_px**2, moved)
+    return PositionMap(moved, seen.sigma)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _log_kernel(contrast: Any) -> Any:
-    """(H, W) float32: the logarithm, NaN where there is no light."""
-    out = np.full(contrast.shape, np.nan, dtype=np.float32)
-    for y in prange(contrast.shape[0]):
+@kernel
+def _log_kernel(first: int, last: int, contrast: Any, out: Any) -> None:
+    """Fill in the logarithm where there is light."""
+    for y in range(first, last):
         for x in range(contrast.shape[1]):
             if contrast[y, x] > 0:
                 out[y, x] = np.log(contrast[y, x])
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _moved_kernel(position: Any, brightness: Any, contrast: Any, deviation: Any, variance: float) -> Any:
+@kernel
+def _moved_kernel(
+    first: int, last: int, position: Any, brightness: Any, contrast: Any, deviation: Any, variance: float, out: Any
+) -> None:
     rows, columns = position.shape
-    out = position.copy()
-    for y in prange(1, rows - 1):
+    for y in range(max(first, 1), min(last, rows - 1)):
         for x in range(1, columns - 1):
             here = position[y, x]
             if np.isnan(here):
@@ -78,4 +80,3 @@ def _moved_kernel(position: Any, brightness: Any, contrast: Any, deviation: Any,
                 if np.isfinite(slope) and np.isfinite(rise) and rise != 0:
                     shift += slope * rise * (rise * rise / (rise * rise + doubt))
             out[y, x] = here - variance * shift
-    return out

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
 _SHARPEST_TURN = np.pi / 3
@@ -57,9 +57,14 @@ def chain_frames(
     each chain (chains,).
     """
     # Positive numbers sort as their bits do; complemented, from the largest to the smallest.
-    by_strength = _order_kernel(~strength.astype(np.float32).view(np.uint32), borders)
+    keys = ~strength.astype(np.float32).view(np.uint32)
+    by_strength = np.zeros(len(keys), dtype=np.int32)
+    in_bands(_order_kernel, len(borders) - 1, keys, borders, by_strength)
     placed = np.concatenate([points_px, normals], axis=1)
-    order, ends, filled, chains = _chain_kernel(placed, strong, by_strength, borders, shape)
+    frames = len(borders) - 1
+    order, ends = np.zeros(len(placed), dtype=np.int32), np.zeros(len(placed), dtype=np.int32)
+    filled, chains = np.zeros(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
+    in_bands(_chain_kernel, frames, placed, strong, by_strength, borders, shape, order, ends, filled, chains)
     none = np.zeros(0, dtype=np.int32)
     parts = list(zip(borders, filled, chains, strict=False))
     lengths = np.concatenate([none, *(np.diff(ends[a : a + count], prepend=0) for a, _, count in parts)])
@@ -70,13 +75,14 @@ def chain_frames(
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _order_kernel(keys: Any, borders: Any) -> Any:
-    """(n,) int32: for each frame the order of its rising keys, ties by index (radix sort, eleven bits at a time)."""
-    order = np.zeros(len(keys), dtype=np.int32)
-    for frame in prange(len(borders) - 1):
+@kernel
+def _order_kernel(begin: int, end: int, keys: Any, borders: Any, order: Any) -> None:
+    """For each frame the order of its rising keys, ties by index (radix sort, eleven bits at a time)."""
+    for frame in range(begin, end):
         first, last = borders[frame], borders[frame + 1]
-        now = np.arange(last - first).astype(np.int32)
+        now = np.zeros(last - first, dtype=np.int32)
+        for k in range(last - first):
+            now[k] = k
         following = np.zeros(last - first, dtype=np.int32)
         for shift in (0, 11, 22):
             place = np.zeros(2049, dtype=np.int64)
@@ -84,28 +90,27 @@ def _order_kernel(keys: Any, borders: Any) -> Any:
                 place[((keys[i] >> shift) & 2047) + 1] += 1
             for digit in range(2048):
                 place[digit + 1] += place[digit]
-            for k in now:
+            for at in range(last - first):
+                k = now[at]
                 digit = (keys[first + k] >> shift) & 2047
                 following[place[digit]] = k
                 place[digit] += 1
             now, following = following, now
-        order[first:last] = now
-    return order
+        for at in range(last - first):
+            order[first + at] = now[at]
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _chain_kernel(placed: Any, strong: Any, by_strength: Any, borders: Any, shape: Any) -> Any:
+@kernel
+def _chain_kernel(
+    begin: int, end: int, placed: Any, strong: Any, by_strength: Any, borders: Any, shape: Any,
+    order: Any, ends: Any, filled: Any, chains: Any,
+) -> None:  # fmt: skip
     """Chain each frame into its own part of the results.
 
-    placed : (n, 4) x, y and normal of each point. Returns order, the ends of the chains within each frame's part, and
+    placed : (n, 4) x, y and normal of each point. Fills in order, the ends of the chains within each frame's part, and
     how much of either each frame has filled.
     """
-    frames = len(borders) - 1
-    order = np.zeros(len(placed), dtype=np.int32)
-    ends = np.zeros(len(placed), dtype=np.int32)
-    filled = np.zeros(frames, dtype=np.int64)
-    chains = np.zeros(frames, dtype=np.int64)
-    for frame in prange(frames):
+    for frame in range(begin, end):
         first, last = borders[frame], borders[frame + 1]
         # at : one more than the point that a pixel holds and no chain has used; 0 for none.
         at = np.zeros(shape, dtype=np.int32)
@@ -139,17 +144,16 @@ def _chain_kernel(placed: Any, strong: Any, by_strength: Any, borders: Any, shap
             ends[first + chains[frame]] = place - first
             chains[frame] += 1
         filled[frame] = place - first
-    return order, ends, filled, chains
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _pixel(placed: Any, i: int, shape: Any) -> Any:
     column = min(max(int(np.rint(placed[i, 0])), 0), shape[1] - 1)
     row = min(max(int(np.rint(placed[i, 1])), 0), shape[0] - 1)
     return row, column
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _trace(start: int, sign: float, at: Any, placed: Any, out: Any) -> int:
     height, width = at.shape
     current = start
@@ -199,7 +203,7 @@ def _trace(start: int, sign: float, at: Any, placed: Any, out: Any) -> int:
         current = best
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _octant(x: float, y: float) -> int:
     """The direction in eighths of a turn, rounded: 0 along x, 2 along y."""
     if abs(y) <= _HALF_OCTANT * abs(x):
@@ -211,7 +215,7 @@ def _octant(x: float, y: float) -> int:
     return 3 if y > 0 else 5
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _use_double(current: int, row: int, column: int, at: Any, placed: Any) -> None:
     if row < 0 or column < 0 or row >= at.shape[0] or column >= at.shape[1]:
         return
@@ -224,7 +228,7 @@ def _use_double(current: int, row: int, column: int, at: Any, placed: Any) -> No
         at[row, column] = 0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _alignment(placed: Any, a: int, b: int) -> float:
     """Cosine of the angle between two points' lines."""
     return float(min(1.0, abs(placed[a, 2] * placed[b, 2] + placed[a, 3] * placed[b, 3])))

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
@@ -78,9 +78,13 @@ def edge_crossings(
     if down:
         # Columns of a transposed copy lie behind one another in memory; strided ones would be far slower to walk.
         given = tuple(np.ascontiguousarray(np.swapaxes(each, -1, -2)) for each in given)  # type: ignore[assignment]
-    fraction, sigma, position = _crossing_kernel(
-        *given, paired, np.float32(read), np.float32(slope), np.asarray(edge_position, np.float64), least_sigma
-    )
+    shape = given[0].shape[1:]
+    fraction, sigma = (np.full(shape, np.nan, dtype=np.float32) for _ in range(2))
+    position = np.full(shape, np.nan)
+    in_bands(
+        _crossing_kernel, shape[0], *given, paired, np.float32(read), np.float32(slope),
+        np.asarray(edge_position, np.float64), least_sigma, fraction, sigma, position,
+    )  # fmt: skip
     along, across = np.nonzero(np.isfinite(position))
     row, column = (across, along) if down else (along, across)
     return EdgeCrossings(
@@ -93,17 +97,15 @@ def edge_crossings(
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(in_every_scan=False)
 def _crossing_kernel(
-    bits: Any, against: Any, lowest: Any, highest: Any, asked: Any, paired: bool, read: Any, slope: Any,
-    edge_position: Any, least_sigma: float,
-) -> Any:  # fmt: skip
-    """Fraction, deviation and edge position at the pixel before each crossing, (H, W) each, NaN where there is none."""
-    count, rows, columns = bits.shape
-    fraction = np.full((rows, columns), np.nan, dtype=np.float32)
-    sigma = np.full((rows, columns), np.nan, dtype=np.float32)
-    position = np.full((rows, columns), np.nan, dtype=np.float64)
-    for y in prange(rows):
+    first: int, last: int, bits: Any, against: Any, lowest: Any, highest: Any, asked: Any, paired: bool, read: Any,
+    slope: Any,
+    edge_position: Any, least_sigma: float, fraction: Any, sigma: Any, position: Any,
+) -> None:  # fmt: skip
+    """Fill in fraction, deviation and edge position at the pixel before each crossing, (H, W) each, NaN so far."""
+    count, _, columns = bits.shape
+    for y in range(first, last):
         swing = np.zeros(columns)
         for b in range(count):
             shown, other = bits[b, y], against[b if paired else 0, y]
@@ -144,10 +146,9 @@ def _crossing_kernel(
                 straight = swing[x] / (swing[x] - swing[x + 1])
                 sigma[y, x] = np.sqrt(spread / (steep * steep) + (at - straight) ** 2)
                 position[y, x] = where
-    return fraction, sigma, position
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _weight(k: int, at: float) -> float:
     """Lagrange's weight of sample k of those at -1, 0, 1, 2, for the value at `at`."""
     if k == 0:
@@ -159,12 +160,12 @@ def _weight(k: int, at: float) -> float:
     return (at + 1) * at * (at - 1) / 6
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _value(a: float, b: float, c: float, d: float, at: float) -> Any:
     return a * _weight(0, at) + b * _weight(1, at) + c * _weight(2, at) + d * _weight(3, at)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _slope(a: float, b: float, c: float, d: float, at: float) -> float:
     """Slope at `at` of the cubic through a, b, c, d at -1, 0, 1, 2."""
     return (
@@ -175,7 +176,7 @@ def _slope(a: float, b: float, c: float, d: float, at: float) -> float:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _root(a: float, b: float, c: float, d: float) -> float:
     """Where the cubic through a, b, c, d at -1, 0, 1, 2 passes zero between b and c, which differ in sign."""
     low, high = 0.0, 1.0

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.model import IntArray, Refusal
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
@@ -79,20 +79,22 @@ def decode(
     paired = frames.inverses is not None
     # Against the middle of white and black a bit swings half as far as against its inverse.
     margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * contrast) * (1.0 if paired else 0.5)
-    _decode_kernel(
-        shown, against, paired, frames.white, lit, margin.astype(np.float32), np.float32(frames.clipped_at),
+    in_bands(
+        _decode_kernel, len(lit), shown, against, paired, frames.white, lit, margin.astype(np.float32),
+        np.float32(frames.clipped_at),
         index_of_word.astype(np.int32), cell_count, limits.widest_interval, lowest, highest, refusal,
     )  # fmt: skip
     return CodeMap(lowest, highest, refusal)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _decode_kernel(
-    shown: Any, against: Any, paired: bool, white: Any, lit: Any, margin: Any, full_scale: Any, index_of_word: Any,
+    first: int, last: int, shown: Any, against: Any, paired: bool, white: Any, lit: Any, margin: Any,
+    full_scale: Any, index_of_word: Any,
     cell_count: int, widest: int, lowest: Any, highest: Any, refusal: Any,
 ) -> None:  # fmt: skip
-    bits, rows, columns = shown.shape
-    for y in prange(rows):
+    bits, _, columns = shown.shape
+    for y in range(first, last):
         uncertain = np.zeros(_MOST_UNCERTAIN_BITS, dtype=np.int32)
         for x in range(columns):
             if not lit[y, x]:

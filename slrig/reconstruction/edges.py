@@ -11,9 +11,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.reconstruction.phase import PositionMap
 
 
@@ -60,9 +60,10 @@ def near_shadows(unlit: NDArray[np.bool_], limits: EdgeLimits, /) -> NDArray[np.
 
 def near_steps(seen: PositionMap, resolution_px: float, limits: EdgeLimits, /) -> NDArray[np.bool_]:
     """(H, W) bool: pixels near a depth step; see `near_edges`."""
-    bends = _bend_kernel(
-        seen.position, np.nan_to_num(seen.sigma), limits.bend_px + 2 * resolution_px, limits.bend_share,
-        limits.bend_sigma,
+    bends = np.zeros(seen.position.shape, dtype=np.bool_)
+    in_bands(
+        _bend_kernel, len(bends), seen.position, np.nan_to_num(seen.sigma), limits.bend_px + 2 * resolution_px,
+        limits.bend_share, limits.bend_sigma, bends,
     )  # fmt: skip
     return _within(bends, limits.depth_px)
 
@@ -81,11 +82,12 @@ def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:
     return np.asarray(distance <= radius_px)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _bend_kernel(position: Any, sigma: Any, limit: float, share: float, sigmas: float) -> Any:
+@kernel
+def _bend_kernel(
+    first: int, last: int, position: Any, sigma: Any, limit: float, share: float, sigmas: float, out: Any
+) -> None:
     rows, columns = position.shape
-    out = np.zeros((rows, columns), dtype=np.bool_)
-    for y in prange(1, rows - 1):
+    for y in range(max(first, 1), min(last, rows - 1)):
         for x in range(1, columns - 1):
             for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
                 before, after = position[y - dy, x - dx], position[y + dy, x + dx]
@@ -94,4 +96,3 @@ def _bend_kernel(position: Any, sigma: Any, limit: float, share: float, sigmas: 
                     s0, s1, s2 = sigma[y - dy, x - dx], sigma[y, x], sigma[y + dy, x + dx]
                     if bend > limit + sigmas * np.sqrt(s0 * s0 + 4 * s1 * s1 + s2 * s2):
                         out[y, x] = True
-    return out

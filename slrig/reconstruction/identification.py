@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, Refusal
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
@@ -55,9 +55,11 @@ def identify(
     Returns the coded stripes, and the (H, W) uint8 map of refusals with those of the stripe points added.
     """
     refusal = code.refusal.copy()
-    shown, cause = _position_kernel(
-        stripes.offsets, stripes.frame, stripes.points_px, code.lowest, code.highest, position_of,
-        near_shadow, near_step,
+    count = len(stripes.points_px)
+    shown, cause = np.full(count, np.nan), np.zeros(count, dtype=np.uint8)
+    in_bands(
+        _position_kernel, len(stripes), stripes.offsets, stripes.frame, stripes.points_px, code.lowest, code.highest,
+        position_of, near_shadow, near_step, shown, cause,
     )  # fmt: skip
     order, offsets, chains, position = _identify_kernel(
         stripes.offsets, stripes.points_px, shown, cause, shortest_points, refusal
@@ -91,9 +93,11 @@ def with_refused_points(
     refusal = code.refusal.copy()
     clipped_at = np.float32(frames.clipped_at)
     for index, points in enumerate(found):
-        cause = _cause_kernel(
-            points.points_px, position_of[index], code.lowest, code.highest, frames.lines, clipped_at, position,
-            near_shadow, near_step,
+        cause = np.zeros(len(points.points_px), dtype=np.uint8)
+        in_bands(
+            _cause_kernel, len(cause), points.points_px, position_of[index], code.lowest, code.highest,
+            frames.lines, clipped_at, position,
+            near_shadow, near_step, cause,
         )  # fmt: skip
         # One after another: the last of the points that share a pixel stands.
         refused = np.flatnonzero(cause)
@@ -102,14 +106,13 @@ def with_refused_points(
     return replace(code, refusal=refusal)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _cause_kernel(
-    points: Any, position_of: Any, lowest: Any, highest: Any, lines: Any, clipped_at: float, position: Any,
-    near_shadow: Any, near_step: Any,
-) -> Any:  # fmt: skip
-    """(n,) uint8: why each point of a frame is refused, 0 where it is not."""
-    cause = np.zeros(len(points), dtype=np.uint8)
-    for i in prange(len(points)):
+    first: int, last: int, points: Any, position_of: Any, lowest: Any, highest: Any, lines: Any, clipped_at: float,
+    position: Any, near_shadow: Any, near_step: Any, cause: Any,
+) -> None:  # fmt: skip
+    """Fill in why each point of a frame is refused, 0 where it is not."""
+    for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         if lowest[y, x] < 0:
             continue
@@ -118,10 +121,9 @@ def _cause_kernel(
             for k in range(len(lines)):
                 if lines[k, y, x] >= clipped_at:
                     cause[i] = _SATURATED
-    return cause
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _cause(low: float, high: float, near_shadow: bool, near_step: bool) -> int:
     """Why a point is refused whose pixel may mean these two lines; 0 if it is not."""
     if np.isnan(low) or np.isnan(high):
@@ -135,14 +137,13 @@ def _cause(low: float, high: float, near_shadow: bool, near_step: bool) -> int:
     return 0
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _position_kernel(
-    offsets: Any, frame: Any, points: Any, lowest: Any, highest: Any, position_of: Any, near_shadow: Any, near_step: Any
-) -> Any:
-    """The position that each point shows, NaN where it is refused, and the cause of that."""
-    position = np.full(len(points), np.nan)
-    cause = np.zeros(len(points), dtype=np.uint8)
-    for s in prange(len(offsets) - 1):
+    first: int, last: int, offsets: Any, frame: Any, points: Any, lowest: Any, highest: Any, position_of: Any,
+    near_shadow: Any, near_step: Any, position: Any, cause: Any,
+) -> None:  # fmt: skip
+    """Fill in the position that each point shows, NaN where it is refused, and the cause of that."""
+    for s in range(first, last):
         for i in range(offsets[s], offsets[s + 1]):
             x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
             if lowest[y, x] < 0:
@@ -152,10 +153,9 @@ def _position_kernel(
             cause[i] = _cause(low, high, near_shadow[y, x], near_step[y, x])
             if not cause[i]:
                 position[i] = low
-    return position, cause
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _identify_kernel(offsets: Any, points: Any, position: Any, cause: Any, shortest: int, refusal: Any) -> Any:
     count = len(points)
     # One after another: points of two frames may share a pixel, and the last one's cause stands.
@@ -213,6 +213,6 @@ def _identify_kernel(offsets: Any, points: Any, position: Any, cause: Any, short
     return order[:filled].copy(), out_offsets[: made + 1].copy(), chains[:made].copy(), out_position[:made].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _mark(refusal: Any, points: Any, i: int, cause: int) -> None:
     refusal[int(np.rint(points[i, 1])), int(np.rint(points[i, 0]))] = cause

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.identification import CodedStripes
 from slrig.reconstruction.stripes import gathered
@@ -59,7 +59,7 @@ def link(coded: CodedStripes, /) -> StripeEnsemble:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _link_kernel(points: Any, offsets: Any, by_position: Any, groups: Any) -> Any:
     total = len(points)
     order = np.zeros(total, dtype=np.int32)
@@ -89,7 +89,7 @@ def _link_kernel(points: Any, offsets: Any, by_position: Any, groups: Any) -> An
     return order, bridge, curve_offsets
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _linked_sequence(points: Any, offsets: Any, members: Any) -> Any:
     """The members of one code in the order of the curve, and whether each runs backwards in it."""
     count = len(members)
@@ -99,14 +99,16 @@ def _linked_sequence(points: Any, offsets: Any, members: Any) -> Any:
     lengths = np.zeros(count)
     first = 0
     for m in range(count):
-        a, b = offsets[members[m]], offsets[members[m] + 1]
+        a, b = np.int64(offsets[members[m]]), np.int64(offsets[members[m] + 1])
         lengths[m] = b - a
         for axis in range(2):
-            centroids[m, axis] = points[a:b, axis].mean()
+            for i in range(a, b):
+                centroids[m, axis] += points[i, axis]
+            centroids[m, axis] /= b - a
             ends[m, 0, axis] = points[a, axis]
             ends[m, 1, axis] = points[b - 1, axis]
-        _end_direction(points, a, 1, b - a, directions[m, 0])
-        _end_direction(points, b - 1, -1, b - a, directions[m, 1])
+        for side in range(2):
+            _end_direction(points, b - 1 if side else a, 1 - 2 * side, b - a, directions[m, side])
         longer = lengths[m] > lengths[first]
         higher = lengths[m] == lengths[first] and centroids[m, 1] < centroids[first, 1]
         if longer or higher:
@@ -115,17 +117,16 @@ def _linked_sequence(points: Any, offsets: Any, members: Any) -> Any:
     reversed_ = np.zeros(2 * count, dtype=np.bool_)
     head = tail = count
     sequence[count] = members[first]
-    left = np.ones(count, dtype=np.bool_)
-    left[first] = False
-    centroid = centroids[first].copy()
+    joined = np.zeros(count, dtype=np.bool_)
+    joined[first] = True
+    # The curve so far, in the row of the stripe that it began with.
+    centroid, end, direction = centroids[first], ends[first], directions[first]
     weight = lengths[first]
-    end = ends[first].copy()
-    direction = directions[first].copy()
     for _ in range(count - 1):
         near = -1
         least = np.inf
         for m in range(count):
-            if left[m]:
+            if not joined[m]:
                 distance = (centroids[m, 0] - centroid[0]) ** 2 + (centroids[m, 1] - centroid[1]) ** 2
                 if distance < least:
                     least = distance
@@ -146,17 +147,17 @@ def _linked_sequence(points: Any, offsets: Any, members: Any) -> Any:
             head -= 1
             sequence[head] = members[near]
             reversed_[head] = theirs == 0
-        end[mine] = ends[near, 1 - theirs]
-        direction[mine] = directions[near, 1 - theirs]
         total = weight + lengths[near]
         for axis in range(2):
+            end[mine, axis] = ends[near, 1 - theirs, axis]
+            direction[mine, axis] = directions[near, 1 - theirs, axis]
             centroid[axis] = (weight * centroid[axis] + lengths[near] * centroids[near, axis]) / total
         weight = total
-        left[near] = False
+        joined[near] = True
     return sequence[head : tail + 1], reversed_[head : tail + 1]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _end_direction(points: Any, end: int, inwards: int, length: int, out: Any) -> None:
     """Eq. 1: weighted mean of the unit steps towards the end, outward; the weight falls with the distance from it."""
     reach = min(_END_POINTS, length)
@@ -173,7 +174,7 @@ def _end_direction(points: Any, end: int, inwards: int, length: int, out: Any) -
         out[0], out[1] = x / norm, y / norm
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _bend(a: Any, direction_a: Any, b: Any, direction_b: Any) -> float:
     """ω1 + ω2: how far the join of two ends turns from the directions in which they point.
 

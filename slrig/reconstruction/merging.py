@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, Source
 from slrig.reconstruction.triangulation import SheetCurves
 
@@ -116,7 +116,7 @@ def _spread(curves: SheetCurves, positions: FloatArray) -> NDArray[np.int32]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _fuse_kernel(
     a: Any, points: Any, deviation: Any, along: Any, source: Any,
     b: Any, points2: Any, deviation2: Any, along2: Any, bridge2: Any, centre: Any, widest: float,
@@ -165,7 +165,7 @@ def _fuse_kernel(
     return fused, spread, kind, sigma, distance
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _along_ray(points: Any, deviation: Any, i: int, first: int, end: int, ray: Any, norm: float) -> float:
     """Standard deviation of the depth at a fixed row: the deviation less its slide along the curve, on the ray."""
     before, after = max(first, i - 2), min(end - 1, i + 2)
@@ -191,7 +191,7 @@ def _along_ray(points: Any, deviation: Any, i: int, first: int, end: int, ray: A
     return float(abs((tt * rd - rt * td) / det))
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _alone_kernel(a: Any, along: Any, bridge: Any, b: Any, along2: Any, widest: float) -> Any:
     """Points of the second camera that lie in no stretch which the first camera has."""
     alone = np.ones(len(along2), dtype=np.bool_)

@@ -9,10 +9,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, Pinhole
 
+_POINTS = 1024  # that are worth calling a kernel for
 _UNDISTORT_STEPS = 30
 _CONVERGED = 1e-7  # of a step of Newton's method, which leaves about the square of it
 
@@ -32,12 +33,16 @@ def packed(device: Pinhole) -> FloatArray:
 
 def rays(device: Pinhole, points_px: FloatArray) -> FloatArray:
     """(n, 3) float64: world direction through each pixel (n, 2), scaled so that its depth in the device is 1."""
-    return np.asarray(_rays_kernel(packed(device), np.ascontiguousarray(points_px, dtype=np.float64)))
+    points, out = np.ascontiguousarray(points_px, dtype=np.float64), np.zeros((len(points_px), 3))
+    in_bands(_rays_kernel, len(points), packed(device), points, out, rows_at_least=_POINTS)
+    return out
 
 
 def project(device: Pinhole, points_mm: FloatArray) -> FloatArray:
     """(n, 2) float64 pixels of world points (n, 3); NaN for points behind the device."""
-    return np.asarray(_project_kernel(packed(device), np.ascontiguousarray(points_mm, dtype=np.float64)))
+    points, out = np.ascontiguousarray(points_mm, dtype=np.float64), np.full((len(points_mm), 2), np.nan)
+    in_bands(_project_kernel, len(points), packed(device), points, out, rows_at_least=_POINTS)
+    return out
 
 
 def to_depths(device: Pinhole, points_mm: FloatArray) -> FloatArray:
@@ -45,7 +50,7 @@ def to_depths(device: Pinhole, points_mm: FloatArray) -> FloatArray:
     return np.asarray(points_mm @ device.rotation[2] + device.translation_mm[2])
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def distort(d: Any, x: float, y: float) -> Any:
     """Distorted normalised coordinates and their Jacobian: xd, yd, ∂xd/∂x, ∂xd/∂y, ∂yd/∂x, ∂yd/∂y."""
     k1, k2, p1, p2, k3 = d[5], d[6], d[7], d[8], d[9]
@@ -65,7 +70,7 @@ def distort(d: Any, x: float, y: float) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
     """Undistorted normalised coordinates of a pixel, by Newton's method on the distortion.
 
@@ -75,7 +80,7 @@ def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
     return normalised_near(d, u, v, (u - d[2] - d[1] * yd) / d[0], yd)
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def normalised_near(d: Any, u: float, v: float, x: float, y: float) -> Any:
     """As `normalised_from_pixel`, from a start: coordinates that are known to be near."""
     yd = (v - d[4]) / d[3]
@@ -94,7 +99,7 @@ def normalised_near(d: Any, u: float, v: float, x: float, y: float) -> Any:
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def world_ray(d: Any, u: float, v: float, out: Any) -> None:
     """Fill out (3,) with the world direction through a pixel: Rᵀ (x, y, 1)."""
     x, y = normalised_from_pixel(d, u, v)
@@ -102,7 +107,7 @@ def world_ray(d: Any, u: float, v: float, out: Any) -> None:
         out[k] = d[10 + k] * x + d[13 + k] * y + d[16 + k]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def to_device(d: Any, px: float, py: float, pz: float) -> Any:
     """World point to device coordinates, mm: R X + t."""
     return (
@@ -112,21 +117,17 @@ def to_device(d: Any, px: float, py: float, pz: float) -> Any:
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _rays_kernel(d: Any, points: Any) -> Any:
-    out = np.zeros((len(points), 3))
-    for i in prange(len(points)):
+@kernel(in_every_scan=False)
+def _rays_kernel(first: int, last: int, d: Any, points: Any, out: Any) -> None:
+    for i in range(first, last):
         world_ray(d, points[i, 0], points[i, 1], out[i])
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _project_kernel(d: Any, points: Any) -> Any:
-    out = np.full((len(points), 2), np.nan)
-    for i in prange(len(points)):
+@kernel(in_every_scan=False)
+def _project_kernel(first: int, last: int, d: Any, points: Any, out: Any) -> None:
+    for i in range(first, last):
         px, py, pz = to_device(d, points[i, 0], points[i, 1], points[i, 2])
         if pz > 0:
             xd, yd, _, _, _, _ = distort(d, px / pz, py / pz)
             out[i, 0] = d[0] * xd + d[1] * yd + d[2]
             out[i, 1] = d[3] * yd + d[4]
-    return out

@@ -12,16 +12,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.surface_fit import fit_kernel, stencils
-
-_ROWS = 16  # rows that one thread takes at a time
+from slrig.reconstruction.surface_fit import POINTS, fit_kernel, stencils
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,8 @@ def position_map(frames: AxisFrames, noise: NoiseModel, code: CodeMap, cell_posi
     phase = has_phase(frames)
     # An interval of more than half a period may hold the phase twice, and does not tell which.
     widest_px = 0.5 * patterns[0].period_px if phase else np.inf
-    middle = _middle_kernel(code.lowest, code.highest, code.refusal, cell_position, widest_px)
+    middle = np.full(code.lowest.shape, np.nan, dtype=np.float32)
+    in_bands(_middle_kernel, len(middle), code.lowest, code.highest, code.refusal, cell_position, widest_px, middle)
     if not phase:
         return PositionMap(middle, np.full_like(middle, np.nan))
     period = patterns[0].period_px
@@ -61,61 +60,63 @@ def position_map(frames: AxisFrames, noise: NoiseModel, code: CodeMap, cell_posi
     given = frames.lines, np.cos(angle), np.sin(angle), float(period), middle
     clipped_at = np.float32(frames.clipped_at)
     if noise.read_share is None or noise.shot_share is None:
-        return PositionMap(*_phase_kernel(*given, noise.read_variance, noise.slope, clipped_at))
+        return PositionMap(*_phases(*given, noise.read_variance, noise.slope, clipped_at))
     # The variance is a sum of one part by read noise and one by shot noise, each with its own share at each pixel.
-    position, by_read = _phase_kernel(*given, noise.read_variance, 0.0, clipped_at)
-    _, by_shot = _phase_kernel(*given, 0.0, noise.slope, clipped_at)
+    position, by_read = _phases(*given, noise.read_variance, 0.0, clipped_at)
+    _, by_shot = _phases(*given, 0.0, noise.slope, clipped_at)
     return PositionMap(position, np.sqrt(noise.read_share * by_read**2 + noise.shot_share * by_shot**2))
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _middle_kernel(lowest: Any, highest: Any, refusal: Any, cell_position: Any, widest: float) -> Any:
-    """(H, W) float32: the middle of each pixel's code interval, px, NaN where it is refused or too wide."""
-    out = np.full(lowest.shape, np.nan, dtype=np.float32)
-    for y in prange(lowest.shape[0]):
+def _phases(lines: NDArray[np.float32], *given: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Position and its deviation, (H, W) float32 each, NaN where unknown."""
+    position, sigma = (np.full(lines.shape[1:], np.nan, dtype=np.float32) for _ in range(2))
+    in_bands(_phase_kernel, len(position), lines, *given, position, sigma)
+    return position, sigma
+
+
+@kernel
+def _middle_kernel(
+    first: int, last: int, lowest: Any, highest: Any, refusal: Any, cell_position: Any, widest: float, out: Any
+) -> None:
+    """Fill in the middle of each pixel's code interval, px, where it is neither refused nor too wide."""
+    for y in range(first, last):
         for x in range(lowest.shape[1]):
             if refusal[y, x] == 0:
                 low, high = cell_position[lowest[y, x]], cell_position[highest[y, x]]
                 if high - low <= widest:
                     out[y, x] = 0.5 * (low + high)
-    return out
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _phase_kernel(
-    lines: Any, cosine: Any, sine: Any, period: float, middle: Any, read: float, slope: float, clipped_at: float
-) -> Any:
-    count, rows, columns = lines.shape
-    out = np.full((rows, columns), np.nan, dtype=np.float32)
-    sigma = np.full((rows, columns), np.nan, dtype=np.float32)
+    first: int, last: int, lines: Any, cosine: Any, sine: Any, period: float, middle: Any, read: float, slope: float,
+    clipped_at: float, out: Any, sigma: Any,
+) -> None:  # fmt: skip
+    count, _, columns = lines.shape
     scale = period / (2 * np.pi)
-    for block in prange((rows + _ROWS - 1) // _ROWS):
-        sums = np.zeros((5, columns))
-        brightest = np.zeros(columns, dtype=np.float32)
-        for y in range(block * _ROWS, min(rows, (block + 1) * _ROWS)):
-            sums[:] = 0
-            brightest[:] = 0
-            for k in range(count):
-                np.maximum(brightest, lines[k, y], brightest)
-                _add_line(lines[k, y], cosine[k], sine[k], sums[0], sums[1])
-                _add_variance(lines[k, y], cosine[k], sine[k], read, slope, sums[2], sums[3], sums[4])
-            for x in range(columns):
-                real, imaginary = sums[0, x], sums[1, x]
-                squared = real * real + imaginary * imaginary
-                if np.isnan(middle[y, x]) or squared <= 0 or brightest[x] >= clipped_at:
-                    continue
-                # ∂φ/∂I_k = (sin θ_k cos φ - cos θ_k sin φ) / |C|
-                variance = (
-                    sums[2, x] * real * real - 2 * sums[3, x] * real * imaginary + sums[4, x] * imaginary * imaginary
-                )
-                within = np.arctan2(imaginary, real) * scale
-                out[y, x] = within + period * np.rint((middle[y, x] - within) / period)
-                sigma[y, x] = scale * np.sqrt(max(variance, 0.0)) / squared
-    return out, sigma
+    sums = np.zeros((5, columns))
+    brightest = np.zeros(columns, dtype=np.float32)
+    for y in range(first, last):
+        sums[:] = 0
+        brightest[:] = 0
+        for k in range(count):
+            np.maximum(brightest, lines[k, y], brightest)
+            _add_line(lines[k, y], cosine[k], sine[k], sums[0], sums[1])
+            _add_variance(lines[k, y], cosine[k], sine[k], read, slope, sums[2], sums[3], sums[4])
+        for x in range(columns):
+            real, imaginary = sums[0, x], sums[1, x]
+            squared = real * real + imaginary * imaginary
+            if np.isnan(middle[y, x]) or squared <= 0 or brightest[x] >= clipped_at:
+                continue
+            # ∂φ/∂I_k = (sin θ_k cos φ - cos θ_k sin φ) / |C|
+            variance = sums[2, x] * real * real - 2 * sums[3, x] * real * imaginary + sums[4, x] * imaginary * imaginary
+            within = np.arctan2(imaginary, real) * scale
+            out[y, x] = within + period * np.rint((middle[y, x] - within) / period)
+            sigma[y, x] = scale * np.sqrt(max(variance, 0.0)) / squared
 
 
 # Loops of few arrays each: with more, the compiler gives up proving that they do not overlap, and uses no vectors.
-@njit(cache=True, nogil=True)
+@kernel_part
 def _add_line(line: Any, cosine: float, sine: float, real: Any, imaginary: Any) -> None:
     for x in range(len(line)):
         real[x] += line[x] * cosine
@@ -123,7 +124,7 @@ def _add_line(line: Any, cosine: float, sine: float, real: Any, imaginary: Any) 
         imaginary[x] += line[x] * sine
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _add_variance(line: Any, cosine: float, sine: float, read: float, slope: float, ss: Any, sc: Any, cc: Any) -> None:
     """Add the variance of a frame times sine², sine · cosine and cosine²."""
     for x in range(len(line)):
@@ -149,9 +150,8 @@ def fitted_points(
     from noise or from the scatter of the pixels about the surface, whichever is larger, and found (n,) bool.
     """
     fitted = no_points(len(starts_px))
-    fit_kernel(
-        *windows(seen, usable), np.ascontiguousarray(starts_px), np.asarray(targets_px, dtype=np.float64), *fitted
-    )
+    starts, targets = np.ascontiguousarray(starts_px), np.asarray(targets_px, dtype=np.float64)
+    in_bands(fit_kernel, len(starts), *windows(seen, usable), starts, targets, *fitted, rows_at_least=POINTS)
     return fitted
 
 

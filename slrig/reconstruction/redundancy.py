@@ -14,9 +14,9 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import Axis, FloatArray, IntArray, Pinhole, Size, Source
 from slrig.reconstruction.merging import by_row
 from slrig.reconstruction.optics import project
@@ -118,9 +118,11 @@ def spare_equation(
     # Displacements by one standard deviation, as the other camera sees them.
     moved = project(other, first.points_mm + first.deviation_mm) - expected
     own = project(other, second.points_mm + second.deviation_mm) - project(other, second.points_mm)
-    residual, sigma = _across_kernel(
-        mine, first.offsets, first.along_px, expected, moved,
+    residual, sigma = (np.full(len(expected), np.nan) for _ in range(2))
+    in_bands(
+        _across_kernel, len(mine), mine, first.offsets, first.along_px, expected, moved,
         theirs, second.offsets, second.along_px, second.pixels_px, own, second.bridge_after, widest_gap_px,
+        residual, sigma,
     )  # fmt: skip
     met = np.isfinite(residual)
     # Walking along rising rows, higher columns are on one side, and along rising columns, higher rows on the other.
@@ -160,14 +162,13 @@ def _cells(coordinate_px: FloatArray, extent_px: int) -> NDArray[np.int64]:
     return np.clip((coordinate_px + 0.5) * CELLS // extent_px, 0, CELLS - 1).astype(np.int64)
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(in_every_scan=False)
 def _across_kernel(
-    mine: Any, a: Any, along: Any, expected: Any, moved: Any,
+    first: int, last: int, mine: Any, a: Any, along: Any, expected: Any, moved: Any,
     theirs: Any, b: Any, along2: Any, pixels2: Any, own: Any, bridge2: Any, widest: float,
-) -> Any:  # fmt: skip
-    residual = np.full(len(along), np.nan)
-    sigma = np.full(len(along), np.nan)
-    for pair in prange(len(mine)):
+    residual: Any, sigma: Any,
+) -> None:  # fmt: skip
+    for pair in range(first, last):
         low, high = b[theirs[pair]], b[theirs[pair] + 1]
         row = low
         for i in range(a[mine[pair]], a[mine[pair] + 1]):
@@ -196,16 +197,15 @@ def _across_kernel(
             theirs_px = (1 - share) * abs(nx * own[k, 0] + ny * own[k, 1])
             theirs_px += share * abs(nx * own[k + 1, 0] + ny * own[k + 1, 1])
             sigma[i] = np.hypot(nx * moved[i, 0] + ny * moved[i, 1], theirs_px)
-    return residual, sigma
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _joined(k: int, along: Any, bridge: Any, widest: float) -> bool:
     """Whether the step from point k to the next one is a piece of seen curve."""
     return not bridge[k] and along[k + 1] - along[k] <= widest
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _foot(point: Any, start: int, low: int, high: int, along: Any, pixels: Any, bridge: Any, widest: float) -> Any:
     """The segment of a curve that holds the foot of the perpendicular from a point, and the foot's share of it.
 

@@ -15,20 +15,19 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.phase import FittedPoints, PositionMap, no_points, windows
 from slrig.reconstruction.stripes import LinePoints
-from slrig.reconstruction.surface_fit import fit_kernel
+from slrig.reconstruction.surface_fit import POINTS, fit_kernel
 
 _LEAST_GRADIENT = 0.05
 _SURE_PX = 0.15
 _FAINT = 1e-6
 _POINTS_TIED = 5
-_POINTS = 8192  # that one thread takes at a time
 _CLEAR_PX = 0.12
 _LINES_KEPT = 2  # of the lines that begin at one pixel, which are neighbours, these many are remembered
 _MOST_FOR_MEDIAN = 20_000
@@ -75,17 +74,18 @@ def _crossings(
     )  # fmt: skip
     counts = np.zeros((rows, frames), dtype=np.int64)
     crossed = np.zeros(usable.shape, dtype=np.bool_)
-    _crossing_kernel(*given, crossed, counts, False, np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
+    nowhere = np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)
+    in_bands(_crossing_kernel, rows, *given, crossed, counts, False, *nowhere)
     ends = np.cumsum(counts.T.ravel()).reshape(frames, rows)
     total = int(ends[-1, -1]) if ends.size else 0
     found = np.zeros(total, dtype=np.int32), np.zeros((total, 2)), np.zeros(total)
-    _crossing_kernel(*given, crossed, np.ascontiguousarray(ends.T) - counts, True, *found)
+    in_bands(_crossing_kernel, rows, *given, crossed, np.ascontiguousarray(ends.T) - counts, True, *found)
     return found
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _crossing_kernel(
-    position: Any, usable: Any, lowest: Any, highest: Any, by_cell: Any, first: float,
+    begin: int, end: int, position: Any, usable: Any, lowest: Any, highest: Any, by_cell: Any, first: float,
     started: Any, landed: Any, moved: Any, normals: Any, begun_targets: Any,
     crossed: Any, place: Any, fill: bool, frame: Any, starts: Any, targets: Any,
 ) -> None:  # fmt: skip
@@ -94,7 +94,7 @@ def _crossing_kernel(
     """
     rows, columns = position.shape
     frames = by_cell.shape[1]
-    for y in prange(1, rows - 1):
+    for y in range(max(begin, 1), min(end, rows - 1)):
         for x in range(1, columns - 1):
             if not usable[y, x] or (fill and not crossed[y, x]):
                 continue
@@ -135,7 +135,7 @@ def _crossing_kernel(
                 place[y, k] += 1
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _slope(before: float, here: float, after: float, before_usable: bool, after_usable: bool) -> float:
     if before_usable and after_usable:
         return 0.5 * (after - before)
@@ -185,18 +185,19 @@ def refined(
     started, landed = _nothing_taken(len(found), usable.shape)
     for index, (points, part) in enumerate(zip(found, parts, strict=True)):
         starts = np.ascontiguousarray(points.points_px)
-        _target_kernel(starts, code.lowest, code.highest, position_of[index], targets[part])
-        fit_kernel(*given, starts, targets[part], *(each[part] for each in old))
+        in_bands(_target_kernel, len(starts), starts, code.lowest, code.highest, position_of[index], targets[part])
+        fitted = tuple(each[part] for each in old)
+        in_bands(fit_kernel, len(starts), *given, starts, targets[part], *fitted, rows_at_least=POINTS)
         own = np.ascontiguousarray(points.sigma_px)
-        _settle_kernel(starts, own, clear, coarsest_px, *(each[part] for each in old), away[part])
+        in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, *fitted, away[part])
         _taken_kernel(starts, moved[part], good[part], part.start, index % _LINES_KEPT, started, landed[index])
     disagreement = np.array([_sure_median(_drawn(away[p], good[p])) for p in parts])
     frame, missed_starts, missed_targets = _crossings(
         seen, usable, code, position_of, started, landed, moved, normals, targets
     )
     missed = no_points(len(frame))
-    fit_kernel(*given, missed_starts, missed_targets, *missed)
-    _new_kernel(frame, coarsest_px, landed, missed[0], missed[2], missed[3])
+    in_bands(fit_kernel, len(frame), *given, missed_starts, missed_targets, *missed, rows_at_least=POINTS)
+    in_bands(_new_kernel, len(frame), frame, coarsest_px, landed, missed[0], missed[2], missed[3])
     new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
     new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
     pairs = zip(found, parts, new_parts, strict=True)
@@ -209,34 +210,15 @@ def _joined(points: LinePoints, old: FittedPoints, part: slice, missed: FittedPo
     first, count = int(np.count_nonzero(kept)), int(np.count_nonzero(added))
     out = np.zeros((first + count, 2)), np.zeros((first + count, 2)), np.zeros(first + count)
     strength, strong = np.zeros(first + count), np.zeros(first + count, dtype=np.bool_)
-    _keep_kernel(kept, *(each[part] for each in old[:3]), *(each[:first] for each in out))
-    _keep_kernel(added, *(each[more] for each in missed[:3]), *(each[first:] for each in out))
+    for filled, fitted, new in zip(out, old[:3], missed[:3], strict=True):
+        np.compress(kept, fitted[part], axis=0, out=filled[:first])
+        np.compress(added, new[more], axis=0, out=filled[first:])
     np.compress(kept, points.strength, out=strength[:first])
     np.compress(kept, points.strong, out=strong[:first])
     # Chains begin at what the filter found; what it missed comes after, the surest first.
     strength[first:] = _FAINT / out[2][first:]
     strong[first:] = out[2][first:] < _SURE_PX
     return LinePoints(points_px=out[0], normals=out[1], strength=strength, strong=strong, sigma_px=out[2])
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _keep_kernel(
-    keep: Any, points: Any, normals: Any, sigma: Any, points_out: Any, normals_out: Any, sigma_out: Any
-) -> None:
-    """Copy what `keep` tells."""
-    blocks = (len(keep) + _POINTS - 1) // _POINTS
-    ends = np.zeros(blocks + 1, dtype=np.int64)
-    for block in prange(blocks):
-        ends[block + 1] = keep[block * _POINTS : (block + 1) * _POINTS].sum()
-    ends = np.cumsum(ends)
-    for block in prange(blocks):
-        at = ends[block]
-        for i in range(block * _POINTS, min(len(keep), (block + 1) * _POINTS)):
-            if keep[i]:
-                points_out[at, 0], points_out[at, 1] = points[i, 0], points[i, 1]
-                normals_out[at, 0], normals_out[at, 1] = normals[i, 0], normals[i, 1]
-                sigma_out[at] = sigma[i]
-                at += 1
 
 
 def _drawn(away: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
@@ -256,9 +238,19 @@ def _sure_median(away: FloatArray) -> float:
     return float(np.copysign(max(abs(median) - 3 * error, 0.0), median))
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _settle_kernel(
-    starts: Any, own_sigma: Any, clear: Any, coarsest: float, moved: Any, normals: Any, sigma: Any, good: Any, away: Any
+    first: int,
+    last: int,
+    starts: Any,
+    own_sigma: Any,
+    clear: Any,
+    coarsest: float,
+    moved: Any,
+    normals: Any,
+    sigma: Any,
+    good: Any,
+    away: Any,
 ) -> None:
     """Give each point what its own frame knows of it, and put how far the other frames moved it into `away`.
 
@@ -266,7 +258,7 @@ def _settle_kernel(
     own frame may know better: its part in the mean is its share of the inverse variance. A filter is trusted clear of
     borders only, and where both agree.
     """
-    for i in prange(len(starts)):
+    for i in range(first, last):
         good[i] = good[i] and sigma[i] < coarsest
         x, y = starts[i, 0], starts[i, 1]
         away[i] = (moved[i, 0] - x) * normals[i, 0] + (moved[i, 1] - y) * normals[i, 1]
@@ -281,10 +273,12 @@ def _settle_kernel(
             sigma[i] *= np.sqrt(1 - weight)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _target_kernel(points: Any, lowest: Any, highest: Any, position_of: Any, targets: Any) -> None:
+@kernel
+def _target_kernel(
+    first: int, last: int, points: Any, lowest: Any, highest: Any, position_of: Any, targets: Any
+) -> None:
     """The position of the line that each point lies on, NaN where its pixel may mean two. position_of : (cells,)."""
-    for i in prange(len(points)):
+    for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         targets[i] = np.nan
         if lowest[y, x] >= 0:
@@ -298,7 +292,7 @@ def _nothing_taken(frames: int, shape: tuple[int, int]) -> tuple[IntArray, NDArr
     return np.zeros((*shape, _LINES_KEPT), dtype=np.int32), np.zeros((frames, *shape), dtype=np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, slot: int, started: Any, landed: Any) -> None:
     """Note which good point of a frame began at each pixel (one more than its index), and whether one landed there."""
     for i in range(len(starts)):
@@ -307,9 +301,11 @@ def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, slot: int, sta
             landed[int(np.rint(moved[i, 1])), int(np.rint(moved[i, 0]))] = 1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _new_kernel(frame: Any, coarsest: float, landed: Any, points: Any, sigma: Any, good: Any) -> None:
+@kernel
+def _new_kernel(
+    first: int, last: int, frame: Any, coarsest: float, landed: Any, points: Any, sigma: Any, good: Any
+) -> None:
     """Leave good only points that are fine enough and land where their line has none."""
-    for i in prange(len(frame)):
+    for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         good[i] = good[i] and sigma[i] < coarsest and not landed[frame[i], y, x]

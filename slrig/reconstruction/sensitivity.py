@@ -10,13 +10,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from slrig.kernels import kernel_part
 from slrig.model import DEVICE_PARAMETERS
 from slrig.reconstruction.optics import distort, to_device
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def gradient(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any) -> None:
     """Fill out (3,) with ∂(a u + b v)/∂X, X in the world."""
     xc, yc, zc = to_device(d, x, y, z)
@@ -29,7 +29,7 @@ def gradient(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any)
         out[k] = d[10 + k] * gx + d[13 + k] * gy + d[16 + k] * gz
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def add_parameters(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any) -> None:
     """Add the derivatives of a u + b v by the device's 15 parameters to out (15,)."""
     xc, yc, zc = to_device(d, x, y, z)
@@ -59,7 +59,7 @@ def add_parameters(d: Any, a: float, b: float, x: float, y: float, z: float, out
     out[14] += gz
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def pixel_squares(d: Any, size: Any, x: float, y: float, z: float, direction: Any, g: Any) -> float:
     """How far, in pixels, squared, the image of a point moves when it moves along a direction; 0 out of the image."""
     xc, yc, zc = to_device(d, x, y, z)
@@ -78,7 +78,7 @@ def pixel_squares(d: Any, size: Any, x: float, y: float, z: float, direction: An
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def add_row(
     devices: Any, camera: int, other: int, a: float, b: float, share: float, point: Any, normal: Any, g: Any, out: Any
 ) -> bool:
@@ -108,7 +108,7 @@ def add_row(
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def across(devices: Any, second: int, point: Any, tangent: Any, g: Any) -> Any:
     """The direction across the stripe in the second camera's image, a unit vector.
 
@@ -134,7 +134,7 @@ def across(devices: Any, second: int, point: Any, tangent: Any, g: Any) -> Any:
     return v / length, -u / length
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def shares_of_mean(devices: Any, sizes: Any, point: Any, ray: Any, g: Any, shares: Any) -> float:
     """Fill shares with each camera's part in the mean of all that see a point; their sum before, 0 if none does."""
     p = devices[len(devices) - 1]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel
 from slrig.model import FloatArray, IntArray
 
 
@@ -19,7 +19,8 @@ class SheetCurves:
     offsets : (c + 1,) int32; position_px : (c,) float64; points_mm : (n, 3) float64, world.
     deviation_mm : (n, 3) float64, displacement of the point for one standard deviation of the stripe position.
     along_px : (n,) float64, the coordinate along the sheet that orders the curve: projector row (column for row
-    patterns), or the reference camera's row where the projector is not calibrated.
+    patterns), or where the projector is not calibrated the reference camera's row (column for stripes that run rather
+    across its image than down).
     pixels_px : (n, 2) float64, (x, y) in the reference camera; stripe : (n,) int32, the stripe each point came from;
     bridge_after : (n,) bool, True where the step to the next point joins two stripes; source : (n,) uint8, `Source`.
     """
@@ -43,41 +44,17 @@ class SheetCurves:
     ) -> SheetCurves:
         """The points at `index`, in its order, under these offsets and bridges."""
         where = np.flatnonzero(index) if index.dtype == np.bool_ else index
-        points, deviation, along, pixels, stripe, source = _gather_kernel(
-            where, self.points_mm, self.deviation_mm, self.along_px, self.pixels_px, self.stripe, self.source
-        )
         return SheetCurves(
             offsets=offsets,
             position_px=self.position_px,
-            points_mm=points,
-            deviation_mm=deviation,
-            along_px=along,
-            pixels_px=pixels,
-            stripe=stripe,
+            points_mm=np.take(self.points_mm, where, axis=0),
+            deviation_mm=np.take(self.deviation_mm, where, axis=0),
+            along_px=np.take(self.along_px, where, axis=0),
+            pixels_px=np.take(self.pixels_px, where, axis=0),
+            stripe=np.take(self.stripe, where, axis=0),
             bridge_after=bridge_after,
-            source=source,
+            source=np.take(self.source, where, axis=0),
         )
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _gather_kernel(where: Any, points: Any, deviation: Any, along: Any, pixels: Any, stripe: Any, source: Any) -> Any:
-    count = len(where)
-    points_out = np.zeros((count, 3))
-    deviation_out = np.zeros((count, 3))
-    along_out = np.zeros(count)
-    pixels_out = np.zeros((count, 2))
-    stripe_out = np.zeros(count, dtype=stripe.dtype)
-    source_out = np.zeros(count, dtype=source.dtype)
-    for i in prange(count):
-        k = where[i]
-        for c in range(3):
-            points_out[i, c] = points[k, c]
-            deviation_out[i, c] = deviation[k, c]
-        along_out[i] = along[k]
-        pixels_out[i, 0], pixels_out[i, 1] = pixels[k, 0], pixels[k, 1]
-        stripe_out[i] = stripe[k]
-        source_out[i] = source[k]
-    return points_out, deviation_out, along_out, pixels_out, stripe_out, source_out
 
 
 def selected(curves: SheetCurves, keep: NDArray[np.bool_], /) -> SheetCurves:
@@ -100,16 +77,17 @@ def ordered_along_sheet(curves: SheetCurves, /) -> SheetCurves:
     the light sheet it is known: every projector row meets the surface once, so stripes of one code follow one another
     by row. Points keep their order within a stripe.
     """
-    order, bridge_after = _sheet_order_kernel(curves.offsets, curves.stripe, curves.along_px)
+    count = len(curves.stripe)
+    order, bridge_after = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.bool_)
+    given = curves.offsets, curves.stripe, curves.along_px
+    in_bands(_sheet_order_kernel, len(curves.position_px), *given, order, bridge_after)
     return curves.taken(order, offsets=curves.offsets, bridge_after=bridge_after)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sheet_order_kernel(offsets: Any, stripe: Any, along: Any) -> Any:
-    """The order of the points, and which of the steps between them join two stripes."""
-    order = np.zeros(len(stripe), dtype=np.int64)
-    bridge = np.zeros(len(stripe), dtype=np.bool_)
-    for curve in prange(len(offsets) - 1):
+@kernel
+def _sheet_order_kernel(begin: int, end: int, offsets: Any, stripe: Any, along: Any, order: Any, bridge: Any) -> None:
+    """Fill in the order of the points, and which of the steps between them join two stripes."""
+    for curve in range(begin, end):
         a, b = offsets[curve], offsets[curve + 1]
         runs = 0
         for i in range(a, b):
@@ -133,10 +111,15 @@ def _sheet_order_kernel(offsets: Any, stripe: Any, along: Any) -> Any:
                 drift += (along[i] - middle[r]) * (i - first[r] - 0.5 * (count - 1))
             turned[r] = drift < 0
         filled = a
-        for r in np.argsort(middle, kind="mergesort"):
+        for _ in range(runs):
+            # Few stripes make up a sheet: the next by its middle, the first of equals, is looked for.
+            r = 0
+            for other in range(1, runs):
+                if middle[other] < middle[r]:
+                    r = other
+            middle[r] = np.inf
             for k in range(first[r + 1] - first[r]):
                 order[filled] = first[r + 1] - 1 - k if turned[r] else first[r] + k
                 filled += 1
             if filled < b:
                 bridge[filled - 1] = True
-    return order, bridge

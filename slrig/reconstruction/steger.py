@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
+
+from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.model import FloatArray, IntArray
 
 RIDGE = 0
 """Bright lines: the point where the first derivative across the line is zero."""
@@ -17,8 +19,7 @@ EDGE = 1
 _SUPPORT = 3.6  # kernel radius in sigmas
 _TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; the chain drops double responses
 _NEWTON_BOX = 1.1
-_ROWS = 32  # rows, and points, that one thread takes at a time
-_POINTS = 1024
+_ROWS, _POINTS = 32, 1024  # that are worth calling a kernel for
 
 
 def kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
@@ -36,51 +37,73 @@ def kernels(sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32], 
     return zero.astype(np.float32), one.astype(np.float32), two.astype(np.float32)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def taylor_kernel(image: Any, noise: Any, lit: Any, weak: Any, zero: Any, one: Any, two: Any, kind: int) -> Any:
-    """One Taylor step at every lit pixel whose response exceeds `weak` times its noise: offset and response.
+def taylor_step(
+    image: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    lit: NDArray[np.bool_],
+    weak: np.float32,
+    zero: NDArray[np.float32],
+    one: NDArray[np.float32],
+    two: NDArray[np.float32],
+    kind: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """One Taylor step at every lit pixel whose response exceeds `weak` times its noise.
 
-    The filters are separable, even or odd: rows first, and then along the row, while it is in the cache.
+    image, noise : (H, W) float32; zero, one, two : as `kernels` gives them; kind : `RIDGE` or `EDGE`.
+    Returns the offsets (H, W, 2) of the points from their pixels, x and y, and the responses (H, W), 0 where none is.
     """
-    rows, columns = image.shape
-    radius = len(zero) // 2
-    offset = np.zeros((rows, columns, 2), dtype=np.float32)
-    response = np.zeros((rows, columns), dtype=np.float32)
-    g0, g1, g2 = zero[radius:], one[radius:], two[radius:]
-    for block in prange((rows + _ROWS - 1) // _ROWS):
-        down = np.zeros((3, columns + 2 * radius), dtype=np.float32)
-        along = np.zeros((6, columns), dtype=np.float32)
-        for y in range(block * _ROWS, min(rows, (block + 1) * _ROWS)):
-            _filter_down(image, y, radius, g0, g1, g2, down)
-            _filter_along(down, radius, g0, g1, g2, along)
-            for x in range(columns):
-                if not lit[y, x]:
-                    continue
-                r, rx, ry, rxx, rxy, ryy = (
-                    along[0, x], along[1, x], along[2, x], along[3, x], along[4, x], along[5, x]
-                )  # fmt: skip
-                if kind == RIDGE:
-                    if rxx + ryy > 0:
-                        continue
-                    nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
-                    if not -curvature > weak * noise[y, x]:
-                        continue
-                    t = -(rx * nx + ry * ny) / curvature
-                    strength = -curvature
-                else:
-                    strength = np.sqrt(rx * rx + ry * ry)
-                    if not strength > max(weak * noise[y, x], 1e-9):
-                        continue
-                    nx, ny = rx / strength, ry / strength
-                    t = -r / strength
-                if abs(t * nx) <= _TAYLOR_BOX and abs(t * ny) <= _TAYLOR_BOX:
-                    offset[y, x, 0] = t * nx
-                    offset[y, x, 1] = t * ny
-                    response[y, x] = strength
+    offset, response = np.zeros((*image.shape, 2), dtype=np.float32), np.zeros(image.shape, dtype=np.float32)
+    in_bands(
+        _taylor_kernel, len(image), image, noise, lit, weak, zero, one, two, kind, offset, response,
+        rows_at_least=_ROWS,
+    )  # fmt: skip
     return offset, response
 
 
-@njit(cache=True, nogil=True)
+@kernel
+def _taylor_kernel(
+    first: int, last: int, image: Any, noise: Any, lit: Any, weak: Any, zero: Any, one: Any, two: Any, kind: int,
+    offset: Any, response: Any,
+) -> None:  # fmt: skip
+    """Fill in offset and response, zeros so far.
+
+    The filters are separable, even or odd: rows first, and then along the row, while it is in the cache.
+    """
+    columns = image.shape[1]
+    radius = len(zero) // 2
+    g0, g1, g2 = zero[radius:], one[radius:], two[radius:]
+    down = np.zeros((3, columns + 2 * radius), dtype=np.float32)
+    along = np.zeros((6, columns), dtype=np.float32)
+    for y in range(first, last):
+        _filter_down(image, y, radius, g0, g1, g2, down)
+        _filter_along(down, radius, g0, g1, g2, along)
+        for x in range(columns):
+            if not lit[y, x]:
+                continue
+            r, rx, ry, rxx, rxy, ryy = (
+                along[0, x], along[1, x], along[2, x], along[3, x], along[4, x], along[5, x]
+            )  # fmt: skip
+            if kind == RIDGE:
+                if rxx + ryy > 0:
+                    continue
+                nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
+                if not -curvature > weak * noise[y, x]:
+                    continue
+                t = -(rx * nx + ry * ny) / curvature
+                strength = -curvature
+            else:
+                strength = np.sqrt(rx * rx + ry * ry)
+                if not strength > max(weak * noise[y, x], 1e-9):
+                    continue
+                nx, ny = rx / strength, ry / strength
+                t = -r / strength
+            if abs(t * nx) <= _TAYLOR_BOX and abs(t * ny) <= _TAYLOR_BOX:
+                offset[y, x, 0] = t * nx
+                offset[y, x, 1] = t * ny
+                response[y, x] = strength
+
+
+@kernel_part
 def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
     """Fill (3, columns + 2 radius) with the image's rows round y, smoothed and differentiated once and twice.
 
@@ -105,7 +128,7 @@ def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out
             out[k, radius + columns - 1 + t] = out[k, radius + _reflected(columns - 1 + t, columns)]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
     """Fill (6, columns) with r, rx, ry, rxx, rxy, ryy of one row."""
     columns = out.shape[1]
@@ -131,19 +154,19 @@ def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -
 
 
 # Loops of three arrays each: with more, the compiler gives up proving that they do not overlap, and uses no vectors.
-@njit(cache=True, nogil=True)
+@kernel_part
 def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
         out[x] += weight * (right[x] + left[x])
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _subtract(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
         out[x] += weight * (right[x] - left[x])
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _reflected(index: int, count: int) -> int:
     while index < 0 or index >= count:
         index = -index if index < 0 else 2 * (count - 1) - index
@@ -152,7 +175,7 @@ def _reflected(index: int, count: int) -> int:
     return index
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _ridge_normal(rxx: float, rxy: float, ryy: float) -> Any:
     # Eigenvector of the symmetric 2 x 2 Hessian for the eigenvalue of largest magnitude.
     half = 0.5 * (rxx - ryy)
@@ -169,67 +192,78 @@ def _ridge_normal(rxx: float, rxy: float, ryy: float) -> Any:
     return ax / length, ay / length, value
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def newton_kernel(image: Any, offset: Any, columns: Any, rows: Any, sigma: float, kind: int) -> Any:
-    """One Newton step from each pixel's offset on kernels centred there; response and normal are those of the start."""
+def newton_step(
+    image: NDArray[np.float32], offset: NDArray[np.float32], columns: IntArray, rows: IntArray, sigma: float, kind: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """One Newton step from the offsets of these pixels, (n,) each, on kernels centred there.
+
+    Returns x and y (n,), px, the normal (n, 2) and the response (n,) at the start, and (n,) bool: the step stayed near.
+    """
     count = len(columns)
+    x, y, response = np.zeros(count), np.zeros(count), np.zeros(count)
+    normals, kept = np.zeros((count, 2)), np.zeros(count, dtype=np.bool_)
+    in_bands(
+        _newton_kernel, count, image, offset, columns, rows, sigma, kind, x, y, normals, response, kept,
+        rows_at_least=_POINTS,
+    )  # fmt: skip
+    return x, y, normals, response, kept
+
+
+@kernel
+def _newton_kernel(
+    first: int, last: int, image: Any, offset: Any, columns: Any, rows: Any, sigma: float, kind: int,
+    x_out: Any, y_out: Any, normals: Any, response: Any, kept: Any,
+) -> None:  # fmt: skip
     height, width = image.shape
     radius = int(np.ceil(_SUPPORT * sigma))
     size = 2 * radius + 1
-    x_out = np.zeros(count)
-    y_out = np.zeros(count)
-    normals = np.zeros((count, 2))
-    response = np.zeros(count)
-    kept = np.zeros(count, dtype=np.bool_)
     whole = np.exp(-((np.arange(size) - radius) ** 2) / (2 * sigma * sigma))
-    for block in prange((count + _POINTS - 1) // _POINTS):
-        wx = np.zeros((3, size))
-        wy = np.zeros((3, size))
-        for i in range(block * _POINTS, min(count, (block + 1) * _POINTS)):
-            column, row = columns[i], rows[i]
-            if column < radius or row < radius or column >= width - radius or row >= height - radius:
+    wx = np.zeros((3, size))
+    wy = np.zeros((3, size))
+    for i in range(first, last):
+        column, row = columns[i], rows[i]
+        if column < radius or row < radius or column >= width - radius or row >= height - radius:
+            continue
+        fx, fy = float(offset[row, column, 0]), float(offset[row, column, 1])
+        _centred_weights(wx, fx, sigma, whole)
+        _centred_weights(wy, fy, sigma, whole)
+        r = rx = ry = rxx = rxy = ryy = 0.0
+        for j in range(size):
+            line = image[row - radius + j, column - radius :]
+            s0 = s1 = s2 = 0.0
+            for k in range(size):
+                value = float(line[k])
+                s0 += value * wx[0, k]
+                s1 += value * wx[1, k]
+                s2 += value * wx[2, k]
+            r += s0 * wy[0, j]
+            rx += s1 * wy[0, j]
+            rxx += s2 * wy[0, j]
+            ry += s0 * wy[1, j]
+            rxy += s1 * wy[1, j]
+            ryy += s0 * wy[2, j]
+        if kind == RIDGE:
+            nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
+            if curvature >= 0:
                 continue
-            fx, fy = float(offset[row, column, 0]), float(offset[row, column, 1])
-            _centred_weights(wx, fx, sigma, whole)
-            _centred_weights(wy, fy, sigma, whole)
-            r = rx = ry = rxx = rxy = ryy = 0.0
-            for j in range(size):
-                line = image[row - radius + j, column - radius :]
-                s0 = s1 = s2 = 0.0
-                for k in range(size):
-                    value = float(line[k])
-                    s0 += value * wx[0, k]
-                    s1 += value * wx[1, k]
-                    s2 += value * wx[2, k]
-                r += s0 * wy[0, j]
-                rx += s1 * wy[0, j]
-                rxx += s2 * wy[0, j]
-                ry += s0 * wy[1, j]
-                rxy += s1 * wy[1, j]
-                ryy += s0 * wy[2, j]
-            if kind == RIDGE:
-                nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
-                if curvature >= 0:
-                    continue
-                t = -(rx * nx + ry * ny) / curvature
-                strength = -curvature
-            else:
-                strength = np.sqrt(rx * rx + ry * ry)
-                if strength <= 1e-9:
-                    continue
-                nx, ny = rx / strength, ry / strength
-                t = -r / strength
-            x, y = fx + t * nx, fy + t * ny
-            if abs(x) > _NEWTON_BOX or abs(y) > _NEWTON_BOX:
+            t = -(rx * nx + ry * ny) / curvature
+            strength = -curvature
+        else:
+            strength = np.sqrt(rx * rx + ry * ry)
+            if strength <= 1e-9:
                 continue
-            x_out[i], y_out[i] = column + x, row + y
-            normals[i, 0], normals[i, 1] = nx, ny
-            response[i] = strength
-            kept[i] = True
-    return x_out, y_out, normals, response, kept
+            nx, ny = rx / strength, ry / strength
+            t = -r / strength
+        x, y = fx + t * nx, fy + t * ny
+        if abs(x) > _NEWTON_BOX or abs(y) > _NEWTON_BOX:
+            continue
+        x_out[i], y_out[i] = column + x, row + y
+        normals[i, 0], normals[i, 1] = nx, ny
+        response[i] = strength
+        kept[i] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
     """Fill (3, size) with Gaussian, first and second derivative weights for samples at -radius … radius.
 

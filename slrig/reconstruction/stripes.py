@@ -13,14 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.chaining import chain_frames
-from slrig.reconstruction.steger import EDGE, RIDGE, kernels, newton_kernel, taylor_kernel
-
-_POINTS = 8192  # that one thread takes at a time
+from slrig.reconstruction.steger import EDGE, RIDGE, kernels, newton_step, taylor_step
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,23 +94,8 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
 def gathered(
     order: IntArray, points_px: FloatArray, normals: FloatArray, sigma_px: FloatArray, /
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points, normals and deviations at the indices `order`, by all cores."""
-    points, across, sigma = _gather_kernel(order, points_px, normals, sigma_px)
-    return points, across, sigma
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _gather_kernel(order: Any, points: Any, normals: Any, sigma: Any) -> Any:
-    count = len(order)
-    points_out = np.zeros((count, 2))
-    normals_out = np.zeros((count, 2))
-    sigma_out = np.zeros(count)
-    for i in prange(count):
-        k = order[i]
-        points_out[i, 0], points_out[i, 1] = points[k, 0], points[k, 1]
-        normals_out[i, 0], normals_out[i, 1] = normals[k, 0], normals[k, 1]
-        sigma_out[i] = sigma[k]
-    return points_out, normals_out, sigma_out
+    """Points, normals and deviations at the indices `order`."""
+    return np.take(points_px, order, axis=0), np.take(normals, order, axis=0), np.take(sigma_px, order)
 
 
 def normalised(
@@ -123,23 +106,23 @@ def normalised(
     (I - black)/(white - black), damped to zero where the contrast is not above the noise.
     noise : (H, W) float32, standard deviation of I - black, camera units.
     """
-    light, deviation = _normalised_kernel(image, black, contrast, noise)
+    light, deviation = np.zeros_like(image), np.zeros_like(image)
+    in_bands(_normalised_kernel, len(image), image, black, contrast, noise, light, deviation)
     return light, deviation
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _normalised_kernel(image: Any, black: Any, contrast: Any, noise: Any) -> Any:
-    light = np.zeros(image.shape, dtype=np.float32)
-    deviation = np.zeros(image.shape, dtype=np.float32)
-    for y in prange(image.shape[0]):
+@kernel(in_every_scan=False)
+def _normalised_kernel(
+    first: int, last: int, image: Any, black: Any, contrast: Any, noise: Any, light: Any, deviation: Any
+) -> None:
+    for y in range(first, last):
         for x in range(image.shape[1]):
             weight = _weight(contrast[y, x], noise[y, x])
             light[y, x] = (image[y, x] - black[y, x]) * weight
             deviation[y, x] = noise[y, x] * abs(weight)
-    return light, deviation
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _weight(contrast: Any, noise: Any) -> Any:
     """1/contrast, damped to zero where the contrast is not above the noise."""
     damping = np.float32(3) * noise
@@ -159,15 +142,19 @@ def normalised_line(
 
     read_variance, slope : of the camera's noise; ends_repeats : how many frames the mean white and black are of.
     """
-    light, deviation = _normalised_line_kernel(line, white, black, read_variance, slope, ends_repeats)
+    light, deviation = np.zeros_like(line), np.zeros_like(line)
+    in_bands(
+        _normalised_line_kernel, len(line), line, white, black, read_variance, slope, ends_repeats, light, deviation
+    )
     return light, deviation
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _normalised_line_kernel(line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float) -> Any:
-    normal = np.zeros(line.shape, dtype=np.float32)
-    deviation = np.zeros(line.shape, dtype=np.float32)
-    for y in prange(line.shape[0]):
+@kernel
+def _normalised_line_kernel(
+    first: int, last: int, line: Any, white: Any, black: Any, read: float, slope: float, ends_repeats: float,
+    normal: Any, deviation: Any,
+) -> None:  # fmt: skip
+    for y in range(first, last):
         for x in range(line.shape[1]):
             contrast, above = white[y, x] - black[y, x], line[y, x] - black[y, x]
             # (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
@@ -179,7 +166,6 @@ def _normalised_line_kernel(line: Any, white: Any, black: Any, read: float, slop
             weight = _weight(contrast, noise)
             normal[y, x] = above * weight
             deviation[y, x] = noise * abs(weight)
-    return normal, deviation
 
 
 def measured_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], lit: NDArray[np.bool_]) -> float:
@@ -246,32 +232,31 @@ def _points(
     kind: int,
 ) -> LinePoints:
     factor = _response_noise_factor(sigma_px, kind)
-    offset, strength = taylor_kernel(
-        image, noise, lit, np.float32(limits.weak_sigma * factor), *kernels(sigma_px), kind
-    )  # fmt: skip
+    weakest = np.float32(limits.weak_sigma * factor)
+    offset, strength = taylor_step(image, noise, lit, weakest, *kernels(sigma_px), kind)
     rows, columns, height = _responses_kernel(strength)
     if len(height):
         counts = height > limits.weak_fraction * np.percentile(height, 90)
         rows, columns = rows[counts], columns[counts]
-    x, y, normals, response, kept = newton_kernel(image, offset, columns, rows, sigma_px, kind)
+    x, y, normals, response, kept = newton_step(image, offset, columns, rows, sigma_px, kind)
     # Noise of the numerator of the last step over its slope: ∫ g_x² for the ridge, ∫ g² = 1/(4 π σ²) for the edge.
     gain = np.sqrt(1 / (8 * np.pi)) / sigma_px**2 if kind == RIDGE else np.sqrt(1 / (4 * np.pi)) / sigma_px
-    weakest = np.float32(limits.strong_sigma * factor)
-    return LinePoints(*_kept_kernel(kept, x, y, normals, response, noise, rows, columns, gain, weakest))
+    strongest = np.float32(limits.strong_sigma * factor)
+    return LinePoints(*_kept_kernel(kept, x, y, normals, response, noise, rows, columns, gain, strongest))
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _responses_kernel(strength: Any) -> Any:
     """Row, column (int32) and value of every pixel that is not zero, in the order of the image."""
-    count = np.zeros(len(strength) + 1, dtype=np.int64)
-    for y in prange(len(strength)):
-        count[y + 1] = np.count_nonzero(strength[y])
-    first = np.cumsum(count)
-    rows = np.zeros(first[-1], dtype=np.int32)
-    columns = np.zeros(first[-1], dtype=np.int32)
-    height = np.zeros(first[-1], dtype=np.float32)
-    for y in prange(len(strength)):
-        at = first[y]
+    count = 0
+    for y in range(strength.shape[0]):
+        for x in range(strength.shape[1]):
+            count += strength[y, x] != 0
+    rows = np.zeros(count, dtype=np.int32)
+    columns = np.zeros(count, dtype=np.int32)
+    height = np.zeros(count, dtype=np.float32)
+    at = 0
+    for y in range(strength.shape[0]):
         for x in range(strength.shape[1]):
             if strength[y, x] != 0:
                 rows[at], columns[at], height[at] = y, x, strength[y, x]
@@ -279,29 +264,25 @@ def _responses_kernel(strength: Any) -> Any:
     return rows, columns, height
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _kept_kernel(
     kept: Any, x: Any, y: Any, normals: Any, response: Any, noise: Any, rows: Any, columns: Any, gain: float,
     weakest: float,
 ) -> Any:  # fmt: skip
     """What `LinePoints` holds, of the points that are kept: gain and weakest make noise a deviation and a threshold."""
-    blocks = (len(kept) + _POINTS - 1) // _POINTS
-    count = np.zeros(blocks + 1, dtype=np.int64)
-    for block in prange(blocks):
-        count[block + 1] = np.count_nonzero(kept[block * _POINTS : (block + 1) * _POINTS])
-    first = np.cumsum(count)
-    total = first[-1]
+    total = 0
+    for i in range(len(kept)):
+        total += kept[i]
     points, across = np.zeros((total, 2)), np.zeros((total, 2))
     strength, sigma = np.zeros(total), np.zeros(total)
     strong = np.zeros(total, dtype=np.bool_)
-    for block in prange(blocks):
-        at = first[block]
-        for i in range(block * _POINTS, min(len(kept), (block + 1) * _POINTS)):
-            if kept[i]:
-                points[at, 0], points[at, 1] = x[i], y[i]
-                across[at, 0], across[at, 1] = normals[i, 0], normals[i, 1]
-                strength[at] = response[i]
-                sigma[at] = noise[rows[i], columns[i]] * gain / max(response[i], 1e-12)
-                strong[at] = response[i] > noise[int(np.rint(y[i])), int(np.rint(x[i]))] * weakest
-                at += 1
+    at = 0
+    for i in range(len(kept)):
+        if kept[i]:
+            points[at, 0], points[at, 1] = x[i], y[i]
+            across[at, 0], across[at, 1] = normals[i, 0], normals[i, 1]
+            strength[at] = response[i]
+            sigma[at] = noise[rows[i], columns[i]] * gain / max(response[i], 1e-12)
+            strong[at] = response[i] > noise[int(np.rint(y[i])), int(np.rint(x[i]))] * weakest
+            at += 1
     return points, across, strength, strong, sigma

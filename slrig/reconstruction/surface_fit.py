@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
+
+from slrig.kernels import kernel, kernel_part
 
 _REACH = 2
 _QUADRATIC_SCALE_PX = 1.1
@@ -17,7 +18,7 @@ _LEAST_GRADIENT = 0.05
 _LEAST_FREEDOM = 0.5
 _PIXELS = 25
 _LANES = 32  # 25 pixels, or points side by side: whole vectors
-_BLOCK = 1024
+POINTS = 1024  # that are worth calling the kernel for
 
 # Rows of the working memory of points side by side: the surface's six coefficients, then these.
 _X, _Y, _NOISE, _MISFIT, _VALUE = 6, 7, 8, 9, 10
@@ -46,9 +47,9 @@ def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
     return quadratic, terms, linear[0], freedom
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def fit_kernel(
-    position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
+    first: int, last: int, position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
     whole_freedom: float, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
 ) -> None:  # fmt: skip
     """Fill in points, normals, deviation and found, zeros so far, as `phase.fitted_points` returns them.
@@ -56,72 +57,70 @@ def fit_kernel(
     whole : (H, W) uint8, pixels whose 5 x 5 neighbours are all usable; stencils, basis, plane, whole_freedom : as
     `stencils` returns them. Sums over pixels are of differences from the middle one, small enough for single precision.
     """
-    count = len(starts)
     rows, columns = position.shape
     flat_position, flat_sigma = position.reshape(-1), sigma.reshape(-1)
-    for block in prange((count + _BLOCK - 1) // _BLOCK):
-        # A small image of pixels, for one point whose neighbours are not all usable.
-        value = np.zeros(_LANES, dtype=np.float32)
-        variance_at = np.ones(_LANES, dtype=np.float32)
-        member = np.zeros(_LANES, dtype=np.float32)
-        gains = np.zeros((6, _LANES), dtype=np.float32)
-        # Points whose neighbours are all usable, side by side, so that they are worked off in vector registers.
-        work = np.zeros(_ROWS * _LANES, dtype=np.float32)
-        which = np.zeros(_LANES, dtype=np.int64)
-        waiting = 0
-        for i in range(block * _BLOCK, min(count, (block + 1) * _BLOCK)):
-            points[i, 0], points[i, 1] = starts[i, 0], starts[i, 1]
-            if np.isnan(targets[i]):
-                continue
-            ix, iy = int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1]))
-            if ix < _REACH or iy < _REACH or ix >= columns - _REACH or iy >= rows - _REACH or not usable[iy, ix]:
-                continue
-            origin = position[iy, ix]
-            if whole[iy, ix]:
-                corner = (iy - _REACH) * columns + ix - _REACH
-                for dy in range(5):
-                    for dx in range(5):
-                        at = np.uintp(corner + dy * columns + dx)
-                        pixel = 5 * dy + dx
-                        work[(_VALUE + pixel) * _LANES + waiting] = flat_position[at] - origin
-                        work[(_VARIANCE + pixel) * _LANES + waiting] = flat_sigma[at] * flat_sigma[at]
-                which[waiting] = i
-                waiting += 1
-                if waiting == _LANES:
-                    _fit_side_by_side(
-                        work, waiting, which, stencils, basis, whole_freedom,
-                        position, starts, targets, points, normals, deviation, found,
-                    )  # fmt: skip
-                    waiting = 0
-                continue
-            members = _members(position, sigma, usable, iy, ix, value, variance_at, member)
-            if not _plane_gains(member, members, plane, basis, gains):
-                continue
-            f0 = f1 = f2 = np.float32(0)
-            for j in range(_PIXELS):
-                f0 += gains[0, j] * value[j]
-                f1 += gains[1, j] * value[j]
-                f2 += gains[2, j] * value[j]
-            x, y, gx, gy = _solved(
-                f0, f1, f2, np.float32(0), np.float32(0), np.float32(0),
-                starts[i, 0] - ix, starts[i, 1] - iy, targets[i] - origin,
-            )  # fmt: skip
-            noise = misfit = np.float32(0)
-            x1, y1 = np.float32(x), np.float32(y)
-            for j in range(_PIXELS):
-                gain = gains[0, j] + gains[1, j] * x1 + gains[2, j] * y1
-                noise += gain * gain * variance_at[j]
-                residual = value[j] - (f0 + f1 * basis[1, j] + f2 * basis[2, j])
-                misfit += member[j] * residual * residual / variance_at[j]
-            freedom = _plane_freedom(member, members, gains, basis)
-            _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found)
-        _fit_side_by_side(
-            work, waiting, which, stencils, basis, whole_freedom,
-            position, starts, targets, points, normals, deviation, found,
+    # A small image of pixels, for one point whose neighbours are not all usable.
+    value = np.zeros(_LANES, dtype=np.float32)
+    variance_at = np.ones(_LANES, dtype=np.float32)
+    member = np.zeros(_LANES, dtype=np.float32)
+    gains = np.zeros((6, _LANES), dtype=np.float32)
+    # Points whose neighbours are all usable, side by side, so that they are worked off in vector registers.
+    work = np.zeros(_ROWS * _LANES, dtype=np.float32)
+    which = np.zeros(_LANES, dtype=np.int64)
+    waiting = np.int64(0)  # and no literal, for which the parts would be compiled once more
+    for i in range(first, last):
+        points[i, 0], points[i, 1] = starts[i, 0], starts[i, 1]
+        if np.isnan(targets[i]):
+            continue
+        ix, iy = int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1]))
+        if ix < _REACH or iy < _REACH or ix >= columns - _REACH or iy >= rows - _REACH or not usable[iy, ix]:
+            continue
+        origin = position[iy, ix]
+        if whole[iy, ix]:
+            corner = (iy - _REACH) * columns + ix - _REACH
+            for dy in range(5):
+                for dx in range(5):
+                    at = np.uintp(corner + dy * columns + dx)
+                    pixel = 5 * dy + dx
+                    work[(_VALUE + pixel) * _LANES + waiting] = flat_position[at] - origin
+                    work[(_VARIANCE + pixel) * _LANES + waiting] = flat_sigma[at] * flat_sigma[at]
+            which[waiting] = i
+            waiting += 1
+            if waiting == _LANES:
+                _fit_side_by_side(
+                    work, waiting, which, stencils, basis, whole_freedom,
+                    position, starts, targets, points, normals, deviation, found,
+                )  # fmt: skip
+                waiting = np.int64(0)
+            continue
+        members = _members(position, sigma, usable, iy, ix, value, variance_at, member)
+        if not _plane_gains(member, members, plane, basis, gains):
+            continue
+        f0 = f1 = f2 = np.float32(0)
+        for j in range(_PIXELS):
+            f0 += gains[0, j] * value[j]
+            f1 += gains[1, j] * value[j]
+            f2 += gains[2, j] * value[j]
+        x, y, gx, gy = _solved(
+            f0, f1, f2, np.float32(0), np.float32(0), np.float32(0),
+            starts[i, 0] - ix, starts[i, 1] - iy, targets[i] - origin,
         )  # fmt: skip
+        noise = misfit = np.float32(0)
+        x1, y1 = np.float32(x), np.float32(y)
+        for j in range(_PIXELS):
+            gain = gains[0, j] + gains[1, j] * x1 + gains[2, j] * y1
+            noise += gain * gain * variance_at[j]
+            residual = value[j] - (f0 + f1 * basis[1, j] + f2 * basis[2, j])
+            misfit += member[j] * residual * residual / variance_at[j]
+        freedom = _plane_freedom(member, members, gains, basis)
+        _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found)
+    _fit_side_by_side(
+        work, waiting, which, stencils, basis, whole_freedom,
+        position, starts, targets, points, normals, deviation, found,
+    )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel_part
 def _fit_side_by_side(
     work: Any, count: int, which: Any, stencils: Any, basis: Any, freedom: float,
     position: Any, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
@@ -156,7 +155,7 @@ def _fit_side_by_side(
 
 
 # Nothing else stands in these loops, and one array holds all: so the compiler sees that rows do not overlap.
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel_part
 def _surface_of(work: Any, stencils: Any) -> None:
     """Rows 0 to 5: the coefficients of 1, x, y, x², xy, y²."""
     work[: 6 * _LANES] = 0
@@ -174,7 +173,7 @@ def _surface_of(work: Any, stencils: Any) -> None:
             work[5 * _LANES + lane] += w5 * value
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel_part
 def _scatter_of(work: Any, stencils: Any, basis: Any) -> None:
     """Rows _NOISE and _MISFIT: variance of the surface at (_X, _Y), and the residuals' squares over their variances."""
     work[_NOISE * _LANES : (_MISFIT + 1) * _LANES] = 0
@@ -198,7 +197,7 @@ def _scatter_of(work: Any, stencils: Any, basis: Any) -> None:
             work[_MISFIT * _LANES + lane] += residual * residual / work[variances + lane]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: float, target: float) -> Any:
     """Move (x, y) along the gradient to where the surface is `target`: x, y and the gradient before the last step."""
     gx = gy = 0.0
@@ -216,7 +215,7 @@ def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: f
     return x, y, gx, gy
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _put(
     i: int, ix: int, iy: int, x: float, y: float, gx: float, gy: float, noise: float, misfit: float, freedom: float,
     starts: Any, points: Any, normals: Any, deviation: Any, found: Any,
@@ -236,7 +235,7 @@ def _put(
     found[i] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _members(
     position: Any, sigma: Any, usable: Any, iy: int, ix: int, value: Any, variance_at: Any, member: Any
 ) -> int:
@@ -261,13 +260,13 @@ def _members(
     return members
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _reached(usable: Any, y: int, x: int, dy: int, dx: int) -> bool:
     """Whether a step of one pixel or none ends on a usable one; a slanting step must not squeeze between two others."""
     return usable[y + dy, x + dx] and (dy == 0 or dx == 0 or usable[y + dy, x] or usable[y, x + dx])
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _plane_freedom(member: Any, members: int, gains: Any, basis: Any) -> float:
     """Trace of (1 - H)ᵀ(1 - H) of the weighted plane: n - 2 tr H + |H|²."""
     trace: float = 0.0
@@ -285,7 +284,7 @@ def _plane_freedom(member: Any, members: int, gains: Any, basis: Any) -> float:
     return members - 2 * trace + square
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _plane_gains(member: Any, members: int, plane: Any, basis: Any, gains: Any) -> bool:
     """Fill the first three rows of gains with those of a weighted plane; False when the pixels fix none.
 
@@ -318,7 +317,7 @@ def _plane_gains(member: Any, members: int, plane: Any, basis: Any, gains: Any) 
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _fill_row(member: Any, plane: Any, basis: Any, one: float, of_x: float, of_y: float, row: Any) -> None:
     p, q, r = np.float32(one), np.float32(of_x), np.float32(of_y)
     for j in range(_LANES):

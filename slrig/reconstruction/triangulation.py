@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numpy.typing import NDArray
 
-from slrig.model import Axis, Pinhole, Source
+from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.model import Axis, Pinhole, Refusal, Source
+from slrig.reconstruction.epipolar import runs_down
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.optics import (
     distort,
@@ -26,21 +28,29 @@ _CONVERGED_PX = 1e-5  # before the last step of Newton's method, which leaves ab
 _PROBE_PX = 1e-3
 _BORDER_PX = 2.0
 _NEAR_PX = 3.0
+_NONE, _BEHIND_DEVICE, _NO_INTERSECTION = int(Refusal.NONE), int(Refusal.BEHIND_DEVICE), int(Refusal.NO_INTERSECTION)
 
 
-def camera_projector(ensemble: StripeEnsemble, camera: Pinhole, projector: Pinhole, axis: Axis, /) -> SheetCurves:
+def camera_projector(
+    ensemble: StripeEnsemble, camera: Pinhole, projector: Pinhole, axis: Axis, /
+) -> tuple[SheetCurves, NDArray[np.uint8]]:
     """Intersect each point's ray with its light sheet.
 
     The sheet of a distorted column is curved, so the depth s along the ray solves column(project(o + s d)) = c by
     Newton's method on the whole distorted projection. Points behind a device, or met where the projector has no pixel,
-    are left out.
+    are left out. Also returns (n,) uint8, `Refusal`: for every point of the ensemble why it was left out, if it was.
     """
-    points, deviation, along, good = _sheet_kernel(
-        packed(camera), packed(projector), camera.centre_mm, ensemble.points_px, ensemble.normals, ensemble.sigma_px,
-        ensemble.offsets, ensemble.position_px, axis is Axis.ROW,
+    count = len(ensemble.points_px)
+    points, deviation = np.zeros((count, 3)), np.zeros((count, 3))
+    along, cause = np.full(count, np.nan), np.full(count, Refusal.NO_INTERSECTION, dtype=np.uint8)
+    in_bands(
+        _sheet_kernel, len(ensemble.position_px), packed(camera), packed(projector), camera.centre_mm,
+        ensemble.points_px, ensemble.normals, ensemble.sigma_px, ensemble.offsets, ensemble.position_px,
+        axis is Axis.ROW, points, deviation, along, cause,
     )  # fmt: skip
     other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
-    good &= (along > -_BORDER_PX) & (along < projector.size.along(other) - 1 + _BORDER_PX)
+    outside = ~((along > -_BORDER_PX) & (along < projector.size.along(other) - 1 + _BORDER_PX))
+    cause[outside & (cause == Refusal.NONE)] = Refusal.OFF_PROJECTOR
     made = SheetCurves(
         offsets=ensemble.offsets,
         position_px=ensemble.position_px,
@@ -52,30 +62,35 @@ def camera_projector(ensemble: StripeEnsemble, camera: Pinhole, projector: Pinho
         bridge_after=ensemble.bridge_after,
         source=np.full(len(points), Source.CAMERA_PROJECTOR, dtype=np.uint8),
     )
-    return ordered_along_sheet(selected(made, good))
+    return ordered_along_sheet(selected(made, cause == Refusal.NONE)), cause
 
 
 def camera_camera(first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole, other: Pinhole, /) -> SheetCurves:
     """Triangulate points of `first` with the curve of the same code in `second`; no projector calibration is used.
 
     The epipolar line of each point is crossed with the other camera's curve between two consecutive points that no
-    bridge separates; the two rays then meet in the least-squares sense.
+    bridge separates; the two rays then meet in the least-squares sense. Curves run by the rows of `camera`, or by its
+    columns where the stripes run rather across the image than down.
     """
     shared, mine, theirs = np.intersect1d(first.position_px, second.position_px, return_indices=True)
     del shared
     partner = np.full(len(first.position_px), -1, dtype=np.int32)
     partner[mine] = theirs
-    points, deviation, good = _stereo_kernel(
-        packed(camera), packed(other), camera.centre_mm, other.centre_mm,
+    count = len(first.points_px)
+    points, deviation = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+    good = np.zeros(count, dtype=np.bool_)
+    in_bands(
+        _stereo_kernel, len(partner), packed(camera), packed(other), camera.centre_mm, other.centre_mm,
         first.offsets, first.points_px, first.normals, first.sigma_px, partner,
         second.offsets, second.points_px, second.normals, second.sigma_px, second.bridge_after,
+        points, deviation, good,
     )  # fmt: skip
     made = SheetCurves(
         offsets=first.offsets,
         position_px=first.position_px,
         points_mm=points,
         deviation_mm=deviation,
-        along_px=first.points_px[:, 1].copy(),
+        along_px=first.points_px[:, 1 if runs_down(first) else 0].copy(),
         pixels_px=first.points_px,
         stripe=first.stripe,
         bridge_after=first.bridge_after,
@@ -84,7 +99,7 @@ def camera_camera(first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole
     return ordered_along_sheet(selected(made, good))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _position(p: Any, x: float, y: float, z: float, row: bool) -> Any:
     """Projector position of a world point along the coded axis, and along the other one; z_p tells behind."""
     xp, yp, zp = to_device(p, x, y, z)
@@ -96,7 +111,7 @@ def _position(p: Any, x: float, y: float, z: float, row: bool) -> Any:
     return u, v, zp, xn, yn, p[0] * a + p[1] * c, p[0] * b + p[1] * e
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _depth_on_sheet(p: Any, o: Any, d: Any, position: float, row: bool, s: float) -> float:
     """The s with position(o + s d) = position, from a start; NaN when it does not settle."""
     dx = p[10] * d[0] + p[11] * d[1] + p[12] * d[2]
@@ -114,19 +129,14 @@ def _depth_on_sheet(p: Any, o: Any, d: Any, position: float, row: bool, s: float
     return np.nan
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel
 def _sheet_kernel(
-    camera: Any, projector: Any, centre: Any, points: Any, normals: Any, sigma: Any, offsets: Any, positions: Any,
-    row: bool,
-) -> Any:  # fmt: skip
-    count = len(points)
-    out = np.zeros((count, 3))
-    deviation = np.zeros((count, 3))
-    along = np.full(count, np.nan)
-    good = np.zeros(count, dtype=np.bool_)
+    first: int, last: int, camera: Any, projector: Any, centre: Any, points: Any, normals: Any, sigma: Any,
+    offsets: Any, positions: Any, row: bool, out: Any, deviation: Any, along: Any, cause: Any,
+) -> None:  # fmt: skip
     p = projector
     ox, oy, oz = to_device(p, centre[0], centre[1], centre[2])
-    for curve in prange(len(offsets) - 1):
+    for curve in range(first, last):
         position = positions[curve]
         d = np.zeros(3)
         slope_d = np.zeros(3)
@@ -152,11 +162,14 @@ def _sheet_kernel(
                 continue
             s = _depth_on_sheet(p, centre, d, position, row, from_plane / (towards - n * deep))
             if not s > 0:
+                if s <= 0:
+                    cause[i] = _BEHIND_DEVICE
                 continue
             for k in range(3):
                 out[i, k] = centre[k] + s * d[k]
             _, v, zp, xn, yn, gx, gy = _position(p, out[i, 0], out[i, 1], out[i, 2], row)
             if zp <= 0:
+                cause[i] = _BEHIND_DEVICE
                 continue
             along[i] = v
             # On the same sheet, for a stripe found a little aside: position(o + s d) stays, so along with the ray's
@@ -174,11 +187,11 @@ def _sheet_kernel(
                 across_d += gradient * slope_d[k]
             for k in range(3):
                 deviation[i, k] = s * (slope_d[k] - across_d / along_d * d[k]) * sigma[i]
-            good[i] = np.isfinite(deviation[i, 0])
-    return out, deviation, along, good
+            if np.isfinite(deviation[i, 0]):
+                cause[i] = _NONE
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _meeting(o1: Any, d1: Any, o2: Any, d2: Any, out: Any) -> bool:
     """Fill out with the point nearest to two rays (midpoint of the common perpendicular); False if behind either."""
     a = b = c = e = f = 0.0
@@ -198,17 +211,17 @@ def _meeting(o1: Any, d1: Any, o2: Any, d2: Any, out: Any) -> bool:
     return s > 0 and t > 0
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _side(normal: Any, d: Any) -> float:
     return float(normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _across(a: Any, b: Any) -> Any:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _crossed(device: Any, normal: Any, u0: float, v0: float, u1: float, v1: float, out: Any) -> bool:
     """Fill out with the ray at which the line through two pixels crosses a plane through the centre."""
     world_ray(device, u0, v0, out)
@@ -222,17 +235,14 @@ def _crossed(device: Any, normal: Any, u0: float, v0: float, u1: float, v1: floa
     return True
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(in_every_scan=False)
 def _stereo_kernel(
-    camera: Any, other: Any, o1: Any, o2: Any,
+    begin: int, end: int, camera: Any, other: Any, o1: Any, o2: Any,
     offsets: Any, points: Any, normals: Any, sigma: Any, partner: Any,
     offsets2: Any, points2: Any, normals2: Any, sigma2: Any, bridge2: Any,
-) -> Any:  # fmt: skip
-    count = len(points)
-    out = np.full((count, 3), np.nan)
-    deviation = np.full((count, 3), np.nan)
-    good = np.zeros(count, dtype=np.bool_)
-    for curve in prange(len(offsets) - 1):
+    out: Any, deviation: Any, good: Any,
+) -> None:  # fmt: skip
+    for curve in range(begin, end):
         match = partner[curve]
         if match < 0:
             continue
@@ -291,7 +301,6 @@ def _stereo_kernel(
             for k in range(3):
                 deviation[i, k] = first[k] * scale
             good[i] = True
-    return out, deviation, good
 
 
 __all__ = ["SheetCurves", "camera_camera", "camera_projector", "ordered_along_sheet", "project", "rays", "selected"]

@@ -27,10 +27,11 @@ from slrig.discovery import open_rig
 from slrig.model import Calibration, LineShift, Mesh
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.outline import Outline
-from slrig.scan.pipeline import _meshed
+from slrig.scan.pipeline import _meshed, _Walked
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.report import Stopwatch
 from slrig.scan.stream import ScanStream, step_px
+from slrig.scan.triangulated import triangulated
 
 RUNS = 5
 FIRST_TO_MESH_S = 1.0
@@ -94,9 +95,10 @@ class Run:
         seen = stream.finish()
         watch.enter("triangulate")
         step = step_px(stream.outline.shown, stream.axis)
+        found = triangulated(seen, calibration.projector, stream.axis)
+        walked = _Walked(calibration, stream.axis, stream.outline.axes, seen, step, {})
         meshed = _meshed(
-            folder, seen, calibration, stream.axis, ReconstructionPlan(), step,
-            lambda stage, _fraction, _detail: watch.enter(stage),
+            folder, found, walked, ReconstructionPlan(), lambda stage, _fraction, _detail: watch.enter(stage)
         )  # fmt: skip
         self.stages_s = watch.finished()
         ended = time.perf_counter()

@@ -62,6 +62,7 @@ def scaled(calibration: Calibration, scale: float) -> Calibration:
     return Calibration(cameras, projector)
 
 
+@pytest.mark.slow
 def test_the_error_of_a_wrong_scale_is_found(tmp_path: Path) -> None:
     config, scale = read_rig(RIG), 1.002
     plan, calibration = plan_of(config, "sphere-1", "bar-1")
@@ -74,6 +75,7 @@ def test_the_error_of_a_wrong_scale_is_found(tmp_path: Path) -> None:
     assert found[Quantity.FORM].error_mm < found[Quantity.FORM].limit_mm
 
 
+@pytest.mark.slow
 def test_a_position_without_its_artefact_is_refused(tmp_path: Path) -> None:
     config = read_rig(RIG)
     plan, _ = plan_of(config, "sphere-1")

@@ -177,7 +177,7 @@ def test_what_the_camera_sees_of_a_ball_is_triangulated_onto_it(seed: int, colum
     rows = np.sort(rng.uniform(90, 150, 30))
     points = lit_rows(column_px, rows, ball)
     ensemble = ensemble_of([opencv_pixels(CAMERA, points)], [column_px])
-    curves = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     assert len(curves.points_mm) == len(points)
     np.testing.assert_allclose(curves.points_mm, points, atol=1e-6)
     # Leaving points out or ordering again changes no point.

@@ -202,14 +202,8 @@ def _laid_out(board: Board, page: str) -> _Page:
 
 def _foot(board: Board, width_mm: float) -> list[str]:
     """The lines at the foot of a page of this width: what the board is, how to print it, how to calibrate with it."""
-    kind = {
-        BoardKind.CHARUCO: f"{board.columns} x {board.rows} corners, squares of {board.square_mm:g} mm, "
-        f"markers of {board.marker_mm or 0:g} mm from {board.dictionary}",
-        BoardKind.CHESSBOARD: f"{board.columns} x {board.rows} inner corners, squares of {board.square_mm:g} mm",
-        BoardKind.CIRCLES: f"{board.columns} circles in each of {board.rows} rows, rows {board.square_mm:g} mm apart",
-    }[board.kind]
     said = (
-        f"slrig: {board.kind}, {kind}",
+        f"slrig: {board.description}",
         "Print at 100 % (actual size). Hold a ruler to both scales: where they are off, give the lengths as measured.",
         solve_command(board),
     )

@@ -1,7 +1,8 @@
 """Good, watch or stale: what several looks at a rig since its calibration say together.
 
 One look may be bad luck: a lamp was switched on, someone leaned on the table. So the trend is judged, the median of the
-last three looks; but a look that is far beyond chance counts at once (`SURE`): a device that was knocked stays knocked.
+last three looks; but a look that is far beyond chance counts at once (`Thresholds.jump_evidence`): a device that was
+knocked stays knocked.
 """
 
 from __future__ import annotations

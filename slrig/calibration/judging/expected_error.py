@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from slrig.calibration.displacement import Moved, modes_of, moved_points, rigid_free, triangulated_axis
+from slrig.calibration.displacement import Moved, modes_of, moved_points, rigid_free
 from slrig.calibration.observations import COLUMN, ROW, Observations
 from slrig.calibration.solution import ExpectedError, Solution
 from slrig.errors import CalibrationError
-from slrig.model import Axis, Calibration, FloatArray
+from slrig.model import Axis, Calibration, FloatArray, triangulated_axis
 
 _PLACES = 1500  # wanted in the volume
 _FEWEST_PLACES = 60
@@ -141,7 +141,7 @@ def _light_sigma_px(observations: Observations, calibration: Calibration) -> flo
     """What a scan makes of the light of the board's paper, along the axis that it triangulates by."""
     if calibration.projector is None:
         return float("nan")
-    axis = triangulated_axis(next(iter(calibration.cameras.values())), calibration.projector)
+    axis = triangulated_axis(list(calibration.cameras.values()), calibration.projector)
     wanted = COLUMN if axis is Axis.COLUMN else ROW
     found = [light.sigma_px[light.axis == wanted] for pose in observations.poses for light in pose.light.values()]
     sigma = np.concatenate([np.zeros(0), *found])

@@ -25,7 +25,7 @@ _FEWEST_LIT = 3
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """What a good set of poses has (reconstruction.md §6, a proposal; the numbers marked * are ours).
+    """What a good set of poses has (usual in practice; the numbers marked * are ours).
 
     cell_share : of the 36 cells of an image, with a corner (the projector: with light on the board) in some pose.
     depths : different distances, each at least depth_step* (a share) from the next. tilt_deg : which tilts count;

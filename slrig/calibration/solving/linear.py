@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from slrig.kernels import kernel
 from slrig.model import FloatArray
 
 
@@ -26,7 +26,7 @@ def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return x
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _solve_kernel(a: Any, x: Any) -> bool:
     """Leave U in the upper triangle of a, and the solution in x; False for a pivot that is not positive."""
     count = len(x)

@@ -16,13 +16,11 @@ with the ray o + s d, the surface's normal n, the board's turn w_b and shift dt_
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from numba import get_num_threads, njit
 
+from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray
 
 DEVICE, POSE, BEND = 15, 6, 7
@@ -45,11 +43,10 @@ def corner_rows(
     """
     residual = np.full((len(where), 2), np.nan)
     rows = np.zeros((len(where) if jacobian else 0, 2, CORNER_TERMS))
-
-    def part(first: int, last: int) -> None:
-        _corner_kernel(devices, poses, points, bend, frame, where, measured, jacobian, residual, rows, first, last)
-
-    _in_parts(part, len(where))
+    in_bands(
+        _corner_kernel, len(where), devices, poses, points, bend, frame, where, measured, jacobian, residual, rows,
+        rows_at_least=_SHARED,
+    )  # fmt: skip
     return residual, rows
 
 
@@ -65,11 +62,10 @@ def light_rows(
     """
     residual = np.full(len(where), np.nan)
     rows = np.zeros((len(where) if jacobian else 0, LIGHT_TERMS))
-
-    def part(first: int, last: int) -> None:
-        _light_kernel(devices, poses, bend, frame, where, pixels, positions, jacobian, residual, rows, first, last)
-
-    _in_parts(part, len(where))
+    in_bands(
+        _light_kernel, len(where), devices, poses, bend, frame, where, pixels, positions, jacobian, residual, rows,
+        rows_at_least=_SHARED,
+    )  # fmt: skip
     return residual, rows
 
 
@@ -83,29 +79,15 @@ def weighed_blocks(
     """
     terms = rows.shape[1]
     blocks, pulls = np.zeros((len(starts) - 1, terms, terms)), np.zeros((len(starts) - 1, terms))
-
-    def part(first: int, last: int) -> None:
-        _block_kernel(rows, residual, weight, starts, blocks, pulls, first, last)
-
-    _in_parts(part, len(starts) - 1, shared=len(rows) >= _SHARED)
+    groups = len(starts) - 1
+    in_bands(
+        _block_kernel, groups, rows, residual, weight, starts, blocks, pulls,
+        rows_at_least=1 if len(rows) >= _SHARED else groups,
+    )  # fmt: skip
     return blocks, pulls
 
 
-def _in_parts(part: Callable[[int, int], None], count: int, *, shared: bool | None = None) -> None:
-    """Walk over `count` things; where they are many, in as many threads as numba may use, for kernels hold no lock.
-
-    Kernels that numba itself spreads over threads cost more than the work here: most calls are short, and many.
-    """
-    workers = get_num_threads() if (count >= _SHARED if shared is None else shared) else 1
-    if workers == 1 or count < workers:
-        part(0, count)
-        return
-    ends = np.linspace(0, count, workers + 1).astype(int).tolist()
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(part, ends[:-1], ends[1:]))
-
-
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def distorted(d: Any, x: float, y: float) -> Any:
     """Distorted coordinates and their derivatives: xd, yd, ∂xd/∂x, ∂xd/∂y = ∂yd/∂x, ∂yd/∂y."""
     k1, k2, p1, p2, k3 = d[4], d[5], d[6], d[7], d[8]
@@ -121,7 +103,7 @@ def distorted(d: Any, x: float, y: float) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def undistorted(d: Any, u: float, v: float) -> Any:
     """Normalised coordinates of a pixel by Newton's method; NaN where the lens sends no light."""
     xd, yd = (u - d[2]) / d[0], (v - d[3]) / d[1]
@@ -139,7 +121,7 @@ def undistorted(d: Any, u: float, v: float) -> Any:
     return np.nan, np.nan
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _height(bend: Any, frame: Any, x: float, y: float, basis: Any) -> Any:
     """The surface's height, and its slopes, at board coordinates; fills the bend's basis (7,)."""
     s = 1 / frame[2]
@@ -154,7 +136,7 @@ def _height(bend: Any, frame: Any, x: float, y: float, basis: Any) -> Any:
     return z, by_a * s, by_b * s
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _turned(m: Any, start: int, x: float, y: float, z: float) -> Any:
     """R v for the rotation that starts at m[start]."""
     return (
@@ -164,7 +146,7 @@ def _turned(m: Any, start: int, x: float, y: float, z: float) -> Any:
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel_part(inline="always")
 def _turned_back(m: Any, start: int, x: float, y: float, z: float) -> Any:
     """Rᵀ v for the rotation that starts at m[start]."""
     return (
@@ -174,7 +156,7 @@ def _turned_back(m: Any, start: int, x: float, y: float, z: float) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _device_row(d: Any, row: bool, x: float, y: float, z: float, w: Any, out: Any) -> Any:
     """A coordinate's derivatives by its device's 15 parameters, into out; returns the gradient in the device.
 
@@ -201,10 +183,10 @@ def _device_row(d: Any, row: bool, x: float, y: float, z: float, w: Any, out: An
     return gx, gy, gz
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _corner_kernel(
-    devices: Any, poses: Any, points: Any, bend: Any, frame: Any, where: Any, measured: Any, jacobian: bool,
-    residual: Any, rows: Any, first: int, last: int,
+    first: int, last: int, devices: Any, poses: Any, points: Any, bend: Any, frame: Any, where: Any,
+    measured: Any, jacobian: bool, residual: Any, rows: Any,
 ) -> None:  # fmt: skip
     basis = np.zeros(BEND)
     for i in range(first, last):
@@ -234,7 +216,7 @@ def _corner_kernel(
                 out[23 + m] = gb[2] * basis[m]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _met(bend: Any, frame: Any, o: Any, e: Any, basis: Any) -> Any:
     """Depth along a ray at which it meets the board, and the surface's slopes there. Ray in the board's frame."""
     s = -o[2] / e[2]
@@ -248,10 +230,10 @@ def _met(bend: Any, frame: Any, o: Any, e: Any, basis: Any) -> Any:
     return np.nan, 0.0, 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _light_kernel(
-    devices: Any, poses: Any, bend: Any, frame: Any, where: Any, pixels: Any, positions: Any, jacobian: bool,
-    residual: Any, rows: Any, first: int, last: int,
+    first: int, last: int, devices: Any, poses: Any, bend: Any, frame: Any, where: Any,
+    pixels: Any, positions: Any, jacobian: bool, residual: Any, rows: Any,
 ) -> None:  # fmt: skip
     projector = devices[len(devices) - 1]
     basis = np.zeros(BEND)
@@ -290,7 +272,7 @@ def _light_kernel(
             out[36 + m] = share * basis[m]
 
 
-@njit(cache=True, nogil=True)
+@kernel_part
 def _ray_row(c: Any, u: float, v: float, xn: float, yn: float, s: float, h: Any, out: Any) -> None:
     """Derivatives by the 15 parameters of the camera that a ray comes from; h : gradient in the camera."""
     _, _, a, b, e = distorted(c, xn, yn)
@@ -309,9 +291,9 @@ def _ray_row(c: Any, u: float, v: float, xn: float, yn: float, s: float, h: Any,
     out[12], out[13], out[14] = -h[0], -h[1], -h[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel(in_every_scan=False)
 def _block_kernel(
-    rows: Any, residual: Any, weight: Any, starts: Any, blocks: Any, pulls: Any, first: int, last: int
+    first: int, last: int, rows: Any, residual: Any, weight: Any, starts: Any, blocks: Any, pulls: Any
 ) -> None:
     terms = rows.shape[1]
     for group in range(first, last):

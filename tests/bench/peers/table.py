@@ -1,4 +1,4 @@
-"""The comparison as a table: plain text for a terminal, Markdown for the README."""
+"""The comparison as a table: plain text for a terminal, Markdown for tests/bench/README.md."""
 
 from __future__ import annotations
 

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from slrig.kernels import in_bands
 from slrig.model import FloatArray
 from slrig.reconstruction.chaining import _order_kernel, chain, chain_frames
 from slrig.reconstruction.optics import normalised_from_pixel, normalised_near, packed
-from slrig.reconstruction.refinement import _keep_kernel
 from slrig.reconstruction.sheet_curves import SheetCurves
 from slrig.reconstruction.steger import (
     _TAYLOR_BOX,
@@ -19,8 +19,8 @@ from slrig.reconstruction.steger import (
     RIDGE,
     _centred_weights,
     kernels,
-    newton_kernel,
-    taylor_kernel,
+    newton_step,
+    taylor_step,
 )
 from slrig.reconstruction.stripes import gathered
 from tests.unit.reconstruction.builders import CAMERA
@@ -44,7 +44,7 @@ def test_first_step_is_taken_from_six_separable_filters(kind: int, sigma_px: flo
     noise = rng.uniform(0.0, 0.1, shape).astype(np.float32)
     lit = rng.uniform(0, 1, shape) > 0.2
     r, rx, ry, rxx, rxy, ryy = filtered(image.astype(np.float64), sigma_px)
-    offset, response = taylor_kernel(image, noise, lit, np.float32(0.5), *kernels(sigma_px), kind)
+    offset, response = taylor_step(image, noise, lit, np.float32(0.5), *kernels(sigma_px), kind)
     kept = 0
     for y, x in np.ndindex(shape):
         if kind == RIDGE:
@@ -88,7 +88,7 @@ def test_second_step_is_taken_from_kernels_centred_on_the_first(kind: int) -> No
     image = cv2.GaussianBlur(rng.normal(0, 1, (50, 60)).astype(np.float32), (0, 0), 1.0)
     offset = rng.uniform(-0.6, 0.6, (50, 60, 2)).astype(np.float32)
     columns, rows = rng.integers(0, 60, 300).astype(np.int32), rng.integers(0, 50, 300).astype(np.int32)
-    x, y, normals, strength, kept = newton_kernel(image, offset, columns, rows, sigma_px, kind)
+    x, y, normals, strength, kept = newton_step(image, offset, columns, rows, sigma_px, kind)
     at = np.arange(-radius, radius + 1.0)
     for i in np.flatnonzero(kept):
         start = offset[rows[i], columns[i]].astype(np.float64)
@@ -124,7 +124,8 @@ def test_keys_are_ordered_frame_by_frame_with_ties_by_index(counts: list[int]) -
     borders = np.cumsum([0, *counts])
     keys = rng.integers(0, 2**32, borders[-1], dtype=np.uint32)
     keys[::3] = keys[: len(keys[::3])] & np.uint32(0xFFC00003)
-    order = _order_kernel(keys, borders)
+    order = np.zeros(len(keys), dtype=np.int32)
+    in_bands(_order_kernel, len(counts), keys, borders, order)
     for a, b in pairwise(borders):
         np.testing.assert_array_equal(order[a:b], np.argsort(keys[a:b], kind="stable"))
 
@@ -175,14 +176,3 @@ def test_a_start_nearby_leads_to_the_same_ray() -> None:
         for away in ((0.0, 0.0), (2e-3, -1e-3), (1e-8, 1e-8)):
             got = normalised_near(device, u, v, wanted[0] + away[0], wanted[1] + away[1])
             np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12)
-
-
-def test_what_is_kept_is_kept_in_its_order() -> None:
-    rng = np.random.default_rng(11)
-    for count in (0, 1, 8192, 20_001):
-        keep = rng.random(count) < 0.6
-        given = rng.random((count, 2)), rng.random((count, 2)), rng.random(count)
-        out = tuple(np.zeros_like(each[keep]) for each in given)
-        _keep_kernel(keep, *given, *out)
-        for got, each in zip(out, given, strict=True):
-            np.testing.assert_array_equal(got, each[keep])

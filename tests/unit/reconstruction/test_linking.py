@@ -92,7 +92,7 @@ def test_one_light_on_a_step_makes_two_stripes_and_one_curve_along_its_sheet(
     np.testing.assert_array_equal(ensemble.points_px, np.concatenate([above, below]))
     assert np.flatnonzero(ensemble.bridge_after).tolist() == [len(above) - 1]
     # In space the curve runs down the sheet: every point at its own row of the projector, in order.
-    sheet = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    sheet, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     assert len(sheet.points_mm) == len(ensemble.points_px)
     assert (np.diff(sheet.along_px) > 0).all()
     assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
@@ -104,7 +104,7 @@ def test_a_cliff_can_mislead_the_papers_rule_and_the_light_sheet_knows_the_order
     ensemble = linked(above, below, position_px=[COLUMN, COLUMN])
     np.testing.assert_array_equal(ensemble.points_px, curve_by_the_paper([above, below]).points)
     assert points_between(ensemble) == [(above[-1].tolist(), below[-1].tolist())]
-    sheet = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
+    sheet, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     np.testing.assert_array_equal(sheet.pixels_px, np.concatenate([above, below]))
     assert np.flatnonzero(sheet.bridge_after).tolist() == [len(above) - 1]
 
@@ -112,7 +112,7 @@ def test_a_cliff_can_mislead_the_papers_rule_and_the_light_sheet_knows_the_order
 def test_adjacent_pixels_of_two_stripes_may_be_far_apart_in_space_and_are_joined_by_a_bridge() -> None:
     # Figure 2 (b, c): the far plate's stripe ends beside the near one's; neighbours in the image, 60 mm apart in depth.
     near, far = lit_plate(-60.0, np.arange(20.0, 110.0, 0.4)), lit_plate(0.0, np.arange(110.4, 200.0, 0.4))
-    sheet = camera_projector(linked(near, far, position_px=[COLUMN] * 2), CAMERA, PROJECTOR, Axis.COLUMN)
+    sheet, _ = camera_projector(linked(near, far, position_px=[COLUMN] * 2), CAMERA, PROJECTOR, Axis.COLUMN)
     (at,) = np.flatnonzero(sheet.bridge_after)
     assert np.linalg.norm(sheet.points_mm[at + 1] - sheet.points_mm[at]) > 59
 

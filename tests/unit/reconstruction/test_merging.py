@@ -42,7 +42,7 @@ def seen(
     ensemble = ensemble_of(pixels, columns, sigma_px=sigma_px, breaks=dict.fromkeys(range(len(columns)), cuts))
     noise = np.random.default_rng(seed).normal(0, noise_px, len(ensemble.points_px)) if noise_px else 0.0
     moved = ensemble.points_px + np.multiply.outer(noise, [1.0, 0.0]) if noise_px else ensemble.points_px
-    return camera_projector(replace(ensemble, points_px=moved), camera, PROJECTOR, Axis.COLUMN)
+    return camera_projector(replace(ensemble, points_px=moved), camera, PROJECTOR, Axis.COLUMN)[0]
 
 
 def both(first: SheetCurves, second: SheetCurves) -> MergedCurves:
@@ -136,7 +136,7 @@ def test_the_residual_of_a_good_calibration_is_its_noise() -> None:
 def test_a_wrong_calibration_shows_in_the_residual() -> None:
     moved = replace(OTHER_CAMERA, translation_mm=OTHER_CAMERA.translation_mm + np.array([0.3, 0.0, 0.0]))
     pixels = [opencv_pixels(OTHER_CAMERA, lit_rows(column, ROWS, BALL)) for column in COLUMNS]
-    second = camera_projector(ensemble_of(pixels, COLUMNS, sigma_px=0.02), moved, PROJECTOR, Axis.COLUMN)
+    second, _ = camera_projector(ensemble_of(pixels, COLUMNS, sigma_px=0.02), moved, PROJECTOR, Axis.COLUMN)
     result = both(seen(CAMERA, ROWS), second)
     assert abs(result.residual_sigma.mean()) > 10
     assert result.residual_sigma.std() < 0.2 * abs(result.residual_sigma.mean())

@@ -66,7 +66,7 @@ def seen(
     cuts = tuple(int(cut) for cut in np.flatnonzero(np.diff(rows) > GAP_PX))
     ensemble = ensemble_of(pixels, COLUMNS, sigma_px=noise_px or 0.01, breaks=dict.fromkeys(range(len(COLUMNS)), cuts))
     ensemble = replace(ensemble, normals=np.concatenate(normals))
-    return camera_projector(ensemble, believed or camera, PROJECTOR, Axis.COLUMN)
+    return camera_projector(ensemble, believed or camera, PROJECTOR, Axis.COLUMN)[0]
 
 
 def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAMERA) -> SpareEquation:
@@ -165,7 +165,7 @@ def test_rows_of_light_count_towards_higher_rows() -> None:
     def rows_seen(camera: Pinhole, believed: Pinhole) -> SheetCurves:
         lit = [lit_row(row, along) for row in columns]
         pixels = [opencv_pixels(camera, each) for each in lit]
-        return camera_projector(ensemble_of(pixels, columns, normal=(0.0, 1.0)), believed, PROJECTOR, Axis.ROW)
+        return camera_projector(ensemble_of(pixels, columns, normal=(0.0, 1.0)), believed, PROJECTOR, Axis.ROW)[0]
 
     spare = spare_equation(
         rows_seen(CAMERA, CAMERA), rows_seen(OTHER_CAMERA, above), above, Axis.ROW, widest_gap_px=GAP_PX

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from slrig.model import Axis
 from slrig.reconstruction.triangulation import SheetCurves, ordered_along_sheet, selected
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from tests.unit.reconstruction.builders import CAMERA, PROJECTOR
@@ -151,8 +154,20 @@ def test_an_unmeasured_point_has_no_deviation() -> None:
 def test_sampling_is_what_a_pixel_or_a_line_covers(depth_mm: float) -> None:
     ahead = CAMERA.centre_mm + depth_mm * CAMERA.rotation[2]
     pixel = depth_mm / 1400.0
-    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, None, 1.0), [pixel])
+    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, None, Axis.COLUMN, 1.0), [pixel])
     before_projector = float(PROJECTOR.rotation[2] @ ahead + PROJECTOR.translation_mm[2])
     line = before_projector / 680.0
-    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, PROJECTOR, 4.0), [max(pixel, 4 * line)])
-    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, PROJECTOR, 0.1), [max(pixel, 0.1 * line)])
+    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, PROJECTOR, Axis.COLUMN, 4.0), [max(pixel, 4 * line)])
+    np.testing.assert_allclose(sampling_mm(ahead[None], CAMERA, PROJECTOR, Axis.COLUMN, 0.1), [max(pixel, 0.1 * line)])
+
+
+@pytest.mark.parametrize(
+    ("axis", "camera_px", "projector_px"), [(Axis.COLUMN, 1400.0, 680.0), (Axis.ROW, 1395.0, 1368.0)]
+)
+def test_sampling_is_measured_along_the_axis_that_is_scanned(axis: Axis, camera_px: float, projector_px: float) -> None:
+    # Rows twice as fine as columns, as on a diamond array of mirrors.
+    fine_rows = replace(PROJECTOR, matrix=PROJECTOR.matrix * np.array([[1.0], [2.0], [1.0]]))
+    ahead = CAMERA.centre_mm + 500.0 * CAMERA.rotation[2]
+    depth = float(PROJECTOR.rotation[2] @ ahead + PROJECTOR.translation_mm[2])
+    found = [sampling_mm(ahead[None], CAMERA, device, axis, 3.0) for device in (None, fine_rows)]
+    np.testing.assert_allclose(found, [[3 * 500.0 / camera_px], [3 * depth / projector_px]])

@@ -17,8 +17,8 @@ from slrig.reconstruction.steger import (
     EDGE,
     RIDGE,
     kernels,
-    newton_kernel,
-    taylor_kernel,
+    newton_step,
+    taylor_step,
 )
 from slrig.reconstruction.stripes import LinePoints, StripeLimits, Stripes, chained, edge_points, stripe_points
 from tests.unit.reconstruction.builders import gaussian_stripe, grid
@@ -79,7 +79,7 @@ def test_the_first_step_is_stegers_equation(kind: int, sigma: float) -> None:
     noise = rng.uniform(0.01, 0.05, image.shape).astype(np.float32)
     lit = np.asarray(rng.random(image.shape) < 0.9)
     sampled = kernels(sigma)
-    offset, strength = taylor_kernel(image, noise, lit, np.float32(2.0), *sampled, kind)
+    offset, strength = taylor_step(image, noise, lit, np.float32(2.0), *sampled, kind)
     zero, one, two = (kernel.astype(np.float64) for kernel in sampled)
     orders = ((zero, zero), (one, zero), (zero, one), (two, zero), (one, one), (zero, two))
     filtered = np.stack([
@@ -143,7 +143,7 @@ def test_the_second_step_is_a_correlation_with_kernels_centred_on_the_point(kind
     offset = rng.uniform(-0.6, 0.6, (40, 50, 2)).astype(np.float32)
     drawn = rng.permutation(2000)[:900]
     columns, rows = (drawn % 50).astype(np.int32), (drawn // 50).astype(np.int32)
-    x, y, normals, strength, kept = newton_kernel(image, offset, columns, rows, sigma, kind)
+    x, y, normals, strength, kept = newton_step(image, offset, columns, rows, sigma, kind)
     for i in range(900):
         pixel = (int(columns[i]), int(rows[i]))
         start = np.array(pixel) + offset[pixel[1], pixel[0]].astype(np.float64)

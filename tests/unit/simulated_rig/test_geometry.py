@@ -12,6 +12,8 @@ import trimesh
 from simulated_rig.device import SimulatedHead
 from simulated_rig.scene import read_scene, surface_of
 from slrig.model import FloatArray
+from slrig.scan.mesh_formats import encode_mesh_glb
+from tests.unit.scan.test_mesh_formats import half_ball
 from tests.unit.simulated_rig.building import FACING_PLATE, small_head
 
 STRAIGHT = {"position_mm": [0.0, 0.0, -500.0], "target_mm": [0.0, 0.0, 0.0]}
@@ -181,6 +183,16 @@ def test_a_mesh_file_stands_in_its_pose_and_unit(tmp_path: Path, suffix: str) ->
     assert depth_of(head)[24, 32] == pytest.approx(487.0, abs=1e-4)
     extent = np.ptp(head.truth().surface.vertices_mm, axis=0)
     np.testing.assert_allclose(extent, [20, 60, 40], atol=1e-4)
+
+
+def test_a_scan_s_own_glb_can_be_put_back_where_it_was_scanned(tmp_path: Path) -> None:
+    mesh = half_ball()
+    (tmp_path / "scan.glb").write_bytes(encode_mesh_glb(mesh))
+    scene = '[[object]]\nshape = "mesh"\nfile = "scan.glb"\nunit_mm = 1000.0\nrotation_deg = [180.0, 0.0, 0.0]\n'
+    (tmp_path / "s.toml").write_text(scene)
+    surface = surface_of(read_scene(tmp_path / "s.toml"), tmp_path)
+    wanted = mesh.vertices_mm[mesh.faces]
+    np.testing.assert_allclose(surface.vertices_mm[surface.faces], wanted, rtol=0, atol=1e-4)
 
 
 SHAPES = {

@@ -119,6 +119,7 @@ def test_a_series_with_crossed_bounds_is_refused(tmp_path: Path, table: dict[str
 # ---- the positioner
 
 
+@pytest.mark.slow
 def test_a_rig_has_the_positioner_of_its_head_and_no_calibration(tmp_path: Path) -> None:
     folder = Path(__file__).parents[3] / "config" / "rigs"
     for name, cameras in (("rendered-calibration", 1), ("rendered-calibration-two-cameras", 2)):

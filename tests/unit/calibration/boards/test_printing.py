@@ -94,7 +94,7 @@ def test_both_scales_are_true(board: Board, page: str, size_mm: tuple[float, flo
 def test_a_page_says_what_it_is_and_how_to_go_on() -> None:
     _, _, text = painted_page(board_pdf(Board(BoardKind.CHARUCO, 11, 8, 12.0)), 1.0)
     words = " ".join(text.split())
-    assert "11 x 8 corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250" in words
+    assert "11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250" in words
     assert "Print at 100 %" in words
     command = "--board charuco --corners 11x8 --square-mm 12 --marker-mm 9 --dictionary DICT_5X5_250"
     assert f"slrig calibrate solve FOLDER {command} --output calibration.json" in words

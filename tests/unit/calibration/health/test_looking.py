@@ -140,6 +140,7 @@ def test_a_device_that_takes_no_part_in_a_look_raises_no_alarm_and_is_told() -> 
     assert look_at_board([dark], BOARD, rig.calibration).unseen == (PROJECTOR,)
 
 
+@pytest.mark.slow
 def test_the_size_of_a_change_has_an_honest_deviation() -> None:
     off = []
     for seed in range(8):

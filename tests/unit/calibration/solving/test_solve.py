@@ -92,12 +92,14 @@ def test_progress_is_told_and_only_rises() -> None:
     assert all(stage and words for stage, _, words in told)
 
 
+@pytest.mark.slow
 def test_the_same_poses_give_the_same_numbers() -> None:
     first, again = (solve(made(replace(SMALL, poses=5))[0]) for _ in range(2))
     np.testing.assert_allclose(first.covariance, again.covariance, rtol=1e-3, atol=1e-9)
     assert first.distortion == again.distortion
 
 
+@pytest.mark.slow
 def test_a_pose_in_which_the_board_moved_is_left_out_by_name() -> None:
     solution, truth = solved(replace(SMALL, cameras=2, moved_pose=3, seed=5))
     assert set(solution.outliers) == {"pose 3"}
@@ -106,6 +108,7 @@ def test_a_pose_in_which_the_board_moved_is_left_out_by_name() -> None:
     assert max(np.abs(list(in_deviations(solution, truth).values()))) < 4
 
 
+@pytest.mark.slow
 def test_with_next_to_no_noise_no_pose_is_called_off() -> None:
     """A lens that is not done justice to must not make outliers of the poses at the image's border."""
     solution, _ = solved(replace(SMALL, cameras=2, corner_px=0.003, light_px=0.01, alike_px=0.0, outlying=0.0, seed=9))
@@ -120,6 +123,7 @@ def test_a_pose_that_no_camera_saw_is_left_out_by_name() -> None:
     assert "no camera saw" in solution.outliers["pose 5"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "words"),
     [

@@ -1,0 +1,199 @@
+"""Kernels: kept between runs by many processes at once, shared out over the cores, beside other work."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slrig.kernels import compilations_told, in_bands, kernel
+
+_ADDS = """
+from slrig.kernels import kernel, kernel_part
+
+@kernel_part
+def {part}(value):
+    return value + {added}
+
+@kernel(in_every_scan=False)
+def sums(values):
+    total = values[0] * 0
+    for i in range(len(values)):
+        total += {part}(values[i])
+    return total
+"""
+
+
+def made(folder: Path, *, added: int, name: str = "adding") -> Any:
+    """The module of a kernel that sums values, each with `added` more, as its file says."""
+    path = folder / f"{name}.py"
+    path.write_text(_ADDS.format(added=added, part="more"))
+    # The file system may stamp two writes with one time.
+    os.utime(path, ns=(added, added))
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def compiled_by(call: Callable[[], object]) -> list[str]:
+    told: list[str] = []
+    with compilations_told(told.append):
+        call()
+    return told
+
+
+@kernel(in_every_scan=False)
+def _square(first: int, last: int, values: Any, out: Any) -> int:
+    for i in range(first, last):
+        out[i] = values[i] * values[i]
+    return last - first
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 1000])
+@pytest.mark.parametrize("rows_at_least", [1, 64])
+def test_bands_cover_every_row_once(count: int, rows_at_least: int) -> None:
+    values, out = np.arange(count, dtype=np.float64), np.full(count, np.nan)
+    answers = in_bands(_square, count, values, out, rows_at_least=rows_at_least)
+    assert sum(answers) == count
+    assert all(rows >= min(rows_at_least, count) for rows in answers[:-1])
+    np.testing.assert_array_equal(out, values**2)
+
+
+def test_what_a_kernel_raises_in_a_band_reaches_the_caller() -> None:
+    def failing(first: int, last: int) -> None:
+        message = f"rows {first} to {last}"
+        raise ValueError(message)
+
+    with pytest.raises(ValueError, match="rows"):
+        in_bands(failing, 1000)
+
+
+def test_dividing_by_zero_is_infinite_as_in_numpy() -> None:
+    @kernel(in_every_scan=False)
+    def ratio(a: float, b: float) -> float:
+        return a / b
+
+    assert ratio(1.0, 0.0) == np.inf
+
+
+def test_a_compiled_kernel_is_kept_and_a_changed_one_is_compiled_anew(tmp_path: Path) -> None:
+    values = np.array([1.0, 2.0])
+    first = made(tmp_path, added=1)
+    assert compiled_by(lambda: first.sums(values)) == ["sums", "more"]
+    again = made(tmp_path, added=1)
+    assert compiled_by(lambda: again.sums(values)) == []
+    assert again.sums(values) == 5
+    changed = made(tmp_path, added=10)
+    assert compiled_by(lambda: changed.sums(values)) == ["sums", "more"]
+    assert changed.sums(values) == 23
+
+
+def test_a_kernel_is_compiled_anew_where_only_a_part_in_another_file_changed(tmp_path: Path) -> None:
+    (tmp_path / "caller.py").write_text(
+        "from slrig.kernels import kernel\n\ndef of(more):\n    globals()['more'] = more\n\n"
+        "@kernel(in_every_scan=False)\ndef sums(values):\n    return more(values[0])\n"
+    )
+    for added in (1, 10):
+        part = made(tmp_path, added=added, name="part")
+        spec = importlib.util.spec_from_file_location("caller", tmp_path / "caller.py")
+        assert spec is not None
+        assert spec.loader is not None
+        caller = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(caller)
+        caller.of(part.more)
+        assert caller.sums(np.array([1.0])) == 1 + added
+
+
+def test_a_file_that_was_cut_short_is_compiled_anew(tmp_path: Path) -> None:
+    values = np.array([1.0, 2.0])
+    made(tmp_path, added=1).sums(values)
+    kept = [*tmp_path.rglob("adding.sums*.nbc")]
+    assert len(kept) == 1
+    kept[0].write_bytes(kept[0].read_bytes()[:100])
+    again = made(tmp_path, added=1)
+    assert compiled_by(lambda: again.sums(values)) == ["sums"]
+    assert again.sums(values) == 5
+
+
+def test_a_full_disk_fails_no_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    module = made(tmp_path, added=1)
+    monkeypatch.setattr(module.sums._cache._cache_file, "_save_data", refuse)
+    assert module.sums(np.array([1.0, 2.0])) == 5
+
+
+_CALL = """
+import sys, numpy as np
+sys.path.insert(0, {folder!r})
+import adding
+sys.stdin.readline()
+for kind in sys.argv[1:]:
+    values = np.array([1, 2]).astype(kind)
+    assert adding.sums(values) == 5, kind
+"""
+
+
+def test_processes_that_compile_at_once_leave_each_signature_its_own_code(tmp_path: Path) -> None:
+    """Numba issue 4807: two processes number their files alike, and the index names the other one's code."""
+    made(tmp_path, added=1)
+    kinds = ["f8", "f4", "i8", "i4", "i2", "u8", "u4", "u2"]
+    call = [sys.executable, "-c", _CALL.format(folder=str(tmp_path))]
+    orders = (kinds, kinds[::-1], kinds[4:] + kinds[:4])
+    racing = [subprocess.Popen([*call, *order], stdin=subprocess.PIPE, text=True) for order in orders]  # noqa: S603 - our own
+    for process in racing:
+        assert process.stdin is not None
+        process.stdin.write("go\n")
+        process.stdin.close()
+    assert [process.wait(timeout=300) for process in racing] == [0, 0, 0]
+    # Whatever order their writes came in, a fresh process loads eight signatures and every one is right.
+    assert len([*tmp_path.rglob("adding.sums*.nbc")]) == len(kinds)
+    fresh = subprocess.run([*call, *kinds], input="go\n", text=True, timeout=300, check=False)  # noqa: S603 - our own
+    assert fresh.returncode == 0
+
+
+_MESHES_IN_3_S = """
+import time
+import numpy as np
+from slrig.meshing.optimisation import optimised
+points = np.array([[0, 0, 0], [9, 0, 0], [0, 1, 0], [3, 1, 5]], dtype=np.float64)
+faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
+optimised(points, faces)
+end, count = time.monotonic() + 3, 0
+while time.monotonic() < end:
+    optimised(points, faces)
+    count += 1
+print(count)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+def test_kernels_share_a_busy_machine() -> None:
+    def meshes() -> int:
+        call = [sys.executable, "-c", _MESHES_IN_3_S]
+        run = subprocess.run(call, capture_output=True, timeout=120, check=True)  # noqa: S603 - our own
+        return int(run.stdout)
+
+    quiet = meshes()
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    try:
+        loaded = meshes()
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    # Half of each core would be 2. Where threads wait for one another by spinning it was 500.
+    assert quiet / loaded < 10
