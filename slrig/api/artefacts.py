@@ -19,18 +19,8 @@ from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
 from slrig.scan.artefacts import MESH, ON_REQUEST, write_converted
 from slrig.scan.folder import DataFolder
+from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, rejected_picture
 from slrig.scan.records import ScanRecord, ScanState
-
-MEDIA_TYPES = {
-    "mesh.ply": "application/octet-stream",
-    "mesh.glb": "model/gltf-binary",
-    "mesh.stl": "model/stl",
-    "mesh.obj": "model/obj",
-    "points.ply": "application/octet-stream",
-    "report.json": "application/json",
-    "preview.png": "image/png",
-}
-BUNDLE_ZIP = "bundle.zip"
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
 _converting = threading.Lock()
@@ -131,8 +121,8 @@ for _name, _media_type in MEDIA_TYPES.items():
     router.add_api_route(f"/{_name}", _fetch, methods=["HEAD"], response_class=Response, include_in_schema=False)
 
 
-@router.head("/rejected-{camera}.png", response_class=Response, include_in_schema=False)
-@router.get("/rejected-{camera}.png", response_class=Response, responses=_answers("image/png"))
+@router.head(f"/{rejected_picture('{camera}')}", response_class=Response, include_in_schema=False)
+@router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
 def fetch_rejected(
     service: Serving,
     scan_id: UUID,
@@ -140,7 +130,7 @@ def fetch_rejected(
     known: KnownTag = None,
 ) -> Response:
     """Return the picture of a camera's refused pixels, one colour per cause."""
-    return _file(service, scan_id, f"rejected-{camera}.png", "image/png", known)
+    return _file(service, scan_id, rejected_picture(camera), "image/png", known)
 
 
 @router.head(f"/{BUNDLE_ZIP}", response_class=Response, include_in_schema=False)

@@ -31,6 +31,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
+from slrig.calibration.board import USUAL_BOARD
 from slrig.sessions.calibration.calibrating import EXPORTS
 from slrig.sessions.calibration.pose_shooting import PoseRequest
 from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord
@@ -86,12 +87,17 @@ def ready_files(service: Service, record: SessionRecord) -> dict[str, str]:
 
 
 @router.post("", status_code=201, responses=problems(422, 507))
-def open_calibration(service: Serving, response: Response, request: CalibrationRequest) -> CalibrationBody:
+def open_calibration(
+    service: Serving,
+    response: Response,
+    request: Annotated[CalibrationRequest, Body(default_factory=CalibrationRequest)],
+) -> CalibrationBody:
     """Open a calibration session for a board. Touches no device."""
     patterns = pattern_plan(request.patterns, service.scan_defaults)
     if request.patterns.rows is None:
         patterns = replace(patterns, rows=True)
-    record = service.calibrations.open(board_of(request.board), label=request.label, patterns=patterns)
+    board = USUAL_BOARD if request.board is None else board_of(request.board)
+    record = service.calibrations.open(board, label=request.label, patterns=patterns)
     response.headers["Location"] = f"/calibration/{record.id}"
     return answered(service, record)
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from slrig.api.problems import fault_problem
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, Strict
-from slrig.calibration.board import Board, BoardKind, BoardShape
+from slrig.calibration.board import USUAL_BOARD, Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import Comparison, Difference
 from slrig.scan.plan import PatternPlan
 from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
@@ -39,9 +39,9 @@ class BoardRequest(Strict):
 
 
 class CalibrationRequest(Strict):
-    """A calibration session."""
+    """A calibration session. An empty request opens one for the usual board."""
 
-    board: BoardRequest
+    board: BoardRequest | None = Field(default=None, description=f"Default: {USUAL_BOARD.description}")
     label: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     patterns: PatternRequest = Field(
         default_factory=PatternRequest,

@@ -38,6 +38,7 @@ STATUS: Mapping[type[SlrigError], int] = {
     errors.DeviceBusyError: 503,
     errors.DeviceStateError: 500,
     errors.UnsupportedByDeviceError: 422,
+    errors.WrongSystemError: 422,
     errors.FrameTimeoutError: 504,
     errors.DriverNotFoundError: 503,
     errors.DriverBrokenError: 503,

@@ -15,6 +15,7 @@ from slrig.api.schemas import (
     DeviceList,
     DriverBody,
     MissingLibraryBody,
+    OtherSystemBody,
     ProjectorBody,
     RigBody,
 )
@@ -67,6 +68,7 @@ def list_devices() -> DeviceList:
         ],
         devices=[DeviceBody(**asdict(device)) for device in found.devices],
         missing=[MissingLibraryBody(**asdict(library)) for library in found.missing],
+        elsewhere=[OtherSystemBody(**asdict(driver)) for driver in found.elsewhere],
         faults=[str(fault) for fault in found.faults],
     )
 

@@ -98,7 +98,7 @@ class RunBody(BaseModel):
     """One due time, and what became of it."""
 
     number: int
-    due: datetime
+    due: datetime = Field(description="as clocks in the schedule's time zone show it")
     state: RunState
     reason: str | None = Field(description="in words, where it did not simply succeed")
     count: int = Field(description="how many due times this row stands for")
@@ -136,11 +136,11 @@ def schedule_body(schedule: Schedule, now: datetime) -> ScheduleBody:
     )
 
 
-def run_body(run: Run) -> RunBody:
-    """A record as an answer."""
+def run_body(run: Run, cron: Cron) -> RunBody:
+    """A record as an answer; cron : of its schedule."""
     return RunBody(
         number=run.number,
-        due=run.due,
+        due=cron.local(run.due),
         state=run.state,
         reason=run.reason,
         count=run.count,

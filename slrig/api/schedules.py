@@ -26,7 +26,7 @@ router = APIRouter(prefix="/schedule", tags=["schedule"])
 
 @router.post("", status_code=201, responses=problems(422, 507))
 def add_schedule(service: Serving, response: Response, request: Annotated[ScheduleRequest, Body()]) -> ScheduleBody:
-    """Put a schedule on record. The answer shows when it is due next."""
+    """Put a schedule on record. The answer shows when it is due next. One that could only fail is refused."""
     now = _now()
     order = request.order()
     service.tasks.check(order)
@@ -59,13 +59,14 @@ def list_runs(
 ) -> RunPage:
     """List what became of a schedule's due times, from new to old."""
     limit = min(limit, service.settings.page_limit)
+    schedule = service.schedules.get(schedule_id)
     found = service.schedules.runs(schedule_id, before=cursor, limit=limit + 1)
     shown = found[:limit]
     following = None
     if len(found) > limit:
         following = f"/schedule/{schedule_id}/runs?cursor={shown[-1].number}&limit={limit}"
         response.headers["Link"] = f'<{following}>; rel="next"'
-    return RunPage(runs=[run_body(run) for run in shown], next=following)
+    return RunPage(runs=[run_body(run, schedule.order.cron) for run in shown], next=following)
 
 
 @router.post("/{schedule_id}/pause", responses=problems(404, 422))

@@ -39,7 +39,11 @@ class PatternRequest(Strict):
     gray_offset_px: Annotated[int, Field(ge=0, le=65535)] | None = Field(
         default=None, description="moves the edges of the Gray cells. Default 0"
     )
-    rows: bool | None = Field(default=None, description="play the row axis as well. Default false")
+    rows: bool | None = Field(
+        default=None,
+        description="true: columns and rows. false: columns alone. Default: what the calibration asks for, columns for "
+        "devices side by side and rows for devices above one another; columns without a calibration",
+    )
 
 
 class ReconstructionRequest(Strict):
@@ -283,19 +287,28 @@ class MissingLibraryBody(BaseModel):
     message: str
 
 
+class OtherSystemBody(BaseModel):
+    """A driver that works on another operating system only."""
+
+    driver: str
+    message: str
+
+
 class DeviceList(BaseModel):
     """What is installed, what is plugged in, and what is missing."""
 
     drivers: list[DriverBody]
     devices: list[DeviceBody]
     missing: list[MissingLibraryBody]
+    elsewhere: list[OtherSystemBody]
     faults: list[str]
 
 
 class Probe(BaseModel):
-    """The answer of a probe: each thing that was looked at, "ok" or what is wrong."""
+    """The answer of a probe: each thing that was looked at, "ok" or what is wrong or not done yet."""
 
     checks: dict[str, str]
+    pending: list[str] = Field(default=[], description="checks that are on their way to ok by themselves")
 
 
 class Explanation(BaseModel):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import socket
@@ -17,6 +16,7 @@ import uvicorn
 from starlette.concurrency import run_in_threadpool
 
 from slrig.api.app import create_app
+from slrig.api.logs import set_up_logs
 from slrig.api.security import KEY_VARIABLE, claim_key
 from slrig.api.service import Service, assembled_service
 from slrig.bundle.storage import write_file
@@ -29,10 +29,13 @@ from slrig.scan.holding import HeldRig
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
 from slrig.scan.sweep import sweep
-from slrig.scan.worker import ReconstructionWorker, prepare_kernel_cache
+from slrig.scan.worker import LOADING, READY, ReconstructionWorker, prepare_kernel_cache
 
 ADDRESS_FILE = "service.json"
 """Where in the data folder a running service tells its URL and process id."""
+
+_TELL_S = 2.5
+"""How often a person is told how far the kernels are."""
 
 _log = structlog.get_logger(__name__)
 
@@ -115,13 +118,13 @@ def serve(
     ServiceError
         The address is taken.
     """
-    _set_up_logs(settings.log_level)
+    set_up_logs(settings.log_level, settings.log_format)
     # uvicorn catches SIGTERM while it serves, ends in good order, and then raises it again: here it must not kill the
     # process before the rest of this function has run.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     # A terminal that is closed, or a connection that breaks, ends the service in good order, too; not under nohup.
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: _terminate())
     if until_eof:
         threading.Thread(target=_stop_at_eof, name="slrig-stdin", daemon=True).start()
     listener = _listener(settings)
@@ -140,7 +143,7 @@ def serve(
     except BaseException:
         listener.close()
         raise
-    address = service.folder.root / ADDRESS_FILE
+    address, ended = service.folder.root / ADDRESS_FILE, threading.Event()
     try:
         key_digest, key = None, None
         if settings.require_key:
@@ -160,11 +163,15 @@ def serve(
             timeout_graceful_shutdown=1,
         )
         server = _Server(config, service)
+        threading.Thread(
+            target=_tell_preparation, args=(service, say, ended), name="slrig-preparation", daemon=True
+        ).start()
         with suppress(KeyboardInterrupt):
             server.run(sockets=[listener])
         if wrong:
             raise wrong[0]
     finally:
+        ended.set()
         service.close()
         with suppress(OSError):
             address.unlink(missing_ok=True)
@@ -183,16 +190,39 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
+def _tell_preparation(service: Service, say: Callable[[str], None], ended: threading.Event) -> None:
+    """Tell a person every few seconds how far the kernels are, the first time that they are compiled."""
+    told = ""
+    while (status := service.runner.status()).preparing and not status.ending:
+        if status.reconstruction not in {told, LOADING}:
+            told = status.reconstruction
+            say(told)
+        ended.wait(_TELL_S)
+    if told and not status.ending:
+        say("kernels are ready" if status.reconstruction == READY else status.reconstruction)
+
+
 def _stop_at_eof() -> None:
     while os.read(sys.stdin.fileno(), 4096):
         pass
-    os.kill(os.getpid(), signal.SIGTERM)
+    _terminate()
+
+
+def _terminate() -> None:
+    """End in good order, as by SIGTERM from outside."""
+    if sys.platform == "win32":
+        # os.kill would end the process then and there.
+        signal.raise_signal(signal.SIGTERM)
+    else:
+        os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _listener(settings: ServiceSettings) -> socket.socket:
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if sys.platform != "win32":
+        # There it would let two programs listen at one address.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((settings.host, settings.port))
         # From now on a client that was told the address may connect: it is answered once the service is up.
@@ -206,40 +236,6 @@ def _listener(settings: ServiceSettings) -> socket.socket:
         raise ServiceError(message) from error
     listener.set_inheritable(False)
     return listener
-
-
-class _Log(structlog.PrintLogger):
-    """A log that never fails whoever writes it: a full disk, a reader that is gone. The line is lost, not the work."""
-
-    def msg(self, message: str) -> None:
-        """Print a line if it can be printed."""
-        with suppress(OSError):
-            super().msg(message)
-
-    log = debug = info = warn = warning = msg
-    fatal = failure = err = error = critical = exception = msg
-
-
-def _set_up_logs(level: str) -> None:
-    on_terminal = sys.stderr.isatty()
-    renderer: structlog.typing.Processor = (
-        structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
-        if on_terminal
-        else structlog.processors.JSONRenderer()
-    )
-    trace = [] if on_terminal else [structlog.processors.format_exc_info]
-    structlog.configure(
-        processors=[
-            structlog.contextvars.merge_contextvars,
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            *trace,
-            renderer,
-        ],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=lambda *_: _Log(sys.stderr),
-        cache_logger_on_first_use=False,
-    )
 
 
 __all__ = ["ADDRESS_FILE", "open_service", "serve"]

@@ -15,7 +15,8 @@ from slrig.scan.folder import DataFolder
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import Job, ReconstructionWorker
+from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker_process import Job
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.notices import NoticedHealth, Notices
 from slrig.scheduling.scheduler import Scheduler

@@ -14,9 +14,6 @@ from slrig.api.service import Service, Serving
 from slrig.errors import StorageError
 from slrig.scan.work import RunnerStatus
 
-BEING_OPENED = "the rig is being opened"
-"""What the probe says of the rig until it was first open, or could not be opened."""
-
 router = APIRouter(tags=["system"])
 
 
@@ -30,7 +27,8 @@ async def livez() -> Probe:
 def readyz(service: Serving) -> Response | Probe:
     """Tell whether a scan could start and end well: records, disk, rig, reconstruction. Touches no device.
 
-    A rig that is held is well. The reconstruction is "loading" until its process has loaded its kernels.
+    A rig that is held is well. `pending` names what is not ready yet and gets there by itself: the rig while it is
+    opened, the reconstruction until its process has loaded its kernels, which the first time takes a minute.
     """
     status = service.runner.status()
     checks = {
@@ -42,7 +40,10 @@ def readyz(service: Serving) -> Response | Probe:
     if all(found == "ok" for found in checks.values()):
         return Probe(checks=checks)
     wrong = "; ".join(f"{name}: {found}" for name, found in checks.items() if found != "ok")
-    return answer(problem(503, "NotReady", f"The service runs and cannot scan: {wrong}", checks=checks))
+    opening = status.facts is None and status.fault is None and not status.ending
+    pending = [name for name, waits in (("rig", opening), ("reconstruction", status.preparing)) if waits]
+    detail = f"The service runs and cannot scan: {wrong}"
+    return answer(problem(503, "NotReady", detail, checks=checks, pending=pending))
 
 
 @router.get("/problems/{name}", responses=problems(404, 422))
@@ -76,4 +77,6 @@ def _rig(status: RunnerStatus) -> str:
         return "the service is ending"
     if status.fault is not None:
         return status.fault
-    return "ok" if status.facts is not None else BEING_OPENED
+    if status.facts is not None:
+        return "ok"
+    return f"the rig is being opened: {status.opening}" if status.opening else "the rig is being opened"

@@ -47,7 +47,7 @@ def capture_bundle(
         Frames contradict their patterns, or do not come, however often they are shot. What there is of them is kept
         for whoever looks for the cause: `folder` holds the frames that counted, and in `refused` those that did not.
     PatternError
-        The plan does not fit the projector.
+        The plan does not fit the projector, or its patterns tell no depth by the rig's calibration.
     DeviceError
         The rig failed.
     ScanCancelledError
@@ -55,7 +55,7 @@ def capture_bundle(
     StorageError
         The disk refused. In these cases nothing is left in `folder`. In every case the projector is dark.
     """
-    sequence = pattern_sequence(plan.patterns, rig.projector.info.size)
+    sequence = pattern_sequence(plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras)
     rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
     for words in told:
         _log.info(words, rig=rig.name)

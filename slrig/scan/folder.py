@@ -1,6 +1,7 @@
 """The data folder: where scans and calibrations lie, how scans get there in one rename, and who may use it.
 
-DATA/lock            held by the one process that owns the folder; holds its process id
+DATA/lock            locked by the one process that owns the folder, as long as it lives; empty
+DATA/holder          that process's id, and that of the last one where none lives
 DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
 DATA/calibrations/   calibrations and their sessions: see `slrig.sessions.calibration.store`
@@ -12,15 +13,19 @@ DATA/cache/          compiled kernels, where the package's own folder cannot be 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
 
+from filelock import FileLock, Timeout
+
+from slrig.bundle.storage import sync_file, sync_folder
 from slrig.errors import StorageError
 from slrig.scan.faults import disk_errors
+
+_HOLDER = "holder"
 
 
 def free_bytes(folder: Path) -> int:
@@ -43,19 +48,29 @@ class DataFolder:
         with disk_errors(self.root):
             for folder in (self.root, self.scans, self.calibrations, self.incoming):
                 folder.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(self.root / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
+            self._lock = FileLock(self.root / "lock", mode=0o600, thread_local=False, fallback_to_soft=False)
+            try:
+                self._lock.acquire(blocking=False)
+            except Timeout as error:
+                message = (
+                    f"The data folder {self.root} is in use by the slrig service with process id {self._holder()}. "
+                    "Stop that service, or give this one another folder with --data."
+                )
+                raise StorageError(message) from error
+            try:
+                # Beside the lock: Windows lets nobody else read what is locked.
+                (self.root / _HOLDER).write_text(f"{os.getpid()}\n", encoding="ascii")
+            except BaseException:
+                self._lock.release()
+                raise
+
+    def _holder(self) -> str:
+        """The process id of who holds the folder."""
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            holder = os.read(self._lock, 32).decode("ascii", "replace").strip() or "unknown"
-            os.close(self._lock)
-            message = (
-                f"The data folder {self.root} is in use by the slrig service with process id {holder}. "
-                "Stop that service, or give this one another folder with --data."
-            )
-            raise StorageError(message) from error
-        os.ftruncate(self._lock, 0)
-        os.pwrite(self._lock, f"{os.getpid()}\n".encode("ascii"), 0)
+            return (self.root / _HOLDER).read_text(encoding="ascii", errors="replace").strip() or "unknown"
+        except OSError:
+            return "unknown"
 
     @property
     def scans(self) -> Path:
@@ -84,9 +99,7 @@ class DataFolder:
 
     def release(self) -> None:
         """Let another process have the folder. Idempotent."""
-        if self._lock >= 0:
-            os.close(self._lock)
-            self._lock = -1
+        self._lock.release()
 
     def require_space(self, needed_bytes: int) -> None:
         """Raise StorageError unless `needed_bytes` can be written."""
@@ -127,8 +140,8 @@ class DataFolder:
                 result.rmdir()
             sync_tree(staged)
             staged.rename(self.scan(scan_id))
-            _sync(self.scans)
-            _sync(self.incoming)
+            sync_folder(self.scans)
+            sync_folder(self.incoming)
 
     def keep_bundle(self, scan_id: UUID) -> None:
         """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it."""
@@ -153,13 +166,5 @@ def sync_tree(folder: Path) -> None:
     """Make every file below `folder`, and every folder, durable."""
     for place, _, files in os.walk(folder):
         for name in files:
-            _sync(Path(place, name))
-        _sync(Path(place))
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+            sync_file(Path(place, name))
+        sync_folder(Path(place))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from slrig.model import Mesh
 
 _METRES_PER_MM = 0.001
+_HALF_A_TURN_ABOUT_X = (1, 0, 0, 0)  # quaternion, x y z w
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
 
 _GLB_MAGIC, _GLB_VERSION = b"glTF", 2
@@ -29,8 +30,10 @@ _OBJ_POSITION_DECIMALS, _OBJ_UNIT_DECIMALS = 5, 4
 def encode_mesh_glb(mesh: Mesh) -> bytes:
     """Binary glTF 2.0 with normals and colours (Khronos, glTF 2.0 specification, sections 3 and 4).
 
-    glTF is in metres: the vertices keep their values in mm, under a node that scales by 0.001. Normals are left out if
-    one is not known, because glTF has no form for that; a mesh without triangles is shown as points.
+    glTF is in metres, with y up and the front towards +z (section 3.4); a scan is in mm, with y down and the front
+    towards the camera, -z. The vertices keep their values, under a node that scales by 0.001 and turns by half a turn
+    about x: (x, y, z) mm stands at (x, -y, -z) / 1000 m. Normals are left out if one is not known, because glTF has no
+    form for that; a mesh without triangles is shown as points.
     """
     positions = np.ascontiguousarray(mesh.vertices_mm, dtype="<f4")
     opaque = np.full((len(mesh.grey), 4), 255, dtype=np.uint8)
@@ -58,7 +61,11 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
 
 
 def _gltf_tree(parts: list[tuple[str, NDArray[Any], dict[str, object]]], length: int) -> dict[str, object]:
-    node: dict[str, object] = {"name": "scan", "scale": [_METRES_PER_MM] * 3}
+    node: dict[str, object] = {
+        "name": "scan",
+        "rotation": [*_HALF_A_TURN_ABOUT_X],
+        "scale": [_METRES_PER_MM] * 3,
+    }
     tree: dict[str, object] = {
         "asset": {"version": "2.0", "generator": "slrig"},
         "scene": 0,

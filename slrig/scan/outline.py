@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from slrig.model import CameraFormat, Capture, Pattern, Size
+from slrig.model import Axis, CameraFormat, Capture, Gray, Pattern, Size
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,3 +27,8 @@ class Outline:
     def shown(self) -> frozenset[Pattern]:
         """The patterns of which there are frames; a description may list more."""
         return frozenset(self.patterns[index] for index, _ in self.frames)
+
+    @property
+    def axes(self) -> frozenset[Axis]:
+        """The axes whose code is shown."""
+        return frozenset(pattern.axis for pattern in self.shown if isinstance(pattern, Gray))

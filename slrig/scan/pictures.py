@@ -53,6 +53,8 @@ _COLOURS: dict[Refusal, tuple[int, int, int]] = {
     Refusal.SHADOW_EDGE: (115, 158, 0),
     Refusal.DEPTH_EDGE: (255, 0, 170),
     Refusal.OFF_PROJECTOR: (60, 90, 140),
+    Refusal.BEHIND_DEVICE: (150, 150, 0),
+    Refusal.NO_INTERSECTION: (120, 40, 120),
 }
 
 

@@ -7,7 +7,7 @@ again.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +20,22 @@ from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import read_refused
 from slrig.capture.exposure import check_exposures
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError
+from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import brightness, compact_mesh
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves, Refusal
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
-from slrig.reconstruction.camera import CameraCurves
-from slrig.reconstruction.merging import MergedCurves, merged
-from slrig.reconstruction.redundancy import Redundancy, redundancy
-from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
 from slrig.scan.calibration_report import calibration_report
+from slrig.scan.light_axis import FAIR_SHARE, LEAST_SHARE, weakness
+from slrig.scan.offered import rejected_picture
 from slrig.scan.outline import Outline
 from slrig.scan.output import REPORT, staged_folder
 from slrig.scan.pictures import preview, rejection_picture, write_png
 from slrig.scan.plan import Progress, ReconstructionPlan
+from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
     calibration_id,
@@ -46,8 +46,8 @@ from slrig.scan.report import (
     with_seconds,
 )
 from slrig.scan.stream import LiveScan, ScanStream, Seen, step_px
+from slrig.scan.triangulated import Triangulated, triangulated
 
-_WIDEST_GAP_PX = 4.0
 _STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
 
 
@@ -57,21 +57,10 @@ class _Walked:
 
     devices: Calibration
     axis: Axis
+    shown: frozenset[Axis]
     seen: list[Seen]
     step_px: float
     sections: dict[str, object]
-
-
-@dataclass(frozen=True, slots=True)
-class _Triangulated:
-    """The curves of all cameras, what they say of one another, and the cameras with the points that fell off the
-    projector among their refusals. second : index of the camera that the first is paired with, without a projector.
-    """
-
-    joined: MergedCurves
-    spare: Redundancy
-    cameras: list[Seen]
-    second: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,21 +109,32 @@ def reconstruct_bundle(
     """
     watch = Stopwatch() if live is None else live.watch
 
+    at = ("", 0.0)
+
     def entered(stage: str, fraction: float, detail: str) -> None:
+        nonlocal at
         if cancelled():
             message = f"the scan was cancelled before '{stage}'"
             raise ScanCancelledError(message)
         watch.enter(stage)
+        at = (stage, fraction)
         progress(stage, fraction, detail)
 
-    with staged_folder(output) as staging:
+    def compiling(kernel: str) -> None:
+        # What only some scans need is compiled when the first one comes.
+        progress(*at, f"preparing kernels, first time only: {kernel}")
+
+    with compilations_told(compiling), staged_folder(output) as staging:
         entered("read bundle", 0.0, str(bundle))
         walked = _walked(bundle, calibration, live, entered)
-        devices, axis, seen, step = walked.devices, walked.axis, walked.seen, walked.step_px
-        _require(any(each.curves.decoded_pixels > 0 for each in seen), bundle, "no pixel could be decoded", seen)
-        _require(any(each.curves.stripe_count > 0 for each in seen), bundle, "no stripe was found", seen)
-        entered("triangulate", 0.6, "")
-        meshed = _meshed(bundle, seen, devices, axis, plan, step, entered)
+        found = _triangulated(walked, bundle, entered)
+        (other,) = set(Axis) - {walked.axis}
+        if found.share_across < FAIR_SHARE and other in walked.shown:
+            # The projector does not stand as was assumed: its stripes run the other way.
+            walked = _walked(bundle, calibration, None, entered, axis=other)
+            found = _triangulated(walked, bundle, entered)
+        sections = _told_depth(found, walked, bundle)
+        meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         write_points(meshed.curves, staging / "points.ply", sigma_calibration_mm=meshed.share_mm)
@@ -146,8 +146,8 @@ def reconstruct_bundle(
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         seconds = watch.finished()
         report = {
-            **walked.sections,
-            "calibration": calibration_report(devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
+            **sections,
+            "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
             "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
@@ -159,6 +159,11 @@ def reconstruct_bundle(
         write_report(report, staging / REPORT)
     progress("done", 1.0, f"{len(mesh.faces)} triangles")
     return report
+
+
+def warm_kernels(told: Callable[[Prepared], None]) -> None:
+    """Load every kernel that a usual scan needs; see `slrig.scan.preparation.prepare_kernels`."""
+    prepare_kernels(reconstruct_bundle, told)
 
 
 def _require_calibration(folder: Path, names: list[str], found: Calibration | None) -> Calibration:
@@ -185,9 +190,14 @@ def _require_calibration(folder: Path, names: list[str], found: Calibration | No
 
 
 def _walked(
-    folder: Path, calibration_file: Path | None, live: LiveScan | None, entered: Callable[[str, float, str], None]
+    folder: Path,
+    calibration_file: Path | None,
+    live: LiveScan | None,
+    entered: Callable[[str, float, str], None],
+    *,
+    axis: Axis | None = None,
 ) -> _Walked:
-    """Frames to curves: those that came while the scan was captured, or else those of the bundle."""
+    """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
     last = ""
 
@@ -208,7 +218,7 @@ def _walked(
         names += recorded.capture.cameras
         devices = _require_calibration(folder, names, recorded.calibration)
         try:
-            stream = ScanStream(Outline.of(recorded.capture), devices, entered=stage_entered)
+            stream = ScanStream(Outline.of(recorded.capture), devices, entered=stage_entered, axis=axis)
             for name in names:
                 for shot in recorded.capture.shots:
                     if shot.camera == name:
@@ -220,7 +230,8 @@ def _walked(
         entered("check frames", 0.58, "")
         evidence = check_exposures(recorded.capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
-    return _Walked(devices, stream.axis, seen, step_px(stream.outline.shown, stream.axis), sections)
+    step = step_px(stream.outline.shown, stream.axis)
+    return _Walked(devices, stream.axis, stream.outline.axes, seen, step, sections)
 
 
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
@@ -238,60 +249,42 @@ def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
     )
 
 
-def _triangulated(cameras: list[Seen], projector: Pinhole | None, axis: Axis) -> _Triangulated:
-    devices = {seen.name: seen.device for seen in cameras}
-    if projector is not None:
-        parts = [camera_projector(seen.curves.ensemble, seen.device, projector, axis) for seen in cameras]
-        told = [
-            replace(seen, curves=replace(seen.curves, refusal=_with_dropped(seen.curves, part)))
-            for seen, part in zip(cameras, parts, strict=True)
-        ]
-        spare = redundancy(parts, devices, axis, widest_gap_px=_WIDEST_GAP_PX)
-        return _Triangulated(merged(parts, projector.centre_mm, widest_gap_px=_WIDEST_GAP_PX), spare, told)
-    first, *others = cameras
-    parts = [camera_camera(first.curves.ensemble, seen.curves.ensemble, first.device, seen.device) for seen in others]
-    # Without a projector the light sheet has no rows to merge by; the pair that gives most is used.
-    second = max(range(len(parts)), key=lambda index: len(parts[index].points_mm))
-    best = parts[second]
-    spare = redundancy([best], devices, axis, widest_gap_px=_WIDEST_GAP_PX)
-    joined = merged([best], first.device.centre_mm, widest_gap_px=_WIDEST_GAP_PX)
-    return _Triangulated(joined, spare, cameras, 1 + second)
+def _triangulated(walked: _Walked, folder: Path, entered: Callable[[str, float, str], None]) -> Triangulated:
+    seen = walked.seen
+    _require(any(each.curves.decoded_pixels > 0 for each in seen), folder, "no pixel could be decoded", seen)
+    _require(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
+    entered("triangulate", 0.6, "")
+    return triangulated(seen, walked.devices.projector, walked.axis)
 
 
-def _with_dropped(curves: CameraCurves, triangulated: SheetCurves) -> NDArray[np.uint8]:
-    """The refusals with those points among them that met their light sheet where the projector has no pixel."""
-    points_px = curves.ensemble.points_px
-    if len(triangulated.pixels_px) == len(points_px):
-        return curves.refusal
-    stays = np.zeros(curves.refusal.shape, dtype=bool)
-    columns, rows = np.rint(triangulated.pixels_px).astype(int).T
-    stays[rows, columns] = True
-    columns, rows = np.rint(points_px).astype(int).T
-    off = ~stays[rows, columns]
-    refusal = curves.refusal.copy()
-    refusal[rows[off], columns[off]] = Refusal.OFF_PROJECTOR
-    return refusal
+def _told_depth(found: Triangulated, walked: _Walked, folder: Path) -> dict[str, object]:
+    """The report's sections, with a note on light that crosses the baseline obliquely. Light along it is refused."""
+    words = weakness(walked.axis, walked.shown, found.share_across)
+    if words is None:
+        return walked.sections
+    if found.share_across < LEAST_SHARE:
+        message = f"{folder}: {words}"
+        raise NothingToReconstructError(message)
+    notes = walked.sections["notes"]
+    return walked.sections | {"notes": [*(notes if isinstance(notes, list) else []), words]}
 
 
 def _meshed(
     folder: Path,
-    cameras: list[Seen],
-    calibration: Calibration,
-    axis: Axis,
+    found: Triangulated,
+    walked: _Walked,
     plan: ReconstructionPlan,
-    step_px: float,
     entered: Callable[[str, float, str], None],
 ) -> _Meshed:
-    """Triangulate and mesh."""
-    first, projector = cameras[0], calibration.projector
-    found = _triangulated(cameras, projector, axis)
+    """From points to the mesh."""
+    first, axis, step_px = walked.seen[0], walked.axis, walked.step_px
     cameras, joined_curves = found.cameras, found.joined
     points = joined_curves.curves
     _require(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
     count = f"{len(points.points_mm)} points"
     surface = finished_mesh(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,
-        sampling_mm(points.points_mm, first.device, projector, step_px), first.device.centre_mm,
+        sampling_mm(points.points_mm, first.device, walked.devices.projector, axis, step_px), first.device.centre_mm,
         MeshingLimits(
             widest_step_px=step_px * plan.max_code_gap,
             depth_edge_ratio=plan.depth_edge_ratio,
@@ -304,7 +297,7 @@ def _meshed(
     _require(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
     entered("vertices", 0.72, count)
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
-    share = _calibration_share(calibration, found, axis, surface.normals)
+    share = _calibration_share(walked.devices, found, axis, surface.normals)
     if share is not None:
         sigma = np.hypot(sigma, share)
     grey = brightness(
@@ -343,7 +336,7 @@ def _used(faces: IntArray, count: int) -> NDArray[np.bool_]:
 
 
 def _calibration_share(
-    calibration: Calibration, found: _Triangulated, axis: Axis, normals: NDArray[np.float32]
+    calibration: Calibration, found: Triangulated, axis: Axis, normals: NDArray[np.float32]
 ) -> FloatArray | None:
     """(n,) float64: the calibration's part of each point's standard deviation; None where it states no error."""
     modes = calibration_modes(calibration, [seen.name for seen in found.cameras], axis, second=found.second)
@@ -359,7 +352,7 @@ def _write_pictures(mesh: Mesh, cameras: list[Seen], staging: Path) -> None:
     write_png(staging / "preview.png", preview(mesh, first.device, first.white, int(first.full_scale)))
     for seen in cameras:
         picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
-        write_png(staging / f"rejected-{seen.name}.png", picture)
+        write_png(staging / rejected_picture(seen.name), picture)
 
 
 def _compared_with_truth(

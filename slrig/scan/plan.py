@@ -20,10 +20,12 @@ class Progress(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PatternPlan:
-    """Which patterns to play (DESIGN 5.1).
+    """Which patterns to play: see `slrig.patterns.sequence.scan_patterns`.
 
     `line_shift_period_px` n; `gray_cell_px` defaults to ⌊n/2⌋, so that a code edge may be off by n/4 px.
-    `line_shift` False gives a Gray-only scan, whose cell defaults to 1 px.
+    `line_shift` False gives a Gray-only scan, whose cell defaults to 1 px. `rows` True plays columns and rows, False
+    columns alone, and None what the calibration asks for: columns for devices side by side, rows for devices above one
+    another; see `slrig.scan.light_axis.played_axes`.
     """
 
     line_shift: bool = True
@@ -31,7 +33,7 @@ class PatternPlan:
     line_width_px: int = 1
     gray_cell_px: int | None = None
     gray_offset_px: int = 0
-    rows: bool = False
+    rows: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from slrig.devices import Positioner
-from slrig.scan.guarding import CALL_LIMIT_S, Calls
+from slrig.devices import USUAL, Positioner
+from slrig.scan.guarding import Calls
 
 MOVE_LIMIT_S = 120.0
 """How long a move may take: a stage crosses its whole travel, a robot goes round an obstacle."""
@@ -31,4 +31,4 @@ class GuardedPositioner:
 
     def close(self) -> None:
         """See `Positioner`."""
-        self._calls.make(_DEVICE, "close", CALL_LIMIT_S, self._positioner.close)
+        self._calls.make(_DEVICE, "close", USUAL.call_s, self._positioner.close)

@@ -91,7 +91,7 @@ class Runner:
         self._lender.refuse_while_stuck()
         rig = self._lender.rig
         # Before the rig was first open nothing is known about it; the scan then fails with the same errors.
-        frame_bytes = 0 if rig.facts is None else check_plan(plan, rig.facts)
+        frame_bytes = 0 if rig.facts is None else check_plan(plan, rig.facts, rig.calibration)
         rig.refuse_misfit()
         # Frames once as captured, and as much again for meshes and the zipped bundle of a careful client.
         self._folder.require_space(2 * frame_bytes + self._spare_bytes)
@@ -211,7 +211,9 @@ class Runner:
             since=lent.since,
             waiting=lent.waiting,
             queue_length=self._lender.queue_length,
+            opening=rig.calls.doing,
             reconstruction=self._worker.condition,
+            preparing=self._worker.loading,
             ending=lent.ending,
         )
 

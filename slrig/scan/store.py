@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timedelta
@@ -35,6 +37,7 @@ KEY_LIFE_S = 24 * 3600.0
 """How long an idempotency key is remembered unless told otherwise."""
 
 _LEAST_STEP = 0.01
+_DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
 
 
 class ScanStore:
@@ -243,10 +246,16 @@ class ScanStore:
 
 
 class ProgressRecorder:
-    """Takes progress from the work and records the steps worth telling: a new stage, or a hundredth of the way."""
+    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, or another
+    detail of a stage that goes on.
+    """
 
-    def __init__(self, store: ScanStore, scan_id: UUID, *, hidden: str) -> None:
+    def __init__(
+        self, store: ScanStore, scan_id: UUID, *, hidden: str, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
         """`hidden` is left out of what is recorded."""
+        self._now_s = now_s
+        self._told_s = -math.inf
         self._hidden = hidden
         self._store = store
         self._scan_id = scan_id
@@ -260,8 +269,10 @@ class ProgressRecorder:
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
         """Take note, as `slrig.scan.plan.Progress` asks."""
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
-        if stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
+        goes_on = detail != self._told.detail and self._now_s() - self._told_s >= _DETAIL_S
+        if goes_on or stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
             self._told = ScanProgress(stage, overall, detail.replace(self._hidden, ""))
+            self._told_s = self._now_s()
             self._store.progress(self._scan_id, self._told)
 
 

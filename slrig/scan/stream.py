@@ -28,6 +28,7 @@ from slrig.reconstruction.frames import (
     telling,
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_frames
+from slrig.scan.light_axis import chosen_axis
 from slrig.scan.outline import Outline
 from slrig.scan.report import Stopwatch
 
@@ -58,17 +59,20 @@ class Seen:
 
 
 class ScanStream:
-    """Reconstructs the curves of every camera while frames come, along the axis that `triangulated_axis` chooses.
+    """Reconstructs the curves of every camera while frames come, along `axis` or the one that `chosen_axis` chooses.
 
     Raises
     ------
     PatternError
-        The frames announced cannot be decoded.
+        The frames announced cannot be decoded, or tell no depth.
     """
 
-    def __init__(self, outline: Outline, calibration: Calibration, *, entered: Entered) -> None:
+    def __init__(
+        self, outline: Outline, calibration: Calibration, *, entered: Entered, axis: Axis | None = None
+    ) -> None:
         self.outline = outline
-        self.axis = triangulated_axis(outline, calibration)
+        devices = [calibration.cameras[name] for name in outline.cameras]
+        self.axis = axis or chosen_axis(outline.axes, devices, calibration.projector)
         self._calibration = calibration
         self._shots: list[Shot] = []
         self._eyes = {name: _Eye(name, outline, self.axis, entered) for name in outline.cameras}
@@ -198,21 +202,6 @@ def _shown_white(frames: AxisFrames, used: NDArray[np.bool_]) -> float:
     """The value to show as white, of a bracket: what shines like a mirror is no measure of it."""
     usual = float(np.median(frames.white[used])) if used.any() else frames.full_scale
     return float(np.clip(_WHITE_OVER_USUAL * usual, 1, frames.clipped_at))
-
-
-def triangulated_axis(outline: Outline, calibration: Calibration) -> Axis:
-    """The axis to triangulate by: of those shown, the one that the first camera stands to the side of.
-
-    A light sheet that contains the camera's centre is seen edge on and tells no depth.
-    """
-    shown = {pattern.axis for pattern in outline.shown if isinstance(pattern, Gray)}
-    if len(shown) == 1:
-        return shown.pop()
-    if calibration.projector is None:
-        return Axis.COLUMN
-    camera = calibration.cameras[next(iter(outline.cameras))]
-    beside, above, _ = calibration.projector.rotation @ camera.centre_mm + calibration.projector.translation_mm
-    return Axis.COLUMN if abs(beside) >= abs(above) else Axis.ROW
 
 
 def step_px(shown: Collection[Pattern], axis: Axis) -> float:

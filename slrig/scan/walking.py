@@ -18,7 +18,8 @@ from slrig.scan.holding import HeldRig, check_plan, driver_errors
 from slrig.scan.records import ScanRecord, ScanState, report_summary
 from slrig.scan.store import ProgressRecorder, ScanStore
 from slrig.scan.work import CaptureBundle, Holder, WatchesHealth
-from slrig.scan.worker import Job, ReconstructionWorker
+from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker_process import Job
 
 CAPTURE_SHARE = 0.5
 """The part of a scan's progress that is capture."""
@@ -45,7 +46,7 @@ class ScanTools:
 
 
 class ScanWalk:
-    """One scan that waits or is under way. Implements `slrig.scan.lending.Task`."""
+    """One scan that waits or is under way. Implements `slrig.scan.work.Task`."""
 
     def __init__(self, record: ScanRecord, tools: ScanTools) -> None:
         self.id = record.id
@@ -114,7 +115,8 @@ class ScanWalk:
         rig = held.open()
         held.refuse_misfit()
         if held.facts is not None:
-            tools.folder.require_space(2 * check_plan(self._plan, held.facts) + tools.spare_bytes)
+            frame_bytes = check_plan(self._plan, held.facts, rig.calibration)
+            tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
         staged = tools.folder.stage(self.id)
         bundle = staged / "bundle"
         progress.span(0.0, CAPTURE_SHARE)

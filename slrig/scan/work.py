@@ -161,7 +161,8 @@ class RunnerStatus:
     """What the runner is at: the rig as far as it is known, who holds it and since when, and how many wait.
 
     `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` is
-    `Holder.name`. `reconstruction` is `ReconstructionWorker.condition`.
+    `Holder.name`. `opening` is what the rig's driver told last, while it is opened. `reconstruction` is
+    `ReconstructionWorker.condition`, `preparing` whether that is on its way to ready.
     """
 
     rig: str
@@ -173,7 +174,9 @@ class RunnerStatus:
     since: datetime | None
     waiting: int
     queue_length: int
+    opening: str
     reconstruction: str
+    preparing: bool
     ending: bool
 
 

@@ -6,16 +6,12 @@ joins it at exit. Here a lost process is seen at once, and the next job starts a
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
 import os
-import pkgutil
 import signal
 import threading
 import time
-import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -23,10 +19,23 @@ from typing import Any
 
 import structlog
 
-from slrig.errors import ScanCancelledError, SlrigError
-from slrig.scan.faults import ScanFault, WorkerLostError, error_classes, fault_of
-from slrig.scan.feed import FedFrames, FrameFeed
-from slrig.scan.plan import ReconstructionPlan
+from slrig.errors import ScanCancelledError
+from slrig.scan.faults import WorkerLostError, error_classes
+from slrig.scan.feed import FrameFeed
+from slrig.scan.worker_process import (
+    Done,
+    Failed,
+    Job,
+    Preparing,
+    Progressed,
+    Ready,
+    Run,
+    Stop,
+    Unloadable,
+    received,
+    sent,
+    serve,
+)
 
 RECONSTRUCT = "slrig.scan.pipeline:reconstruct_bundle"
 """What the process runs, named rather than passed: the service itself need not load numba for it."""
@@ -37,61 +46,14 @@ CANCEL_LIMIT_S = 10.0
 LOADING = "loading"
 READY = "ok"
 
+PREPARING = "preparing kernels"
+"""The stage of compiling what numba has not compiled on this machine before."""
+
 _POLL_S = 0.1
 
+_Told = Callable[[str, float, str], None]
+
 _log = structlog.get_logger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One reconstruction: the arguments of `slrig.scan.pipeline.reconstruct_bundle`."""
-
-    bundle: Path
-    output: Path
-    plan: ReconstructionPlan
-
-
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """Parent to child: do this job, with the frames that were sent before if `fed`."""
-
-    job: Job
-    fed: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Stop:
-    """Parent to child: the job under way is not wanted any more."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Ready:
-    """Child to parent: the task is loaded."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Unloadable:
-    """Child to parent: the task cannot be loaded, and the process ends."""
-
-    cause: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Progressed:
-    stage: str
-    fraction: float
-    detail: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Done:
-    report: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class _Failed:
-    fault: ScanFault
-    trace: str
 
 
 class UnexpectedWorkerError(Exception):
@@ -111,23 +73,39 @@ class ReconstructionWorker:
         self._fed: tuple[FrameFeed, Connection | None] | None = None
         self._closed = False
         self._running = False
-        self._condition = LOADING
+        self._condition, self._loading = LOADING, True
 
     @property
     def condition(self) -> str:
-        """`LOADING`, `READY` once the process has loaded its task, or why it cannot; looks, and never waits."""
+        """`READY` once the process has loaded its task, `LOADING` or how far that is, or why it cannot; never waits."""
         with self._guard:
             # While a job is under way `run` reads the pipe, and an answer read here would be lost.
-            if self._condition == LOADING and not self._running and self._pipe is not None and self._pipe.poll():
-                self._note(_received(self._pipe))
+            while self._loading and not self._running and self._pipe is not None and self._pipe.poll():
+                self._note(received(self._pipe))
             return self._condition
+
+    @property
+    def loading(self) -> bool:
+        """Whether the process is not ready yet, and there is hope, as `condition` found it last."""
+        return self._loading
+
+    def _hear(self, told: object | None, progress: _Told) -> None:
+        """Take note of what is no answer, and pass on how far the kernels are."""
+        if told is None or isinstance(told, (Preparing, Ready, Unloadable)):
+            with self._guard:
+                self._note(told)
+        if isinstance(told, Preparing):
+            progress(PREPARING, 0.0, str(told))
 
     def _note(self, told: object | None) -> None:
         """Take what a process says before its first answer; None stands for its death."""
-        if isinstance(told, _Ready):
-            self._condition = READY
-        elif self._condition == LOADING and not self._closed:
-            cause = told.cause if isinstance(told, _Unloadable) else "its process ended"
+        if isinstance(told, Preparing):
+            self._condition = f"{PREPARING}, {told}"
+        elif isinstance(told, Ready):
+            self._condition, self._loading = READY, False
+        elif self._loading and not self._closed:
+            self._loading = False
+            cause = told.cause if isinstance(told, Unloadable) else "its process ended"
             self._condition = f"the reconstruction cannot be loaded: {cause}; the service's log has the details"
             _log.error("the reconstruction cannot be loaded", cause=cause)
 
@@ -145,10 +123,10 @@ class ReconstructionWorker:
                 # A feed may still be in the middle of a message to the process that ended.
                 with self._sending:
                     self._pipe.close()
-            self._condition = LOADING
+            self._condition, self._loading = LOADING, True
             self._pipe, far_end = self._spawning.Pipe()
             self._process = self._spawning.Process(
-                target=_serve, args=(far_end, self._task), name="slrig-reconstruction", daemon=True
+                target=serve, args=(far_end, self._task), name="slrig-reconstruction", daemon=True
             )
             self._process.start()
             # The child holds the only other end now, so its death reads as end of file here.
@@ -163,7 +141,7 @@ class ReconstructionWorker:
         def send(message: object) -> bool:
             # A feed that was abandoned in the middle of a message finishes it before anyone sends the next.
             with self._sending:
-                return pipe is not None and _sent(pipe, message)
+                return pipe is not None and sent(pipe, message)
 
         self._fed = FrameFeed(send), pipe
         return self._fed[0]
@@ -172,7 +150,7 @@ class ReconstructionWorker:
         self,
         job: Job,
         *,
-        progress: Callable[[str, float, str], None],
+        progress: _Told,
         cancelled: Callable[[], bool],
         feed: FrameFeed | None = None,
     ) -> Mapping[str, Any]:
@@ -198,16 +176,25 @@ class ReconstructionWorker:
             raise ScanCancelledError(message)
         try:
             # A process that was started since the capture has not seen its frames.
-            fed = feed is not None and self._fed == (feed, pipe) and self._settled(feed, process, cancelled)
-            return self._answered(process, pipe, _Run(job, fed), progress, cancelled)
+            fed = (
+                feed is not None
+                and self._fed == (feed, pipe)
+                and self._settled(feed, process, pipe, progress, cancelled)
+            )
+            return self._answered(process, pipe, Run(job, fed), progress, cancelled)
         finally:
             with self._guard:
                 self._running = False
 
-    def _settled(self, feed: FrameFeed, process: BaseProcess, cancelled: Callable[[], bool]) -> bool:
+    def _settled(
+        self, feed: FrameFeed, process: BaseProcess, pipe: Connection, progress: _Told, cancelled: Callable[[], bool]
+    ) -> bool:
         """Wait until the frames of a capture have been sent, or cannot be; return whether all were."""
         stop_after: float | None = None
         while not feed.settled(_POLL_S):
+            # A process that still prepares its kernels takes no frames, and tells how far it is.
+            while pipe.poll() and (told := received(pipe)) is not None:
+                self._hear(told, progress)
             if cancelled():
                 if stop_after is None:
                     stop_after = time.monotonic() + CANCEL_LIMIT_S
@@ -227,16 +214,16 @@ class ReconstructionWorker:
         self,
         process: BaseProcess,
         pipe: Connection,
-        run: _Run,
-        progress: Callable[[str, float, str], None],
+        run: Run,
+        progress: _Told,
         cancelled: Callable[[], bool],
     ) -> Mapping[str, Any]:
         with self._sending:
-            begun = _sent(pipe, run)
+            begun = sent(pipe, run)
         if not begun:
             # What it last said may lie in the pipe still: why it could not be loaded.
             with self._guard:
-                self._note(_received(pipe))
+                self._note(received(pipe))
             raise self._lost(process)
         stop_after: float | None = None
         while True:
@@ -245,23 +232,21 @@ class ReconstructionWorker:
                     self._note(None)
                 raise self._lost(process)
             while pipe.poll():
-                message_in = _received(pipe)
-                if message_in is None or isinstance(message_in, (_Ready, _Unloadable)):
-                    with self._guard:
-                        self._note(message_in)
-                if message_in is None or isinstance(message_in, _Unloadable):
+                message_in = received(pipe)
+                self._hear(message_in, progress)
+                if message_in is None or isinstance(message_in, Unloadable):
                     raise self._lost(process)
-                if isinstance(message_in, _Progressed):
+                if isinstance(message_in, Progressed):
                     progress(message_in.stage, message_in.fraction, message_in.detail)
-                elif isinstance(message_in, _Done):
+                elif isinstance(message_in, Done):
                     return message_in.report
-                elif isinstance(message_in, _Failed):
+                elif isinstance(message_in, Failed):
                     raise _error(message_in)
             if cancelled():
                 if stop_after is None:
                     stop_after = time.monotonic() + CANCEL_LIMIT_S
                     with self._sending:
-                        _sent(pipe, _Stop())
+                        sent(pipe, Stop())
                 elif time.monotonic() > stop_after:
                     self._end(process)
                     message = "The reconstruction was cancelled."
@@ -278,7 +263,7 @@ class ReconstructionWorker:
 
     def _lost(self, process: BaseProcess) -> WorkerLostError:
         process.join()
-        if self._condition not in {LOADING, READY}:
+        if not self._loading and self._condition != READY:
             message = f"No mesh was made: {self._condition}. The bundle is kept: scan again once that is put right."
             return WorkerLostError(message)
         code = process.exitcode
@@ -302,81 +287,6 @@ def prepare_kernel_cache(folder: Path) -> None:
         os.environ["NUMBA_CACHE_DIR"] = str(folder)
 
 
-def _error(failed: _Failed) -> Exception:
+def _error(failed: Failed) -> Exception:
     known = error_classes().get(failed.fault.kind)
-    if known is None:
-        return UnexpectedWorkerError(failed.trace)
-    return known(failed.fault.message)
-
-
-def _sent(pipe: Connection, message: object) -> bool:
-    try:
-        pipe.send(message)
-    except OSError:
-        return False
-    return True
-
-
-def _received(pipe: Connection) -> object | None:
-    try:
-        received: object = pipe.recv()
-    except (EOFError, OSError):
-        return None
-    return received
-
-
-def _serve(pipe: Connection, task: str) -> None:
-    """The child's life: load the task, then do jobs until the parent's end of the pipe is gone."""
-    # Ctrl-C reaches the whole foreground group; the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    module, _, name = task.partition(":")
-    try:
-        loaded = importlib.import_module(module)
-        warm = getattr(loaded, "warm_kernels", None)
-        if warm is not None:
-            warm()
-        reconstruct = pkgutil.resolve_name(f"{module}:{name}")
-        begin = getattr(loaded, "LiveScan", None)
-    except Exception as error:
-        _sent(pipe, _Unloadable(f"{type(error).__name__}: {error}"))
-        # The traceback goes to the service's log.
-        raise
-    _sent(pipe, _Ready())
-    frames = FedFrames(begin)
-    while (message := _received(pipe)) is not None:
-        if isinstance(message, _Run):
-            live = frames.taken() if message.fed else None
-            frames.forget()
-            try:
-                answer = _answer(pipe, reconstruct, message.job, live)
-            except (ConnectionError, EOFError):
-                return
-            del live
-            _sent(pipe, answer)
-        else:
-            frames.hear(message)
-
-
-def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job: Job, live: Any) -> _Done | _Failed:
-    stopped = False
-    seen = {} if live is None else {"live": live}
-
-    def progress(stage: str, fraction: float, detail: str) -> None:
-        pipe.send(_Progressed(stage, fraction, detail))
-
-    def cancelled() -> bool:
-        nonlocal stopped
-        while pipe.poll():
-            stopped = isinstance(pipe.recv(), _Stop) or stopped
-        return stopped
-
-    try:
-        return _Done(reconstruct(job.bundle, job.output, plan=job.plan, progress=progress, cancelled=cancelled, **seen))
-    except (ConnectionError, EOFError):
-        # The parent is gone: nobody waits for an answer.
-        raise
-    except (SlrigError, OSError) as error:
-        return _Failed(fault_of(error), traceback.format_exc())
-    except Exception as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
-        return _Failed(fault_of(error), traceback.format_exc())
+    return UnexpectedWorkerError(failed.trace) if known is None else known(failed.fault.message)

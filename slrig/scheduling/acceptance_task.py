@@ -8,6 +8,7 @@ from typing import Any
 from slrig.scan.faults import fault_of
 from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
+from slrig.scheduling.positions import require_positions
 from slrig.scheduling.task_options import checked
 from slrig.scheduling.waiting import error_of, until
 from slrig.sessions.acceptance.asking import AcceptanceRequest
@@ -26,6 +27,7 @@ class AcceptanceTask:
     def check(self, options: Mapping[str, Any], /) -> None:
         """See `Task`."""
         _options(options)
+        require_positions(self._lender.status().facts, ())
 
     def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. A rig that fails the test is a run that succeeded."""

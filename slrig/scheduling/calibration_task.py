@@ -10,6 +10,7 @@ from slrig.calibration.judging.verdict import Grade
 from slrig.errors import UnsupportedByDeviceError
 from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
+from slrig.scheduling.positions import require_positions
 from slrig.scheduling.task_options import CalibrationOptions, checked
 from slrig.scheduling.waiting import error_of, until
 from slrig.sessions.calibration.calibrating import Calibrations
@@ -30,7 +31,7 @@ class CalibrationTask:
 
     def check(self, options: Mapping[str, Any], /) -> None:
         """See `Task`."""
-        _options(options)
+        require_positions(self._lender.status().facts, _options(options).positions)
 
     def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. Poses that are refused are left out; one that fails ends the run."""

@@ -24,7 +24,7 @@ class Task(Protocol):
     """One kind of work."""
 
     def check(self, options: Mapping[str, Any], /) -> None:
-        """Raise ScheduleError for options that no run could be done with."""
+        """Raise ScheduleError for options that no run could be done with, as far as is known now."""
         ...
 
     def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from slrig.calibration.board import Board
-from slrig.errors import CalibrationError
+from slrig.errors import CalibrationError, ScheduleError
 from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
+from slrig.scheduling.positions import require_positions
 from slrig.scheduling.task_options import VerificationOptions, checked
 from slrig.scheduling.waiting import error_of, until
 from slrig.sessions.calibration.calibrating import Calibrations
@@ -26,8 +27,16 @@ class VerificationTask:
         self._desk = desk
 
     def check(self, options: Mapping[str, Any], /) -> None:
-        """See `Task`."""
-        _options(options)
+        """See `Task`. A calibration may be made before the first run; a board to look at is named now or never."""
+        asked = _options(options)
+        if asked.position is not None:
+            require_positions(self._lender.status().facts, [asked.position])
+        if asked.board is None:
+            try:
+                self._board_in_use()
+            except CalibrationError as error:
+                message = f"options: {error}"
+                raise ScheduleError(message) from error
 
     def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. A rig that is found stale is a verification that succeeded."""
@@ -48,9 +57,11 @@ class VerificationTask:
         active = self._calibrations.active
         board = None if active is None else self._calibrations.register.get(active).board
         if board is None:
+            used = "no calibration that was made here is in use" if active is None else "the one in use was imported"
             message = (
-                "the calibration in use was imported or is the rig's own, and its board is not known here; give the "
-                'schedule the option "board" with kind, corners and square_mm of the one that is in view'
+                f"which board is in view is not known: {used}. Give the schedule the option "
+                '"board", as {"kind": "charuco", "corners": [11, 8], "square_mm": 12}, or activate a calibration that '
+                "was made here"
             )
             raise CalibrationError(message)
         return board

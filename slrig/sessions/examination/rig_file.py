@@ -156,7 +156,7 @@ def _table(table: Mapping[str, Any], path: Path_, comments: Comments) -> Iterato
         if not _is_table(value):
             if (*path, key) in comments:
                 yield from _comment(comments[(*path, key)])
-            yield f"{_key(key)} = {_value(value)}"
+            yield f"{_key(key)} = {toml_value(value)}"
     for key, value in table.items():
         for number, each in enumerate(value if isinstance(value, list) else [value] if _is_table(value) else []):
             if not _is_table(value):
@@ -178,7 +178,7 @@ def _key(key: str) -> str:
     return key if _BARE.fullmatch(key) else _text(key)
 
 
-def _value(value: Any) -> str:
+def toml_value(value: Any) -> str:
     """A TOML value on one line."""
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -187,9 +187,9 @@ def _value(value: Any) -> str:
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(key)} = {_value(each)}" for key, each in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(key)} = {toml_value(each)}" for key, each in value.items()) + "}"
     if isinstance(value, Sequence):
-        return "[" + ", ".join(map(_value, value)) + "]"
+        return "[" + ", ".join(map(toml_value, value)) + "]"
     # Integers, and floats as Python writes them, are TOML's.
     return repr(value)
 

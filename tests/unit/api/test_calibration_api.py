@@ -127,6 +127,22 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient) -> 
     assert (refused.status_code, refused.json()["type"]) == (409, "/problems/calibration-state")
 
 
+@pytest.mark.parametrize("request_body", [None, {}, {"label": "spring"}], ids=str)
+def test_board_that_no_request_names_is_the_usual_one(
+    calibrating: TestClient, request_body: dict[str, Any] | None
+) -> None:
+    answer = calibrating.post("/calibration", json=request_body)
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["board"] == {
+        "kind": "charuco",
+        "corners": [11, 8],
+        "square_mm": 12.0,
+        "marker_mm": 9.0,
+        "dictionary": "DICT_5X5_250",
+        "title": "charuco 11x8, 12 mm",
+    }
+
+
 def test_solve_is_told_what_the_board_is_taken_for(calibrating: TestClient, served: ServedBench) -> None:
     made = opened(calibrating)
     shot(calibrating, made["id"])
@@ -290,7 +306,7 @@ def test_import_that_is_no_calibration_or_of_another_rig_is_refused(calibrating:
 @pytest.mark.parametrize(
     ("body", "fields"),
     [
-        ({}, ["board"]),
+        ({"board": {}}, ["board.kind", "board.corners", "board.square_mm"]),
         ({"board": {"kind": "dots", "corners": [4, 3], "square_mm": 10}}, ["board.kind"]),
         ({"board": {**BOARD, "corners": [4]}}, ["board.corners"]),
         ({"board": {**BOARD, "corners": [4, 2]}}, ["board.corners.1"]),

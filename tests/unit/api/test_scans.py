@@ -104,7 +104,7 @@ def test_plan_is_request_over_rig_file_over_default(client: TestClient) -> None:
     plan = client.post("/scan", json=request).json()["plan"]
     assert plan["patterns"]["line_width_px"] == 2
     assert plan["patterns"]["line_shift_period_px"] == 6
-    assert plan["patterns"]["rows"] is False
+    assert plan["patterns"]["rows"] is None
     assert plan["reconstruction"] == {
         "keep_holes": True,
         "depth_edge_ratio": 6.0,
@@ -335,18 +335,28 @@ def test_drivers_and_devices_are_listed(client: TestClient) -> None:
 
 def test_probes_are_well(client: TestClient) -> None:
     ended(client, client.post("/scan").json()["id"])
-    assert client.get("/livez").json() == {"checks": {"process": "ok"}}
+    assert client.get("/livez").json()["checks"] == {"process": "ok"}
     assert client.get("/readyz").json() == {
-        "checks": {"records": "ok", "disk": "ok", "rig": "ok", "reconstruction": "ok"}
+        "checks": {"records": "ok", "disk": "ok", "rig": "ok", "reconstruction": "ok"},
+        "pending": [],
     }
 
 
-@pytest.mark.parametrize("condition", ["loading", "the reconstruction cannot be loaded: its process ended"])
+@pytest.mark.parametrize(
+    ("condition", "pending"),
+    [
+        ("loading", ["reconstruction"]),
+        ("preparing kernels, first time only: 41 of 118", ["reconstruction"]),
+        ("the reconstruction cannot be loaded: its process ended", []),
+    ],
+)
 def test_service_is_not_ready_before_its_reconstruction_is(
-    client: TestClient, monkeypatch: pytest.MonkeyPatch, condition: str
+    client: TestClient, monkeypatch: pytest.MonkeyPatch, condition: str, pending: list[str]
 ) -> None:
     ended(client, client.post("/scan").json()["id"])
     monkeypatch.setattr(ReconstructionWorker, "condition", condition)
+    monkeypatch.setattr(ReconstructionWorker, "loading", bool(pending))
     ready = client.get("/readyz")
     assert (ready.status_code, ready.json()["checks"]["reconstruction"]) == (503, condition)
+    assert ready.json()["pending"] == pending
     assert f"reconstruction: {condition}" in ready.json()["detail"]

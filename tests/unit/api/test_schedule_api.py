@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -12,9 +13,15 @@ from fastapi.testclient import TestClient
 from slrig.bundle.calibration_file import write_calibration
 from slrig.scheduling.records import RunState
 from tests.unit.api.conftest import ServedBench
+from tests.unit.scan.fakes import WAIT_S
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
-ORDER: dict[str, Any] = {"cron": "30 6 * * mon-fri", "time_zone": "Europe/Berlin", "task": "verification"}
+ORDER: dict[str, Any] = {
+    "cron": "30 6 * * mon-fri",
+    "time_zone": "Europe/Berlin",
+    "task": "verification",
+    "options": {"board": BOARD},
+}
 
 
 @pytest.fixture(autouse=True)
@@ -32,6 +39,14 @@ def added(client: TestClient, **more: Any) -> dict[str, Any]:
     return made
 
 
+def opened(client: TestClient) -> None:
+    """Wait until the rig is open: what it can do is known from then on."""
+    deadline_s = time.monotonic() + WAIT_S
+    while not client.get("/rig").json()["open"]:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
 def test_schedule_is_added_shown_and_listed_with_its_next_five_times(client: TestClient) -> None:
     made = added(client, options={"board": BOARD}, label="mornings")
     times = [datetime.fromisoformat(each) for each in made["upcoming"]]
@@ -41,7 +56,7 @@ def test_schedule_is_added_shown_and_listed_with_its_next_five_times(client: Tes
     assert all((each.hour, each.minute) == (6, 30) and each.weekday() < 5 for each in times)
     assert (made["grace_s"], made["retry_s"], made["catch_up"], made["enabled"]) == (3600, 60, True, True)
     assert client.get(made["links"]["self"]).json() == made
-    second = added(client, task="calibration", options={"board": BOARD}, enabled=False)
+    second = added(client, label="paused", enabled=False)
     assert [each["id"] for each in client.get("/schedule").json()["schedules"]] == [made["id"], second["id"]]
     assert second["enabled"] is False
     assert client.get(made["links"]["runs"]).json() == {"runs": [], "next": None}
@@ -75,6 +90,7 @@ def test_runs_are_listed_page_by_page(client: TestClient, served: ServedBench) -
     assert len(whole) >= 3
     first = client.get(f"{made['links']['runs']}?limit=2").json()
     assert first["runs"] == whole[:2]
+    assert {each["due"][-15:] for each in whole} <= {"T06:30:00+01:00", "T06:30:00+02:00"}
     second = client.get(first["next"]).json()
     assert second["runs"] == whole[2:4]
     assert sum(each["count"] for each in whole) >= 10
@@ -94,13 +110,17 @@ def test_runs_are_listed_page_by_page(client: TestClient, served: ServedBench) -
         ({"time_zone": "Europe/Atlantis"}, "time_zone: expected a name of the IANA database"),
         ({"options": {"bord": BOARD}}, "bord: unknown key; did you mean 'board'?"),
         ({"options": {"colour": 1}}, "The options of verification are: board, position, exposure_s"),
-        ({"task": "calibration"}, "board: missing"),
+        ({"task": "calibration", "options": {}}, "board: missing"),
+        ({"options": {}}, "which board is in view is not known: no calibration that was made here is in use"),
+        ({"task": "calibration"}, "this rig has no positioner"),
+        ({"task": "acceptance", "options": {}}, "this rig has no positioner"),
         ({"options": {"board": {**BOARD, "square_mm": -1}}}, "square_mm"),
     ],
 )
 def test_schedule_that_cannot_be_kept_is_refused_in_words(
     client: TestClient, request_body: dict[str, Any], words: str
 ) -> None:
+    opened(client)
     response = client.post("/schedule", json={**ORDER, **request_body})
     assert response.status_code == 422
     assert response.json()["type"] == "/problems/schedule"

@@ -5,7 +5,11 @@ from __future__ import annotations
 import os
 import signal
 
+from tests.unit.scan.fake_pipeline import LiveScan, reconstruct_bundle
 
-def warm_kernels() -> None:
+__all__ = ["LiveScan", "reconstruct_bundle", "warm_kernels"]
+
+
+def warm_kernels(_told: object) -> None:
     """End the process."""
     os.kill(os.getpid(), signal.SIGKILL)

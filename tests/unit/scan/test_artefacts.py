@@ -29,6 +29,7 @@ from slrig.scan.artefacts import (
     write_report,
 )
 from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
+from slrig.scan.offered import MEDIA_TYPES
 
 ENCODERS = (encode_mesh_ply, encode_mesh_glb, encode_mesh_stl, encode_mesh_obj)
 
@@ -143,6 +144,10 @@ def test_other_formats_are_made_of_the_ply_beside_them(tmp_path: Path, name: str
     (tmp_path / "mesh.ply").unlink()
     with pytest.raises(StorageError, match=r"mesh\.ply: the disk refused"):
         write_converted(tmp_path, name)
+
+
+def test_formats_that_are_made_on_request_are_offered() -> None:
+    assert set(ON_REQUEST) < set(MEDIA_TYPES)
 
 
 def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ from slrig.scan import worker as worker_module
 from slrig.scan.feed import Abandon, Begin, End, FrameFeed, Take
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.records import ScanState
-from slrig.scan.worker import Job, ReconstructionWorker
+from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker_process import Job
 from tests.unit.scan.bench import TASK, Bench
 from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S
 

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from uuid import UUID, uuid4
@@ -60,7 +61,36 @@ def test_second_owner_is_refused_and_told_the_first(folder: DataFolder) -> None:
     assert f"process id {os.getpid()}" in second.stderr
 
 
+def test_second_owner_in_the_same_process_is_refused_and_leaves_the_first_its_lock(folder: DataFolder) -> None:
+    for _ in range(2):
+        with pytest.raises(StorageError, match=f"process id {os.getpid()}"):
+            DataFolder(folder.root)
+    (folder.root / "holder").unlink()
+    with pytest.raises(StorageError, match="process id unknown"):
+        DataFolder(folder.root)
+
+
+def test_folder_of_a_process_that_was_killed_may_be_taken(tmp_path: Path) -> None:
+    code = (
+        "import sys, time; from pathlib import Path; from slrig.scan.folder import DataFolder\n"
+        "held = DataFolder(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)  # noqa: S603
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"held\n"
+    with pytest.raises(StorageError, match=f"process id {holder.pid}"):
+        DataFolder(tmp_path)
+    holder.kill()
+    holder.wait()
+    holder.stdout.close()
+    DataFolder(tmp_path).release()
+
+
 def test_released_folder_may_be_taken_again(folder: DataFolder) -> None:
+    # By whichever thread ends the service.
+    other = threading.Thread(target=folder.release)
+    other.start()
+    other.join()
     folder.release()
     DataFolder(folder.root).release()
 

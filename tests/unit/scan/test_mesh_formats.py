@@ -46,11 +46,11 @@ def load(data: bytes, kind: str) -> Any:
 
 
 def in_mm(data: bytes, kind: str) -> trimesh.Trimesh:
-    """One mesh as a reader places it in its scene; glTF is in metres."""
+    """One mesh as a reader places it in its scene, brought back from glTF's axes (y up, front to +z) and metres."""
     found = load(data, kind)
     if isinstance(found, trimesh.Scene):
         (found,) = found.dump()
-        found.apply_scale(1000)
+        found.apply_transform(np.diag([1000, -1000, -1000, 1]))
     return found
 
 
@@ -83,16 +83,17 @@ def glb_tree(data: bytes) -> Any:
     return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
 
 
-def test_glb_is_in_metres_by_the_scale_of_its_node() -> None:
+def test_glb_is_in_metres_with_y_up_and_its_front_to_plus_z_by_its_node() -> None:
     mesh = half_ball()
     data = encode_mesh_glb(mesh)
     (stored,) = load(data, "glb").geometry.values()
     assert np.array_equal(stored.vertices, mesh.vertices_mm)
     assert np.array_equal(stored.faces, mesh.faces)
     tree = glb_tree(data)
-    assert tree["nodes"] == [{"name": "scan", "scale": [0.001, 0.001, 0.001], "mesh": 0}]
+    assert tree["nodes"] == [{"name": "scan", "rotation": [1, 0, 0, 0], "scale": [0.001] * 3, "mesh": 0}]
     (placed,) = load(data, "glb").dump()
-    assert placed.vertices == pytest.approx(mesh.vertices_mm * 1e-3, rel=1e-6)
+    # (x right, y down, z away) mm stands at (x right, y up, z towards the viewer) m.
+    assert placed.vertices == pytest.approx(mesh.vertices_mm * [1e-3, -1e-3, -1e-3], rel=1e-6)
 
 
 def test_glb_is_laid_out_as_the_specification_says() -> None:

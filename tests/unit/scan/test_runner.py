@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from slrig.errors import (
@@ -16,11 +18,14 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
+from slrig.model import Calibration
 from slrig.scan.faults import ScanInterruptedError
+from slrig.scan.holding import ActiveCalibration
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import ScanState
 from tests.unit.scan.bench import Bench, fault_kind
 from tests.unit.scan.fakes import WAIT_S
+from tests.unit.sessions.calibration.calibration_bench import tame_calibration
 
 
 def test_scan_walks_to_its_mesh(bench: Bench) -> None:
@@ -158,6 +163,18 @@ def test_plan_is_held_against_the_open_rig(bench: Bench) -> None:
         bench.runner.submit(ScanPlan(patterns=PatternPlan(gray_cell_px=7)), label=None, wait=False)
     with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s: 5 s .*'cam0' can do 0\.001 s to 1 s"):
         bench.runner.submit(ScanPlan(exposure_s=5.0), label=None, wait=False)
+
+
+def test_columns_alone_are_refused_for_a_camera_above_the_projector(bench: Bench) -> None:
+    bench.until(bench.scan().id)
+    known = tame_calibration()
+    above = replace(known.cameras["cam0"], rotation=np.eye(3), translation_mm=np.array([0.0, 90.0, 0.0]))
+    assert known.projector is not None
+    level = replace(known.projector, rotation=np.eye(3), translation_mm=np.zeros(3))
+    bench.runner.use_calibration(ActiveCalibration("spring", Calibration({"cam0": above}, level)))
+    with pytest.raises(PatternError, match="above or below the projector"):
+        bench.runner.submit(ScanPlan(patterns=PatternPlan(rows=False)), label=None, wait=False)
+    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
 
 
 def test_small_disk_is_noticed_before_the_scan(bench: Bench) -> None:

@@ -15,7 +15,7 @@ from slrig.errors import IdempotencyError, ScanNotFoundError, StorageError
 from slrig.scan.faults import KeyInFlightError, ScanFault
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import ScanProgress, ScanState
-from slrig.scan.store import ScanStore
+from slrig.scan.store import ProgressRecorder, ScanStore
 from slrig.scan.tables import Base
 from tests.unit.scan.fakes import SetClock
 
@@ -150,3 +150,26 @@ def test_record_that_is_no_database_is_a_storage_error(tmp_path: Path) -> None:
     (tmp_path / "slrig.sqlite").write_bytes(b"not a database, for certain" * 100)
     with pytest.raises(StorageError, match=r"slrig\.sqlite"):
         ScanStore(tmp_path / "slrig.sqlite")
+
+
+def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(store: ScanStore) -> None:
+    scan = store.create(ScanPlan(), rig="bench", label=None)
+    now_s = [0.0]
+    record = ProgressRecorder(store, scan.id, hidden="secret/", now_s=lambda: now_s[0])
+    for at_s, stage, fraction, detail in (
+        (0.0, "preparing kernels", 0.0, "0 of 56"),
+        (0.5, "preparing kernels", 0.0, "1 of 56"),  # too soon to be told
+        (2.5, "preparing kernels", 0.0, "9 of 56"),
+        (9.0, "preparing kernels", 0.0, "9 of 56"),  # nothing new
+        (9.1, "decode", 0.001, "secret/a"),
+        (9.2, "decode", 0.5, ""),
+    ):
+        now_s[0] = at_s
+        record(stage, fraction, detail)
+    events = [event.data for event in store.events(scan.id, after=0) if event.kind == "progress"]
+    assert [(each["stage"], each["detail"]) for each in events] == [
+        ("preparing kernels", "0 of 56"),
+        ("preparing kernels", "9 of 56"),
+        ("decode", "a"),
+        ("decode", ""),
+    ]

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,14 +17,8 @@ from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.scan import worker as worker_module
 from slrig.scan.faults import WorkerLostError
 from slrig.scan.plan import ReconstructionPlan
-from slrig.scan.worker import (
-    LOADING,
-    READY,
-    Job,
-    ReconstructionWorker,
-    UnexpectedWorkerError,
-    prepare_kernel_cache,
-)
+from slrig.scan.worker import LOADING, READY, ReconstructionWorker, UnexpectedWorkerError, prepare_kernel_cache
+from slrig.scan.worker_process import Job, serve
 from tests.unit.scan.fakes import WAIT_S
 
 TASK = "tests.unit.scan.fake_pipeline:reconstruct_bundle"
@@ -129,6 +124,27 @@ def test_condition_is_loading_and_then_ok(tmp_path: Path) -> None:
     fresh.close()
 
 
+def test_how_far_the_kernels_are_is_told_before_and_during_a_job(tmp_path: Path) -> None:
+    fresh = ReconstructionWorker("tests.unit.scan.preparing_pipeline:reconstruct_bundle")
+    gate = tmp_path / "go"
+    os.environ["PREPARING_GATE"] = str(gate)
+    try:
+        fresh.start()
+    finally:
+        del os.environ["PREPARING_GATE"]
+    deadline = time.monotonic() + WAIT_S
+    while fresh.condition == LOADING and time.monotonic() < deadline:
+        pass
+    assert fresh.condition == "preparing kernels, first time only: 41 of 118"
+    assert fresh.loading
+    told = Told()
+    gate.touch()
+    fresh.run(job(tmp_path, "finish"), progress=told, cancelled=never)
+    assert ("preparing kernels", 0.0) in told.stages
+    assert (fresh.condition, fresh.loading) == (READY, False)
+    fresh.close()
+
+
 @pytest.mark.parametrize(
     ("task", "cause"),
     [
@@ -153,7 +169,7 @@ def test_process_whose_parent_is_gone_ends_without_a_word(monkeypatch: pytest.Mo
     # Signals belong to the tests here. An error in the thread would fail the test as an unhandled one.
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     near, far = multiprocessing.Pipe()
-    orphan = threading.Thread(target=worker_module._serve, args=(far, TASK))
+    orphan = threading.Thread(target=serve, args=(far, TASK))
     orphan.start()
     assert near.poll(WAIT_S)
     if read:
@@ -171,7 +187,7 @@ def test_process_whose_parent_was_gone_before_it_was_ready_ends_without_a_word(
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     near, far = multiprocessing.Pipe()
     near.close()
-    worker_module._serve(far, TASK)
+    serve(far, TASK)
     far.close()
 
 

@@ -25,6 +25,7 @@ from slrig.errors import (
 )
 from slrig.scan.faults import ScanFault
 from slrig.scan.records import ScanState
+from slrig.scan.work import Holder
 from slrig.scheduling.acceptance_task import AcceptanceTask
 from slrig.scheduling.cron import Cron
 from slrig.scheduling.naming import NamedLender
@@ -77,6 +78,12 @@ class TaskBench(CalibrationBench):
         """Have scans use a calibration whose board is known."""
         self.calibrations.activate(self.solved())
 
+    def open(self) -> None:
+        """Wait until the rig is open."""
+        opened = threading.Event()
+        self.lender.borrow(lambda *_: None, holder=Holder("a", "b", "/c"), wait=True, ended=lambda _: opened.set())
+        assert opened.wait(WAIT_S)
+
     def close(self) -> None:
         super().close()
         self.health.close()
@@ -126,7 +133,43 @@ def test_options_that_no_run_could_be_done_with_are_refused_at_once(
         checked(bench.tasks, TaskKind(task), options)
 
 
+@pytest.mark.parametrize(
+    ("task", "options", "words"),
+    [
+        ("verification", {}, r"not known: no calibration that was made here is in use\. Give the schedule .*\"board\""),
+        ("verification", {"board": BOARD, "position": 3}, "no 3; it has 0 to 2: near, far"),
+        ("calibration", {"board": BOARD, "positions": [0, "upside down", 7]}, "no 'upside down', 7; it has 0 to 2"),
+    ],
+)
+def test_work_that_can_only_fail_on_this_rig_is_refused_at_once(
+    bench: TaskBench, task: str, options: dict[str, Any], words: str
+) -> None:
+    bench.open()
+    with pytest.raises(ScheduleError, match=words):
+        checked(bench.tasks, TaskKind(task), options)
+
+
+def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: Path) -> None:
+    bench = TaskBench(tmp_path, positioner=False)
+    orders: list[tuple[TaskKind, dict[str, Any]]] = [
+        (TaskKind.CALIBRATION, {"board": BOARD}),
+        (TaskKind.ACCEPTANCE, {}),
+        (TaskKind.VERIFICATION, {"board": BOARD, "position": 0}),
+    ]
+    for task, options in orders:
+        # Nobody knows before the rig is open: a run is refused then.
+        checked(bench.tasks, task, options)
+    bench.runner.start()
+    bench.open()
+    for task, options in orders:
+        with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
+            checked(bench.tasks, task, options)
+    checked(bench.tasks, TaskKind.VERIFICATION, {"board": BOARD})
+    bench.close()
+
+
 def test_options_that_are_right_are_taken(bench: TaskBench) -> None:
+    bench.use_a_calibration()
     exact = {"value_mm": 30, "uncertainty_mm": 0.001}
     artefacts = {"sphere": exact, "bar": exact, "plane_mm": [160, 110], "sphere_form_mm": 0, "plane_form_mm": 0}
     for task, options in (
@@ -199,7 +242,7 @@ def test_rig_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
 
 
 def test_verification_is_of_the_board_in_use(bench: TaskBench) -> None:
-    with pytest.raises(CalibrationError, match='its board is not known here; give the schedule the option "board"'):
+    with pytest.raises(CalibrationError, match=r"that was made here is in use\. Give the schedule the option .board"):
         bench.do(TaskKind.VERIFICATION)
     bench.use_a_calibration()
     told = bench.do(TaskKind.VERIFICATION, position=2)

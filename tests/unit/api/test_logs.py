@@ -1,0 +1,91 @@
+"""Log lines: text for people, JSON for programs, and never among what a command prints."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import structlog
+from typer.testing import CliRunner
+
+from slrig.api.logs import LogFormat, set_up_logs, set_up_logs_for_a_person
+from slrig.cli.commands import app
+
+
+class Stream(io.StringIO):
+    """A standard error that is, or is not, a terminal."""
+
+    def __init__(self, *, terminal: bool) -> None:
+        super().__init__()
+        self._terminal = terminal
+
+    def isatty(self) -> bool:
+        return self._terminal
+
+
+def line(monkeypatch: pytest.MonkeyPatch, form: LogFormat, *, terminal: bool) -> str:
+    stream = Stream(terminal=terminal)
+    monkeypatch.setattr(sys, "stderr", stream)
+    set_up_logs("info", form)
+    structlog.get_logger().warning("the rig cannot be opened", rig="bench", cause="no light")
+    return stream.getvalue()
+
+
+def test_a_terminal_shows_text_and_a_pipe_carries_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = line(monkeypatch, "auto", terminal=True)
+    assert "{" not in shown
+    assert shown.index("the rig cannot be opened") < shown.index("bench") < shown.index("no light")
+    carried = json.loads(line(monkeypatch, "auto", terminal=False))
+    assert (carried["event"], carried["cause"]) == ("the rig cannot be opened", "no light")
+    assert carried["timestamp"].endswith("Z")
+
+
+def test_either_form_can_be_had_anywhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = line(monkeypatch, "text", terminal=False)
+    assert written.partition(" ")[2] == "[warning] the rig cannot be opened rig=bench cause='no light'\n"
+    assert json.loads(line(monkeypatch, "json", terminal=True))["rig"] == "bench"
+
+
+def test_an_error_is_told_with_its_trace_in_either_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    for form in ("text", "json"):
+        stream = Stream(terminal=False)
+        monkeypatch.setattr(sys, "stderr", stream)
+        set_up_logs("info", form)
+        try:
+            [][0]
+        except IndexError:
+            structlog.get_logger().exception("it failed")
+        assert "Traceback" in stream.getvalue()
+        assert "IndexError" in stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["conform", "{}"],
+        ["latency", "{}"],
+        ["doctor", "{}"],
+        ["verify", "{}"],
+        ["accept", "{}", "--output", "{}"],
+        ["reconstruct", "{}", "--output", "{}"],
+        ["calibrate", "solve", "{}", "--output", "{}.json"],
+    ],
+    ids=lambda arguments: str(arguments[0]),
+)
+def test_a_command_that_works_by_itself_logs_beside_its_output(tmp_path: Path, arguments: list[str]) -> None:
+    result = CliRunner().invoke(app, [word.format(tmp_path / "absent") for word in arguments])
+    assert result.exit_code == 2, result.output
+    assert structlog.is_configured()
+
+
+def test_a_person_is_told_warnings_and_no_more(capsys: pytest.CaptureFixture[str]) -> None:
+    set_up_logs_for_a_person()
+    structlog.get_logger().info("a frame was shot again")
+    structlog.get_logger().warning("the projector may still be lit")
+    written = capsys.readouterr()
+    assert written.out == ""
+    assert "the projector may still be lit" in written.err
+    assert "a frame was shot again" not in written.err

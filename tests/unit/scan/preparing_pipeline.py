@@ -1,0 +1,22 @@
+"""Stands in for a pipeline whose kernels take long to prepare: as long as a file is not there."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from slrig.kernels import Prepared
+from tests.unit.scan.fake_pipeline import LiveScan, reconstruct_bundle
+
+__all__ = ["LiveScan", "reconstruct_bundle", "warm_kernels"]
+
+
+def warm_kernels(told: Callable[[Prepared], None]) -> None:
+    """Tell of 41 kernels, wait for the file, and tell of one more."""
+    told(Prepared(41, 118))
+    gate = Path(os.environ["PREPARING_GATE"])
+    while not gate.exists():
+        threading.Event().wait(0.01)
+    told(Prepared(42, 118))

@@ -1,0 +1,68 @@
+"""Kernels prepared ahead: all that a usual scan needs, and the production pipeline has what the worker looks up."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slrig.errors import StorageError
+from slrig.kernels import Prepared, compilations_told, prepared
+from slrig.scan import pipeline, preparation
+from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.preparation import prepare_kernels, sample_scan
+from slrig.scan.worker import RECONSTRUCT
+
+
+def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:
+    module, _, task = RECONSTRUCT.partition(":")
+    loaded = importlib.import_module(module)
+    assert callable(getattr(loaded, task))
+    assert callable(loaded.warm_kernels)
+    assert callable(loaded.LiveScan)
+
+
+def test_the_made_up_scan_is_a_surface() -> None:
+    capture, calibration = sample_scan()
+    assert len(capture.shots) == len(capture.patterns)
+    assert calibration.projector is not None
+    assert all(shot.image.std() > 5 for shot in capture.shots[2:-2])
+    assert np.ptp(capture.shots[0].image) > 100
+
+
+def test_every_kernel_of_a_usual_scan_is_prepared() -> None:
+    told: list[Prepared] = []
+    pipeline.warm_kernels(told.append)
+    done, total = prepared()
+    # Those that only some scans need are marked so at their definition.
+    assert done == total > 40
+    assert all(each.total == total for each in told)
+
+
+@pytest.mark.shared
+def test_a_recorded_scan_compiles_nothing_more(shared: Path, tmp_path: Path) -> None:
+    pipeline.warm_kernels(lambda _: None)
+    late: list[str] = []
+    plan = ReconstructionPlan()
+    with compilations_told(late.append):
+        pipeline.reconstruct_bundle(
+            shared / "bundles" / "terrace",
+            tmp_path / "out",
+            plan=plan,
+            progress=lambda *_: None,
+            cancelled=lambda: False,
+        )
+    # The truth beside this bundle is compared with by a search tree, which scans do without.
+    of_truth = {"interleaved", "boxes", "box_gap", "box_entry", "squared_distances", "ray_hits", "triangle_gap"}
+    assert not {name for name in late if "<locals>" not in name} - of_truth - {"segment_gap", "ray_meets_triangle"}
+
+
+def test_a_disk_that_refuses_the_made_up_scan_keeps_nobody_from_scanning(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        message = "no space left"
+        raise StorageError(message)
+
+    monkeypatch.setattr(preparation, "write_bundle", refuse)
+    prepare_kernels(pipeline.reconstruct_bundle, lambda _: None)
