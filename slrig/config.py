@@ -1,14 +1,9 @@
-"""Rig files and service settings: TOML in, checked values out, every fault in one message.
-
-`python -m slrig.config` prints the JSON schema of a rig file, kept as config/schema.json for editors.
-"""
+"""Rig files and service settings: TOML in, checked values out, every fault in one message."""
 
 from __future__ import annotations
 
 import ipaddress
-import json
 import os
-import sys
 import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
@@ -69,12 +64,13 @@ class ScanDefaults(Strict):
     )
 
 
-class DriverTable(Strict):
+class DriverTable(Strict, use_attribute_docstrings=True):
     """A device: the driver that opens it; every other key is an option of that driver, checked by the driver."""
 
     model_config = ConfigDict(extra="allow")
 
     driver: DriverName
+    """Which driver opens the device. `slrig devices` lists those that are installed."""
 
     @property
     def options(self) -> Mapping[str, object]:
@@ -86,15 +82,23 @@ class HeadTable(DriverTable):
     """One instrument that is projector and cameras. Exposure and gain hold for each of its cameras."""
 
     exposure_s: ExposureSeconds | None = None
+    """Of each frame; else 1/60 s, if the camera can. On a video projector, whole refresh periods."""
+
     gain: Gain = 1.0
+    """A factor; 1 is the least that the sensor does."""
 
 
 class CameraTable(DriverTable):
     """One camera."""
 
     name: CameraName
+    """The rig's name for it."""
+
     exposure_s: ExposureSeconds | None = None
+    """Of each frame; else 1/60 s, if the camera can. On a video projector, whole refresh periods."""
+
     gain: Gain = 1.0
+    """A factor; 1 is the least that the sensor does."""
 
 
 class SynchronisationTable(Strict):
@@ -176,7 +180,17 @@ def read_rig(path: Path) -> RigConfig:
     ConfigError
         The file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one message.
     """
-    data = _read_toml(path)
+    return rig_of(_read_toml(path), path)
+
+
+def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
+    """Return the rig that the data of a TOML file describe; `path` is where the file lies, or is going to lie.
+
+    Raises
+    ------
+    ConfigError
+        Any key is unknown or wrong; all faults in one message.
+    """
     try:
         table = RigTable.model_validate(data)
     except ValidationError as cause:
@@ -196,11 +210,6 @@ def read_rig(path: Path) -> RigConfig:
     )
 
 
-def rig_schema() -> str:
-    """The JSON schema of a rig file, as text."""
-    return json.dumps(RigTable.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
-
-
 def default_data_dir() -> Path:
     """Where scans are kept unless a setting says otherwise: the folder for data of the XDG base directories."""
     base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
@@ -214,7 +223,8 @@ class ServiceSettings(BaseSettings):
     `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
     environment they are separated by commas. `webhook_url` is told when a scheduled run was missed or failed, and when
     the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
-    are removed with their poses, but for the one in use and those that a scan or an acceptance test names.
+    are removed with their poses, but for the one in use and those that a scan or an acceptance test names. `log_format`
+    auto is text on a terminal, and JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -237,6 +247,7 @@ class ServiceSettings(BaseSettings):
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
     keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] = 100
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+    log_format: Literal["auto", "text", "json"] = "auto"
     webhook_url: Annotated[str, Field(max_length=2000)] | None = None
 
     @property
@@ -318,7 +329,3 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as cause:
         message = f"{path}: expected TOML, found a fault: {cause}; correct that line"
         raise ConfigError(message) from cause
-
-
-if __name__ == "__main__":
-    sys.stdout.write(rig_schema())

@@ -42,6 +42,7 @@ from slrig.errors import (
     DriverNotFoundError,
     LibraryMissingError,
     SlrigError,
+    WrongSystemError,
 )
 from slrig.model import Calibration
 
@@ -77,12 +78,24 @@ class MissingLibrary:
 
 
 @dataclass(frozen=True, slots=True)
+class OtherSystem:
+    """A driver that works on another operating system only."""
+
+    driver: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
-    """What the finders found, the libraries that some of them lack, and the finders that failed otherwise."""
+    """What the finders found, the libraries that some of them lack, and the finders that failed otherwise.
+
+    elsewhere : the drivers that are for other operating systems.
+    """
 
     devices: tuple[FoundDevice, ...]
     missing: tuple[MissingLibrary, ...]
     faults: tuple[DriverBrokenError, ...]
+    elsewhere: tuple[OtherSystem, ...] = ()
 
 
 def installed_drivers() -> tuple[InstalledDriver, ...]:
@@ -105,6 +118,7 @@ def found_devices() -> Findings:
     devices: list[FoundDevice] = []
     missing: list[MissingLibrary] = []
     faults: list[DriverBrokenError] = []
+    elsewhere: list[OtherSystem] = []
     for entry in sorted(importlib.metadata.entry_points(group=GROUPS["finder"]), key=lambda entry: entry.name):
         try:
             finder = _load("finder", entry)
@@ -112,18 +126,21 @@ def found_devices() -> Findings:
                 devices.extend(_devices(entry.name, finder()))
         except LibraryMissingError as error:
             missing.append(MissingLibrary(entry.name, error.install, str(error)))
+        except WrongSystemError as error:
+            elsewhere.append(OtherSystem(entry.name, str(error)))
         except DriverBrokenError as error:
             faults.append(error)
         except SlrigError as error:
             message = f"finder '{entry.name}' failed: {error}"
             faults.append(DriverBrokenError(message))
-    return Findings(tuple(devices), tuple(missing), tuple(faults))
+    return Findings(tuple(devices), tuple(missing), tuple(faults), tuple(elsewhere))
 
 
 def open_rig(config: RigConfig) -> Rig:
     """Open every device of a rig; if one fails, those that are open already are closed again.
 
-    The calibration is that of the rig file, else that which the head carries.
+    What is wrong with the rig file is told of all devices together. The calibration is that of the rig file, else that
+    which the head carries.
 
     Raises
     ------
@@ -132,7 +149,7 @@ def open_rig(config: RigConfig) -> Rig:
     DriverBrokenError
         A driver cannot be loaded, or fails with an error of no known kind.
     ConfigError
-        A driver does not take the options of the rig file.
+        A driver does not take the options of the rig file. Several faults, unknown drivers among them, are one message.
     CalibrationError
         The calibration is malformed, or made for devices of another size.
     DeviceError
@@ -150,14 +167,8 @@ def open_rig(config: RigConfig) -> Rig:
             if config.projector is None:
                 message = f"rig '{config.name}' has neither a head nor a projector; add one of the tables to its file"
                 raise ConfigError(message)
-            projector = _open("projector", config.projector, Projector, config.folder)
-            _close_later(opened, projector, {})
-            cameras, asked = {}, {}
-            for table in config.cameras:
-                camera = _open("camera", table, Camera, config.folder, table.name)
-                opened.callback(_close_quietly, camera)
-                cameras = {**cameras, table.name: camera}
-                asked[table.name] = (table.exposure_s, table.gain)
+            projector, cameras = _open_each(config, config.projector, opened)
+            asked = {table.name: (table.exposure_s, table.gain) for table in config.cameras}
         settings = {
             name: CameraSettings(_exposure_s(camera.info, asked[name][0], config), asked[name][1])
             for name, camera in cameras.items()
@@ -176,6 +187,37 @@ def open_rig(config: RigConfig) -> Rig:
         )
         opened.pop_all()
         return rig
+
+
+def _open_each(
+    config: RigConfig, projector_table: DriverTable, opened: ExitStack
+) -> tuple[Projector, Mapping[str, Camera]]:
+    """A projector and its cameras, closed again by `opened`. Raises as `open_rig`."""
+    faults: list[ConfigError] = []
+
+    def attempt(kind: str, table: DriverTable, protocol: type[Any], *name: str) -> Any:
+        try:
+            device = _open(kind, table, protocol, config.folder, *name)
+        except ConfigError as error:
+            faults.append(error)
+            return None
+        except SlrigError:
+            # After a fault of the file the others are opened only to hear what their drivers say of theirs.
+            if faults:
+                return None
+            raise
+        opened.callback(_close_quietly, device)
+        return device
+
+    projector = attempt("projector", projector_table, Projector)
+    cameras = {table.name: attempt("camera", table, Camera, table.name) for table in config.cameras}
+    if len(faults) == 1:
+        raise faults[0]
+    if faults:
+        told = "\n".join(str(fault) for fault in faults)
+        message = f"rig '{config.name}': {len(faults)} of its tables are wrong; correct each and try again:\n{told}"
+        raise ConfigError(message)
+    return projector, cameras
 
 
 def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) -> float:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import structlog
 from hypothesis import settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
@@ -70,3 +72,10 @@ def shared() -> Path:
     if not (folder / "bundles").is_dir():
         pytest.skip(f"no sample data in {folder}: set SLRIG_SHARED to its folder")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def logs_as_they_come() -> Iterator[None]:
+    """A command that a test runs sets up the logs of the whole process: afterwards they are as they were."""
+    yield
+    structlog.reset_defaults()

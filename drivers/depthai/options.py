@@ -18,27 +18,31 @@ Socket = Literal["CAM_A", "CAM_B", "CAM_C", "CAM_D", "CAM_E", "CAM_F", "CAM_G", 
 PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 
 
-class OakOptions(Strict):
-    """The driver's keys in a `[[camera]]` table.
-
-    device : the device's id, as `slrig devices` shows it; its address or USB port will do, too. Several tables may
-    name one device: it is opened once, and its cameras are paired frame by frame.
-    socket : which camera of it. On an OAK-D, CAM_A is the colour camera, CAM_B the left and CAM_C the right mono one.
-    size_px : width and height of the frames; the sensor's own where absent.
-    fps : how many frames the sensor makes per second; the longest exposure follows from it. One for all of a device.
-    focus : lens position, 0 to 255, of a camera with autofocus (which is switched off); where absent, the position at
-    which the camera was calibrated in the factory.
-    colour_temperature_k : white balance of a colour camera, fixed.
-    external_trigger : a rising edge on the pin FSIN starts each exposure. One for all of a device.
-    """
+class OakOptions(Strict, use_attribute_docstrings=True):
+    """The keys of a `[[camera]]` table with `driver = "depthai"` (beside name, exposure_s and gain)."""
 
     device: Annotated[str, Field(min_length=1)]
+    """The device's id, as `slrig devices` lists it; its address or USB port will do, too. Several tables may name one
+    device: it is opened once, and its cameras are paired frame by frame."""
+
     socket: Socket
+    """Which camera of it. On an OAK-D, CAM_A is the colour camera, CAM_B the left and CAM_C the right mono one."""
+
     size_px: Annotated[tuple[PixelExtent, PixelExtent], Field(strict=False)] | None = None
-    fps: Annotated[float, Field(ge=1, le=240)] = USUAL_FPS
+    """[width, height] of the frames; else the sensor's own."""
+
+    fps: Annotated[float, Field(ge=1, le=240, json_schema_extra={"unit": "Hz"})] = USUAL_FPS
+    """How many frames the sensor makes per second; the longest exposure follows from it. One for all of a device."""
+
     focus: Annotated[int, Field(ge=0, le=255)] | None = None
+    """Lens position of a camera with autofocus (which is switched off); else the position at which the camera was
+    calibrated in the factory."""
+
     colour_temperature_k: Annotated[int, Field(ge=1000, le=12000)] = 5000
+    """White balance of a colour camera, fixed."""
+
     external_trigger: bool = False
+    """A rising edge on the pin FSIN starts each exposure. One for all of a device."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,47 +16,67 @@ _LEAST_PACKET_BYTES = 576
 _MOST_PACKET_BYTES = 16_000
 
 
-class Region(Strict):
+class Region(Strict, use_attribute_docstrings=True):
     """Part of the sensor, px. The calibration holds for the region it was made with."""
 
     x_px: int = Field(default=0, ge=0)
+    """First column."""
+
     y_px: int = Field(default=0, ge=0)
+    """First row."""
+
     width_px: int = Field(ge=1)
+    """How many columns."""
+
     height_px: int = Field(ge=1)
+    """How many rows."""
 
 
-class GenicamOptions(Strict):
-    """The `[[camera]]` table of a GenICam camera.
-
-    device : Aravis' id (vendor-model-serial, as `slrig devices` lists it), or the IP address of a GigE camera.
-    pixel_format : PFNC name: Mono8, Mono10, Mono12, Mono16, their packed kinds, Bayer…, RGB8, BGR8.
-    region : part of the sensor; all of it where absent.
-    trigger_line, trigger_activation : the input and edge of a hardware trigger; the first line where absent.
-    features : further GenICam features, set in this order when the camera is opened, and read back.
-    time_stamp : which instant the camera's time stamps mean; "exposure", the default, is some instant within it,
-        "none" distrusts them (cameras that stamp a frame when it is sent).
-    transfer_s : the longest time from the end of an exposure to the arrival of the frame's first packet; believed only
-        where the camera's clock cannot be tied to the host's.
-    answer_s : how long a frame may take from its software trigger to that arrival, beyond the exposure; so long the
-        next trigger waits for it.
-    packet_size_bytes : GigE; the largest that arrives whole is found out where absent. packet_delay_ns : GigE, the
-        camera's pause between packets. packet_resend : ask for lost packets again. packet_socket : read the network
-        card directly (less load; needs CAP_NET_RAW, and receives nothing on a loopback interface).
-    """
+class GenicamOptions(Strict, use_attribute_docstrings=True):
+    """The keys of a `[[camera]]` table with `driver = "genicam"` (beside name, exposure_s and gain)."""
 
     device: str = Field(min_length=1)
+    """Aravis' id (vendor-model-serial, as `slrig devices` lists it), or the IP address of a GigE camera."""
+
     pixel_format: str = Field(default="Mono8", min_length=1)
+    """PFNC name: Mono8, Mono10, Mono12, Mono16, their packed kinds, Bayer…, RGB8, BGR8."""
+
     region: Region | None = None
+    """Part of the sensor; else all of it."""
+
     trigger_line: str | None = Field(default=None, min_length=1)
+    """The input of a hardware trigger; else the first line."""
+
     trigger_activation: str = Field(default="RisingEdge", min_length=1)
+    """The edge of a hardware trigger, by its GenICam name."""
+
     features: Mapping[str, bool | int | float | str] = Field(default_factory=dict)
+    """Further GenICam features, set in this order when the camera is opened, and read back."""
+
     time_stamp: Stamp = "exposure"
+    """Which instant the camera's time stamps mean: "exposure" is some instant within it, "none" distrusts them (cameras
+    that stamp a frame when it is sent)."""
+
     transfer_s: float = Field(default=0.1, gt=0, le=10)
+    """The longest time from the end of an exposure to the arrival of the frame's first packet; believed only where the
+    camera's clock cannot be tied to the host's."""
+
     answer_s: float = Field(default=0.5, gt=0, le=10)
+    """How long a frame may take from its software trigger to that arrival, beyond the exposure; so long the next
+    trigger waits for it."""
+
     packet_size_bytes: int | None = Field(default=None, ge=_LEAST_PACKET_BYTES, le=_MOST_PACKET_BYTES)
+    """GigE: the size of packets; else the largest that arrives whole is found out."""
+
     packet_delay_ns: int | None = Field(default=None, ge=0)
+    """GigE: the camera's pause between packets; else as the camera has it."""
+
     packet_resend: bool = True
+    """GigE: ask for lost packets again."""
+
     packet_socket: bool = False
+    """GigE: read the network card directly (less load; needs CAP_NET_RAW, and receives nothing on a loopback
+    interface)."""
 
     @model_validator(mode="after")
     def _set_once(self) -> Self:

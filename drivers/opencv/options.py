@@ -34,32 +34,41 @@ class Kind(StrEnum):
     """A recording: begun anew by `arm`, timed by itself."""
 
 
-class OpenCvOptions(Strict):
-    """The keys of a `[[camera]]` table with `driver = "opencv"` (beside name, exposure_s and gain).
-
-    device : an index, a device's path, a URL, a file, or a numbered series ("frames/%03d.png").
-    backend : OpenCV's name of it (v4l2, ffmpeg, gstreamer, …); else v4l2 for cameras on Linux, ffmpeg for URLs and
-        films, images for a series, and for anything else what OpenCV finds.
-    size_px : [width, height]; fourcc : the pixel format's four characters; frame_rate_hz : of a camera, what it is set
-        to; of a live source, what it sends at most; of a film, the rate in place of its own.
-    bit_depth : how many low bits of a 16-bit sample the sensor fills; else all that the format has.
-    source_exposure_s : the exposure (at most) of a source that OpenCV cannot set; unused where it can.
-    delay_s : of a source without time stamps, the longest time from the end of an exposure to the frame's arrival, all
-        buffers between them included; given for a camera with time stamps, they are not trusted.
-    settle_frames : of a camera, frames discarded after it starts, until its settings have taken effect.
-    focus : value of a camera's focus control; autofocus is off in any case.
-    """
+class OpenCvOptions(Strict, use_attribute_docstrings=True):
+    """The keys of a `[[camera]]` table with `driver = "opencv"` (beside name, exposure_s and gain)."""
 
     device: Annotated[int, Field(ge=0, le=255)] | Annotated[str, Field(min_length=1)]
+    """An index, a device's path, a URL, a file, or a numbered series ("frames/%03d.png")."""
+
     backend: str = "auto"
+    """OpenCV's name of it (v4l2, ffmpeg, gstreamer, …). "auto" is v4l2 for cameras on Linux, ffmpeg for URLs and films,
+    images for a series, and for anything else what OpenCV finds."""
+
     size_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
+    """[width, height]; else as the source has it."""
+
     fourcc: Annotated[str, Field(pattern=r"^[\x20-\x7e]{3,4}$")] | None = None
+    """The pixel format's four characters."""
+
     frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)] | None = None
+    """Of a camera, what it is set to; of a live source, what it sends at most; of a film, the rate in place of its
+    own."""
+
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
+    """How many low bits of a 16-bit sample the sensor fills; else all that the format has."""
+
     source_exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
+    """The exposure (at most) of a source that OpenCV cannot set; unused where it can."""
+
     delay_s: Annotated[float, Field(ge=0, le=60)] | None = None
+    """Of a source without time stamps, the longest time from the end of an exposure to the frame's arrival, all buffers
+    between them included; given for a camera with time stamps, they are not trusted."""
+
     settle_frames: Annotated[int, Field(ge=1, le=1000)] = 5
+    """Of a camera, frames discarded after it starts, until its settings have taken effect."""
+
     focus: float | None = None
+    """Value of a camera's focus control; autofocus is off in any case."""
 
     @field_validator("backend")
     @classmethod

@@ -12,32 +12,39 @@ from slrig.bundle.faults import Strict, explain, keys_of
 from slrig.errors import ConfigError
 
 
-class SerialProjectorOptions(Strict):
-    """The keys of a `[projector]` table with `driver = "serial_projector"`.
+class SerialProjectorOptions(Strict, use_attribute_docstrings=True):
+    """The keys of a `[projector]` table with `driver = "serial_projector"`."""
 
-    port : the serial port: a path, a name in /dev/serial/by-id (it stays the same), COM3, or a pyserial URL.
-    baud : of a port behind a real serial line; USB ignores it.
-    watchdog_s : the box goes dark when it hears nothing from the host for so long: a crash, a kill, a cable.
-    max_on_s : the box puts a pattern out that was lit for so long without another one being asked for.
-    max_duty : the largest share of any 10 s in which there may be light.
-    brightness : of the light's full power; below 1 the box must be able to dim.
-    open_s : how long a box may take to answer after its port was opened; many boards restart then.
-    reply_s : how long an answer may take before the command is sent again; longer for a slow line.
-    deadline_s : how long a command may be sent again before it has failed.
-    export_folder : where to write the patterns of a sequence that the box does not hold, for flashing; from the rig
-        file's folder.
-    """
+    port: Annotated[str, Field(min_length=1, json_schema_extra={"takes": "device"})]
+    """The serial port: a path, a name in /dev/serial/by-id (it stays the same), COM3, or a pyserial URL."""
 
-    port: Annotated[str, Field(min_length=1)]
-    baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 115_200
+    baud: Annotated[int, Field(ge=1200, le=12_000_000, json_schema_extra={"unit": "bit/s"})] = 115_200
+    """Of a port behind a real serial line; USB ignores it."""
+
     watchdog_s: Annotated[float, Field(ge=0.05, le=10)] = 2.0
+    """The box goes dark when it hears nothing from the host for so long: a crash, a kill, a cable."""
+
     max_on_s: Annotated[float, Field(ge=0.001, le=3600)] = 60.0
+    """The box puts a pattern out that was lit for so long without another one being asked for."""
+
     max_duty: Annotated[float, Field(ge=0.001, le=1)] = 1.0
+    """The largest share of any 10 s in which there may be light."""
+
     brightness: Annotated[float, Field(ge=0.001, le=1)] = 1.0
+    """Share of the light's full power; below 1 the box must be able to dim."""
+
     open_s: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """How long a box may take to answer after its port was opened; many boards restart then."""
+
     reply_s: Annotated[float, Field(ge=0.005, le=5)] = 0.15
+    """How long an answer may take before the command is sent again; longer for a slow line."""
+
     deadline_s: Annotated[float, Field(ge=0.1, le=60)] = 2.5
+    """How long a command may be sent again before it has failed."""
+
     export_folder: Annotated[str, Field(min_length=1)] | None = None
+    """Where to write the patterns of a sequence that the box does not hold, for flashing; from the rig file's
+    folder."""
 
 
 def checked(options: Mapping[str, object]) -> SerialProjectorOptions:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.calibration.artefacts import Decision
 from slrig.cli.display import progress_shown
 from slrig.config import RigConfig, read_rig
@@ -115,6 +116,7 @@ def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_jso
     SlrigError
         As `run_acceptance`, or the rig file is wrong or the rig cannot be opened.
     """
+    set_up_logs_for_a_person()
     config = read_rig(rig_file)
     console = Console(stderr=as_json)
     with TemporaryDirectory(prefix="slrig-acceptance-") as scratch:

@@ -7,22 +7,30 @@ from typing import Annotated
 
 import typer
 
+from slrig.cli.options import AsJson, RigFile
+
 
 def accept(
-    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    rig: RigFile,
     output: Annotated[Path, typer.Option(help="New folder for report.html, report.json and the points.")],
     scripted: Annotated[
         bool, typer.Option("--scripted", help="The rig's positioner places the artefacts; a rendered rig always can.")
     ] = False,
     sphere: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Certified diameter of the sphere and its expanded uncertainty (k = 2), mm."),
+        typer.Option(
+            metavar="MM MM", help="Certified diameter of the sphere and its expanded uncertainty (k = 2), mm."
+        ),
     ] = None,
     bar: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Certified distance of the ball bar's centres and its expanded uncertainty, mm."),
+        typer.Option(
+            metavar="MM MM", help="Certified distance of the ball bar's centres and its expanded uncertainty, mm."
+        ),
     ] = None,
-    plane: Annotated[tuple[float, float] | None, typer.Option(help="Length and width of the plane, mm.")] = None,
+    plane: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="MM MM", help="Length and width of the plane, mm.")
+    ] = None,
     ball_mm: Annotated[float | None, typer.Option(help="Diameter of the bar's balls. Default: the sphere's.")] = None,
     sphere_form_mm: Annotated[
         float | None, typer.Option(help="By how much the sphere itself is out of round, from its certificate.")
@@ -33,8 +41,9 @@ def accept(
     volume: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
+            metavar="X Y Z X Y Z",
             help="Working volume in the world: x y z of its least corner, then of its greatest, mm. "
-            "Default: that of the calibration."
+            "Default: that of the calibration.",
         ),
     ] = None,
     spacing_limit_mm: Annotated[
@@ -52,11 +61,11 @@ def accept(
     certificate: Annotated[str, typer.Option(help="Numbers of the artefacts' certificates, for the report.")] = "",
     temperature_c: Annotated[float | None, typer.Option(help="Temperature of the room, for the report.")] = None,
     notes: Annotated[str, typer.Option(help="Free text for the report.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Test a rig with a sphere, a ball bar and a plane, in the manner of VDI/VDE 2634-2.
+    """Test a rig with a sphere, a ball bar and a plane.
 
-    Exit code 1 unless it passes.
+    In the manner of VDI/VDE 2634-2. Exit code 1 unless it passes.
     """
     from slrig.cli.accept import Asked
     from slrig.cli.accept import accept as test

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from slrig.cli.options import USUAL_URL, KeyFile, Url
+from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -33,15 +33,18 @@ class ShapeName(StrEnum):
     BOWED = "bowed"
 
 
-CalibrationId = Annotated[str, typer.Argument(help="Id of the calibration, or the beginning of it that no other has.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-Kind = Annotated[BoardName | None, typer.Option("--board", help="What is printed on the board.")]
+_ID_HELP = "Id of the calibration, or the beginning of it that no other has."
+CalibrationId = Annotated[str, typer.Argument(metavar="ID", help=_ID_HELP)]
+Kind = Annotated[BoardName | None, typer.Option("--board", help="What is printed on the board. Default: charuco.")]
 Corners = Annotated[
-    str | None, typer.Option(help="Inner corners across x down, as 11x8; of circles, those of one row x rows.")
+    str | None,
+    typer.Option(help="Inner corners across x down, as 11x8 (default); of circles, those of one row x rows."),
 ]
 SquareMm = Annotated[
     float | None,
-    typer.Option(help="Side of a square, mm, measured on the print; of circles, the distance of two rows."),
+    typer.Option(
+        help="Side of a square, mm, measured on the print (default 12); of circles, the distance of two rows."
+    ),
 ]
 MarkerMm = Annotated[
     float | None, typer.Option(help="Side of a marker of a ChArUco board, mm. Default: 0.75 of the square.")
@@ -71,7 +74,10 @@ def board(
         str, typer.Option(help="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm.")
     ] = "A4",
 ) -> None:
-    """Write a board to print, in true size, with scales to check the printer by."""
+    """Write a board to print, in true size, with scales.
+
+    The scales show whether the printer kept the size.
+    """
     from slrig.cli.calibrate_board import write_board
 
     write_board(chosen_board(kind, corners, square_mm, marker_mm, dictionary), output, page=page)
@@ -79,7 +85,10 @@ def board(
 
 @app.command()
 def solve(
-    folder: Annotated[Path, typer.Argument(help="Folder with one bundle per pose, each a folder with bundle.json.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder with one bundle per pose, each a folder with bundle.json."),
+    ],
     output: Annotated[Path, typer.Option(help="File for the calibration: .json, or OpenCV's .yml or .xml.")],
     kind: Kind = None,
     corners: Corners = None,
@@ -126,7 +135,10 @@ def run(
     url: Url = USUAL_URL,
     key_file: KeyFile = None,
 ) -> None:
-    """Walk through a calibration with a running service: shoot, be told what to move and why, solve."""
+    """Walk through a calibration with a running service.
+
+    Shoot, be told what to move and why, and solve.
+    """
     from slrig.cli.calibrate_stored import whole_id
     from slrig.cli.calibrate_walk import opened, walk
 
@@ -168,13 +180,16 @@ def show(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = N
 
 @app.command()
 def compare(
-    first: CalibrationId,
-    second: CalibrationId,
+    first: Annotated[str, typer.Argument(metavar="FIRST", help=_ID_HELP)],
+    second: Annotated[str, typer.Argument(metavar="SECOND", help="Id of the one to compare it with.")],
     url: Url = USUAL_URL,
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Tell what a second calibration says otherwise than a first, and by how much points move for it."""
+    """Compare two calibrations, and say by how much points move.
+
+    Tells what the second one says otherwise than the first.
+    """
     from slrig.cli.calibrate_stored import compare_calibrations
 
     with _client(url, key_file) as client:
@@ -202,7 +217,10 @@ def deactivate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFi
 @app.command()
 def export(
     calibration: CalibrationId,
-    file: Annotated[Path, typer.Argument(help="File to write: .json, OpenCV's .yml or .xml, or the report as .html.")],
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="File to write: .json, OpenCV's .yml or .xml, or the report as .html."),
+    ],
     url: Url = USUAL_URL,
     key_file: KeyFile = None,
 ) -> None:
@@ -215,7 +233,7 @@ def export(
 
 @app.command(name="import")
 def take_in(
-    file: Annotated[Path, typer.Argument(help="Calibration: slrig's .json, or OpenCV's .yml or .xml.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Calibration: slrig's .json, or OpenCV's .yml or .xml.")],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
     url: Url = USUAL_URL,
     key_file: KeyFile = None,
@@ -240,13 +258,7 @@ def chosen_board(
     marker_mm: float | None,
     dictionary: str | None,
 ) -> Any:
-    """The board that the options describe. Raises CalibrationError that names those that are missing."""
-    from slrig.cli.board_options import board_option
-    from slrig.errors import CalibrationError
+    """See `slrig.cli.board_options.chosen_board`, which loads numpy."""
+    from slrig.cli import board_options
 
-    if kind is None or corners is None or square_mm is None:
-        given = {"--board": kind, "--corners": corners, "--square-mm": square_mm}
-        missing = ", ".join(name for name, value in given.items() if value is None)
-        message = f"Which board? Missing: {missing}. Say, for example: --board charuco --corners 11x8 --square-mm 12"
-        raise CalibrationError(message)
-    return board_option(kind.value, corners, square_mm, marker_mm, dictionary)
+    return board_options.chosen_board(None if kind is None else kind.value, corners, square_mm, marker_mm, dictionary)

@@ -31,6 +31,6 @@ def write_board(board: Board, output: Path, *, page: str) -> None:
     with refusals_of(output.parent):
         output.parent.mkdir(parents=True, exist_ok=True)
     write_file(output, content)
-    typer.echo(f"board     {output}")
+    typer.echo(f"written   {output}: {board.description}")
     typer.echo("Print it at 100 % (actual size), glue it on something flat and stiff, and check both of its scales.")
     typer.echo(f"Then:     {solve_command(board)}")

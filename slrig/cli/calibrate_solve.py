@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import typer
 from rich.console import Console
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration, write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_file
 from slrig.calibration.board import Board, BoardShape
@@ -76,6 +77,7 @@ def solve_folder(
     StorageError
         The disk refused.
     """
+    set_up_logs_for_a_person()
     _require_writable(output, report)
     bundles = pose_bundles(folder)
     before = None if earlier is None else read_calibration(earlier)
@@ -126,6 +128,8 @@ def solve_folder(
 def pose_bundles(folder: Path) -> dict[str, Path]:
     """The bundles in a folder, one per pose, by name and in the order of their names.
 
+    Each is a folder with a bundle.json, or has it in a folder `bundle`, as the service keeps the poses of a session.
+
     Raises
     ------
     BundleError
@@ -135,7 +139,12 @@ def pose_bundles(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         message = f"{folder}: {what}; found {'a file' if folder.exists() else 'nothing'} there"
         raise BundleError(message)
-    found = {path.name: path for path in sorted(folder.iterdir()) if (path / DESCRIPTION).is_file()}
+    found = {
+        path.name: bundle
+        for path in sorted(folder.iterdir())
+        for bundle in (path, path / "bundle")
+        if (bundle / DESCRIPTION).is_file()
+    }
     if not found:
         inside = sum(path.is_dir() for path in folder.iterdir())
         folders = "1 folder" if inside == 1 else f"{inside} folders"

@@ -18,7 +18,7 @@ from slrig.calibration.board import Board
 from slrig.cli.calibration_screen import tell_result
 from slrig.cli.client import ServiceClient
 from slrig.cli.coverage_screen import coverage_picture, tell_next
-from slrig.cli.demo import rig_is_open
+from slrig.cli.demo import still_missing
 from slrig.cli.display import progress_shown
 from slrig.errors import CalibrationStateError, PoseRefusedError, ServiceError, SolveRefusedError
 
@@ -61,9 +61,7 @@ def walk(
     """
     console = Console()
     if session["board"] is None:
-        message = (
-            f"Calibration {session['id']} was imported and has no board. Open a new one: slrig calibrate run --board …"
-        )
+        message = f"Calibration {session['id']} was imported and has no board. Open a new one: slrig calibrate run"
         raise CalibrationStateError(message)
     console.print(Text.assemble(("calibration ", "bold"), session["id"], f" · {session['board']['title']}"))
     walked = Walk(client, session, console, exposure_s=exposure_s, board_shape=board_shape)
@@ -103,13 +101,13 @@ class Walk:
 
     def await_rig(self) -> None:
         """Wait until the rig is open. Raises ServiceError where it cannot be opened."""
-        if rig_is_open(self._client):
+        if still_missing(self._client) is None:
             return
         with progress_shown() as display:
-            display("opening the rig", 0.0, "")
-            while not rig_is_open(self._client):
+            while (missing := still_missing(self._client)) is not None:
+                display("opening the rig", 0.0, missing)
                 self._pause(_POLL_S)
-                # Refuses when the service is gone, which `rig_is_open` takes for one that is still starting.
+                # Refuses when the service is gone, which `still_missing` takes for one that is still starting.
                 self._client.get("/rig")
 
     def by_hand(self) -> None:

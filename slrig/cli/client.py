@@ -8,6 +8,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -37,6 +38,14 @@ def read_key(file: Path | None) -> str | None:
             f"The API key cannot be read from {file}: {error}. Name the file that holds it, or set {KEY_VARIABLE}."
         )
         raise ConfigError(message) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Readiness:
+    """What /readyz tells. checks : each thing "ok" or what it lacks; pending : those that get there by themselves."""
+
+    checks: dict[str, str]
+    pending: frozenset[str]
 
 
 class ServiceClient:
@@ -85,13 +94,13 @@ class ServiceClient:
     ) -> None:
         self._http.close()
 
-    def checks(self) -> dict[str, str] | None:
-        """Return what the service says of its parts, each "ok" or what is wrong; None while it does not answer."""
+    def readiness(self) -> Readiness | None:
+        """Return what the service says of its parts; None while it does not answer."""
         try:
-            checks: dict[str, str] = self._http.get("/readyz").json()["checks"]
+            answer = self._http.get("/readyz").json()
+            return Readiness(dict(answer["checks"]), frozenset(answer.get("pending", ())))
         except (httpx2.TransportError, ValueError, KeyError, TypeError):
             return None
-        return checks
 
     def start(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Start a scan and return it. Raises ServiceError."""

@@ -15,7 +15,7 @@ import typer
 import typer.core
 
 from slrig.cli import acceptance_command, calibrate, schedule, verify_command
-from slrig.cli.options import USUAL_URL, KeyFile, Url
+from slrig.cli.options import USUAL_URL, AsJson, KeyFile, RigFile, Url
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -39,15 +39,29 @@ class _Commands(typer.core.TyperGroup):
 app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
-    add_completion=False,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Structured-light scanning: from a projector and cameras to a triangle mesh in millimetres.",
     epilog="Start with: slrig demo",
 )
-app.add_typer(calibrate.app, name="calibrate")
-app.add_typer(schedule.app, name="schedule")
-app.command()(verify_command.verify)
-app.command()(acceptance_command.accept)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"slrig {version('slrig')}")
+        raise typer.Exit
+
+
+@app.callback()
+def slrig(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Options that stand before any command; what `slrig --help` says is `app`'s."""
+
 
 KeepHoles = Annotated[
     bool | None,
@@ -87,11 +101,15 @@ class WatchedBy(StrEnum):
 @app.command()
 def demo(
     rig: Annotated[
-        Path | None, typer.Argument(help="Rig file. Default: config/rigs/demo.toml, a rendered rig.")
+        Path | None,
+        typer.Argument(metavar="RIG", help="Rig file. Default: config/rigs/demo.toml, a rendered rig."),
     ] = None,
     output: Annotated[Path, typer.Option(help="Folder for mesh, preview and report.")] = Path("scans/demo"),
 ) -> None:
-    """Scan once through the real service on a rendered rig, and compare the mesh with the known truth."""
+    """Scan once on a rendered rig, and compare with the truth.
+
+    Goes through the real service, in a process of its own.
+    """
     from slrig.cli.demo import run_demo
 
     run_demo(rig, output)
@@ -99,7 +117,7 @@ def demo(
 
 @app.command()
 def serve(
-    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    rig: RigFile,
     host: Annotated[
         str | None, typer.Option(help="Address to listen on. Default 127.0.0.1: this machine only.")
     ] = None,
@@ -115,7 +133,7 @@ def serve(
     no_key: Annotated[bool, typer.Option("--no-key", help="Ask for no API key; only on this machine.")] = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", help="Stop when standard input ends.")] = False,
 ) -> None:
-    """Start the service: it holds the rig and takes scans over HTTP."""
+    """Start the service: it holds the rig and scans over HTTP."""
     from slrig.api.server import serve as run_service
     from slrig.config import read_rig, read_settings
 
@@ -149,7 +167,9 @@ def scan(
     line_width_px: Annotated[int | None, typer.Option(help="Width of a line, projector pixels.")] = None,
     gray_cell_px: Annotated[int | None, typer.Option(help="Width of the finest Gray cell, projector pixels.")] = None,
     gray_only: Annotated[bool, typer.Option("--gray-only", help="Play the Gray code without shifted lines.")] = False,
-    rows: Annotated[bool, typer.Option("--rows", help="Play the row axis as well.")] = False,
+    rows: Annotated[
+        bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
+    ] = False,
     keep_holes: KeepHoles = None,
     depth_edge_ratio: DepthEdgeRatio = None,
     max_code_gap: MaxCodeGap = None,
@@ -157,7 +177,7 @@ def scan(
     smooth_boundary: SmoothBoundary = None,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
-    """Scan with a running service, follow the progress, and fetch the mesh."""
+    """Scan with a running service, and fetch the mesh."""
     from slrig.cli.client import ServiceClient, read_key
     from slrig.cli.scan import FILES, scan_with, tell_result
 
@@ -182,13 +202,14 @@ def scan(
         ),
     }
     with ServiceClient(url, read_key(key_file)) as client:
-        result = scan_with(client, request, output, files=tuple(file or FILES))
-    tell_result(result, output)
+        files = tuple(file or FILES)
+        result = scan_with(client, request, output, files=files)
+    tell_result(result, output, files=files)
 
 
 @app.command()
 def reconstruct(
-    bundle: Annotated[Path, typer.Argument(help="Folder with bundle.json and its frames.")],
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder with bundle.json and its frames.")],
     output: Annotated[Path, typer.Option(help="Folder for mesh, points, report and pictures.")],
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration to use in place of the bundle's calibration.json.")
@@ -219,20 +240,73 @@ def reconstruct(
 
 @app.command()
 def devices(
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    options: Annotated[
+        str | None,
+        typer.Option(metavar="DRIVER", help="Show every option of this driver, for a rig file."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON; of options, JSON Schema.")] = False,
 ) -> None:
-    """List the drivers that are installed and the devices that are plugged in."""
+    """List installed drivers and the devices that are plugged in."""
+    if options is not None:
+        from slrig.cli.driver_options import tell_options
+
+        tell_options(options, as_json=as_json)
+        return
     from slrig.cli.devices import list_devices
 
     list_devices(as_json=as_json)
 
 
 @app.command()
-def conform(
-    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+def init(
+    output: Annotated[Path, typer.Option(help="The rig file to write.")] = Path("rig.toml"),
+    name: Annotated[str, typer.Option(help="What the rig is called.")] = "bench",
+    camera: Annotated[
+        list[str] | None,
+        typer.Option(metavar="[NAME=]DRIVER[:DEVICE]", help="A camera, as slrig devices lists it; may be repeated."),
+    ] = None,
+    projector: Annotated[str | None, typer.Option(metavar="DRIVER[:DEVICE]", help="The projector.")] = None,
+    exposure_s: Annotated[
+        float | None, typer.Option(help="Exposure of every camera. Default 0.0167, a period of 60 Hz.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="TABLE.KEY=VALUE", help="An option of a camera or projector; may be repeated."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing; take all cameras that are plugged in.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
 ) -> None:
-    """Examine a rig by the driver contract and score it; exit code 1 unless every check that applies passes."""
+    """Write a rig file for what is plugged in.
+
+    Asks what it cannot know. Checks the file by the drivers before it is written; opens no device.
+    """
+    from slrig.cli.init import Asked
+    from slrig.cli.init import init as write_rig_file
+
+    asked = Asked(name, camera or (), projector, settings or (), exposure_s)
+    write_rig_file(asked, output, yes=yes, force=force)
+
+
+@app.command()
+def warm() -> None:
+    """Compile ahead what the first scan would wait for.
+
+    For images and installers: it takes about a minute once, and a few seconds after that.
+    """
+    from slrig.cli.warm import warm as prepare
+
+    prepare()
+
+
+@app.command()
+def conform(
+    rig: RigFile,
+    as_json: AsJson = False,
+) -> None:
+    """Examine a rig by the driver contract, and score it.
+
+    Exit code 1 unless every check that applies passes.
+    """
     from slrig.cli.conform import conform as examine
 
     if not examine(rig, as_json=as_json):
@@ -241,7 +315,7 @@ def conform(
 
 @app.command()
 def latency(
-    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    rig: RigFile,
     flashes: Annotated[int, typer.Option(min=8, max=1000, help="Flashes that each camera must see happen.")] = 40,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
     exposure_s: Annotated[
@@ -250,9 +324,12 @@ def latency(
     trigger: Annotated[
         WatchedBy | None, typer.Option(help="How exposures are started. Default: free where a camera can.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Flash the projector: how late is its light, and do the cameras have rolling shutters?"""
+    """Flash the projector: how late is its light?
+
+    Tells whether the cameras have rolling shutters, too, and what to write into the rig file.
+    """
     from slrig.cli.latency import tell_latency
 
     kind = None if trigger is None else trigger.value
@@ -266,20 +343,26 @@ def _exposure(times_s: list[float]) -> dict[str, object]:
 
 @app.command()
 def doctor(
-    rig: Annotated[Path, typer.Argument(help="Rig file; examples are in config/rigs.")],
+    rig: RigFile,
     output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Examine a rig before a still object: light, timing, picture, focus, response, flicker, and what to do about them.
+    """Examine a rig before a still object: what is wrong?
 
-    Exit code 1 if there is a fault.
+    Light, timing, picture, focus, response and flicker, and what to do about them. Exit code 1 if there is a fault.
     """
     from slrig.cli.doctor import doctor as examine
 
     if not examine(rig, output=output, force=force, search_s=search_s, as_json=as_json):
         raise typer.Exit(1)
+
+
+app.command()(verify_command.verify)
+app.command()(acceptance_command.accept)
+app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(schedule.app, name="schedule")
 
 
 def _given(**options: object) -> dict[str, object]:

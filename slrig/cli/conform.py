@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.cli.display import progress_shown
 from slrig.config import RigConfig, read_rig
@@ -34,6 +35,7 @@ def conform(rig: Path, *, as_json: bool) -> bool:
     SlrigError
         The rig file is wrong, or the rig cannot be opened.
     """
+    set_up_logs_for_a_person()
     config = read_rig(rig)
     with progress_shown() as display:
         display("opening the rig", 0.0, "")
@@ -79,5 +81,5 @@ def tell(report: Report, console: Console) -> None:
 def _sequence(config: RigConfig) -> PatternSequence:
     """The patterns of a scan on this rig as its file describes it."""
     with open_rig(config) as rig:
-        size = rig.projector.info.size
-    return pattern_sequence(scan_plan(ScanRequest(), config.scan).patterns, size)
+        patterns = scan_plan(ScanRequest(), config.scan).patterns
+        return pattern_sequence(patterns, rig.projector.info.size, rig.calibration, rig.cameras)

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,6 @@ START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
 _POLL_S = 0.05
 _SERVICE_SHARE = 0.05
-BEING_OPENED = "the rig is being opened"
-"""What /readyz says of a rig that is worth waiting for."""
-
 LABEL = "demo"
 
 
@@ -51,7 +48,7 @@ def run_demo(rig: Path | None, output: Path) -> None:
     with progress_shown() as display:
         display("starting the service", 0.0, str(rig))
         with _service(rig, data, key) as process, ServiceClient(_url(process, data), key) as client:
-            _await_ready(process, client, data)
+            _await_ready(process, client, data, display)
 
             def shown(stage: str, fraction: float, detail: str) -> None:
                 display(stage, _SERVICE_SHARE + (1 - _SERVICE_SHARE) * fraction, detail)
@@ -92,7 +89,7 @@ def _service(rig: Path, data: Path, key: str) -> Iterator[subprocess.Popen[bytes
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=subprocess.STDOUT,
-            env={**os.environ, KEY_VARIABLE: key},
+            env={"SLRIG_LOG_FORMAT": "text", **os.environ, KEY_VARIABLE: key},
             # Ctrl-C is for the client: it cancels the scan, and then ends the service.
             start_new_session=True,
         )
@@ -119,23 +116,35 @@ def _url(process: subprocess.Popen[bytes], data: Path) -> str:
     return url
 
 
-def _await_ready(process: subprocess.Popen[bytes], client: ServiceClient, data: Path) -> None:
+def _await_ready(
+    process: subprocess.Popen[bytes], client: ServiceClient, data: Path, display: Callable[[str, float, str], None]
+) -> None:
     deadline = time.monotonic() + START_LIMIT_S
-    while not rig_is_open(client):
+    told = ""
+    while (missing := still_missing(client)) is not None:
+        if missing != told:
+            # A slow machine is no reason to give up, as long as it gets on.
+            told, deadline = missing, time.monotonic() + START_LIMIT_S
+            display("opening the rig", 0.0, missing)
         _require_alive(process, data, deadline)
         time.sleep(_POLL_S)
 
 
-def rig_is_open(client: ServiceClient) -> bool:
-    """Whether the service's rig is open; False while there is hope. Raises ServiceError with what is wrong.
+def still_missing(client: ServiceClient) -> str | None:
+    """What the service's rig waits for, None once it is open. Raises ServiceError with what is wrong.
 
-    The reconstruction is not waited for: its kernels load while the frames are taken.
+    The reconstruction is not waited for: its kernels are prepared while the frames are taken. How far they are is told.
     """
-    found = (client.checks() or {}).get("rig", BEING_OPENED)
-    if found not in {"ok", BEING_OPENED}:
+    now = client.readiness()
+    if now is None:
+        return "the service is starting"
+    found = now.checks.get("rig", "")
+    if found == "ok":
+        return None
+    if "rig" not in now.pending:
         message = f"The rig cannot be opened: {found}"
         raise ServiceError(message)
-    return found == "ok"
+    return f"{found}; {now.checks.get('reconstruction', '')}" if "reconstruction" in now.pending else found
 
 
 def remove_earlier(client: ServiceClient, scan: Mapping[str, Any]) -> int:

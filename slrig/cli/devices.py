@@ -41,6 +41,7 @@ def list_devices(*, as_json: bool) -> None:
             "devices": [asdict(device) for device in found.devices],
             "missing": [asdict(library) for library in found.missing],
             "broken": [asdict(package) for package in broken],
+            "elsewhere": [asdict(driver) for driver in found.elsewhere],
             "faults": [str(fault) for fault in found.faults],
         }
         typer.echo(json.dumps(document, indent=2))
@@ -67,6 +68,7 @@ def broken_packages(drivers: Sequence[InstalledDriver]) -> tuple[BrokenPackage, 
 
 def _tell_drivers(drivers: Sequence[InstalledDriver], found: Findings, console: Console) -> None:
     missing = {library.driver for library in found.missing}
+    elsewhere = {driver.driver for driver in found.elsewhere}
     table = _table("Installed drivers", "driver", "for a", "package", "state")
     for driver in drivers:
         if driver.kind == "finder":
@@ -76,6 +78,8 @@ def _tell_drivers(drivers: Sequence[InstalledDriver], found: Findings, console: 
             state = "broken, see below"
         elif driver.name in missing:
             state = "its library is missing, see below"
+        elif driver.name in elsewhere:
+            state = "not on this system, see below"
         package = f"{driver.package} {driver.version}".strip()
         table.add_row(escape(driver.name), driver.kind, escape(package), state)
     console.print(table)
@@ -93,7 +97,7 @@ def _tell_devices(found: Findings, console: Console) -> None:
     for device in found.devices:
         table.add_row(escape(device.driver), escape(device.device), escape(device.label))
     console.print(table)
-    console.print('\nWrite driver and device into a rig file: driver = "…", device = "…".', markup=False)
+    console.print("\nslrig init writes a rig file for them. Every option: slrig devices --options DRIVER")
 
 
 def _tell_remedies(found: Findings, broken: Sequence[BrokenPackage], told: set[str | None]) -> None:
@@ -102,6 +106,10 @@ def _tell_remedies(found: Findings, broken: Sequence[BrokenPackage], told: set[s
         typer.echo("\nMore devices can be used after:")
         for library in found.missing:
             typer.echo(f"  {library.driver}: {library.install}")
+    if found.elsewhere:
+        typer.echo("\nNot on this system:")
+        for other in found.elsewhere:
+            typer.echo(f"  {other.message}")
     for package in broken:
         names = ", ".join(package.drivers)
         typer.echo(f"\nBroken: package {package.package} (drivers: {names}); the others work without it.")

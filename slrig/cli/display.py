@@ -11,6 +11,9 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+_EVERY_S = 2.0
+"""How often a line tells of a stage that goes on, where there is no bar."""
+
 
 class ProgressDisplay:
     """Told the stage, the fraction done and a detail; shows them on stderr."""
@@ -29,8 +32,8 @@ class ProgressDisplay:
                 console=console,
             )
             self._task = self._bar.add_task("", total=1.0, detail="")
-        self._stage = ""
-        self._began_s = time.monotonic()
+        self._stage = self._detail = ""
+        self._began_s = self._told_s = time.monotonic()
 
     def start(self) -> None:
         """Begin to show."""
@@ -47,9 +50,10 @@ class ProgressDisplay:
         if self._bar is not None:
             shown = detail if len(detail) <= 32 else f"{detail[:31]}…"
             self._bar.update(self._task, description=stage, completed=fraction, detail=shown)
-        elif stage != self._stage:
-            seconds = time.monotonic() - self._began_s
-            print(f"{seconds:6.1f} s  {fraction:4.0%}  {stage}", file=self._stream, flush=True)
+        elif stage != self._stage or (detail != self._detail and time.monotonic() - self._told_s >= _EVERY_S):
+            self._told_s, self._detail = time.monotonic(), detail
+            line = f"{self._told_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
+            print(f"{line:<40}{detail}".rstrip(), file=self._stream, flush=True)
         self._stage = stage
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.cli.display import progress_shown
 from slrig.config import RigConfig, read_rig
@@ -32,6 +33,7 @@ def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float,
     SlrigError
         The rig file is wrong, the rig cannot be opened, or the new rig file cannot be written.
     """
+    set_up_logs_for_a_person()
     config = read_rig(rig_file)
     if output is not None:
         refuse_existing(output, force=force)
@@ -43,7 +45,7 @@ def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float,
             plan = scan_plan(ScanRequest(), config.scan).patterns
             diagnosis = examine(
                 _as_scanned(rig, config),
-                own_sequence=pattern_sequence(plan, rig.projector.info.size),
+                own_sequence=pattern_sequence(plan, rig.projector.info.size, rig.calibration, rig.cameras),
                 displays=displays,
                 period_px=plan.line_shift_period_px,
                 search_s=search_s,

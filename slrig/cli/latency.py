@@ -9,6 +9,7 @@ from pathlib import Path
 
 import typer
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.capture.flashes import CameraLatency
 from slrig.capture.synchronisation import LatencyMeasurement, measure_latency
 from slrig.cli.display import progress_shown
@@ -21,6 +22,7 @@ def tell_latency(
     rig_file: Path, *, trials: int, search_s: float, exposure_s: float | None, trigger: str | None, as_json: bool
 ) -> None:
     """Measure a rig's latency, and print it in words with the table for its rig file, or as JSON."""
+    set_up_logs_for_a_person()
     with open_rig(read_rig(rig_file)) as rig, progress_shown() as display:
         measured = measure_latency(
             rig,

@@ -13,3 +13,5 @@ Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is
 KeyFile = Annotated[
     Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
 ]
+RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

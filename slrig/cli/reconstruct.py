@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.cli.display import progress_shown
 from slrig.cli.scan import quality_lines
+from slrig.cli.warm import prepare_here
 from slrig.scan.artefacts import MESH, write_converted
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.records import report_summary
-from slrig.scan.worker import prepare_kernel_cache
 
 
 def reconstruct_with_progress(
@@ -24,12 +24,10 @@ def reconstruct_with_progress(
 
     formats : further formats of the mesh, "stl" or "obj"; options : fields of `ReconstructionPlan` that were given.
     """
+    set_up_logs_for_a_person()
     plan = ReconstructionPlan(**options)
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    prepare_kernel_cache(Path(base) / "slrig")
     with progress_shown() as display:
-        display("loading", 0.0, "")
-        # numba and its kernels: a second or two, and many the first time.
+        prepare_here(display)
         from slrig.scan.pipeline import reconstruct_bundle
 
         report = reconstruct_bundle(

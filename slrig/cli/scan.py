@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ import typer
 from slrig.bundle.storage import refusals_of
 from slrig.cli.client import ServiceClient
 from slrig.cli.display import progress_shown
-from slrig.errors import ScanCancelledError, ServiceError
+from slrig.errors import ConfigError, ScanCancelledError, ServiceError
+from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, not_offered, rejected_picture
 
 _STATES = {"queued": "waiting for the rig", "capturing": "preparing the rig", "reconstructing": "reconstructing"}
 
@@ -31,14 +32,27 @@ def scan_with(
 
     Raises
     ------
+    ConfigError
+        No scan has one of the files. Nothing was shot.
     ServiceError
         The service refused, is gone, or the scan failed.
     ScanCancelledError
         Somebody else cancelled it.
     """
-    if display is None:
-        with progress_shown() as own:
-            return scan_with(client, request, output, files=files, display=own)
+    _require_offered(client, files)
+    if display is not None:
+        return _scanned(client, request, output, files, display)
+    with progress_shown() as own:
+        return _scanned(client, request, output, files, own)
+
+
+def _scanned(
+    client: ServiceClient,
+    request: Mapping[str, Any],
+    output: Path,
+    files: tuple[str, ...],
+    display: Callable[[str, float, str], None],
+) -> dict[str, Any]:
     started = client.start(request)
     fraction = 0.0
     try:
@@ -73,12 +87,26 @@ def scan_with(
     return scan
 
 
+def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:
+    """Refuse names that no scan has before minutes are spent on one."""
+    unknown, cameras = not_offered(files, None), None
+    if not unknown and not_offered(files, ()):
+        # A picture per camera: which there are is known once the rig is open.
+        cameras = [each["name"] for each in client.get("/rig")["cameras"]] or None
+        unknown = not_offered(files, cameras)
+    if unknown:
+        pictures = [rejected_picture(name) for name in cameras or ("CAMERA",)]
+        there_are = ", ".join([*MEDIA_TYPES, *pictures, BUNDLE_ZIP])
+        message = f"--file: a scan has no {', '.join(unknown)}. There are: {there_are}."
+        raise ConfigError(message)
+
+
 def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...] = FILES) -> None:
     """Print where the files of a scan lie and how good the mesh is."""
     names = {"mesh.ply": "mesh", "preview.png": "preview", "report.json": "report"}
     for name in files:
         if (output / name).is_file():
-            typer.echo(f"{names.get(name, name):<10}{output / name}")
+            typer.echo(f"{names.get(name, name):<9} {output / name}")
     for line in quality_lines(scan.get("summary") or {}):
         typer.echo(line)
 

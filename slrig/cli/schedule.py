@@ -9,20 +9,21 @@ from typing import Annotated, Any
 
 import typer
 
-from slrig.cli.options import USUAL_URL, KeyFile, Url
+from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url
 
-app = typer.Typer(
-    no_args_is_help=True, help="Work for the rig at set times: add, list, runs, pause, resume, cancel, remove."
-)
+app = typer.Typer(no_args_is_help=True, help="Work for the rig at set times.")
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-ScheduleId = Annotated[str, typer.Argument(help="Id of the schedule, or the beginning of it that no other has.")]
+ScheduleId = Annotated[
+    str, typer.Argument(metavar="ID", help="Id of the schedule, or the beginning of it that no other has.")
+]
 
 
 @app.command()
 def add(
-    cron: Annotated[str, typer.Argument(help="Five fields: '30 6 * * mon-fri' is 06:30 on working days.")],
-    task: Annotated[str, typer.Argument(help="verification, calibration or acceptance.")],
+    cron: Annotated[
+        str, typer.Argument(metavar="CRON", help="Five fields: '30 6 * * mon-fri' is 06:30 on working days.")
+    ],
+    task: Annotated[str, typer.Argument(metavar="TASK", help="verification, calibration or acceptance.")],
     time_zone: Annotated[str, typer.Option(help="Whose clocks; a name such as Europe/Berlin.")] = "UTC",
     label: Annotated[str | None, typer.Option(help="Free text, to find the schedule again.")] = None,
     option: Annotated[
@@ -40,7 +41,10 @@ def add(
     key_file: KeyFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Have a service do something by the clock, and show the next five times."""
+    """Have a service do something by the clock.
+
+    Shows the next five times.
+    """
     request = {
         "cron": cron,
         "task": task,
@@ -67,14 +71,14 @@ def list_schedules(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJs
         _print_json(found)
         return
     if not found["schedules"]:
-        typer.echo("no schedules; add one with: slrig schedule add '30 6 * * *' verification")
+        typer.echo("no schedules; add one with: slrig schedule add '30 6 * * mon-fri' verification")
         return
     rows = [
         (
             each["id"][:8],
             each["task"],
-            f"{each['cron']}  {each['time_zone']}",
-            _clock(each["upcoming"][0]) if each["enabled"] else "paused",
+            each["cron"],
+            f"{_clock(each['upcoming'][0]) if each['enabled'] else 'paused'}  {each['time_zone']}",
             each["label"] or "",
         )
         for each in found["schedules"]
@@ -92,7 +96,8 @@ def runs(
 ) -> None:
     """List what became of a schedule's due times, from new to old."""
     with _client(url, key_file) as client:
-        found = client.get(f"/schedule/{_whole_id(client, schedule)}/runs?limit={limit}")
+        chosen = _chosen(client, schedule)
+        found = client.get(f"{chosen['links']['runs']}?limit={limit}")
     if as_json:
         _print_json(found)
         return
@@ -107,14 +112,14 @@ def runs(
         )
         for run in found["runs"]
     ]
-    _print_table(("due (here)", "what became of it", "why"), rows)
+    _print_table((f"due ({chosen['time_zone']})", "what became of it", "why"), rows)
 
 
 @app.command()
 def pause(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Let nothing become due until the schedule is resumed."""
     with _client(url, key_file) as client:
-        client.post(f"/schedule/{_whole_id(client, schedule)}/pause", None)
+        client.post(f"{_path(client, schedule)}/pause", None)
     typer.echo("paused")
 
 
@@ -122,14 +127,14 @@ def pause(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) 
 def resume(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Go on after a pause."""
     with _client(url, key_file) as client:
-        _tell_schedule(client.post(f"/schedule/{_whole_id(client, schedule)}/resume", None), as_json=False)
+        _tell_schedule(client.post(f"{_path(client, schedule)}/resume", None), as_json=False)
 
 
 @app.command()
 def cancel(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
-    """Have the run that is under way end early. The schedule stays as it is."""
+    """Have the run under way end early. The schedule stays as it is."""
     with _client(url, key_file) as client:
-        client.post(f"/schedule/{_whole_id(client, schedule)}/cancel", None)
+        client.post(f"{_path(client, schedule)}/cancel", None)
     typer.echo("the run was asked to end")
 
 
@@ -137,7 +142,7 @@ def cancel(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None)
 def remove(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Forget a schedule and its runs."""
     with _client(url, key_file) as client:
-        client.delete_at(f"/schedule/{_whole_id(client, schedule)}")
+        client.delete_at(_path(client, schedule))
     typer.echo("removed")
 
 
@@ -165,13 +170,19 @@ def _options(given: list[str]) -> dict[str, Any]:
     return options
 
 
-def _whole_id(client: Any, beginning: str) -> str:
+def _path(client: Any, beginning: str) -> str:
+    return str(_chosen(client, beginning)["links"]["self"])
+
+
+def _chosen(client: Any, beginning: str) -> Mapping[str, Any]:
+    """The schedule whose id begins so."""
     from slrig.errors import ScheduleNotFoundError
 
-    ids = [each["id"] for each in client.get("/schedule")["schedules"]]
-    found = [each for each in ids if each.startswith(beginning)]
+    schedules: list[Mapping[str, Any]] = client.get("/schedule")["schedules"]
+    ids = [each["id"] for each in schedules]
+    found = [each for each in schedules if each["id"].startswith(beginning)]
     if len(found) == 1:
-        return str(found[0])
+        return found[0]
     what = "no schedule's" if not found else f"{len(found)} schedules'"
     known = ", ".join(each[:8] for each in ids) or "none"
     message = f"'{beginning}' is the beginning of {what} id; there are: {known}"
@@ -189,7 +200,8 @@ def _tell_schedule(schedule: Mapping[str, Any], *, as_json: bool) -> None:
 
 
 def _clock(stamp: str) -> str:
-    return f"{datetime.fromisoformat(stamp).astimezone():%a %Y-%m-%d %H:%M}"
+    """A time as the service states it: by the clocks of the schedule's own time zone."""
+    return f"{datetime.fromisoformat(stamp):%a %Y-%m-%d %H:%M}"
 
 
 def _print_table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration
 from slrig.calibration.board import Board
 from slrig.calibration.health.look import Look
@@ -38,6 +39,7 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
     SlrigError
         There is no calibration, the rig cannot be opened, or the board is not to be seen.
     """
+    set_up_logs_for_a_person()
     with progress_shown() as display:
         if source.is_dir():
             calibration = _calibration(calibration_file or source / "calibration.json")

@@ -7,11 +7,15 @@ from typing import Annotated
 
 import typer
 
-from slrig.cli.calibrate import AsJson, Corners, Dictionary, Kind, MarkerMm, SquareMm, chosen_board
+from slrig.cli.calibrate import Corners, Dictionary, Kind, MarkerMm, SquareMm, chosen_board
+from slrig.cli.options import AsJson
 
 
 def verify(
-    source: Annotated[Path, typer.Argument(help="A recorded pose of the board, a bundle; or a rig file to shoot one.")],
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="SOURCE", help="A recorded pose of the board, a bundle; or a rig file to shoot one."),
+    ],
     kind: Kind = None,
     corners: Corners = None,
     square_mm: SquareMm = None,
@@ -23,7 +27,10 @@ def verify(
     position: Annotated[int | None, typer.Option(min=0, help="Pose of the rig's positioner, by number.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Look at the board once: does the calibration still hold? Exit code 1 if it is stale."""
+    """Look at the board once: does the calibration still hold?
+
+    Exit code 1 if it is stale.
+    """
     from slrig.cli.verify import verify as look
 
     board = chosen_board(kind, corners, square_mm, marker_mm, dictionary)

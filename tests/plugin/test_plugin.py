@@ -5,6 +5,9 @@ that fail, of which slrig tells and otherwise takes no notice.
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +121,37 @@ def test_devices_tells_people_the_causes_and_the_commands_whole(
     # What a plug-in prints is not part of our answer.
     assert "Vendor SDK" not in done.stdout
     assert "Vendor SDK" in done.stderr
+
+
+def test_its_options_are_told_if_it_describes_them(example_site: Path, tmp_path: Path) -> None:
+    path = path_with(example_site)
+    done = slrig("devices", "--options", "example_chart", path=path, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "speed_px_s  number      px/s  0\n    How fast the chart moves to the right.\n" in done.stdout
+    done = slrig("devices", "--options", "example_lamp", path=path, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "'example_lamp' does not describe its options" in done.stdout
+
+
+def test_init_writes_a_rig_of_plug_ins_that_opens(example_site: Path, tmp_path: Path) -> None:
+    path = path_with(example_site)
+    settings = ["--exposure-s", "0.01", "--set", "camera.light=light.jsonl", "--set", "projector.light=light.jsonl"]
+    named = ["--camera", "example_chart:chart-1", "--projector", "example_lamp", *settings]
+    done = slrig("init", *named, path=path, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    code = (
+        "from pathlib import Path; from slrig.config import read_rig; from slrig.discovery import open_rig\n"
+        "with open_rig(read_rig(Path('rig.toml'))) as rig: print(rig.cameras['camera'].info.serial)"
+    )
+    opened = subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert opened.stdout == "chart-1\n", opened.stderr
 
 
 def test_the_example_conforms(example_site: Path, tmp_path: Path) -> None:

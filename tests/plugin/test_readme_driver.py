@@ -1,4 +1,4 @@
-"""The driver in the README is a driver: it passes the contract, and its package can be installed."""
+"""The driver in drivers/README.md is a driver: it passes the contract, and its package can be installed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.contract.stage import Stage, StagedProjector
 from tests.plugin.conftest import path_with, pip_install, slrig
 from tests.unit.capture.fake_rig import Scene, patterns_for
 
-README = Path(__file__).resolve().parents[2] / "README.md"
+README = Path(__file__).resolve().parents[2] / "drivers" / "README.md"
 PROJECTOR = Size(128, 96)
 CAMERA = Size(160, 120)
 MODULE = "slrig_ramp"

@@ -14,15 +14,15 @@ import httpx2
 import pytest
 from typer.testing import CliRunner
 
-from slrig.api import system
 from slrig.api.schemas import ScanRequest
 from slrig.cli import client as client_module
 from slrig.cli.client import ServiceClient, read_key
 from slrig.cli.commands import INTERRUPTED, app
-from slrig.cli.demo import BEING_OPENED, remove_earlier, rig_is_open
+from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay
-from slrig.cli.scan import quality_lines, scan_with
-from slrig.errors import ConfigError, ScanCancelledError, ServiceError
+from slrig.cli.scan import quality_lines, scan_with, tell_result
+from slrig.errors import ConfigError, ScanCancelledError, ServiceError, SlrigError
+from slrig.scan.offered import MEDIA_TYPES
 
 SCAN = {
     "id": "5f",
@@ -67,7 +67,7 @@ def ignore(_stage: str, _fraction: float, _detail: str) -> None:
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys, slrig.cli\n"
-        "heavy = {'numba', 'numpy', 'cv2', 'fastapi', 'sqlalchemy', 'scipy', 'trimesh', 'pydantic', 'httpx2'}\n"
+        "heavy = {'numba', 'numpy', 'cv2', 'fastapi', 'sqlalchemy', 'scipy', 'trimesh', 'pydantic', 'httpx2', 'rich'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
@@ -224,23 +224,23 @@ def test_refused_key_is_told_with_where_to_put_it() -> None:
         client.get("/scan")
 
 
-def ready_answer(status: int, rig: str) -> httpx2.Response:
-    return httpx2.Response(status, json={"checks": {"rig": rig, "reconstruction": "loading"}})
+def ready_answer(status: int, rig: str, *pending: str) -> httpx2.Response:
+    checks = {"rig": rig, "reconstruction": "preparing kernels, first time only: 3 of 56"}
+    return httpx2.Response(status, json={"checks": checks, "pending": [*pending, "reconstruction"]})
 
 
 def test_demo_waits_for_the_rig_and_for_nothing_else() -> None:
-    assert BEING_OPENED == system.BEING_OPENED
-    with client_of(lambda _request: ready_answer(503, BEING_OPENED)) as client:
-        assert not rig_is_open(client)
+    with client_of(lambda _request: ready_answer(503, "tracing light, 30 %", "rig")) as client:
+        assert still_missing(client) == "tracing light, 30 %; preparing kernels, first time only: 3 of 56"
     with client_of(lambda _request: ready_answer(503, "ok")) as client:
-        assert rig_is_open(client)
+        assert still_missing(client) is None
 
     def absent(_request: httpx2.Request) -> httpx2.Response:
         message = "refused"
         raise httpx2.ConnectError(message)
 
     with client_of(absent) as client:
-        assert not rig_is_open(client)
+        assert still_missing(client) == "the service is starting"
 
 
 def test_demo_tells_at_once_why_the_rig_cannot_be_opened() -> None:
@@ -248,7 +248,7 @@ def test_demo_tells_at_once_why_the_rig_cannot_be_opened() -> None:
         client_of(lambda _request: ready_answer(503, "scene 'tabel.toml': expected a readable file")) as client,
         pytest.raises(ServiceError, match=r"The rig cannot be opened: scene 'tabel\.toml': expected a readable file"),
     ):
-        rig_is_open(client)
+        still_missing(client)
 
 
 def test_demo_removes_its_own_earlier_scans_and_no_others() -> None:
@@ -382,6 +382,19 @@ def test_scan_is_followed_and_fetched(tmp_path: Path) -> None:
     ]
 
 
+def test_every_file_that_was_fetched_is_told_with_its_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = ("mesh.ply", "mesh.obj", "rejected-left.png")
+    for name in (*files, "report.json"):
+        (tmp_path / name).write_bytes(b"of this scan or of an earlier one")
+    tell_result({}, tmp_path, files=files)
+    told = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in told] == [
+        ["mesh", str(tmp_path / "mesh.ply")],
+        ["mesh.obj", str(tmp_path / "mesh.obj")],
+        ["rejected-left.png", str(tmp_path / "rejected-left.png")],
+    ]
+
+
 def test_failed_scan_tells_the_cause(tmp_path: Path) -> None:
     walk = Walk("failed", {"detail": "No stripe was found."})
     with client_of(walk) as client, pytest.raises(ServiceError, match=r"Scan 5f failed: No stripe was found\."):
@@ -394,10 +407,43 @@ def test_scan_cancelled_elsewhere_is_told_as_such(tmp_path: Path) -> None:
         scan_with(client, {}, tmp_path / "out", display=ignore)
 
 
-def test_file_that_a_scan_has_not_is_told_before_anything_is_fetched(tmp_path: Path) -> None:
-    with client_of(Walk("succeeded")) as client, pytest.raises(ServiceError, match=r"no mesh\.3mf\. It has: mesh\.ply"):
-        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", "mesh.3mf"), display=ignore)
+def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path: Path) -> None:
+    with client_of(Walk("succeeded")) as client, pytest.raises(ServiceError, match=r"no mesh\.obj\. It has: mesh\.ply"):
+        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", "mesh.obj"), display=ignore)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "cameras", "told"),
+    [
+        ("mesh.e57", ["left"], "a scan has no mesh.e57. There are: mesh.ply, "),
+        ("rejected-top.png", ["left"], "no rejected-top.png. There are: .*, rejected-left.png, bundle.zip"),
+        ("rejected-top.png", [], None),
+        ("rejected-left.png", ["left"], None),
+        ("bundle.zip", ["left"], None),
+    ],
+)
+def test_name_that_no_scan_has_is_refused_before_one_is_shot(
+    tmp_path: Path, name: str, cameras: list[str], told: str | None
+) -> None:
+    started: list[httpx2.Request] = []
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        if request.url.path == "/rig":
+            return httpx2.Response(200, json={"cameras": [{"name": each} for each in cameras]})
+        started.append(request)
+        return httpx2.Response(409, json={"detail": "the rig is held"})
+
+    with client_of(handler) as client, pytest.raises(SlrigError, match=told or "the rig is held"):
+        scan_with(client, {}, tmp_path / "out", files=("mesh.ply", name), display=ignore)
+    assert (len(started) == 0) == (told is not None)
+
+
+def test_name_that_no_scan_has_is_exit_code_2_without_a_service(tmp_path: Path) -> None:
+    arguments = ["scan", "--url", "http://127.0.0.1:9", "--output", str(tmp_path), "--file", "mesh.e57"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert all(f" {name}," in result.stderr for name in MEDIA_TYPES)
 
 
 def test_ctrl_c_cancels_the_scan_on_the_service(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from slrig.bundle import read_calibration, read_opencv_calibration
-from slrig.calibration.board import BoardShape
+from slrig.calibration.board import USUAL_BOARD, BoardShape
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import PoseRefusedError, SolveRefusedError
 from slrig.sessions.calibration.pose_judging import summary
@@ -63,7 +63,7 @@ def solving(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     def read_pose(folder: Path, board: object, name: str) -> object:
         assert board == BOARD
-        assert folder.name == name
+        assert name in {folder.name, folder.parent.name}
         return known[name]
 
     def solve_poses(board: object, cameras: object, projector: object, given: Any, **options: Any) -> object:
@@ -102,7 +102,7 @@ def test_folder_of_poses_becomes_a_calibration(poses: Path, solving: dict[str, A
     assert "flat as far as the poses tell: 0.031 ± 0.012 mm" in result.stdout
     assert solving["board_shape"] is BoardShape.AUTO
     # Off a terminal every stage is a line of its own.
-    stages = [line.split("%  ")[1] for line in result.stderr.splitlines()]
+    stages = [line.split("%  ")[1].split("   ")[0] for line in result.stderr.splitlines()]
     assert stages[:2] == ["loading", "reading pose_00"]
     assert stages[-2:] == ["adjustment", "done"]
 
@@ -247,6 +247,15 @@ def test_refused_solve_names_the_poses_that_were_not_used(
     assert not (tmp_path / "rig.json").exists()
 
 
+def test_poses_as_the_service_keeps_them_are_solved(poses: Path, solving: dict[str, Any], tmp_path: Path) -> None:
+    for pose in sorted(poses.iterdir()):
+        (tmp_path / "kept" / pose.name).mkdir(parents=True)
+        pose.rename(tmp_path / "kept" / pose.name / "bundle")
+    result = run("solve", tmp_path / "kept", *BOARD_OPTIONS, "--output", tmp_path / "rig.json")
+    assert result.exit_code == 0, result.output
+    assert solving["poses"] == list(GIVEN)
+
+
 def test_folder_that_is_none_of_poses_is_refused(tmp_path: Path) -> None:
     output = ["--output", tmp_path / "rig.json"]
     (tmp_path / "file").write_text("x")
@@ -294,12 +303,43 @@ def test_board_is_written_to_be_printed(tmp_path: Path) -> None:
     )
 
 
+def test_board_that_is_not_named_is_the_usual_one(tmp_path: Path) -> None:
+    named = ["--board", "charuco", "--corners", "11x8", "--square-mm", "12"]
+    for number, (options, square_mm) in enumerate(
+        (
+            ([], "12"),
+            (["--board", "charuco"], "12"),
+            (["--corners", "11 x 8"], "12"),
+            (["--square-mm", "11.94"], "11.94"),
+        )
+    ):
+        sheet, whole = tmp_path / f"{number}.svg", tmp_path / f"{number}-whole.svg"
+        result = run("board", *options, "--output", sheet)
+        assert result.exit_code == 0, result.output
+        assert f"charuco, 11 x 8 inner corners, squares of {square_mm} mm" in result.stderr
+        assert run("board", *named[:4], "--square-mm", square_mm, "--output", whole).stderr == ""
+        # The sheet that is printed is that of the same board named in full: 12 x 9 squares.
+        assert sheet.read_bytes() == whole.read_bytes()
+        assert f"--corners 11x8 --square-mm {square_mm}" in sheet.read_text(encoding="utf-8")
+
+
+def test_help_names_the_usual_board() -> None:
+    told = " ".join(run("board", "--help").stdout.replace("│", " ").split())
+    assert f"Default: {USUAL_BOARD.kind}." in told
+    assert f"as {USUAL_BOARD.columns}x{USUAL_BOARD.rows} (default)" in told
+    assert f"measured on the print (default {USUAL_BOARD.square_mm:g})" in told
+
+
 def test_board_that_is_none_is_refused(poses: Path, tmp_path: Path) -> None:
     for options, words in (
         (["--board", "chessboard", "--corners", "11", "--square-mm", "12"], "--corners: expected COLUMNSxROWS"),
         (["--board", "chessboard", "--corners", "11x8", "--square-mm", "12", "--marker-mm", "8"], "marker_mm"),
         (["--board", "chessboard", "--corners", "1x8", "--square-mm", "12"], "found 1 x 8"),
         (["--board", "chessboard", "--corners", "11x8"], "Missing: --square-mm."),
+        (["--board", "circles"], "Missing: --corners, --square-mm."),
+        (["--corners", "9x6"], "Missing: --board, --square-mm."),
+        (["--square-mm", "12", "--marker-mm", "13"], "less than the square's 12 mm"),
+        (["--dictionary", "DICT_4X4_50"], "needs 54 markers and DICT_4X4_50 has 50"),
     ):
         assert words in refused(run("solve", poses, *options, "--output", tmp_path / "rig.json"))
     assert run("solve", poses, "--board", "triangles", "--output", tmp_path / "rig.json").exit_code == 2

@@ -134,8 +134,14 @@ def test_session_is_taken_up_by_the_beginning_of_its_id(monkeypatch: pytest.Monk
     assert f"'999' is the beginning of no calibration's id. There are: {ID[:8]}" in refused(run("run", "--id", "999"))
 
 
-def test_walk_without_a_board_or_session_says_how_to_name_one() -> None:
-    assert "Missing: --board, --corners, --square-mm" in refused(run("run"))
+def test_walk_without_a_board_takes_the_usual_one_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk()
+    monkeypatch.setattr(calibrate, "_client", lambda _url, _key: client_of(desk))
+    result = run("run")
+    assert result.exit_code == 0, result.output
+    board = desk.asked[0][2]["board"]
+    assert (board["kind"], board["corners"], board["square_mm"], board["marker_mm"]) == ("charuco", [11, 8], 12.0, 9.0)
+    assert "charuco, 11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250" in result.stderr
 
 
 def test_script_shoots_every_position_then_solves(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
@@ -22,6 +24,7 @@ from tests.unit.api.conftest import KEY, ServedBench
 from tests.unit.calibrate_command import refused
 
 BOARD = 'board={"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}'
+OPTION = ("--option", BOARD)
 
 
 @pytest.fixture(scope="module")
@@ -76,16 +79,15 @@ def test_add_shows_the_next_five_times(service: TestClient) -> None:
 
 def test_options_reach_the_service(service: TestClient) -> None:
     more = ("--label", "nights", "--grace-s", "600", "--retry-s", "30", "--no-catch-up", "--paused", "--json")
-    given = ("--option", BOARD, "--option", "activate=true")
-    made = json.loads(done("add", "0 2 * * *", "calibration", *given, *more))
+    made = json.loads(done("add", "0 2 * * *", "verification", *OPTION, "--option", "exposure_s=0.5", *more))
     assert kept(service) == [made]
     assert (made["label"], made["grace_s"], made["retry_s"]) == ("nights", 600, 30)
-    assert (made["catch_up"], made["enabled"], made["options"]["activate"]) == (False, False, True)
+    assert (made["catch_up"], made["enabled"], made["options"]["exposure_s"]) == (False, False, 0.5)
 
 
 def test_list_runs_pause_resume_and_remove(service: TestClient) -> None:
-    assert done("list") == "no schedules; add one with: slrig schedule add '30 6 * * *' verification\n"
-    made = json.loads(done("add", "0 2 * * *", "verification", "--label", "nights", "--json"))
+    assert done("list") == "no schedules; add one with: slrig schedule add '30 6 * * mon-fri' verification\n"
+    made = json.loads(done("add", "0 2 * * *", "verification", *OPTION, "--label", "nights", "--json"))
     beginning = made["id"][:8]
     heads, row = done("list").splitlines()
     assert heads.split() == ["id", "task", "when", "next", "label"]
@@ -101,8 +103,30 @@ def test_list_runs_pause_resume_and_remove(service: TestClient) -> None:
     assert kept(service) == []
 
 
+def test_times_are_those_of_the_schedules_own_zone(service: TestClient) -> None:
+    done("add", "30 6 * * *", "verification", *OPTION, "--time-zone", "Asia/Tokyo")
+    done("add", "30 6 * * *", "verification", *OPTION, "--time-zone", "America/Lima", "--paused")
+    _, running, paused = done("list").splitlines()
+    assert re.search(r"30 6 \* \* \*  \w{3} \d{4}-\d\d-\d\d 06:30  Asia/Tokyo", running)
+    assert "paused  America/Lima" in paused
+    schedules = cast("FastAPI", service.app).state.service.schedules
+    schedules.reckon(datetime.now(UTC) + timedelta(days=3))
+    (tokyo, _) = kept(service)
+    heads, *rows = done("runs", tokyo["id"][:8]).splitlines()
+    assert heads.startswith("due (Asia/Tokyo)")
+    assert rows
+    assert all(" 06:30  " in row for row in rows if row.startswith(("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")))
+
+
+def test_verification_without_a_board_is_refused_with_what_to_do(service: TestClient) -> None:
+    told = refused(run("add", "30 6 * * mon-fri", "verification"))
+    assert "which board is in view is not known: no calibration that was made here is in use" in told
+    assert 'the option "board", as {"kind": "charuco", "corners": [11, 8], "square_mm": 12}' in told
+    assert kept(service) == []
+
+
 def test_cancel_ends_the_run_and_leaves_the_schedule(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = json.loads(done("add", "0 2 * * *", "verification", "--json"))
+    made = json.loads(done("add", "0 2 * * *", "verification", *OPTION, "--json"))
     assert "has no run under way" in refused(run("cancel", made["id"][:8]))
     stopped = threading.Event()
     # As a run under way leaves it there.
@@ -129,6 +153,6 @@ def test_what_cannot_be_is_refused_in_words() -> None:
 
 
 def test_beginning_that_is_not_known_lists_those_that_are(service: TestClient) -> None:
-    done("add", "0 2 * * *", "verification")
+    done("add", "0 2 * * *", "verification", *OPTION)
     (made,) = kept(service)
     assert f"there are: {made['id'][:8]}" in refused(run("pause", "zzz"))

@@ -250,6 +250,30 @@ def test_an_unknown_driver_is_told_with_those_installed(tmp_path: Path) -> None:
     assert [device.closed for device in OPENED] == [1, 1]
 
 
+def test_faults_of_several_tables_are_told_together_and_all_is_closed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        _open(
+            tmp_path,
+            _camera("left", "fkae"),
+            _camera("middle", "lost"),
+            _camera("right", "strict", 'port = "x"\nspeed = 5'),
+            _camera("top"),
+            projector="skreen",
+        )
+    told = str(caught.value)
+    assert told.startswith("rig 'bench': 3 of its tables are wrong; correct each and try again:\n")
+    order = [
+        "projector driver 'skreen'",
+        "camera driver 'fkae'",
+        "camera driver 'strict' does not take",
+        "speed: unknown",
+    ]
+    places = [told.index(part) for part in order]
+    assert places == sorted(places)
+    assert "is not there" not in told
+    assert [(device.name, device.closed) for device in OPENED] == [("top", 1)]
+
+
 @pytest.mark.parametrize(
     ("driver", "error", "part"),
     [

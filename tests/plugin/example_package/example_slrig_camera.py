@@ -43,18 +43,18 @@ _BLUR_PX = 0.6
 
 
 class Options(BaseModel):
-    """The keys of a `[[camera]]` table that belong to this driver.
-
-    device : a chart. size_px : width, height. light : a file, from the rig file's folder, that says what lights the
-    chart since when; without it there is the room's light only. speed_px_s : how fast the chart moves to the right.
-    """
+    """The keys of a `[[camera]]` table that belong to this driver."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    device: str = "chart-0"
-    size_px: tuple[int, int] = Field(default=(320, 240))
-    light: str | None = None
-    speed_px_s: float = 0.0
+    device: str = Field(default="chart-0", description="A chart.")
+    size_px: tuple[int, int] = Field(default=(320, 240), description="[width, height].")
+    light: str | None = Field(
+        default=None,
+        description="A file, from the rig file's folder, that says what lights the chart since when; else there is the "
+        "room's light only.",
+    )
+    speed_px_s: float = Field(default=0.0, description="How fast the chart moves to the right.")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,57 @@
+"""What the drivers say of their options: every one has a meaning, and no library of a vendor is loaded to learn it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from slrig.option_models import described_drivers, kinds_of, option_model
+
+SHIPPED = {"depthai", "dlpc350", "genicam", "opencv", "replay", "screen", "serial_projector", "simulated", "v4l2"}
+
+
+def properties(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for table in (schema, *schema.get("$defs", {}).values()):
+        yield from table.get("properties", {}).items()
+
+
+def test_every_driver_of_slrig_describes_its_options() -> None:
+    assert set(described_drivers("slrig")) == SHIPPED
+
+
+@pytest.mark.parametrize("driver", sorted(SHIPPED))
+def test_every_option_has_a_meaning_in_a_sentence(driver: str) -> None:
+    model = option_model(driver)
+    assert model is not None
+    assert kinds_of(driver)
+    told = dict(properties(model.model_json_schema()))
+    assert told
+    for name, part in told.items():
+        assert len(part.get("description", "")) > 5, name
+        assert part["description"].endswith((".", ")")), name
+
+
+def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:
+    marked = {
+        driver: [name for name, part in properties(model.model_json_schema()) if part.get("takes") == "device"]
+        for driver in SHIPPED
+        if (model := option_model(driver)) is not None
+    }
+    assert {driver: names for driver, names in marked.items() if names} == {
+        "screen": ["output"],
+        "serial_projector": ["port"],
+    }
+
+
+def test_no_vendors_library_is_needed() -> None:
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('depthai', 'gi', 'serial', 'sdl2')))\n"
+        "from slrig.option_models import option_model\n"
+        f"print(all(option_model(name) for name in {sorted(SHIPPED - {'simulated'})}), 'numba' in sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)  # noqa: S603
+    assert shown.stdout == "True False\n"
