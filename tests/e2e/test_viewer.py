@@ -1,70 +1,88 @@
-"""The GLB opened in a viewer that other people wrote: F3D, which reads it through VTK, on a virtual display."""
+"""The GLB opened in viewers that other people wrote: F3D, and three.js in a browser."""
 
 from __future__ import annotations
 
 import math
-import os
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from slrig.model import Mesh
 from slrig.scan.mesh_formats import encode_mesh_glb
+from tests.e2e.viewers.f3d import SIZE_PX, f3d_picture
+from tests.e2e.viewers.three_js import three_js
 from tests.unit.scan.test_mesh_formats import half_ball
 
 pytestmark = pytest.mark.slow
 
-WIDTH_PX, HEIGHT_PX = 480, 360
+WIDTH_PX, HEIGHT_PX = SIZE_PX
 VIEW_ANGLE_DEG = 30.0
-# The dome of radius 50 mm about (3, -4, 500) mm looks along -z, towards the device that scanned it.
+# The dome of radius 50 mm about (3, -4, 500) mm looks along -z, towards the camera that scanned it.
 EYE_MM = np.array([3.0, -4.0, 200.0])
 CENTRE_MM = np.array([3.0, -4.0, 500.0])
-
-
-def viewer() -> list[str]:
-    missing = [name for name in ("f3d", "xvfb-run") if shutil.which(name) is None]
-    if missing:
-        pytest.skip(f"{' and '.join(missing)} not installed; Debian: apt-get install f3d xvfb xauth")
-    return ["xvfb-run", "--auto-servernum", "f3d"]
-
-
-def picture(mesh: Mesh, folder: Path, *, eye_mm: NDArray[np.float64] = EYE_MM) -> NDArray[np.uint8]:
-    """(H, W, 4) uint8: blue, green, red and opacity of the mesh seen from a point, rows rising with y."""
-    folder.mkdir()
-    (folder / "mesh.glb").write_bytes(encode_mesh_glb(mesh))
-    places = {"--camera-position": eye_mm / 1000, "--camera-focal-point": CENTRE_MM / 1000}
-    seen_from = [f"{option}={','.join(f'{value:.6f}' for value in place)}" for option, place in places.items()]
-    result = subprocess.run(  # noqa: S603 - a viewer from the system's own packages
-        [
-            *viewer(), str(folder / "mesh.glb"), f"--output={folder / 'picture.png'}", "--no-background",
-            f"--resolution={WIDTH_PX},{HEIGHT_PX}", *seen_from, "--camera-view-up=0,-1,0",
-            f"--camera-view-angle={VIEW_ANGLE_DEG}",
-        ],
-        env={**os.environ, "HOME": str(folder), "LIBGL_ALWAYS_SOFTWARE": "1"},
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    found = cv2.imread(str(folder / "picture.png"), cv2.IMREAD_UNCHANGED)
-    assert found is not None, result.stdout + result.stderr
-    assert found.shape == (HEIGHT_PX, WIDTH_PX, 4)
-    return np.asarray(found, dtype=np.uint8)
+# Camera axes in mm (x right, y down, z away) to glTF's in m (x right, y up, z towards the viewer).
+TO_GLTF = np.array([0.001, -0.001, -0.001])
 
 
 def two_shades() -> Mesh:
-    """The dome, dark where x is below its centre and bright where it is above."""
+    """The dome as a camera sees it: dark on the left and bright on the right, its lower right quarter missing."""
     mesh = half_ball(60, 160)
-    bright = mesh.vertices_mm[:, 0] > CENTRE_MM[0]
-    return replace(mesh, grey=np.where(bright, 230, 60).astype(np.uint8))
+    right, low = (mesh.vertices_mm - CENTRE_MM)[:, :2].T > 0
+    missing = (right & low)[mesh.faces].all(axis=1)
+    return replace(mesh, grey=np.where(right, 230, 60).astype(np.uint8), faces=mesh.faces[~missing])
 
 
-def test_the_mesh_is_seen_in_metres_in_its_shades_and_from_the_side_that_was_scanned(tmp_path: Path) -> None:
-    shown = picture(two_shades(), tmp_path / "front")
-    opaque = shown[..., 3] > 127
+def assert_upright_and_from_the_front(shown: NDArray[np.uint8]) -> None:
+    """The picture shows `two_shades` as the camera that scanned it did."""
+    opaque, light = shown[..., 3] > 127, shown[..., :3].mean(axis=2)
+    rows, columns = np.nonzero(opaque)
+    top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
+    # The whole of it is shown, in the middle, as large as can be looked at.
+    assert 0 < top < bottom < shown.shape[0]
+    assert 0 < left < right < shown.shape[1]
+    assert bottom - top > shown.shape[0] / 4
+    middle, centre = (top + bottom) // 2, (left + right) // 2
+    quarters = {
+        "upper left": np.s_[top : middle - 3, left : centre - 3],
+        "upper right": np.s_[top : middle - 3, centre + 3 : right],
+        "lower left": np.s_[middle + 3 : bottom, left : centre - 3],
+        "lower right": np.s_[middle + 3 : bottom, centre + 3 : right],
+    }
+    covered = {name: opaque[quarter].mean() for name, quarter in quarters.items()}
+    shade = {name: light[quarter][opaque[quarter]].mean() for name, quarter in quarters.items() if covered[name] > 0.5}
+    assert covered.pop("lower right") < 0.05
+    assert min(covered.values()) > 0.65, covered
+    assert max(shade["upper left"], shade["lower left"]) < 0.7 * shade["upper right"], shade
+
+
+def test_f3d_by_itself_shows_the_side_that_was_scanned_upright(tmp_path: Path) -> None:
+    (tmp_path / "mesh.glb").write_bytes(encode_mesh_glb(two_shades()))
+    assert_upright_and_from_the_front(f3d_picture(tmp_path / "mesh.glb", tmp_path))
+
+
+def test_three_js_by_itself_shows_the_side_that_was_scanned_upright_and_in_metres(tmp_path: Path) -> None:
+    mesh = two_shades()
+    shown = three_js(encode_mesh_glb(mesh), tmp_path)
+    assert_upright_and_from_the_front(shown.picture)
+    placed_m = mesh.vertices_mm[np.unique(mesh.faces)] * TO_GLTF
+    np.testing.assert_allclose(shown.least_m, placed_m.min(axis=0), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(shown.most_m, placed_m.max(axis=0), rtol=0, atol=1e-6)
+
+
+def from_the_eye(mesh: Mesh, folder: Path) -> NDArray[np.uint8]:
+    """The mesh in F3D, seen from EYE_MM; (H, W, 4) uint8."""
+    folder.mkdir()
+    (folder / "mesh.glb").write_bytes(encode_mesh_glb(mesh))
+    places = {"--camera-position": EYE_MM * TO_GLTF, "--camera-focal-point": CENTRE_MM * TO_GLTF}
+    seen_from = [f"{option}={','.join(f'{value:.6f}' for value in place)}" for option, place in places.items()]
+    return f3d_picture(folder / "mesh.glb", folder, *seen_from, f"--camera-view-angle={VIEW_ANGLE_DEG}")
+
+
+def test_the_mesh_is_seen_in_metres(tmp_path: Path) -> None:
+    opaque = from_the_eye(half_ball(60, 160), tmp_path / "front")[..., 3] > 127
     # Its rim, 49.9 mm from the axis and 3.5 mm before the centre, and the hole in its middle, 9.9 mm and 49 mm.
     focal_px = HEIGHT_PX / 2 / math.tan(math.radians(VIEW_ANGLE_DEG / 2))
     depth_mm = CENTRE_MM[2] - EYE_MM[2]
@@ -73,18 +91,12 @@ def test_the_mesh_is_seen_in_metres_in_its_shades_and_from_the_side_that_was_sca
     radius = np.hypot(columns - (WIDTH_PX - 1) / 2, rows - (HEIGHT_PX - 1) / 2)
     assert opaque[(radius > inner + 3) & (radius < outer - 3)].all()
     assert not opaque[(radius < inner - 3) | (radius > outer + 3)].any()
-    # Rows rise with y and the eye looks along +z, so x rises to the right, as in a camera's image.
-    light = shown[..., :3].mean(axis=2)
-    ring = (radius > inner + 5) & (radius < 0.8 * outer)
-    left, right = (light[ring & side].mean() for side in (columns < WIDTH_PX / 2 - 5, columns > WIDTH_PX / 2 + 5))
-    assert 20 < left < 0.7 * right
-    assert right < 250
 
 
 def test_the_shade_is_that_of_the_stored_normals(tmp_path: Path) -> None:
     mesh = half_ball(60, 160)
-    shown = picture(replace(mesh, grey=np.full_like(mesh.grey, 200)), tmp_path / "front")
-    turned = picture(replace(mesh, grey=np.full_like(mesh.grey, 200), normals=-mesh.normals), tmp_path / "turned")
+    shown = from_the_eye(replace(mesh, grey=np.full_like(mesh.grey, 200)), tmp_path / "front")
+    turned = from_the_eye(replace(mesh, grey=np.full_like(mesh.grey, 200), normals=-mesh.normals), tmp_path / "turned")
     light = shown[HEIGHT_PX // 2, :, :3].astype(float).mean(axis=1)
     opaque = shown[HEIGHT_PX // 2, :, 3] == 255
     across = light[opaque]

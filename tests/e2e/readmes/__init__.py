@@ -1,0 +1,1 @@
+"""The commands of the READMEs, and the person who types them."""

@@ -1,0 +1,135 @@
+"""Somebody with two terminals and a fresh folder: types commands in one, and has the service running in the other."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+
+import httpx2
+
+from tests.e2e.readmes.commands import ROOT
+
+COMMAND_LIMIT_S = 600.0
+_START_LIMIT_S = 60.0
+_STOP_LIMIT_S = 15.0
+_POLL_S = 0.1
+USUAL_ADDRESS = "127.0.0.1:8731"
+"""Where the READMEs have the service; here it takes a free port, so that it is in nobody's way."""
+
+
+class Person:
+    """A context manager. folder : holds `config` and an environment that is made; address : host and port."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir()
+        shutil.copytree(ROOT / "config", folder / "config")
+        _lay_out_environment(folder / ".venv" / "bin")
+        home = folder / "home"
+        home.mkdir()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"127.0.0.1:{free.getsockname()[1]}"
+        given = {name: text for name, text in os.environ.items() if not name.startswith(("SLRIG_", "XDG_"))}
+        host, _, port = self.address.partition(":")
+        self._environment = given | {
+            "HOME": str(home),
+            "PYTHONPATH": str(ROOT),
+            "SLRIG_HOST": host,
+            "SLRIG_PORT": port,
+            "SLRIG_URL": f"http://{self.address}",
+            "SLRIG_MIN_FREE_BYTES": "0",
+        }
+        self.key: str | None = None
+        self._service: subprocess.Popen[bytes] | None = None
+        self._log = folder / "service.log"
+
+    def __enter__(self) -> Person:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.stop_service()
+
+    def type(self, command: str) -> str:
+        """Run a command in the client's terminal, with what it leaves in the environment. Raises AssertionError."""
+        if command.startswith("slrig serve "):
+            return self.serve(command)
+        kept = self.folder / ".environment"
+        typed = subprocess.Popen(  # noqa: S603 - the commands of our own READMEs
+            ["bash", "-c", f"{command}\nstatus=$?\nenv -0 > {kept}\nexit $status"],  # noqa: S607
+            cwd=self.folder, env=self._environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+        try:
+            said = typed.communicate(timeout=COMMAND_LIMIT_S)[0].decode(errors="replace")
+        except subprocess.TimeoutExpired:
+            os.killpg(typed.pid, signal.SIGKILL)
+            said = typed.communicate()[0].decode(errors="replace")
+            message = f"it did not end in {COMMAND_LIMIT_S:g} s:\n{said[-3000:]}"
+            raise AssertionError(message) from None
+        assert typed.returncode == 0, f"it ended with exit code {typed.returncode}:\n{said[-3000:]}"
+        self._environment = dict(each.split("=", 1) for each in kept.read_text().split("\0") if each)
+        return said
+
+    def serve(self, command: str) -> str:
+        """Start the service in the other terminal, in place of one that runs there; wait until it answers."""
+        self.stop_service()
+        # The key was exported in the client's terminal only.
+        environment = {name: text for name, text in self._environment.items() if name != "SLRIG_API_KEY"}
+        with self._log.open("wb") as log:
+            self._service = subprocess.Popen(  # noqa: S603 - the commands of our own READMEs
+                ["bash", "-c", f"exec {command}"],  # noqa: S607
+                cwd=self.folder, env=environment | {"PYTHONUNBUFFERED": "1"}, stdin=subprocess.DEVNULL,
+                stdout=log, stderr=subprocess.STDOUT,
+            )  # fmt: skip
+        give_up = time.monotonic() + _START_LIMIT_S
+        while not self._answers():
+            said = self._log.read_text(errors="replace")
+            assert self._service.poll() is None, f"the service ended with {self._service.returncode}:\n{said[-3000:]}"
+            assert time.monotonic() < give_up, f"the service did not answer in {_START_LIMIT_S:g} s:\n{said[-3000:]}"
+            time.sleep(_POLL_S)
+        said = self._log.read_text(errors="replace")
+        # It is printed once for each data folder; a later service there has the same one.
+        shown = re.search(r"^API key, shown only now: (\S+)$", said, re.MULTILINE)
+        self.key = self.key if shown is None else shown.group(1)
+        assert self.key is not None, f"the service showed no key:\n{said}"
+        return said
+
+    def stop_service(self) -> None:
+        """Ctrl-C in the service's terminal. Raises AssertionError if it does not end well."""
+        if self._service is None:
+            return
+        self._service.send_signal(signal.SIGINT)
+        service, self._service = self._service, None
+        try:
+            code = service.wait(_STOP_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            service.kill()
+            service.wait()
+            message = f"the service did not end in {_STOP_LIMIT_S:g} s after Ctrl-C"
+            raise AssertionError(message) from None
+        assert code in {0, 130}, f"the service ended with {code}:\n{self._log.read_text(errors='replace')[-3000:]}"
+
+    def _answers(self) -> bool:
+        try:
+            return httpx2.get(f"http://{self.address}/livez", timeout=2).status_code == 200
+        except httpx2.TransportError:
+            return False
+
+
+def _lay_out_environment(folder: Path) -> None:
+    """What `python3 -m venv` and `pip install -e .` would have made: `slrig`, and a file that puts it on the path."""
+    folder.mkdir(parents=True)
+    (folder / "slrig").write_text(
+        f"#!/bin/sh\nexec '{sys.executable}' -c 'import sys; from slrig.cli import main; sys.exit(main())' \"$@\"\n"
+    )
+    (folder / "slrig").chmod(0o755)
+    (folder / "activate").write_text(f'export PATH="{folder}:$PATH"\n')
