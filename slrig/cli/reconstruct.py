@@ -9,6 +9,8 @@ from typing import Any
 import typer
 
 from slrig.api.logs import set_up_logs_for_a_person
+from slrig.bundle.calibration_file import read_calibration
+from slrig.bundle.description import read_description
 from slrig.cli.display import progress_shown
 from slrig.cli.scan import quality_lines
 from slrig.cli.warm import prepare_here
@@ -26,6 +28,10 @@ def reconstruct_with_progress(
     """
     set_up_logs_for_a_person()
     plan = ReconstructionPlan(**options)
+    # What is wrong with the files is said at once, not after a minute in which kernels are compiled.
+    read_description(bundle)
+    if calibration is not None:
+        read_calibration(calibration)
     with progress_shown() as display:
         prepare_here(display)
         from slrig.scan.pipeline import reconstruct_bundle

@@ -62,6 +62,7 @@ def test_less_is_there_than_linux_has() -> None:
     assert run("-c", code) == "False\n"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("elsewhere")
 def test_every_module_loads() -> None:
     assert int(run("-c", EVERY_MODULE)) > 300

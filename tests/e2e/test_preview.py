@@ -49,6 +49,7 @@ def scanned(url: str) -> None:
     assert json.load(opened(f"{url}/scan/{scan['id']}"))["state"] == "succeeded"
 
 
+@pytest.mark.slow
 def test_pictures_come_until_a_scan_does_and_again_after_it(start: Start, tmp_path: Path) -> None:
     service = start(write_rig(tmp_path / "rig"))
     # A scan that is over says that the rig is open.

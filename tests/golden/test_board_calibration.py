@@ -20,6 +20,7 @@ from slrig.sessions.calibration.pose_frames import bundle_device_sizes
 from slrig.sessions.calibration.pose_reading import read_pose
 from slrig.sessions.calibration.solving import CalibrationResult, ReadPose, solve_poses
 
+pytestmark = pytest.mark.slow
 BOARD = Board(BoardKind.CHESSBOARD, 7, 9, 75.0)
 POSES = ("pose_0", "pose_1", "pose_2", "pose_3")
 

@@ -27,7 +27,9 @@ def reconstructed(bundle: Path, output: Path) -> Any:
     )
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    "scene", [pytest.param(each, marks=[pytest.mark.slow] * (each == "terrace")) for each in SCENES]
+)
 def test_a_line_shift_bundle_meets_its_figures(shared: Path, tmp_path: Path, scene: str) -> None:
     report = reconstructed(shared / "bundles" / scene, tmp_path / "out")
     truth = report["truth"]
@@ -51,6 +53,7 @@ def test_a_line_shift_bundle_meets_its_figures(shared: Path, tmp_path: Path, sce
     assert report["evidence"]["contradictions"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
     shared: Path, tmp_path: Path, scene: str

@@ -40,7 +40,7 @@ def test_the_skull_covers_its_reference_points(shared: Path, tmp_path: Path) -> 
     assert (_distances(vertices, reference) > 10.0).mean() <= 0.01
 
 
-@pytest.mark.parametrize("pose", range(4))
+@pytest.mark.parametrize("pose", [0, *(pytest.param(pose, marks=pytest.mark.slow) for pose in (1, 2, 3))])
 @pytest.mark.parametrize("axis", list(Axis))
 def test_a_board_decodes_on_both_axes(shared: Path, pose: int, axis: Axis) -> None:
     capture = read_capture(shared / "captures" / "boards" / f"pose_{pose}")

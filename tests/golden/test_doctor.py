@@ -88,6 +88,7 @@ DEFECTS = {
     "mirrored image": planted("picture.mirrored", faults='picture = "mirrored"'),
     "second display swapped": planted("display.other", faults="other_display = true"),
 }
+FIRST = {"clean", "40 ms latency", "saturation"}
 FURTHER = {
     "clean, 60 Hz display": planted(projector="refresh_hz = 60.0"),
     "clean, rolling shutter, 12 bits": planted(camera="line_time_s = 3e-5\nbit_depth = 12", head="ambient = 0.2"),
@@ -165,7 +166,9 @@ def require(name: str, defect: Planted, diagnosis: Diagnosis) -> None:
     assert all(each.remedy for each in told)
 
 
-@pytest.mark.parametrize("name", DEFECTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in FIRST)) for name in DEFECTS]
+)
 def test_a_planted_defect_is_named_and_none_is_invented(tmp_path: Path, name: str) -> None:
     require(name, DEFECTS[name], examined(written(tmp_path, DEFECTS[name])))
 

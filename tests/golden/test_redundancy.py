@@ -127,6 +127,7 @@ def test_a_first_camera_that_is_turned_shows_in_the_second(recorded: Path, tmp_p
     assert pair["mean"] == pytest.approx(predicted, rel=0.2)
 
 
+@pytest.mark.slow
 def test_without_a_calibrated_projector_there_is_no_spare_equation(recorded: Path, tmp_path: Path) -> None:
     section = redundancy_of(recorded, tmp_path, lambda file: file.update(projector=None))
     assert section["residual_px"] is None

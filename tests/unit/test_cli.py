@@ -88,6 +88,8 @@ def test_error_of_ours_is_one_screen_and_exit_code_2(tmp_path: Path) -> None:
         assert result.stderr.count("error: ") == 1, arguments
         assert "Traceback" not in result.stderr, arguments
         assert len(result.stderr.splitlines()) < 20, arguments
+        # Nothing is compiled for a mistake.
+        assert "preparing" not in result.stderr, arguments
     assert not (tmp_path / "out").exists()
 
 

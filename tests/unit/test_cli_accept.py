@@ -63,6 +63,7 @@ def test_a_given_volume_is_used() -> None:
     assert plan.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
 
 
+@pytest.mark.slow
 def test_a_rig_whose_script_has_the_positions_moves_its_own_artefacts(tmp_path: Path) -> None:
     config = read_rig(RIGS / "rendered-acceptance.toml")
     assert moving(config, Asked(), tmp_path) is config

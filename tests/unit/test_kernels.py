@@ -146,6 +146,7 @@ for kind in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_processes_that_compile_at_once_leave_each_signature_its_own_code(tmp_path: Path) -> None:
     """Numba issue 4807: two processes number their files alike, and the index names the other one's code."""
     made(tmp_path, added=1)

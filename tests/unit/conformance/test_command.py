@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from typer.testing import CliRunner
 
 from slrig.cli.commands import app
@@ -51,6 +53,7 @@ def small_rig(folder: Path, *, faults: str = "") -> Path:
     return rig
 
 
+@pytest.mark.slow
 def test_conform_scores_a_rig_that_keeps_the_contract(tmp_path: Path) -> None:
     rig = small_rig(tmp_path)
     shown = CliRunner().invoke(app, ["conform", str(rig)])

@@ -65,6 +65,7 @@ def exact(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return output, run(recorded, output)
 
 
+@pytest.mark.slow
 def test_every_vertex_states_its_share(recorded: Path, exact: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     calibration = read_calibration(recorded / "calibration.json")
     write_calibration(tmp_path / "solved.json", stating(calibration))

@@ -85,6 +85,7 @@ def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(recorded: Path, tmp
     assert initial["triangles"] == initial["strip_triangles"] - initial["dropped_triangles"]
 
 
+@pytest.mark.slow
 def test_results_of_an_earlier_run_are_replaced_and_other_folders_are_not(recorded: Path, tmp_path: Path) -> None:
     run(recorded, tmp_path / "out")
     run(recorded, tmp_path / "out")
@@ -96,6 +97,7 @@ def test_results_of_an_earlier_run_are_replaced_and_other_folders_are_not(record
     assert [path.name for path in other.iterdir()] == ["picture.jpg"]
 
 
+@pytest.mark.slow
 def test_holes_are_kept_on_request(recorded: Path, tmp_path: Path) -> None:
     filled = run(recorded, tmp_path / "filled")["mesh"]["initial"]  # type: ignore[index]
     kept = run(recorded, tmp_path / "kept", keep_holes=True)["mesh"]["initial"]  # type: ignore[index]
@@ -246,7 +248,9 @@ def test_rows_alone_are_enough(both_axes: Path, tmp_path: Path) -> None:
     assert report["truth"]["rms_mm"] < 0.05  # type: ignore[index]
 
 
-@pytest.mark.parametrize("shifts", [(0,), (0, 2, 4, 6), (0, 1, 2, 5)])
+@pytest.mark.parametrize(
+    "shifts", [(0,), *(pytest.param(each, marks=pytest.mark.slow) for each in ((0, 2, 4, 6), (0, 1, 2, 5)))]
+)
 def test_some_of_the_line_shifts_make_a_coarser_mesh(truthful: Path, tmp_path: Path, shifts: tuple[int, ...]) -> None:
     def some(shot: Shot, capture: Capture) -> Shot | None:
         pattern = capture.patterns[shot.pattern]

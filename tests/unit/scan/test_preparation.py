@@ -41,6 +41,7 @@ def test_every_kernel_of_a_usual_scan_is_prepared() -> None:
     assert all(each.total == total for each in told)
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 def test_a_recorded_scan_compiles_nothing_more(shared: Path, tmp_path: Path) -> None:
     pipeline.warm_kernels(lambda _: None)

@@ -14,6 +14,7 @@ from slrig.model import Axis, Gray, LineShift
 from tests.rendered_boards import board_options, rendered_poses
 
 
+@pytest.mark.slow
 def test_each_pose_is_a_bundle_of_both_axes_with_the_truth_of_its_pose(tmp_path: Path) -> None:
     bundles = rendered_poses(tmp_path, board_options(cameras=2), poses=[0, 5])
     assert [bundle.name for bundle in bundles] == ["pose_00", "pose_01"]

@@ -189,10 +189,8 @@ def test_corners_are_placed_again_after_a_small_movement(board: Board) -> None:
 
 
 def refused(image: NDArray[np.uint8], board: Board, words: str) -> None:
-    started = time.process_time()
     with pytest.raises(PoseRefusedError, match=words):
         find_board(image, board, full_scale=255)
-    assert time.process_time() - started < 3
 
 
 @pytest.mark.parametrize("board", ALL, ids=title)
@@ -351,9 +349,26 @@ def test_an_image_that_is_none_is_a_fault_of_the_caller() -> None:
         find_board(np.full((40, 40), np.nan), CHESSBOARD, full_scale=255)
 
 
+def reference_s() -> float:
+    """Processor time of filters that OpenCV runs on one image of 1280 x 1024: how fast this machine is, just now.
+
+    0.13 to 0.16 s on a quiet core of the machine that measured the times below.
+    """
+    image = as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
+    taken = []
+    for _ in range(3):
+        started = time.process_time()
+        for _ in range(4):
+            cv2.medianBlur(image, 21)
+            cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, 51, 2)
+        taken.append(time.process_time() - started)
+    return min(taken)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("board", ALL, ids=title)
 def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
+    """It took 0.13 to 0.22 s when it was measured."""
     seen_by = eye(board, width=1280, height=1024, focal_px=1600.0)
     image = shot(board, seen_by)
     find_board(image, board, full_scale=255)
@@ -363,14 +378,14 @@ def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
         view = find_board(image, board, full_scale=255)
         taken.append(time.process_time() - started)
     assert len(view.corner) == board.corner_count
-    assert min(taken) < 0.6
+    assert min(taken) < 4 * reference_s()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("asked", [*ALL, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100")], ids=title)
 @pytest.mark.parametrize("there", [*ALL, None], ids=title)
 def test_another_board_is_refused_within_two_seconds_of_one_core(asked: Board, there: Board | None) -> None:
-    """A pose is answered within two seconds. It took 0.5 to 1.3 s when it was measured."""
+    """A pose is answered within two seconds. It took 0.2 to 1.3 s when it was measured."""
     if there is None:
         image = as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
     else:
@@ -383,4 +398,4 @@ def test_another_board_is_refused_within_two_seconds_of_one_core(asked: Board, t
         with pytest.raises(PoseRefusedError):
             find_board(image, asked, full_scale=255)
         taken.append(time.process_time() - started)
-    assert min(taken) < 2.0
+    assert min(taken) < 15 * reference_s()

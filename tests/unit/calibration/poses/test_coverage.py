@@ -266,7 +266,7 @@ ALL = tuple(two_cameras_and_projector())
 @pytest.mark.parametrize(
     ("board", "only"),
     [
-        pytest.param(CHESSBOARD, ALL, id="chessboard, all"),
+        pytest.param(CHESSBOARD, ALL, id="chessboard, all", marks=pytest.mark.slow),
         pytest.param(CHARUCO, ALL, id="charuco, all", marks=pytest.mark.slow),
         pytest.param(CHESSBOARD, ("left",), id="chessboard, one camera", marks=pytest.mark.slow),
         pytest.param(CHARUCO, ("left",), id="charuco, one camera"),

@@ -28,9 +28,9 @@ def solved(recipe: Recipe) -> tuple[Solution, Calibration]:
 @pytest.mark.parametrize(
     "recipe",
     [
-        SMALL,
+        pytest.param(SMALL, marks=pytest.mark.slow),
         replace(SMALL, lens_shift=False, seed=1),
-        replace(SMALL, cameras=2, seed=2),
+        pytest.param(replace(SMALL, cameras=2, seed=2), marks=pytest.mark.slow),
         replace(SMALL, cameras=2, projector=False, seed=3),
         replace(SMALL, projector=False, seed=4),
     ],
@@ -175,7 +175,8 @@ def test_poses_that_all_contradict_one_another_are_refused() -> None:
         solve(replace(observations, poses=tuple(poses)))
 
 
-@pytest.mark.parametrize("bow_mm", [0.2, pytest.param(1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("bow_mm", [0.2, 1.0])
 def test_a_bowed_board_is_found_and_does_no_harm(bow_mm: float) -> None:
     recipe = replace(SMALL, poses=7, bow_mm=bow_mm)
     (shaped, truth), (observations, _) = solved(recipe), made(recipe)
