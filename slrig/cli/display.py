@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,15 +12,20 @@ from typing import TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-_EVERY_S = 2.0
+EVERY_S = 2.0
 """How often a line tells of a stage that goes on, where there is no bar."""
 
 
 class ProgressDisplay:
-    """Told the stage, the fraction done and a detail; shows them on stderr."""
+    """Told the stage, the fraction done and a detail; shows them on stderr.
 
-    def __init__(self, stream: TextIO) -> None:
+    Where there is no terminal it prints a line for each stage, and another every `every_s` while one goes on, even if
+    nothing more is told: one kernel may take ten seconds to compile.
+    """
+
+    def __init__(self, stream: TextIO, *, every_s: float = EVERY_S) -> None:
         self._stream = stream
+        self._every_s = every_s
         console = Console(file=stream)
         self._bar: Progress | None = None
         if console.is_terminal:
@@ -32,29 +38,53 @@ class ProgressDisplay:
                 console=console,
             )
             self._task = self._bar.add_task("", total=1.0, detail="")
-        self._stage = self._detail = ""
+        self._now = ("beginning", 0.0, "")
         self._began_s = self._told_s = time.monotonic()
+        self._telling = threading.Lock()
+        self._ended = threading.Event()
+        self._repeating = threading.Thread(target=self._repeat, name="slrig-progress", daemon=True)
 
     def start(self) -> None:
         """Begin to show."""
         if self._bar is not None:
             self._bar.start()
+        else:
+            self._repeating.start()
 
     def stop(self) -> None:
         """Leave what was shown, and show no more."""
+        self._ended.set()
         if self._bar is not None:
             self._bar.stop()
+        elif self._repeating.is_alive():
+            self._repeating.join()
 
     def __call__(self, stage: str, fraction: float, detail: str, /) -> None:
         """Show where the work is."""
         if self._bar is not None:
             shown = detail if len(detail) <= 32 else f"{detail[:31]}…"
             self._bar.update(self._task, description=stage, completed=fraction, detail=shown)
-        elif stage != self._stage or (detail != self._detail and time.monotonic() - self._told_s >= _EVERY_S):
-            self._told_s, self._detail = time.monotonic(), detail
-            line = f"{self._told_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
-            print(f"{line:<40}{detail}".rstrip(), file=self._stream, flush=True)
-        self._stage = stage
+            return
+        with self._telling:
+            begun = stage != self._now[0]
+            self._now = (stage, fraction, detail)
+            if begun:
+                self._print()
+
+    def _repeat(self) -> None:
+        wait_s = self._every_s
+        while not self._ended.wait(wait_s):
+            with self._telling:
+                wait_s = self._told_s + self._every_s - time.monotonic()
+                if wait_s <= 0:
+                    self._print()
+                    wait_s = self._every_s
+
+    def _print(self) -> None:
+        self._told_s = time.monotonic()
+        stage, fraction, detail = self._now
+        line = f"{self._told_s - self._began_s:6.1f} s  {fraction:4.0%}  {stage}"
+        print(f"{line:<40}{detail}".rstrip(), file=self._stream, flush=True)
 
 
 @contextmanager

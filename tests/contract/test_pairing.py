@@ -72,6 +72,7 @@ def counted(
     )
 
 
+@pytest.mark.slow
 def test_disturbed_frames_are_shot_again_and_none_is_paired_wrongly(tmp_path: Path, sound: Bench) -> None:
     result = counted(simulated(tmp_path, faults=DISTURBED, seed=3), sound, frames=300)
     assert result.frames >= 300
@@ -97,6 +98,7 @@ def test_what_the_evidence_keeps_away_is_found_without_it(tmp_path: Path, sound:
     assert result.refused_scans < result.scans
 
 
+@pytest.mark.slow
 def test_a_driver_that_delivers_old_frames_is_found(tmp_path: Path, sound: Bench) -> None:
     alone = counted(simulated(tmp_path), sound, frames=200, broken=True, proven=False)
     assert alone.wrong > 20

@@ -216,6 +216,7 @@ def _started(name: str, *words: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "watchdog_s"),
     [(signal.SIGKILL, 0.25), (signal.SIGKILL, 1.0), (signal.SIGTERM, 0.25), (signal.SIGSTOP, 0.25)],
@@ -232,6 +233,7 @@ def test_a_host_that_is_killed_leaves_darkness_within_the_watchdogs_time(
     assert 0 < (dark_ns - ended_ns) / 1e9 <= watchdog_s + SLACK_S
 
 
+@pytest.mark.slow
 def test_a_host_that_crashes_leaves_darkness(
     box: BoxProcess, host: Callable[[str, float], subprocess.Popen[str]]
 ) -> None:

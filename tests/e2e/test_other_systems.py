@@ -68,6 +68,7 @@ def test_every_module_loads() -> None:
     assert int(run("-c", EVERY_MODULE)) > 300
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("elsewhere")
 def test_devices_says_which_drivers_are_for_linux_only() -> None:
     assert "devices" in run("-m", "slrig.cli", "--help")

@@ -25,6 +25,7 @@ def white_frame(folder: Path) -> NDArray[np.uint8]:
     return np.asarray(cv2.imread(str(folder / frame["file"]), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
+@pytest.mark.slow
 def test_the_real_board_is_found_in_all_poses_and_fits_a_camera(shared: Path) -> None:
     places, points = [], []
     for pose in range(4):

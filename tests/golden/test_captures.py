@@ -24,6 +24,7 @@ pytestmark = pytest.mark.shared
 CORNERS = (7, 9)
 
 
+@pytest.mark.slow
 def test_the_skull_covers_its_reference_points(shared: Path, tmp_path: Path) -> None:
     folder = shared / "captures" / "skull"
     report = reconstructed(folder, tmp_path / "out")

@@ -195,6 +195,7 @@ def images(path: Path, synchronisation: Synchronisation | None) -> dict[tuple[in
         return {(shot.pattern, shot.camera): shot.image.astype(np.float64) for shot in shots}
 
 
+@pytest.mark.slow
 def test_a_scan_with_a_late_projector_is_right_once_its_latency_is_known(tmp_path: Path) -> None:
     honest = images(written(tmp_path, latency_s=0.0, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0), None)
     path = written(tmp_path, latency_s=0.031, exposure_s=0.01, line_s=3e-5, twin_line_s=0.0)

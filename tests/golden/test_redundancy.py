@@ -47,6 +47,7 @@ def redundancy_of(recorded: Path, folder: Path, change: CalibrationChange | None
     return section
 
 
+@pytest.mark.slow
 def test_a_right_calibration_leaves_the_noise_of_the_stripes(recorded: Path, tmp_path: Path) -> None:
     section = redundancy_of(recorded, tmp_path)
     (pair,) = section["residual_px"]
@@ -84,6 +85,7 @@ def pixels(device: dict[str, Any], points_mm: FloatArray) -> FloatArray:
     return np.asarray(found, dtype=np.float64).reshape(-1, 2)
 
 
+@pytest.mark.slow
 def test_a_camera_turned_by_a_twentieth_of_a_degree_shows_as_projective_geometry_says(
     recorded: Path, tmp_path: Path
 ) -> None:

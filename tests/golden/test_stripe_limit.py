@@ -10,11 +10,9 @@ import pytest
 from tests.bench.stripe_limit import PLANE, SOFT_PX, SPHERE, exposed_at_snr, measured, rig
 
 
-@pytest.mark.parametrize("snr", [pytest.param(20.0, marks=pytest.mark.slow), 60.0])
-@pytest.mark.parametrize(
-    ("thing", "goal"),
-    [pytest.param(PLANE, 1.15, id="plane"), pytest.param(SPHERE, 1.5, id="sphere", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("snr", [20.0, 60.0])
+@pytest.mark.parametrize(("thing", "goal"), [(PLANE, 1.15), (SPHERE, 1.5)], ids=["plane", "sphere"])
 def test_noise_costs_little_more_than_the_bound(thing: Mapping[str, object], goal: float, snr: float) -> None:
     bench = rig(thing, size_px=(200, 140), blur_px=SOFT_PX)
     points = measured(bench, exposed_at_snr(bench, snr), captures=4)

@@ -75,6 +75,7 @@ def named(name: str) -> Check:
     return next(check for check in CHECKS if check.name == name)
 
 
+@pytest.mark.slow
 def test_the_camera_of_the_readme_conforms(tmp_path: Path) -> None:
     report = run(before_a_stage(loaded(tmp_path)), sequence())
     assert failures(report) == []

@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -470,3 +471,22 @@ def test_progress_off_a_terminal_is_one_line_per_stage() -> None:
     lines = stream_of_text.getvalue().splitlines()
     assert [line.split("  ")[-1] for line in lines] == ["capture", "decode", "done"]
     assert [line.split("%")[0].split()[-1] for line in lines] == ["0", "50", "100"]
+
+
+def test_a_stage_that_goes_on_without_a_word_is_told_again_off_a_terminal() -> None:
+    class Lines(io.StringIO):
+        third = threading.Event()
+
+        def flush(self) -> None:
+            if self.getvalue().count("\n") == 3:
+                self.third.set()
+
+    stream = Lines()
+    display = ProgressDisplay(stream, every_s=0.01)
+    display.start()
+    display("preparing kernels", 0.0, "41 of 56")
+    assert stream.third.wait(10)
+    display.stop()
+    lines = stream.getvalue().splitlines()
+    assert len(lines) >= 3
+    assert all(line.endswith("41 of 56") for line in lines)

@@ -119,11 +119,13 @@ def test_json_says_what_the_screen_says(poses: Path, solving: dict[str, Any], tm
     assert solving["poses"] == list(GIVEN)
 
 
+@pytest.mark.slow
 def test_a_board_may_be_said_to_be_flat(poses: Path, solving: dict[str, Any], tmp_path: Path) -> None:
     run("solve", poses, *BOARD_OPTIONS, "--board-shape", "flat", "--output", tmp_path / "rig.json")
     assert solving["board_shape"] is BoardShape.FLAT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".yml", ".xml"])
 def test_output_may_be_opencvs(poses: Path, solving: dict[str, Any], tmp_path: Path, ending: str) -> None:
     output = tmp_path / f"rig{ending}"
@@ -134,6 +136,7 @@ def test_output_may_be_opencvs(poses: Path, solving: dict[str, Any], tmp_path: P
     assert written.projector.matrix[1, 2] == 842.4
 
 
+@pytest.mark.slow
 def test_report_is_written_with_what_each_camera_saw(
     poses: Path, solving: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,6 +198,7 @@ def test_pose_that_cannot_be_used_is_named_with_its_cause(
     assert "refused  pose_02  half a board: move it fully into view" in result.stdout
 
 
+@pytest.mark.slow
 def test_two_poses_the_same_are_judged_as_live_ones_are(
     poses: Path, solving: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +251,7 @@ def test_refused_solve_names_the_poses_that_were_not_used(
     assert not (tmp_path / "rig.json").exists()
 
 
+@pytest.mark.slow
 def test_poses_as_the_service_keeps_them_are_solved(poses: Path, solving: dict[str, Any], tmp_path: Path) -> None:
     for pose in sorted(poses.iterdir()):
         (tmp_path / "kept" / pose.name).mkdir(parents=True)

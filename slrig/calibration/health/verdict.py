@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtr
 
 from slrig.calibration.health.devices import device_words
 from slrig.calibration.health.look import Look, PairFigures
@@ -192,7 +192,7 @@ def _crept(values: Sequence[float]) -> tuple[float, float]:
     scatter = float(np.sqrt((np.diff(found) ** 2).mean() / 2))
     crept = float(found[-count:].mean() - found[:count].mean())
     size = abs(crept) / max(scatter * np.sqrt(2 / count), 1e-12)
-    return crept, float(2 * student.sf(size, 2 * (len(values) - 1) / 3))
+    return crept, float(2 * stdtr(2 * (len(values) - 1) / 3, -size))
 
 
 def _trend(looks: Sequence[Look], value: Callable[[Look], float], jumps: Callable[[Look], bool]) -> tuple[float, bool]:

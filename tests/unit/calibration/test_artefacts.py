@@ -34,6 +34,7 @@ def cap(
     return np.asarray(np.array(centre_mm) + directions * radii[:, None])
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.floats(5.0, 40.0), st.floats(-200.0, 200.0), st.floats(300.0, 900.0))
 def test_an_exact_ball_is_found_exactly(seed: int, radius_mm: float, x_mm: float, z_mm: float) -> None:
     points = cap(300, centre_mm=(x_mm, 12.0, z_mm), radius_mm=radius_mm, sigma_mm=0.0, seed=seed)

@@ -72,6 +72,7 @@ def test_one_camera_is_passed_through() -> None:
     assert len(result.residual_sigma) == len(result.residual_mm) == 0
 
 
+@pytest.mark.slow
 def test_two_views_of_one_ball_make_one_sheet_of_it() -> None:
     first, second = seen(CAMERA, ROWS), seen(OTHER_CAMERA, ROWS + 0.37)
     result = both(first, second)

@@ -73,6 +73,7 @@ def both(first: SheetCurves, second: SheetCurves, *, other: Pinhole = OTHER_CAME
     return spare_equation(first, second, other, Axis.COLUMN, widest_gap_px=GAP_PX)
 
 
+@pytest.mark.slow
 def test_a_perfect_rig_has_nothing_to_spare() -> None:
     spare = both(seen(CAMERA), seen(OTHER_CAMERA, rows=ROWS + 0.37))
     assert len(spare.residual_px) > 0.97 * len(COLUMNS) * len(ROWS)

@@ -64,7 +64,7 @@ def slope_by_the_rule(
 
 
 @SLOPES
-@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("missing", [pytest.param(0.0, marks=pytest.mark.slow), 0.3])
 def test_every_pixel_that_a_line_crosses_is_a_start(slope: float, angle_rad: float, missing: float) -> None:
     here, code = mapped(tilted(slope, angle_rad), noise=0.01)
     rng = np.random.default_rng(4)
@@ -154,7 +154,7 @@ def test_points_of_the_filter_move_onto_their_lines_and_say_how_far(slope: float
 
 
 @SLOPES
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("share", [0.0, pytest.param(0.5, marks=pytest.mark.slow), 1.0])
 def test_no_pixel_holds_two_points_of_one_line(slope: float, angle_rad: float, share: float) -> None:
     here, code = mapped(tilted(slope, angle_rad), noise=0.03)
     frame, starts, _ = line_crossings(here, EVERYWHERE, code, POSITION_OF)

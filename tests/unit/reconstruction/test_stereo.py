@@ -44,6 +44,7 @@ def seen(
     return replace(ensemble, normals=np.stack([tangent[:, 1], -tangent[:, 0]], axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", [OTHER_CAMERA, OBLIQUE_CAMERA], ids=["beside", "oblique"])
 def test_points_that_both_cameras_see_come_back(other: Pinhole) -> None:
     curves = camera_camera(seen(CAMERA, COLUMNS, ROWS), seen(other, COLUMNS, ROWS), CAMERA, other)

@@ -167,7 +167,10 @@ def every(exposures: Mapping[str, Sequence[float]]) -> set[tuple[float | None, i
     return {(time, index, name) for name, times in exposures.items() for time in times for index in range(COUNT)}
 
 
-@pytest.mark.parametrize("trigger", [Trigger.SOFTWARE, Trigger.FREE, Trigger.HARDWARE])
+@pytest.mark.parametrize(
+    "trigger",
+    [Trigger.HARDWARE, *(pytest.param(each, marks=pytest.mark.slow) for each in (Trigger.SOFTWARE, Trigger.FREE))],
+)
 def test_the_sequence_is_played_once_for_each_exposure_from_short_to_long(tmp_path: Path, trigger: Trigger) -> None:
     sink, rig = Sink(), fake(trigger=trigger)
     told = captured(rig, tmp_path / "bundle", (0.016, 0.005, 0.01), sink=sink)
@@ -222,6 +225,7 @@ def test_an_exposure_that_is_too_long_or_too_short_is_left_out_and_the_report_sa
     assert not any("left out" in cause for cause in evidence["shot_again_because"])
 
 
+@pytest.mark.slow
 def test_an_exposure_that_one_camera_cannot_use_is_the_others_all_the_same(tmp_path: Path) -> None:
     rig = fake({"left": 0.6, "right": 4.0})
     rig.cameras["right"].scene.noise_dn = 0.2
@@ -232,6 +236,7 @@ def test_an_exposure_that_one_camera_cannot_use_is_the_others_all_the_same(tmp_p
     assert summary.shot_again > 0
 
 
+@pytest.mark.slow
 def test_a_reconstruction_that_was_fed_an_exposure_that_is_left_out_reads_the_bundle(tmp_path: Path) -> None:
     feeds = [FrameFeed(lambda _message: True) for _ in range(2)]
     for feed, exposures_s in zip(feeds, (BRACKET, (0.005, 0.08)), strict=True):
@@ -274,6 +279,7 @@ def test_frames_that_are_wrong_at_one_exposure_for_good_end_the_scan(tmp_path: P
     assert "failed 3 times" in told
 
 
+@pytest.mark.slow
 def test_what_moves_between_two_exposures_ends_the_scan(tmp_path: Path) -> None:
     told = ended(fake(pushed_at=3), tmp_path / "bundle")
     assert "camera 'left', pattern" in told

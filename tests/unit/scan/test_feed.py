@@ -234,6 +234,36 @@ def test_cancel_ends_a_process_that_is_stuck_in_a_frame(
     assert worker.process_id != before
 
 
+def test_frames_that_wait_for_the_kernels_arrive_and_the_wait_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = tmp_path / "go"
+    monkeypatch.setenv("PREPARING_GATE", str(gate))
+    worker = ReconstructionWorker("tests.unit.scan.preparing_pipeline:reconstruct_bundle")
+    feed = worker.feed()
+    # More than the pipe holds, so that the feed waits for a process that prepares.
+    fed(feed, SHOTS[0], replace(SHOTS[1], image=np.zeros((4000, 4000), dtype=np.uint8)))
+    told: list[str] = []
+
+    def hear(stage: str, _fraction: float, detail: str) -> None:
+        told.append(f"{stage} {detail}".strip())
+        gate.touch()
+
+    bundle = tmp_path / "bundle"
+    bundle.mkdir()
+    (bundle / "order").write_text("finish")
+    report = worker.run(
+        Job(bundle, tmp_path / "result", ReconstructionPlan()), progress=hear, cancelled=lambda: False, feed=feed
+    )
+    worker.close()
+    assert report["live"] == [2, 2, True]
+    assert told[:3] == [
+        "preparing kernels first time only: 41 of 118",
+        "preparing kernels first time only: 42 of 118",
+        "decode",
+    ]
+
+
 def test_scan_hands_its_frames_on_while_it_captures(bench: Bench) -> None:
     record = bench.until(bench.scan().id)
     assert record.state is ScanState.SUCCEEDED

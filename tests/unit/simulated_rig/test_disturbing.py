@@ -135,6 +135,7 @@ def test_a_device_drifts_with_the_time_of_the_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(now.translation_mm - stated.translation_mm, [0.0, 1 - np.exp(-1), 0.0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_board_that_moves_is_elsewhere_in_the_last_frame(tmp_path: Path) -> None:
     moving = [{"pose": 1, "shift_mm": [2.0, 0.0, 0.0], "steps": 5}]
     head, steady = head_of(tmp_path / "a", faults={"moving": moving}), head_of(tmp_path / "b")

@@ -178,6 +178,7 @@ def test_opencv_finds_a_chessboard_where_it_stands(bow_mm: float) -> None:
         assert float(np.sqrt(((found - flat) ** 2).mean())) > 0.5
 
 
+@pytest.mark.slow
 def test_opencv_finds_a_charuco_board_where_it_stands_and_no_mirrored_one() -> None:
     each = board("charuco")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

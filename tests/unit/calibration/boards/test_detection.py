@@ -217,7 +217,7 @@ def test_a_board_out_of_focus_is_refused(board: Board) -> None:
             "another board.*found a chessboard of 10 x 5",
             marks=pytest.mark.slow,
         ),
-        (CHESSBOARD, Board(BoardKind.CHESSBOARD, 6, 4, 16.0), "another board.*found a chessboard of 6 x 4"),
+        slow(CHESSBOARD, Board(BoardKind.CHESSBOARD, 6, 4, 16.0), "another board.*found a chessboard of 6 x 4"),
         pytest.param(
             CHESSBOARD,
             Board(BoardKind.CHESSBOARD, 7, 6, 14.0),
@@ -225,8 +225,8 @@ def test_a_board_out_of_focus_is_refused(board: Board) -> None:
             marks=pytest.mark.slow,
         ),
         (CHESSBOARD, Board(BoardKind.CHARUCO, 8, 5, 14.0), "another board.*ChArUco.*DICT_5X5"),
-        (CHESSBOARD, CIRCLES, "another board.*circles"),
-        (CHARUCO, CHESSBOARD, "another board.*chessboard of 8 x 5"),
+        slow(CHESSBOARD, CIRCLES, "another board.*circles"),
+        slow(CHARUCO, CHESSBOARD, "another board.*chessboard of 8 x 5"),
         slow(CHARUCO, CIRCLES, "another board.*circles"),
         (CHARUCO, Board(BoardKind.CHARUCO, 7, 5, 14.0, dictionary="DICT_4X4_100"), "another board.*DICT_4X4"),
         (CHARUCO, Board(BoardKind.CHARUCO, 9, 6, 12.0), "another board.*marker .* is in view.*9 corners in a row"),
@@ -236,7 +236,7 @@ def test_a_board_out_of_focus_is_refused(board: Board) -> None:
         pytest.param(
             CIRCLES, Board(BoardKind.CIRCLES, 5, 7, 9.0), "another board.*7 rows of 4", marks=pytest.mark.slow
         ),
-        (CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
+        slow(CIRCLES, CHESSBOARD, "another board.*chessboard of 8 x 5"),
     ],
     ids=title,
 )

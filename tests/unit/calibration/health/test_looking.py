@@ -91,6 +91,7 @@ def test_what_the_geometry_cannot_tell_is_said(change: str) -> None:
     assert found.expected_mm == pytest.approx(true_mm, abs=0.3 * true_mm + 0.5 * (found.stated_mm or 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "device"), [("camera turned up", "left"), ("projector turned up", PROJECTOR), ("baseline", PROJECTOR)]
 )

@@ -76,6 +76,7 @@ def along_rays(points: FloatArray, of: FloatArray, camera: Pinhole) -> FloatArra
     return np.asarray(np.einsum("ni,ni->n", points - of, ray / np.linalg.norm(ray, axis=1, keepdims=True)))
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_calibrations_drawn_from_the_covariance() -> None:
     camera, projector = left_camera(), light_source()
     solution, observations = solved({"left": camera}, projector)

@@ -94,6 +94,7 @@ def test_a_loss_is_a_square_where_it_is_small_and_grows_slowly_where_it_is_large
     assert losses[0] == pytest.approx(CAUCHY**2 * np.log1p(1e4))
 
 
+@pytest.mark.slow
 def test_the_board_s_shape_is_found_where_it_is_asked_for() -> None:
     rng = np.random.default_rng(8)
     offsets = np.column_stack([rng.normal(0, 0.05, (88, 2)), np.zeros(88)])

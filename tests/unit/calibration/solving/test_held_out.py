@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from slrig.calibration.solving.held_out import LADDER, chosen_terms, climbed, folds_of
 from slrig.calibration.solving.problem import Problem, fitted
@@ -37,12 +38,14 @@ def test_three_poses_are_too_few_to_hold_any_out() -> None:
     assert chosen(recipe) == ("k1",)
 
 
+@pytest.mark.slow
 def test_a_lens_without_distortion_gets_few_terms() -> None:
     taken = [len(chosen(Recipe(seed=seed, poses=12, projector=False, side=4, distorted=False))) for seed in range(6)]
     assert np.median(taken) <= 1
     assert min(taken) == 0
 
 
+@pytest.mark.slow
 def test_a_distorted_lens_gets_the_terms_that_it_has() -> None:
     taken = [chosen(Recipe(seed=seed, poses=14, projector=False, side=4)) for seed in range(4)]
     assert all({"k1", "k2"} <= set(terms) for terms in taken)

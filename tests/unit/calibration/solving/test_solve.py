@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from functools import cache
 
@@ -48,6 +49,7 @@ def test_every_number_is_within_its_own_deviation(recipe: Recipe) -> None:
     assert set(solution.poses) == {f"pose {number}" for number in range(recipe.poses)}
 
 
+@pytest.mark.slow
 def test_a_principal_point_outside_the_image_needs_no_help() -> None:
     solution, truth = solved(SMALL)
     assert truth.projector is not None
@@ -116,6 +118,7 @@ def test_with_next_to_no_noise_no_pose_is_called_off() -> None:
     assert solution.residuals["right"].rms_px < 0.006
 
 
+@pytest.mark.slow
 def test_a_pose_that_no_camera_saw_is_left_out_by_name() -> None:
     observations, _ = made(replace(SMALL, poses=6))
     poses = (*observations.poses[:5], replace(observations.poses[5], views={}))
@@ -161,6 +164,7 @@ def test_all_poses_parallel_are_refused() -> None:
         solve(made(replace(SMALL, most_tilt_deg=0.0))[0])
 
 
+@pytest.mark.slow
 def test_poses_that_all_contradict_one_another_are_refused() -> None:
     observations, _ = made(replace(SMALL, cameras=2, projector=False))
     rng = np.random.default_rng(3)
@@ -231,12 +235,11 @@ def test_corners_that_lie_off_their_printed_places_are_found() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("cameras", "rigs"), [(1, 40)])
-def test_nearly_all_numbers_of_many_rigs_are_within_three_deviations(cameras: int, rigs: int) -> None:
-    """95 % is asked for; and deviations that are far too large would be no use either."""
-    found = []
+def test_nearly_all_numbers_of_many_rigs_are_within_three_deviations() -> None:
+    """95 % is asked for, of 40 rigs (SLRIG_RIGS=40); and deviations that are far too large would be no use either."""
+    found, rigs = [], int(os.environ.get("SLRIG_RIGS", "12"))
     for seed in range(rigs):
-        solution, truth = solved(Recipe(seed=100 + seed, poses=10, side=12, cameras=cameras))
+        solution, truth = solved(Recipe(seed=100 + seed, poses=10, side=12))
         found.append(list(in_deviations(solution, truth).values()))
         for left in solution.residuals.values():
             assert left.held_out_rms_px <= 1.3 * left.rms_px

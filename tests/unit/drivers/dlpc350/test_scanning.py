@@ -53,7 +53,9 @@ def turn_around(engine: FakeEngine) -> None:
     engine._planes[0] = tuple(255 - plane for plane in engine._planes[0])
 
 
-@pytest.mark.parametrize("spoil", [misplace, darken, turn_around])
+@pytest.mark.parametrize(
+    "spoil", [misplace, *(pytest.param(each, marks=pytest.mark.slow) for each in (darken, turn_around))]
+)
 def test_a_flash_that_holds_something_else_ends_the_scan_in_the_dark(
     tmp_path: Path, spoil: Callable[[FakeEngine], None]
 ) -> None:

@@ -136,6 +136,7 @@ class FollowingProjector(StagedProjector):
         return Shown(index, at_ns, 0)
 
 
+@pytest.mark.slow
 def test_a_film_of_a_sequence_pairs_with_a_projector_that_follows_it(tmp_path: Path) -> None:
     light, shown, per_slot = staged(noise_dn=1.0), sequence(), 12
     # Each slot begins with a frame in which the pattern before is still seen: a scan must not take it.

@@ -104,6 +104,7 @@ def test_a_source_that_is_faster_than_told_gives_no_frame_and_says_why() -> None
             camera.read(0, 0.3)
 
 
+@pytest.mark.slow
 def test_cut_frames_are_passed_over_and_counted() -> None:
     light = staged()
     with before(light, network=NetworkCamera(light, cut=0.5)) as camera:
@@ -172,6 +173,7 @@ def test_closing_ends_a_read_that_waits() -> None:
         thread.join(LONG_S)
 
 
+@pytest.mark.slow
 def test_a_pipe_that_falls_silent_can_be_closed(tmp_path: Path) -> None:
     # Nothing wakes who reads a pipe in which nothing comes: the reader is left behind, and lets the pipe go later.
     path = tmp_path / "video.mjpeg"
@@ -220,6 +222,7 @@ def test_no_camera_at_all_is_told(tmp_path: Path) -> None:
         open_camera("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_projector_is_followed_frame_by_frame() -> None:
     light = staged()
     with before(light) as camera:

@@ -175,6 +175,7 @@ def test_devices_that_look_past_one_another_have_no_volume() -> None:
         rig_volume_mm(Calibration({"left": camera}, away))
 
 
+@pytest.mark.slow
 def test_the_shipped_rig_takes_the_positions_that_are_prescribed_for_it() -> None:
     config = read_rig(RIGS / "rendered-acceptance.toml")
     assert config.head is not None
