@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("slrig", "drivers", "simulated_rig")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -89,6 +91,7 @@ def _dangling(path: Path) -> Iterator[str]:
                 yield f"{path.relative_to(ROOT)}: `{name}`"
 
 
+@pytest.mark.slow
 def test_dotted_names_in_docstrings_are_names_of_something() -> None:
     assert [each for path in SOURCES for each in _dangling(path)] == []
 

@@ -32,7 +32,7 @@ def solved(recipe: Recipe) -> tuple[Solution, Calibration]:
         pytest.param(SMALL, marks=pytest.mark.slow),
         replace(SMALL, lens_shift=False, seed=1),
         pytest.param(replace(SMALL, cameras=2, seed=2), marks=pytest.mark.slow),
-        replace(SMALL, cameras=2, projector=False, seed=3),
+        pytest.param(replace(SMALL, cameras=2, projector=False, seed=3), marks=pytest.mark.slow),
         replace(SMALL, projector=False, seed=4),
     ],
     ids=["shifted lens", "straight lens", "two cameras", "cameras alone", "one camera alone"],

@@ -80,6 +80,7 @@ def test_figures_say_how_well_the_board_was_seen(read: ReadPose) -> None:
     assert figures.decoded > 0.9
 
 
+@pytest.mark.slow
 def test_without_line_shift_code_edges_tell_the_light() -> None:
     found = read_captured(shot(line_shift=False), BOARD, "gray")
     for rms_px, ratio, count in off_px(found.observation.light["left"]).values():
