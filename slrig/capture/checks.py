@@ -28,6 +28,12 @@ BAND_SAMPLES = 300
 
 _LIT_SAMPLES = 40
 
+_EDGE_PX = 8.0
+"""Breadth of an edge that a scaler blurred, projector pixels: from end to end of a Gaussian of 2 px, ± 2 deviations."""
+
+_STEEPEST_GAMMA = 2.4
+"""Of displays: ITU-R BT.1886."""
+
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
@@ -158,15 +164,24 @@ def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str |
     )
 
 
-def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float) -> str | None:
+def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, run_px: int) -> str | None:
     """Light is additive: a bit and its inverse add up to white and black.
 
-    Limits leave room for noise, and for a camera that is not linear: its blurred edges add up to more than white.
+    Limits leave room for noise; for a camera that is not linear, whose blurred edges add up to more than white; and for
+    a projector behind a scaler. That blurs the pattern's values before gamma makes light of them, and then both frames
+    are dark at an edge. There a pair may fall short by as much as its own swing explains (`_least_sum`). How much of
+    the image lies at edges follows from run_px, the length of the bit's runs of equal pixels in the projector.
     """
-    excess = ref.relative(bit) + ref.relative(inverse) - 1
+    u, v = ref.relative(bit), ref.relative(inverse)
+    excess = u + v - 1
     slack = np.clip(8 * max(noise, noise_dn(bit, inverse, ref)) / ref.contrast[ref.judged], 0.2, 0.5)
-    wrong = (excess < -slack) | (excess > 0.8)
-    worst = _worst_judged(wrong, ref, whole=0.1)
+    above = excess > 0.8
+    at_edges = min(1.0, _EDGE_PX / run_px)
+    dark = _in_dark_bands(u, v, ref)
+    worst = _worst_judged(above | dark | (u + v < _least_sum(np.abs(u - v)) - slack), ref, whole=0.1)
+    if worst is None and at_edges < 1.0:
+        wrong = above | (excess < -slack)
+        worst = _worst_judged(wrong, ref, whole=0.1 + at_edges, quarter=0.25 + at_edges)
     if worst is None:
         return None
     apart = float(np.median(np.abs((bit - inverse)[ref.judged]) / ref.contrast[ref.judged]))
@@ -176,6 +191,32 @@ def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float) 
         f"the frame and its inverse do not add up to white and black on {worst}: one of them shows another pattern or "
         f"was damaged, or something moved, or {_contrast(ref)}; scan again"
     )
+
+
+def _in_dark_bands(u: Samples, v: Samples, ref: Reference) -> Chosen:
+    """Which pixels lie in bands where one frame of a pair has hardly any light and the other does not make up for it.
+
+    What a scaler takes from the edges it takes from both.
+    """
+    band = ref.band[ref.judged]
+    counts = np.bincount(band, minlength=BANDS)
+    means = np.stack([np.bincount(band, weights=each, minlength=BANDS) for each in (u, v)]) / np.maximum(counts, 1)
+    dark = (means.sum(axis=0) < 0.8) & (means.min(axis=0) < 0.3 * means.max(axis=0))
+    return np.asarray(dark[band], dtype=np.bool_)
+
+
+_SIGNAL = np.linspace(0.5, 1.0, 257)
+_SWING = _SIGNAL**_STEEPEST_GAMMA - (1 - _SIGNAL) ** _STEEPEST_GAMMA
+_SUM = _SIGNAL**_STEEPEST_GAMMA + (1 - _SIGNAL) ** _STEEPEST_GAMMA
+
+
+def _least_sum(swing: Samples) -> Samples:
+    """What a bit and its inverse add up to, at least, where they differ by `swing`; all on the scale of `u`.
+
+    A blurred bit has the value s where its inverse has 1 - s: they differ by s^g - (1 - s)^g and add up to
+    s^g + (1 - s)^g, least for the steepest gamma g.
+    """
+    return np.asarray(np.interp(swing, _SWING, _SUM), dtype=np.float32)
 
 
 def variation(frame: Samples, ref: Reference) -> float:
@@ -271,8 +312,8 @@ def changed_fault(
     )
 
 
-def _worst_judged(wrong: Chosen, ref: Reference, *, whole: float) -> str | None:
-    return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole)
+def _worst_judged(wrong: Chosen, ref: Reference, *, whole: float, quarter: float = 0.25) -> str | None:
+    return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole, quarter=quarter)
 
 
 def _worst(

@@ -67,8 +67,11 @@ class Witness:
 
     @property
     def measured_noise_dn(self) -> float | None:
-        """Noise of a frame, DN; None where no pair told."""
-        return float(np.median(self._found.noises)) if self._found.noises else None
+        """Noise of a frame, DN; None where no pair told.
+
+        The least that a pair told: behind a scaler finer bits do not add up, and by more than noise.
+        """
+        return min(self._found.noises, default=None)
 
     @property
     def _noise(self) -> float:
@@ -239,7 +242,7 @@ class Witness:
         # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
         if partner is not None:
             bit, inverse = self._frames[index], self._frames[partner]
-            fault = checks.pair_fault(bit, inverse, ref, noise=self._noise)
+            fault = checks.pair_fault(bit, inverse, ref, noise=self._noise, run_px=_run_px(pattern))
             if fault is not None:
                 words = f"beside {named(partner, self._patterns[partner])}, {fault}"
                 return [self._says(index, words, [index, partner], self._unproven_reference)]
@@ -362,6 +365,11 @@ class Witness:
 
 def _inverse(pattern: Gray) -> Gray:
     return replace(pattern, inverted=not pattern.inverted)
+
+
+def _run_px(pattern: Gray) -> int:
+    """Length of the pattern's inner runs of equal pixels: the finest bit of a Gray code changes every two cells."""
+    return pattern.cell_px << (pattern.bits - pattern.bit if pattern.bit else pattern.bits - 1)
 
 
 def _code_of(pattern: Gray) -> tuple[Axis, int, int, int]:

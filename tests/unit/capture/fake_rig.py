@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
 
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
 from slrig.errors import DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
@@ -45,7 +46,11 @@ def patterns_for(
 
 @dataclass
 class Scene:
-    """What a camera sees. Levels are fractions of full scale; `noise_dn` is per frame; gamma is the camera's."""
+    """What a camera sees. Levels are fractions of full scale; `noise_dn` is per frame; gamma is the camera's.
+
+    scaler_px : standard deviation of a scaler's blur of the pattern's values, of which the display's own gamma of 2.2
+    makes light afterwards.
+    """
 
     camera: Size = CAMERA
     bit_depth: int = 8
@@ -58,6 +63,7 @@ class Scene:
     blur_px: float = 0.7
     noise_dn: float = 0.0
     gamma: float = 1.0
+    scaler_px: float = 0.0
     shadow_until_px: int = 0
     seed: int = 0
     rng: np.random.Generator = field(init=False)
@@ -81,7 +87,10 @@ class Scene:
         extent_px = self.projector.width_px if along_columns else self.projector.height_px
         fine = 8
         sent = np.broadcast_to(profile.ravel(), (extent_px,)) if profile.size == 1 else profile.ravel()
-        steps = np.repeat(sent.astype(np.float64) / 255, fine)
+        values = sent.astype(np.float64) / 255
+        if self.scaler_px:
+            values = gaussian_filter1d(values, self.scaler_px, mode="nearest") ** 2.2
+        steps = np.repeat(values, fine)
         reach = np.arange(-6 * fine, 6 * fine + 1)
         kernel = np.exp(-0.5 * (reach / (self.blur_px * fine)) ** 2)
         blurred = np.convolve(np.pad(steps, 6 * fine, mode="edge"), kernel / kernel.sum(), mode="valid")

@@ -40,6 +40,8 @@ SCENES = {
     "12 bit": Scene(bit_depth=12, noise_dn=6.0),
     "16 bit, mostly empty range": Scene(bit_depth=16, white=0.01, ambient=0.0, noise_dn=15.0),
     "saturated in places": Scene(white=1.3, noise_dn=1.5),
+    "behind a scaler": Scene(scaler_px=0.7, noise_dn=1.0),
+    "behind a soft scaler": Scene(scaler_px=1.1, noise_dn=1.0),
     "small object": Scene(
         camera=Size(640, 480), columns_per_px=0.18, rows_per_px=0.19, shadow_until_px=560, noise_dn=1.5
     ),
@@ -182,8 +184,9 @@ def cut(shots: list[Shot], index: int) -> Pixels:
 @pytest.mark.parametrize(
     "spoil", [stale, stale_and_exposed_again, dark, garbled, cut], ids=lambda spoil: spoil.__name__
 )
-def test_a_frame_that_is_not_what_it_claims_is_refused(spoil: Spoil, index: int) -> None:
-    scene = Scene(noise_dn=1.0)
+@pytest.mark.parametrize("scaler_px", [0.0, pytest.param(0.7, marks=pytest.mark.slow)])
+def test_a_frame_that_is_not_what_it_claims_is_refused(spoil: Spoil, index: int, scaler_px: float) -> None:
+    scene = Scene(noise_dn=1.0, scaler_px=scaler_px)
     shots = scene.shots(PATTERNS)
     with pytest.raises(ScanEvidenceError, match=r"camera 'left', pattern \d+ \(column (Gray bit|lines)"):
         judged(scene, with_image(shots, index, spoil(shots, index)))
