@@ -71,10 +71,11 @@ def read_truth(folder: Path) -> BundleTruth | None:
     BundleError
         One of its files is missing, cut, or of another shape.
     """
-    import trimesh
-
     if not (folder / SURFACE).exists() and not (folder / VISIBLE).exists():
         return None
+    # A second, for what no live scan has.
+    import trimesh
+
     path = folder / SURFACE
     try:
         mesh = trimesh.load_mesh(path, process=False)
