@@ -62,8 +62,14 @@ class ByFile(LoadScopeScheduling):  # type: ignore[misc] # xdist is untyped
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
-    """How `-n` shares the tests out."""
+    """How `-n` shares the tests out: in the order of collection."""
+    config.option.loadscopereorder = False
     return ByFile(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files of few tests that take minutes come first: begun last, they would keep one process busy, and no other."""
+    items.sort(key=lambda item: not item.nodeid.startswith("tests/e2e/"))
 
 
 def pytest_collection_finish() -> None:
