@@ -41,15 +41,16 @@ class Step:
 
 @dataclass(slots=True)
 class Hold:
-    """A step at which the rig waits. `reached` : it does; `go` : it need not any more."""
+    """A step at which the rig waits. `reached` : it does; `go` : it need not any more; `steps` : what it did so far."""
 
     step: Step
+    steps: list[tuple[str, str, int]]
     reached: threading.Event = field(default_factory=threading.Event)
     go: threading.Event = field(default_factory=threading.Event)
 
     def until_reached(self) -> None:
         """Return when the rig is there."""
-        assert self.reached.wait(WAIT_S), f"the rig did not come to {self.step}"
+        assert self.reached.wait(WAIT_S), f"the rig did not come to {self.step}, only to {self.steps}"
 
 
 class Desk:
@@ -96,7 +97,7 @@ class Desk:
     @contextmanager
     def held(self, step: Step) -> Iterator[Hold]:
         """Have the rig wait at a step, the next time that it comes there; it goes on at the end of the block."""
-        hold = Hold(step)
+        hold = Hold(step, self.steps)
         with self._changed:
             self._holds.append(hold)
         try:
