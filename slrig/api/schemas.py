@@ -174,7 +174,7 @@ class ScanBody(BaseModel):
     plan: ScanPlan
     progress: ProgressBody
     error: FaultBody
-    summary: dict[str, Any] | None = Field(description="the plain figures of report.json")
+    summary: dict[str, Any] | None = Field(description="the plain figures and the notes of report.json")
     links: ScanLinks
 
 

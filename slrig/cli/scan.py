@@ -128,4 +128,4 @@ def quality_lines(summary: Mapping[str, Any]) -> list[str]:
         complete = truth.get("complete_0.3mm")
         covered = "" if complete is None else f", {complete:.1%} of the visible surface within 0.3 mm"
         lines.append(f"{'error':<10}rms {truth['rms_mm']:.4f} mm against the known truth{covered}")
-    return lines
+    return lines + [f"{'note':<10}{words}" for words in summary.get("notes") or []]

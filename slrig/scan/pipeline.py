@@ -25,6 +25,7 @@ from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import brightness, compact_mesh
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves, Refusal
+from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
@@ -40,6 +41,7 @@ from slrig.scan.report import (
     Stopwatch,
     calibration_id,
     camera_report,
+    capture_notes,
     capture_report,
     mesh_report,
     redundancy_report,
@@ -61,6 +63,7 @@ class _Walked:
     seen: list[Seen]
     step_px: float
     sections: dict[str, object]
+    notes: list[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +71,7 @@ class _Meshed:
     """The mesh and its points, the cameras with all their refusals, and what the report says.
 
     share_mm : (n,) float64, the calibration's part of each point's standard deviation, and mesh_share_mm : (V,) of each
-    vertex's; None where the calibration does not state its error.
+    vertex's; None where the calibration does not state its error. notes : for the report.
     """
 
     mesh: Mesh
@@ -79,6 +82,7 @@ class _Meshed:
     stages: tuple[Stage, ...]
     figures: Mapping[str, object]
     redundancy: Mapping[str, object]
+    notes: tuple[str, ...]
 
 
 def reconstruct_bundle(
@@ -133,7 +137,7 @@ def reconstruct_bundle(
             # The projector does not stand as was assumed: its stripes run the other way.
             walked = _walked(bundle, calibration, None, entered, axis=other)
             found = _triangulated(walked, bundle, entered)
-        sections = _told_depth(found, walked, bundle)
+        depth = _told_depth(found, walked, bundle)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
@@ -146,7 +150,8 @@ def reconstruct_bundle(
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         seconds = watch.finished()
         report = {
-            **sections,
+            **walked.sections,
+            "notes": [*walked.notes, *depth, *meshed.notes],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
@@ -230,8 +235,9 @@ def _walked(
         entered("check frames", 0.58, "")
         evidence = check_exposures(recorded.capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
+    notes = capture_notes(stream.capture, stream.axis, evidence)
     step = step_px(stream.outline.shown, stream.axis)
-    return _Walked(devices, stream.axis, stream.outline.axes, seen, step, sections)
+    return _Walked(devices, stream.axis, stream.outline.axes, seen, step, sections, notes)
 
 
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
@@ -257,16 +263,13 @@ def _triangulated(walked: _Walked, folder: Path, entered: Callable[[str, float, 
     return triangulated(seen, walked.devices.projector, walked.axis)
 
 
-def _told_depth(found: Triangulated, walked: _Walked, folder: Path) -> dict[str, object]:
-    """The report's sections, with a note on light that crosses the baseline obliquely. Light along it is refused."""
+def _told_depth(found: Triangulated, walked: _Walked, folder: Path) -> tuple[str, ...]:
+    """A note on light that crosses the baseline obliquely. Light along it is refused."""
     words = weakness(walked.axis, walked.shown, found.share_across)
-    if words is None:
-        return walked.sections
-    if found.share_across < LEAST_SHARE:
+    if words is not None and found.share_across < LEAST_SHARE:
         message = f"{folder}: {words}"
         raise NothingToReconstructError(message)
-    notes = walked.sections["notes"]
-    return walked.sections | {"notes": [*(notes if isinstance(notes, list) else []), words]}
+    return () if words is None else (words,)
 
 
 def _meshed(
@@ -300,6 +303,9 @@ def _meshed(
     share = _calibration_share(walked.devices, found, axis, surface.normals)
     if share is not None:
         sigma = np.hypot(sigma, share)
+    apart = disagreement(joined_curves, share)
+    if apart is not None:
+        sigma = np.hypot(sigma, apart.sigma_mm)
     grey = brightness(
         points.pixels_px, joined_curves.camera,
         [seen.white for seen in cameras], [float(seen.full_scale) for seen in cameras],
@@ -325,6 +331,7 @@ def _meshed(
         stages=surface.stages,
         figures=mesh_report(surface, mesh, curves),
         redundancy=redundancy_report(joined_curves, points.source, found.spare),
+        notes=() if apart is None else (str(apart),),
     )
 
 

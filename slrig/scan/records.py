@@ -107,7 +107,7 @@ def plan_from_json(document: Mapping[str, Any]) -> ScanPlan:
 
 
 def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a report that is worth a row in a list: its plain values, and the whole of "truth" and "mesh".
+    """The part of a report that is worth a row in a list: its plain values, and the whole of "truth", "mesh", "notes".
 
     >>> report_summary({"method": "Gray-only", "stages": {"decode": 0.1}, "truth": {"rms_mm": float("nan")}})
     {'method': 'Gray-only', 'truth': {'rms_mm': None}}
@@ -115,7 +115,7 @@ def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: _finite(value)
         for name, value in report.items()
-        if name in {"truth", "mesh"} or value is None or isinstance(value, (bool, int, float, str))
+        if name in {"truth", "mesh", "notes"} or value is None or isinstance(value, (bool, int, float, str))
     }
 
 

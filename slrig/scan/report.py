@@ -176,16 +176,11 @@ def with_seconds(stages: Sequence[Stage], seconds: Mapping[str, float]) -> list[
 
 def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> dict[str, object]:
     """What was shown and taken, and what the frames prove of themselves."""
-    line_shift = any(
-        isinstance(pattern := capture.patterns[shot.pattern], LineShift) and pattern.axis is axis
-        for shot in capture.shots
-    )
     return {
         "format": REPORT_FORMAT,
         "version": 1,
-        "method": "Gray code and line shift" if line_shift else "Gray-only",
+        "method": "Gray code and line shift" if _has_lines(capture, axis) else "Gray-only",
         "identity": str(evidence),
-        "notes": _notes(line_shift, evidence),
         "axis": axis.value,
         "frames": {
             "patterns": len(capture.patterns),
@@ -203,9 +198,15 @@ def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> d
     }
 
 
-def _notes(line_shift: bool, evidence: EvidenceSummary) -> list[str]:
+def _has_lines(capture: Capture, axis: Axis) -> bool:
+    shown = (capture.patterns[shot.pattern] for shot in capture.shots)
+    return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in shown)
+
+
+def capture_notes(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> list[str]:
+    """What a person should know of the frames, one sentence each."""
     notes = []
-    if not line_shift:
+    if not _has_lines(capture, axis):
         notes.append(
             "Gray-only: no line-shift frames, so points lie on the edges of the Gray code, located to sub-pixel"
         )

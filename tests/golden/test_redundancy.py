@@ -12,12 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
+from slrig.cli.scan import quality_lines
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import FloatArray
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.records import report_summary
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "two_cameras.toml"
 DEGREES = 0.05
@@ -32,8 +34,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def redundancy_of(recorded: Path, folder: Path, change: CalibrationChange | None = None) -> dict[str, Any]:
-    """The report's section, read back from its file, for a calibration that was changed."""
+def report_of(recorded: Path, folder: Path, change: CalibrationChange | None = None) -> dict[str, Any]:
+    """The report, read back from its file, for a calibration that was changed."""
     calibration = json.loads((recorded / "calibration.json").read_text())
     if change is not None:
         change(calibration)
@@ -43,7 +45,13 @@ def redundancy_of(recorded: Path, folder: Path, change: CalibrationChange | None
         recorded, folder / "out", plan=ReconstructionPlan(), calibration=folder / "calibration.json",
         progress=lambda *_: None, cancelled=lambda: False,
     )  # fmt: skip
-    section: dict[str, Any] = json.loads((folder / "out" / "report.json").read_text())["redundancy"]
+    report: dict[str, Any] = json.loads((folder / "out" / "report.json").read_text())
+    return report
+
+
+def redundancy_of(recorded: Path, folder: Path, change: CalibrationChange | None = None) -> dict[str, Any]:
+    """The section of `report_of` on what the cameras say of one another."""
+    section: dict[str, Any] = report_of(recorded, folder, change)["redundancy"]
     return section
 
 
@@ -152,3 +160,25 @@ def test_the_gauge_of_another_renderer_tells_a_turned_camera_apart(shared: Path,
     predicted = float((pixels(devices[0], truth) - pixels(devices[1], truth))[:, 0].mean())
     assert abs(predicted) > 1
     assert pair["mean"] == pytest.approx(predicted, rel=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["left", "right"])
+def test_cameras_that_are_off_by_half_a_millimetre_are_told_and_their_error_is_stated(
+    recorded: Path, tmp_path: Path, name: str
+) -> None:
+    sound = report_of(recorded, tmp_path / "sound")
+    assert sound["notes"] == []
+
+    def shifted(calibration: dict[str, Any]) -> None:
+        calibration["cameras"][name]["translation_mm"][0] += 0.5
+
+    wrong = report_of(recorded, tmp_path / "wrong", shifted)
+    (told,) = wrong["notes"]
+    assert "the cameras contradict each other" in told
+    assert (told,) == tuple(report_summary(wrong)["notes"])
+    assert f"{'note':<10}{told}" in quality_lines(report_summary(wrong))
+    # One of the two is right, and whichever it is, 5 % of the mesh at least are the other's.
+    actual_mm = wrong["truth"]["p95_mm"]
+    assert actual_mm > 1.5
+    assert 0.7 * actual_mm <= wrong["mesh"]["sigma_mm"]["p50"] <= 1.5 * actual_mm

@@ -21,7 +21,7 @@ from slrig.scan.acquisition import capture_bundle
 from slrig.scan.feed import FrameFeed
 from slrig.scan.outline import Outline
 from slrig.scan.plan import ScanPlan
-from slrig.scan.report import capture_report
+from slrig.scan.report import capture_notes, capture_report
 from tests.samples import sample_calibration
 from tests.unit.capture.fake_rig import FakeCamera, FakeProjector, Scene, World
 from tests.unit.scan.fakes import WAIT_S
@@ -213,8 +213,7 @@ def test_an_exposure_that_is_too_long_or_too_short_is_left_out_and_the_report_sa
     summary = check_exposures(capture, refused)
     assert summary == sink.evidence
     report = capture_report(capture, Axis.COLUMN, summary)
-    notes = report["notes"]
-    assert isinstance(notes, list)
+    notes = capture_notes(capture, Axis.COLUMN, summary)
     for name in ("left", "right"):
         assert any(n.startswith(f"an exposure was left out: 0.0001 s is too dark for camera '{name}': ") for n in notes)
         assert any(n.startswith(f"an exposure was left out: 0.08 s is too bright for camera '{name}': ") for n in notes)
