@@ -96,7 +96,7 @@ class Run:
         watch.enter("triangulate")
         step = step_px(stream.outline.shown, stream.axis)
         found = triangulated(seen, calibration.projector, stream.axis)
-        walked = _Walked(calibration, stream.axis, stream.outline.axes, seen, step, {})
+        walked = _Walked(calibration, stream.axis, stream.outline.axes, seen, step, {}, [])
         meshed = _meshed(
             folder, found, walked, ReconstructionPlan(), lambda stage, _fraction, _detail: watch.enter(stage)
         )  # fmt: skip
