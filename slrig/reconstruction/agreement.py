@@ -8,12 +8,11 @@ import numpy as np
 
 from slrig.model import FloatArray
 from slrig.reconstruction.merging import MergedCurves
+from slrig.reconstruction.redundancy import DEVIATIONS_PER_MEDIAN
 
 FEWEST_POINTS = 100
 MOST_OVER_SIGMA = 3.0
 """Beyond this the deviations that were stated do not explain what was found."""
-
-_DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,5 +54,5 @@ def disagreement(merged: MergedCurves, share_mm: FloatArray | None, /) -> Disagr
     noise = apart[told] / np.abs(merged.residual_sigma[told])
     # Each of the two has the calibration's error.
     share = 0.0 if share_mm is None else 2**0.5 * float(np.median(share_mm))
-    over = _DEVIATIONS_PER_MEDIAN * float(np.median(apart[told] / np.hypot(noise, share)))
+    over = DEVIATIONS_PER_MEDIAN * float(np.median(apart[told] / np.hypot(noise, share)))
     return Disagreement(float(np.median(apart[told])), over) if over > MOST_OVER_SIGMA else None

@@ -27,7 +27,7 @@ FEWEST_PAIRS = 20
 _STEPS = 32
 _TANGENT_REACH = 2
 _OUTLYING = 12.0
-_DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +134,7 @@ def in_figures(spare: SpareEquation, reference: str, camera: str, size: Size, /)
     """The figures of one pair; `size` is that of the reference camera's image. At least one point is needed."""
     residual = spare.residual_px
     centre = np.median(residual)
-    spread = _DEVIATIONS_PER_MEDIAN * max(np.median(np.abs(residual - centre)), np.median(spare.sigma_px))
+    spread = DEVIATIONS_PER_MEDIAN * max(np.median(np.abs(residual - centre)), np.median(spare.sigma_px))
     same = np.abs(residual - centre) <= _OUTLYING * spread
     kept, pixels = residual[same], spare.pixels_px[same]
     cell = _cells(pixels[:, 1], size.height_px) * CELLS + _cells(pixels[:, 0], size.width_px)
