@@ -61,7 +61,8 @@ def serve(tmp_path: Path, desk: Desk) -> Iterator[Callable[[], ServiceProcess]]:
         running.append(ServiceProcess(rig, tmp_path / "data"))
         return running[-1]
 
-    with installed(tmp_path / "site"):
+    # Each driver returns here, late on a busy machine, and what it had opened is to be closed then.
+    with installed(tmp_path / "site", shutdown_s=STOP_LIMIT_S / 2):
         yield served
     for service in running:
         if service.process.poll() is None:

@@ -20,7 +20,7 @@ from tests.e2e.faulty_rig.desk import Desk
 
 CHECKOUT = Path(__file__).parents[3]
 SHUTDOWN_S = 1.0
-"""How long the services of these tests wait for a driver at their end."""
+"""Short, for drivers that never return."""
 
 _RIG = """
 name = "bench"
@@ -46,8 +46,11 @@ faulty = {__package__}.driver:open_projector
 
 
 @contextmanager
-def installed(folder: Path) -> Iterator[None]:
-    """Have the faulty driver installed for the services that are started within the block."""
+def installed(folder: Path, *, shutdown_s: float = SHUTDOWN_S) -> Iterator[None]:
+    """Have the faulty driver installed for the services that are started within the block.
+
+    shutdown_s : how long they wait for a driver at their end.
+    """
     info = folder / "faulty_rig-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(_METADATA)
@@ -55,7 +58,7 @@ def installed(folder: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for path in (CHECKOUT, folder):
             patch.setenv("PYTHONPATH", str(path), prepend=":")
-        patch.setenv("SLRIG_SHUTDOWN_S", str(SHUTDOWN_S))
+        patch.setenv("SLRIG_SHUTDOWN_S", str(shutdown_s))
         patch.setenv("PYTHONFAULTHANDLER", "1")
         yield
 
