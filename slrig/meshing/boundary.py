@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.kernels import kernel, kernel_part
+from slrig.kernels import kernel
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary_rules import (
     add,
@@ -170,9 +170,7 @@ def smoothed(
     points, allowed = np.ascontiguousarray(points_mm, np.float64), np.ascontiguousarray(allowed_mm, np.float64)
     faces = np.ascontiguousarray(faces)
     across = neighbours(faces, vertex_count=len(points)) if adjacency is None else np.ascontiguousarray(adjacency)
-    new_faces, new_across, alive, rounds = _smooth(
-        points, faces, across, allowed, math.cos(psi_rad), most_rounds, _MOST_TRIANGLES_OF_A_SPIKE
-    )
+    new_faces, new_across, alive, rounds = _smooth(points, faces, across, allowed, math.cos(psi_rad), most_rounds)
     removed = len(faces) - int(np.count_nonzero(alive[: len(faces)]))
     if not removed and len(new_faces) == len(faces):
         return Smoothed(faces, across, np.zeros(len(faces), dtype=np.bool_), 0, rounds)
@@ -234,88 +232,103 @@ def _kept(faces: Any, adjacency: Any, alive: Any) -> Any:
     return kept, across
 
 
-@kernel_part
-def _lengthened(rows: Any, length: int) -> Any:
-    longer = np.zeros((length, 3), dtype=rows.dtype)
-    for row in range(len(rows)):
-        for k in range(3):
-            longer[row, k] = rows[row, k]
-    return longer
+def _smooth(
+    points: FloatArray,
+    given: IntArray,
+    given_adjacency: IntArray,
+    allowed_mm: FloatArray,
+    cos_psi: float,
+    most_rounds: int,
+) -> tuple[IntArray, IntArray, NDArray[np.bool_], int]:
+    """Faces given and added, their adjacency, which of them are alive, and the number of rounds."""
+    queue = np.flatnonzero(given_adjacency.ravel() < 0)
+    degree = np.bincount(given.ravel(), minlength=len(points)).astype(np.int32)
+    ends = given[queue // 3, (queue + 2) % 3]
+    corners = np.bincount(ends, minlength=len(points)).astype(np.int32)
+    stays = np.zeros(len(points), dtype=np.bool_)
+    count = len(given)
+    faces, adjacency = given.copy(), given_adjacency.copy()
+    alive, waiting = np.ones(count, dtype=np.bool_), np.zeros((count, 3), dtype=np.bool_)
+    for rounds in range(most_rounds):
+        waiting.ravel()[queue] = False
+        sharp, rank = _sharp_corners(points, faces, adjacency, alive, queue, cos_psi)
+        if not len(sharp):
+            return faces[:count], adjacency[:count], alive[:count], rounds
+        # Each corner adds one face at most.
+        room = max(count + len(sharp) - len(faces), 0)
+        faces, adjacency, waiting = (_lengthened(rows, room) for rows in (faces, adjacency, waiting))
+        alive = _lengthened(alive, room)
+        count, queue = _smooth_corners(
+            points, faces, adjacency, count, alive, waiting, degree, corners, stays, allowed_mm, cos_psi,
+            sharp[np.argsort(rank, kind="stable")], _MOST_TRIANGLES_OF_A_SPIKE,
+        )  # fmt: skip
+    return faces[:count], adjacency[:count], alive[:count], most_rounds
+
+
+def _lengthened(rows: Any, more: int) -> Any:
+    return np.concatenate((rows, np.zeros((more, *rows.shape[1:]), dtype=rows.dtype))) if more else rows
 
 
 @kernel
-def _smooth(
-    points: Any,
-    given: Any,
-    given_adjacency: Any,
-    allowed_mm: Any,
-    cos_psi: float,
-    most_rounds: int,
-    most_triangles: int,
-) -> Any:
-    """Faces given and added, their adjacency, which of them are alive, and the number of rounds."""
-    degree, corners = np.zeros(len(points), dtype=np.int32), np.zeros(len(points), dtype=np.int32)
-    stays = np.zeros(len(points), dtype=np.bool_)
-    queue = boundary_half_edges(given_adjacency)
+def _sharp_corners(points: Any, faces: Any, adjacency: Any, alive: Any, queue: Any, cos_psi: float) -> Any:
+    """Half-edges of the queue that run into a sharp corner, and the rank of each: notches before spikes, each sharpest
+    first.
+    """
+    sharp, rank = np.zeros(len(queue), dtype=np.int64), np.zeros(len(queue))
+    count = 0
     for into in queue:
-        corners[given[into // 3, (into + 2) % 3]] += 1
-    for face in range(len(given)):
-        for corner in range(3):
-            degree[given[face, corner]] += 1
-    count = len(given)
-    room = count + len(queue) // 8 + 16
-    faces, adjacency = _lengthened(given, room), _lengthened(given_adjacency, room)
-    # waiting: half-edges that are in the queue; alive: faces, three times over.
-    waiting = np.zeros((room, 3), dtype=np.bool_)
-    alive = np.zeros((room, 3), dtype=np.bool_)
-    alive[:count] = True
-    rounds = 0
-    while len(queue) and rounds < most_rounds:
-        sharp = [np.int64(0) for _ in range(0)]
-        rank = [0.0 for _ in range(0)]
-        for into in queue:
-            waiting[into // 3, into % 3] = False
-            if alive[into // 3, 0] and adjacency[into // 3, into % 3] < 0:
-                out = following(faces, adjacency, into)
-                a, b = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3]
-                cosine = cosine_at(points, a, b, faces[out // 3, (out + 2) % 3])
-                if cosine > cos_psi:
-                    # Notches before spikes, each sharpest first.
-                    notch = is_notch(points, faces, adjacency, into, out)
-                    sharp.append(into)
-                    rank.append(-cosine - (2.0 if notch else 0.0))
-        queue = [np.int64(0) for _ in range(0)]
-        if not len(sharp):
-            break
-        rounds += 1
-        for place in np.argsort(np.array(rank), kind="mergesort"):
-            into = sharp[place]
-            if not alive[into // 3, 0] or adjacency[into // 3, into % 3] >= 0:
-                continue
+        if alive[into // 3] and adjacency[into // 3, into % 3] < 0:
             out = following(faces, adjacency, into)
             a, b = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3]
-            c = faces[out // 3, (out + 2) % 3]
-            if not cosine_at(points, a, b, c) > cos_psi:
-                continue
-            changed = [np.int64(0) for _ in range(0)]
-            if is_notch(points, faces, adjacency, into, out):
-                if may_add(points, faces, adjacency, degree, allowed_mm, into, out):
-                    if count == room:
-                        room *= 2
-                        faces, adjacency = _lengthened(faces, room), _lengthened(adjacency, room)
-                        waiting, alive = _lengthened(waiting, room), _lengthened(alive, room)
-                    add(faces, adjacency, degree, corners, count, into, out)
-                    alive[count] = True
-                    if adjacency[count, 1] < 0:
-                        changed.append(np.int64(3 * count + 1))
-                        changed.append(preceding(faces, adjacency, np.int64(3 * count + 1)))
-                    count += 1
-            elif not stays[b] and may_remove(faces, adjacency, corners, into, out, most_triangles):
-                stays[a] = stays[c] = True
-                changed.append(preceding(faces, adjacency, into))
-                remove(faces, adjacency, degree, corners, alive, into, out, changed)
-            for half_edge in changed:
-                if not waiting[half_edge // 3, half_edge % 3]:
-                    waiting[half_edge // 3, half_edge % 3] = True
-                    queue.append(half_edge)
-    return faces[:count], adjacency[:count], alive[:count, 0].copy(), rounds
+            cosine = cosine_at(points, a, b, faces[out // 3, (out + 2) % 3])
+            if cosine > cos_psi:
+                sharp[count] = into
+                rank[count] = -cosine - (2.0 if is_notch(points, faces, adjacency, into, out) else 0.0)
+                count += 1
+    return sharp[:count], rank[:count]
+
+
+@kernel
+def _smooth_corners(
+    points: Any,
+    faces: Any,
+    adjacency: Any,
+    count: int,
+    alive: Any,
+    waiting: Any,
+    degree: Any,
+    corners: Any,
+    stays: Any,
+    allowed_mm: Any,
+    cos_psi: float,
+    sharp: Any,
+    most_triangles: int,
+) -> Any:
+    """One round, in place. The number of faces after it, and the half-edges to look at in the next."""
+    queue = [np.int64(0) for _ in range(0)]
+    for into in sharp:
+        if not alive[into // 3] or adjacency[into // 3, into % 3] >= 0:
+            continue
+        out = following(faces, adjacency, into)
+        a, b = faces[into // 3, (into + 1) % 3], faces[into // 3, (into + 2) % 3]
+        c = faces[out // 3, (out + 2) % 3]
+        if not cosine_at(points, a, b, c) > cos_psi:
+            continue
+        changed = [np.int64(0) for _ in range(0)]
+        if is_notch(points, faces, adjacency, into, out):
+            if may_add(points, faces, adjacency, degree, allowed_mm, into, out):
+                add(faces, adjacency, degree, corners, count, into, out)
+                alive[count] = True
+                if adjacency[count, 1] < 0:
+                    changed.append(np.int64(3 * count + 1))
+                    changed.append(preceding(faces, adjacency, np.int64(3 * count + 1)))
+                count += 1
+        elif not stays[b] and may_remove(faces, adjacency, corners, into, out, most_triangles):
+            stays[a] = stays[c] = True
+            changed.append(preceding(faces, adjacency, into))
+            remove(faces, adjacency, degree, corners, alive, into, out, changed)
+        for half_edge in changed:
+            if not waiting[half_edge // 3, half_edge % 3]:
+                waiting[half_edge // 3, half_edge % 3] = True
+                queue.append(half_edge)
+    return count, np.array(queue)
