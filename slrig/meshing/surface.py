@@ -14,6 +14,8 @@ from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import Optimised, optimised
 from slrig.model import FlipRule, FloatArray, IntArray
 
+FIRST_STAGE = "initial meshing"
+
 
 @dataclass(frozen=True, slots=True)
 class MeshingLimits:
@@ -79,12 +81,12 @@ def finished_mesh(
         points = stages[-1].boundary_points if adjacency is None else boundary_point_count(faces, adjacency)
         stages.append(Stage(name, len(faces), points))
 
-    entered("initial meshing")
+    entered(FIRST_STAGE)
     initial = initial_mesh(
         points_mm, offsets, position_px, bridge_after, sampling_mm, eye_mm,
         widest_step_px=limits.widest_step_px, depth_edge_ratio=limits.depth_edge_ratio, keep_holes=limits.keep_holes,
     )  # fmt: skip
-    done("initial meshing", initial.faces, initial.adjacency)
+    done(FIRST_STAGE, initial.faces, initial.adjacency)
     entered("global optimisation")
     best = optimised(points_mm, initial.faces, rule=limits.flip_rule, adjacency=initial.adjacency)
     done("global optimisation", best.faces, None)

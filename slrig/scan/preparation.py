@@ -1,19 +1,28 @@
-"""Kernels prepared before there is a frame: by a small made-up scan that needs all that a usual scan needs."""
+"""Kernels prepared before there is a frame: by a small made-up scan that needs all that a usual scan needs.
+
+Where they have to be compiled, two processes share that: this one begins with those that read the frames, another
+with those that make a mesh (`slrig.meshing.preparation`). What that one cannot do is compiled here in the end.
+"""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import cv2
 import numpy as np
 import structlog
+from numba import config
 
 from slrig.bundle.writing import write_bundle
 from slrig.errors import StorageError
 from slrig.kernels import Prepared, compilations_told, prepared
+from slrig.meshing.surface import FIRST_STAGE
 from slrig.model import Calibration, CameraFormat, Capture, FloatArray, Pinhole, Pixels, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.scan.plan import ReconstructionPlan
@@ -33,17 +42,64 @@ def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[Prepared], 
     reconstruct : `slrig.scan.pipeline.reconstruct_bundle`. `told` hears how far that is, once for every kernel or part
     of one that has to be compiled, on the thread that compiles it.
     """
-    try:
-        with compilations_told(lambda _: told(prepared())), TemporaryDirectory(prefix="slrig-") as folder:
-            bundle = Path(folder, "bundle")
-            write_bundle(bundle, *sample_scan())
-            reconstruct(
-                bundle, Path(folder, "result"), plan=ReconstructionPlan(), progress=lambda *_: None,
-                cancelled=lambda: False,
+    with _MeshingCompiler() as beside:
+
+        def compiling(_: str) -> None:
+            beside.start()
+            told(prepared())
+
+        def entered(stage: str, *_: object) -> None:
+            if stage == FIRST_STAGE:
+                beside.join()
+
+        try:
+            with compilations_told(compiling), TemporaryDirectory(prefix="slrig-") as folder:
+                bundle = Path(folder, "bundle")
+                write_bundle(bundle, *sample_scan())
+                reconstruct(
+                    bundle, Path(folder, "result"), plan=ReconstructionPlan(), progress=entered,
+                    cancelled=lambda: False,
+                )  # fmt: skip
+        except (OSError, StorageError) as error:
+            # A full disk is told by the scan that meets it; kernels are then compiled while it waits.
+            _log.warning("kernels could not be prepared", cause=str(error))
+
+
+class _MeshingCompiler:
+    """The other process, while there is need of it. A context manager: at the end of the block it is no more."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        self._late = config.NUMBA_NUM_THREADS < 2
+
+    def start(self) -> None:
+        """Begin, unless that was done or is too late."""
+        if self._late:
+            return
+        self._late = True
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "slrig.meshing.preparation"],
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
-    except (OSError, StorageError) as error:
-        # A full disk is told by the scan that meets it; kernels are then compiled while it waits.
-        _log.warning("kernels could not be prepared", cause=str(error))
+        except OSError as error:
+            _log.warning("kernels are compiled by one process", cause=str(error))
+
+    def join(self) -> None:
+        """Wait until it has done what it can."""
+        self._late = True
+        if self._process is not None:
+            self._process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
 
 
 def sample_scan() -> tuple[Capture, Calibration]:

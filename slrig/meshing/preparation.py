@@ -1,0 +1,48 @@
+"""The kernels that make a mesh, compiled in a process of their own while another compiles those that read the frames.
+
+`python -m slrig.meshing.preparation` meshes a small made-up sheet, so that the kernels lie compiled on the disk. It
+ends when its standard input does: it does not outlive the process that started it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+
+import numpy as np
+
+from slrig.meshing.quality import mesh_figures
+from slrig.meshing.surface import MeshingLimits, finished_mesh
+from slrig.model import FlipRule
+
+_CURVES, _POINTS = 16, 40
+_LIMITS = MeshingLimits(
+    widest_step_px=1.0, depth_edge_ratio=6.0, keep_holes=False, flip_rule=FlipRule.CONSTRAINED, smooth_boundary=True
+)
+
+
+def mesh_sample() -> None:
+    """Mesh a wavy sheet with a ragged border, by the types of array that a scan has."""
+    ragged = np.random.default_rng(0).integers(0, 8, (_CURVES, 2))
+    lengths = _POINTS - ragged.sum(axis=1)
+    offsets = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
+    curve = np.repeat(np.arange(_CURVES), lengths)
+    along = np.arange(offsets[-1]) - offsets[curve] + ragged[curve, 0]
+    points = np.column_stack((curve, 0.5 * along, 400 + np.sin(curve / 3) * np.cos(along / 7)))
+    bridge = np.zeros(len(points), dtype=np.bool_)
+    surface = finished_mesh(
+        points, offsets, curve.astype(np.float64), bridge, np.ones(len(points)), np.zeros(3), _LIMITS,
+        entered=lambda _: None,
+    )  # fmt: skip
+    mesh_figures(points, surface.faces)
+
+
+def _end_with_input() -> None:
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    mesh_sample()
