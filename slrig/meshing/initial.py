@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
 from slrig.meshing.normals import vertex_normals
-from slrig.meshing.strips import neighbouring_curves, strip_neighbours, strips, to_drop
+from slrig.meshing.runs import neighbouring_curves, whole_curves
+from slrig.meshing.strips import strip_neighbours, strips, to_drop
 from slrig.meshing.topology import component_sizes
 from slrig.model import FloatArray, IntArray
 
@@ -54,16 +55,20 @@ def initial_mesh(
     depth_edge_ratio: float,
     keep_holes: bool,
     smallest_component: int = 100,
+    runs: IntArray | None = None,
 ) -> InitialMesh:
     """Mesh between neighbouring curves and drop what is no surface.
 
     points_mm : (n, 3) float64; offsets : (c + 1,) int32; position_px : (c,) float64; bridge_after : (n,) bool;
     sampling_mm : (n,) float64; eye_mm : (3,) float64, the camera that decides which side is the front.
     smallest_component : pieces of fewer connected triangles are dust: a few stripe points that agreed by chance.
+    runs : (s, 4) int32, the parts to be joined, as `slrig.meshing.runs.parts_of_curves` gives them; without them whole
+    neighbouring curves are.
     """
-    pairs = neighbouring_curves(position_px, offsets, widest_step_px=widest_step_px)
-    everything = strips(points_mm, offsets, pairs)
-    adjacency = strip_neighbours(everything, offsets, pairs)
+    if runs is None:
+        runs = whole_curves(neighbouring_curves(position_px, offsets, widest_step_px=widest_step_px), offsets)
+    everything = strips(points_mm, runs)
+    adjacency = strip_neighbours(everything, runs, len(points_mm))
     drop = to_drop(
         points_mm, everything, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
     )
@@ -78,7 +83,7 @@ def initial_mesh(
         points_mm=points_mm,
         faces=faces,
         adjacency=across,
-        strip_pairs=len(pairs),
+        strip_pairs=len(runs),
         strip_triangles=len(everything),
         dropped_at_depth_edges=int(np.count_nonzero(drop.depth_edge)),
         dropped_at_bridges=int(np.count_nonzero(drop.bridge)),

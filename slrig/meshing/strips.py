@@ -31,37 +31,31 @@ class DroppedTriangles:
         return self.depth_edge | self.bridge
 
 
-def neighbouring_curves(position_px: FloatArray, offsets: IntArray, /, *, widest_step_px: float) -> IntArray:
-    """(s, 2) int32: pairs of consecutive curves, neither empty, at most `widest_step_px` columns apart."""
-    filled = np.flatnonzero(np.diff(offsets) > 0)
-    near = np.diff(position_px[filled]) <= widest_step_px + 1e-9
-    return np.stack([filled[:-1][near], filled[1:][near]], axis=1).astype(np.int32)
+def strips(points_mm: FloatArray, runs: IntArray, /) -> IntArray:
+    """Triangulate between the parts of two curves each.
 
-
-def strips(points_mm: FloatArray, offsets: IntArray, pairs: IntArray, /) -> IntArray:
-    """Triangulate between each pair of curves.
-
-    points_mm : (n, 3) float64, in curve order; offsets : (c + 1,) int32; pairs : (s, 2) int32.
+    points_mm : (n, 3) float64, in curve order; runs : (s, 4) int32, the first and last point of both parts, those of
+    the second behind those of the first; see `slrig.meshing.runs`. A step of a curve is in one strip on either side.
     Returns (Σ(I + J - 2), 3) int32. Seen with curves running down and following one another to the right, triangles
     run counter-clockwise.
     """
-    firsts = _firsts(offsets, pairs)
+    firsts = _firsts(runs)
     faces = np.zeros((int(firsts[-1]), 3), dtype=np.int32)
-    in_bands(_strips_kernel, len(pairs), np.ascontiguousarray(points_mm), offsets, pairs, firsts, faces)
+    in_bands(_strips_kernel, len(runs), np.ascontiguousarray(points_mm), runs, firsts, faces)
     return faces
 
 
-def strip_neighbours(faces: IntArray, offsets: IntArray, pairs: IntArray, /) -> IntArray:
-    """What `neighbours` finds for the faces that `strips` made of these pairs, in a fraction of its time.
+def strip_neighbours(faces: IntArray, runs: IntArray, point_count: int, /) -> IntArray:
+    """What `neighbours` finds for the faces that `strips` made of these runs, in a fraction of its time.
 
     Triangles of a strip follow one another; two strips meet in the steps of the curve that they share.
     Returns (F, 3) int32: entry k is the face across the edge opposite corner k, -1 at a boundary.
     """
-    after_first, after_second = np.full((2, int(offsets[-1])), -1, dtype=np.int32)
+    after_first, after_second = np.full((2, point_count), -1, dtype=np.int32)
     across = np.zeros(faces.shape, dtype=np.int32)
-    given = faces, offsets, pairs, _firsts(offsets, pairs), after_first, after_second
-    in_bands(_note_steps, len(pairs), *given)
-    in_bands(_strip_neighbours, len(pairs), *given, across)
+    given = faces, runs, _firsts(runs), after_first, after_second
+    in_bands(_note_steps, len(runs), *given)
+    in_bands(_strip_neighbours, len(runs), *given, across)
     return across
 
 
@@ -90,19 +84,18 @@ def to_drop(
     return DroppedTriangles(depth_edge=depth_edge, bridge=bridge)
 
 
-def _firsts(offsets: IntArray, pairs: IntArray) -> NDArray[np.int64]:
+def _firsts(runs: IntArray) -> NDArray[np.int64]:
     """(s + 1,) int64: where each strip's triangles begin."""
-    lengths = np.diff(offsets)
-    counts = lengths[pairs[:, 0]] + lengths[pairs[:, 1]] - 2
+    counts = runs[:, 1] - runs[:, 0] + runs[:, 3] - runs[:, 2]
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 @kernel
-def _strips_kernel(begin: int, end: int, points: Any, offsets: Any, pairs: Any, firsts: Any, faces: Any) -> None:
+def _strips_kernel(begin: int, end: int, points: Any, runs: Any, firsts: Any, faces: Any) -> None:
     for s in range(begin, end):
         # Of one type from the start, so that the rule is compiled once.
-        i, last_i = np.int64(offsets[pairs[s, 0]]), offsets[pairs[s, 0] + 1] - 1
-        j, last_j = np.int64(offsets[pairs[s, 1]]), offsets[pairs[s, 1] + 1] - 1
+        i, last_i = np.int64(runs[s, 0]), runs[s, 1]
+        j, last_j = np.int64(runs[s, 2]), runs[s, 3]
         at = firsts[s]
         while i < last_i or j < last_j:
             if i == last_i:
@@ -124,14 +117,12 @@ def _strips_kernel(begin: int, end: int, points: Any, offsets: Any, pairs: Any, 
 
 
 @kernel
-def _note_steps(
-    begin: int, end: int, faces: Any, offsets: Any, pairs: Any, firsts: Any, after_first: Any, after_second: Any
-) -> None:
+def _note_steps(begin: int, end: int, faces: Any, runs: Any, firsts: Any, after_first: Any, after_second: Any) -> None:
     """Note who stands on each step, as a strip's first curve and as its second: a curve is either at most once."""
     for s in range(begin, end):
-        last_of_first = offsets[pairs[s, 0] + 1]
+        last_of_first = runs[s, 1]
         for face in range(firsts[s], firsts[s + 1]):
-            if faces[face, 1] < last_of_first:
+            if faces[face, 1] <= last_of_first:
                 after_first[faces[face, 0]] = face
             else:
                 after_second[faces[face, 2]] = face
@@ -139,15 +130,14 @@ def _note_steps(
 
 @kernel
 def _strip_neighbours(
-    begin: int, end: int, faces: Any, offsets: Any, pairs: Any, firsts: Any, after_first: Any, after_second: Any,
-    across: Any,
-) -> None:  # fmt: skip
+    begin: int, end: int, faces: Any, runs: Any, firsts: Any, after_first: Any, after_second: Any, across: Any
+) -> None:
     for s in range(begin, end):
-        last_of_first = offsets[pairs[s, 0] + 1]
+        last_of_first = runs[s, 1]
         for face in range(firsts[s], firsts[s + 1]):
             before = face - 1 if face > firsts[s] else -1
             after = face + 1 if face + 1 < firsts[s + 1] else -1
-            if faces[face, 1] < last_of_first:
+            if faces[face, 1] <= last_of_first:
                 # (i, i + 1, j): the step lies opposite j, the next triangle opposite i, the one before opposite i + 1.
                 across[face, 0], across[face, 1], across[face, 2] = after, before, after_second[faces[face, 0]]
             else:

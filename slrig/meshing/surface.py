@@ -69,6 +69,7 @@ def finished_mesh(
     /,
     *,
     entered: Callable[[str], None],
+    runs: IntArray | None = None,
 ) -> FinishedMesh:
     """Mesh the curves: strips and what is dropped of them, global optimisation, boundary.
 
@@ -85,6 +86,7 @@ def finished_mesh(
     initial = initial_mesh(
         points_mm, offsets, position_px, bridge_after, sampling_mm, eye_mm,
         widest_step_px=limits.widest_step_px, depth_edge_ratio=limits.depth_edge_ratio, keep_holes=limits.keep_holes,
+        runs=runs,
     )  # fmt: skip
     done(FIRST_STAGE, initial.faces, initial.adjacency)
     entered("global optimisation")

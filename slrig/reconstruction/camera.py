@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.centroid import at_pixel_centres
-from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
+from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.identification import identify, with_refused_points
@@ -20,6 +20,7 @@ from slrig.reconstruction.linking import StripeEnsemble, link
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.refinement import refined
+from slrig.reconstruction.resolution import unresolved_bits
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -69,7 +70,8 @@ class CameraCurves:
     """What one camera gives. refusal : (H, W) uint8, `Refusal`; stripe_points, stripe_count : before linking.
 
     refined : the points are those of `refinement.refined`; disagreement_px : as of `refinement.Refinement`, empty where
-    there was no phase.
+    there was no phase. unresolved : (H, W) uint8, how many of the finest bits are left out at each pixel; None where
+    lines were shown, that the bits only number.
     """
 
     ensemble: StripeEnsemble
@@ -81,13 +83,15 @@ class CameraCurves:
     stripe_count: int
     refined: bool
     disagreement_px: FloatArray
+    unresolved: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Coded:
     """What white, black and code frames tell of every pixel.
 
-    near_shadow : (H, W) bool, for a fit to pixels; contrast_deviation : (H, W) float32, of white minus black by noise.
+    near_shadow : (H, W) bool, for a fit to pixels; contrast_deviation : (H, W) float32, of white minus black by noise;
+    unresolved : as of `CameraCurves`.
     """
 
     frames: AxisFrames
@@ -95,6 +99,7 @@ class _Coded:
     code: CodeMap
     near_shadow: NDArray[np.bool_]
     contrast_deviation: NDArray[np.float32]
+    unresolved: NDArray[np.uint8] | None
 
     @property
     def unlit(self) -> NDArray[np.bool_]:
@@ -166,11 +171,16 @@ class CameraStream:
     def _decoded(self, frames: AxisFrames) -> _Coded:
         self._entered("decode")
         noise = estimate_noise(frames) if self._noise is None else self._noise
-        tables = self._tables
-        code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), self._limits.decoding)
+        tables, limits = self._tables, self._limits.decoding
+        unresolved = None
+        if not self._stacks.patterns.lines:
+            unresolved = unresolved_bits(frames, lit_pixels(frames, noise, limits))
+        code = decode(
+            frames, noise, tables.index_of_word, len(tables.cell_position), limits, unresolved=unresolved
+        )  # fmt: skip
         near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
         ends = noise.variance(frames.white) + noise.variance(frames.black)
-        return _Coded(frames, noise, code, near_shadow, np.sqrt(ends / np.float32(frames.ends_repeats)))
+        return _Coded(frames, noise, code, near_shadow, np.sqrt(ends / np.float32(frames.ends_repeats)), unresolved)
 
     def _locate(self, coded: _Coded) -> None:
         if self._scales is None and not self._stacks.patterns.lines:
@@ -227,7 +237,9 @@ def _curves(
     points, disagreement_px, steady = found, np.zeros(0), False
     entered("refine stripes")
     seen = position_map(frames, noise, code, tables.cell_position)
-    resolution_px = float(frames.gray.cell_px)
+    resolution_px: float | NDArray[np.float32] = float(frames.gray.cell_px)
+    if coded.unresolved is not None:
+        resolution_px = frames.gray.cell_px * np.exp2(coded.unresolved, dtype=np.float32)
     if has_phase(frames):
         resolution_px = 0.0
         seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, limits.camera_blur_px)
@@ -258,6 +270,7 @@ def _curves(
         stripe_count=len(numbered.stripes),
         refined=steady,
         disagreement_px=disagreement_px,
+        unresolved=coded.unresolved,
     )
 
 
@@ -287,7 +300,7 @@ def _matched_scale_px(stripe_sigma_px: float) -> float:
 
 
 def _edge_points(coded: _Coded, limits: StripeLimits, scale_px: float) -> list[LinePoints]:
-    """Points of each code bit's edges."""
+    """Points of each code bit's edges, where the bit resolves."""
     frames, noise = coded.frames, coded.noise
     contrast, lit = frames.contrast, ~coded.unlit
     none = np.zeros_like(contrast)
@@ -302,5 +315,6 @@ def _edge_points(coded: _Coded, limits: StripeLimits, scale_px: float) -> list[L
             swing = 2 * bit - frames.white - frames.black
             variance = 4 * noise.variance(bit) + ends_variance
         image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
-        parts.append(edge_points(image, deviation, lit, limits, sigma_px=scale_px))
+        read = lit if coded.unresolved is None else lit & (index < len(frames.bits) - coded.unresolved)
+        parts.append(edge_points(image, deviation, read, limits, sigma_px=scale_px))
     return parts

@@ -61,18 +61,34 @@ class CodeMap:
         return np.where(self.refusal == 0, middle, np.nan)
 
 
+def lit_pixels(frames: AxisFrames, noise: NoiseModel, limits: DecodingLimits, /) -> NDArray[np.bool_]:
+    """(H, W) bool: where white stands out of black."""
+    spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
+    least = np.maximum(limits.lit_sigma * spread, limits.lit_fraction * frames.full_scale)
+    return np.asarray(frames.contrast > least)
+
+
 def decode(
-    frames: AxisFrames, noise: NoiseModel, index_of_word: IntArray, cell_count: int, limits: DecodingLimits, /
+    frames: AxisFrames,
+    noise: NoiseModel,
+    index_of_word: IntArray,
+    cell_count: int,
+    limits: DecodingLimits,
+    /,
+    *,
+    unresolved: NDArray[np.uint8] | None = None,
 ) -> CodeMap:
     """Decode the Gray code of one axis.
 
     index_of_word : (2^bits,) int32, the cell index of each Gray word; cell_count : cells that the projector shows.
+    unresolved : (H, W) uint8, how many of the finest bits are not read at each pixel; all are read without it.
     """
     contrast = frames.contrast
     shown = frames.bits
     against = frames.inverses if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
     spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
-    lit = contrast > np.maximum(limits.lit_sigma * spread, limits.lit_fraction * frames.full_scale)
+    lit = lit_pixels(frames, noise, limits)
+    unread = np.zeros(contrast.shape, dtype=np.uint8) if unresolved is None else unresolved
     lowest = np.full(contrast.shape, -1, dtype=np.int32)
     highest = np.full(contrast.shape, -1, dtype=np.int32)
     refusal = np.zeros(contrast.shape, dtype=np.uint8)
@@ -80,7 +96,7 @@ def decode(
     # Against the middle of white and black a bit swings half as far as against its inverse.
     margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * contrast) * (1.0 if paired else 0.5)
     in_bands(
-        _decode_kernel, len(lit), shown, against, paired, frames.white, lit, margin.astype(np.float32),
+        _decode_kernel, len(lit), shown, against, paired, frames.white, lit, unread, margin.astype(np.float32),
         np.float32(frames.clipped_at),
         index_of_word.astype(np.int32), cell_count, limits.widest_interval, lowest, highest, refusal,
     )  # fmt: skip
@@ -89,13 +105,13 @@ def decode(
 
 @kernel
 def _decode_kernel(
-    first: int, last: int, shown: Any, against: Any, paired: bool, white: Any, lit: Any, margin: Any,
+    first: int, last: int, shown: Any, against: Any, paired: bool, white: Any, lit: Any, unread: Any, margin: Any,
     full_scale: Any, index_of_word: Any,
     cell_count: int, widest: int, lowest: Any, highest: Any, refusal: Any,
 ) -> None:  # fmt: skip
     bits, _, columns = shown.shape
     for y in range(first, last):
-        uncertain = np.zeros(_MOST_UNCERTAIN_BITS, dtype=np.int32)
+        uncertain = np.zeros(2 * _MOST_UNCERTAIN_BITS, dtype=np.int32)
         for x in range(columns):
             if not lit[y, x]:
                 refusal[y, x] = _NOT_LIT
@@ -105,6 +121,7 @@ def _decode_kernel(
                 continue
             word = 0
             count = 0
+            read = bits - unread[y, x]
             clipped = False
             for b in range(bits):
                 seen = shown[b, y, x]
@@ -113,14 +130,14 @@ def _decode_kernel(
                     word |= 1 << (bits - 1 - b)
                 if paired and seen >= full_scale and other >= full_scale:
                     clipped = True
-                if abs(seen - other) < margin[y, x]:
-                    if count < _MOST_UNCERTAIN_BITS:
+                if b >= read or abs(seen - other) < margin[y, x]:
+                    if count < len(uncertain):
                         uncertain[count] = bits - 1 - b
                     count += 1
             if clipped:
                 refusal[y, x] = _SATURATED
                 continue
-            if count > _MOST_UNCERTAIN_BITS:
+            if count > min(_MOST_UNCERTAIN_BITS + unread[y, x], len(uncertain)):
                 refusal[y, x] = _AMBIGUOUS_BIT
                 continue
             low = index_of_word[word]
@@ -133,7 +150,8 @@ def _decode_kernel(
                 index = index_of_word[other_word]
                 low = min(low, index)
                 high = max(high, index)
-            if high - low > widest:
+            # In cells of the bits that are read.
+            if (high >> unread[y, x]) - (low >> unread[y, x]) > widest:
                 refusal[y, x] = _AMBIGUOUS_BIT
             elif low >= cell_count:
                 refusal[y, x] = _BEYOND_PROJECTOR

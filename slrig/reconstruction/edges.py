@@ -44,11 +44,12 @@ class EdgeLimits:
 
 
 def near_edges(
-    seen: PositionMap, unlit: NDArray[np.bool_], resolution_px: float, limits: EdgeLimits, /
+    seen: PositionMap, unlit: NDArray[np.bool_], resolution_px: float | NDArray[np.float32], limits: EdgeLimits, /
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Pixels near the lit area's border, and pixels near a depth step: two (H, W) bool maps.
 
-    unlit : (H, W) bool; resolution_px : step of the position map (0 where phase makes it continuous).
+    unlit : (H, W) bool; resolution_px : step of the position map (0 where phase makes it continuous), (H, W) if it
+    varies.
     """
     return near_shadows(unlit, limits), near_steps(seen, resolution_px, limits)
 
@@ -58,12 +59,15 @@ def near_shadows(unlit: NDArray[np.bool_], limits: EdgeLimits, /) -> NDArray[np.
     return _within(_without_specks(unlit, limits.smallest_shadow_px), limits.shadow_px)
 
 
-def near_steps(seen: PositionMap, resolution_px: float, limits: EdgeLimits, /) -> NDArray[np.bool_]:
+def near_steps(
+    seen: PositionMap, resolution_px: float | NDArray[np.float32], limits: EdgeLimits, /
+) -> NDArray[np.bool_]:
     """(H, W) bool: pixels near a depth step; see `near_edges`."""
+    limit_px = np.full(seen.position.shape, limits.bend_px + 2 * resolution_px, dtype=np.float32)
     bends = np.zeros(seen.position.shape, dtype=np.bool_)
     in_bands(
-        _bend_kernel, len(bends), seen.position, np.nan_to_num(seen.sigma), limits.bend_px + 2 * resolution_px,
-        limits.bend_share, limits.bend_sigma, bends,
+        _bend_kernel, len(bends), seen.position, np.nan_to_num(seen.sigma), limit_px, limits.bend_share,
+        limits.bend_sigma, bends,
     )  # fmt: skip
     return _within(bends, limits.depth_px)
 
@@ -84,12 +88,13 @@ def _within(mask: NDArray[np.bool_], radius_px: float) -> NDArray[np.bool_]:
 
 @kernel
 def _bend_kernel(
-    first: int, last: int, position: Any, sigma: Any, limit: float, share: float, sigmas: float, out: Any
+    first: int, last: int, position: Any, sigma: Any, limits: Any, share: float, sigmas: float, out: Any
 ) -> None:
     rows, columns = position.shape
     for y in range(max(first, 1), min(last, rows - 1)):
         for x in range(1, columns - 1):
             for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
+                limit = limits[y, x]
                 before, after = position[y - dy, x - dx], position[y + dy, x + dx]
                 bend = abs(before - 2 * position[y, x] + after)
                 if bend > limit and bend > share * abs(after - before):

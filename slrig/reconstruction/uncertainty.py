@@ -24,12 +24,13 @@ def sigma_along_normal(deviation_mm: FloatArray, normals: NDArray[np.float32]) -
 
 
 def sampling_mm(
-    points_mm: FloatArray, camera: Pinhole, projector: Pinhole | None, axis: Axis, step_px: float
+    points_mm: FloatArray, camera: Pinhole, projector: Pinhole | None, axis: Axis, step_px: float | FloatArray
 ) -> FloatArray:
     """(n,) float64: how far apart the rig samples a surface that faces it, mm.
 
     The larger of a camera pixel at the point's depth and, with a projector, of `step_px` of its columns, or rows where
-    `axis` says so. Each is measured along that axis: an array of mirrors may be addressed twice as finely in one.
+    `axis` says so; (n,) where it varies. Each is measured along that axis: an array of mirrors may be addressed twice
+    as finely in one.
     """
     k = 0 if axis is Axis.COLUMN else 1
     pixel = to_depths(camera, points_mm) / camera.matrix[k, k]

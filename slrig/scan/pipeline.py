@@ -24,12 +24,13 @@ from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import brightness, compact_mesh
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves, Refusal
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
 from slrig.scan.calibration_report import calibration_report
+from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.light_axis import FAIR_SHARE, LEAST_SHARE, weakness
 from slrig.scan.offered import rejected_picture
 from slrig.scan.outline import Outline
@@ -47,8 +48,9 @@ from slrig.scan.report import (
     redundancy_report,
     with_seconds,
 )
+from slrig.scan.resolved import steps, unresolved_notes
 from slrig.scan.stream import LiveScan, ScanStream, Seen, step_px
-from slrig.scan.triangulated import Triangulated, triangulated
+from slrig.scan.triangulated import Triangulated, triangulated, widest_gap_px
 
 _STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
 
@@ -145,19 +147,20 @@ def reconstruct_bundle(
         write_mesh(mesh, staging, sigma_calibration_mm=meshed.mesh_share_mm)
         entered("pictures", 0.85, "")
         _write_pictures(mesh, cameras, staging)
+        covered = covered_share(mesh, cameras[0])
         known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
         entered("write report", 0.98, "")
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         seconds = watch.finished()
         report = {
             **walked.sections,
-            "notes": [*walked.notes, *depth, *meshed.notes],
+            "notes": [*walked.notes, *depth, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
             "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
             "redundancy": dict(meshed.redundancy),
-            "mesh": {**figures, "stages": with_seconds(meshed.stages, seconds)},
+            "mesh": {**figures, "covers_of_decoded": covered, "stages": with_seconds(meshed.stages, seconds)},
             **known,
             "stages_s": seconds,
         }
@@ -235,8 +238,8 @@ def _walked(
         entered("check frames", 0.58, "")
         evidence = check_exposures(recorded.capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
-    notes = capture_notes(stream.capture, stream.axis, evidence)
     step = step_px(stream.outline.shown, stream.axis)
+    notes = [*capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step)]
     return _Walked(devices, stream.axis, stream.outline.axes, seen, step, sections, notes)
 
 
@@ -257,8 +260,8 @@ def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
 
 def _triangulated(walked: _Walked, folder: Path, entered: Callable[[str, float, str], None]) -> Triangulated:
     seen = walked.seen
-    _require(any(each.curves.decoded_pixels > 0 for each in seen), folder, "no pixel could be decoded", seen)
-    _require(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
+    require_surface(any(each.curves.decoded_pixels > 0 for each in seen), folder, "no pixel could be decoded", seen)
+    require_surface(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
     entered("triangulate", 0.6, "")
     return triangulated(seen, walked.devices.projector, walked.axis)
 
@@ -283,11 +286,16 @@ def _meshed(
     first, axis, step_px = walked.seen[0], walked.axis, walked.step_px
     cameras, joined_curves = found.cameras, found.joined
     points = joined_curves.curves
-    _require(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
+    require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
     count = f"{len(points.points_mm)} points"
+    projector = walked.devices.projector
+    gap_px = widest_gap_px(projector, axis)
+    beside = steps(cameras, joined_curves, step_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
+    sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
     surface = finished_mesh(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,
-        sampling_mm(points.points_mm, first.device, walked.devices.projector, axis, step_px), first.device.centre_mm,
+        # Two points of one place are as far apart as noise has them.
+        np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), first.device.centre_mm,
         MeshingLimits(
             widest_step_px=step_px * plan.max_code_gap,
             depth_edge_ratio=plan.depth_edge_ratio,
@@ -296,8 +304,9 @@ def _meshed(
             smooth_boundary=plan.smooth_boundary,
         ),
         entered=lambda stage: entered(stage, 0.68, count),
+        runs=beside.runs,
     )  # fmt: skip
-    _require(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
+    require_surface(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
     entered("vertices", 0.72, count)
     sigma = sigma_along_normal(points.deviation_mm, surface.normals)
     share = _calibration_share(walked.devices, found, axis, surface.normals)
@@ -371,20 +380,3 @@ def _compared_with_truth(
         return {}
     entered("compare with truth", 0.9, "")
     return {"truth": score(mesh, truth.surface, truth.visible_points_mm, camera.centre_mm).as_dict()}
-
-
-def _require(holds: bool, folder: Path, what: str, cameras: list[Seen]) -> None:
-    """Refuse a scan that holds no surface, with the figures that tell why."""
-    if holds:
-        return
-    figures = "; ".join(
-        f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
-        f"{seen.largest_contrast:.0f} above black, {(seen.curves.refusal != Refusal.NOT_LIT).mean():.1%} of the image "
-        f"lit, {seen.curves.decoded_pixels} pixels decoded"
-        for seen in cameras
-    )
-    message = (
-        f"{folder}: {what}. {figures}. Look whether the projector lit the object, the lens cap is off, and the "
-        "exposure leaves white below full scale and well above black"
-    )
-    raise NothingToReconstructError(message)

@@ -78,6 +78,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
     return bracket | {
         "decoded_pixels": curves.decoded_pixels,
         "refused_pixels": {cause.name.lower(): int(counts[cause]) for cause in Refusal if cause is not Refusal.NONE},
+        "lit_by_unresolved_bits": share_by_bits(curves),
         "noise": {"read_variance": curves.noise.read_variance, "slope": curves.noise.slope},
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,
@@ -88,6 +89,16 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "refined_by_all_lines": curves.refined,
         "frame_disagreement_px": curves.disagreement_px.tolist(),
     }
+
+
+def share_by_bits(curves: CameraCurves) -> list[float] | None:
+    """Of the lit pixels, the shares where every bit of the code resolves, all but the finest, and so on; None where
+    lines were shown.
+    """
+    if curves.unresolved is None:
+        return None
+    counts = np.bincount(curves.unresolved[curves.refusal != Refusal.NOT_LIT], minlength=1)
+    return [round(float(each), 4) for each in counts / max(counts.sum(), 1)]
 
 
 def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8], spare: Redundancy) -> dict[str, object]:

@@ -60,16 +60,20 @@ def triangulated(cameras: list[Seen], projector: Pinhole | None, axis: Axis) -> 
     pairs = {i: camera_camera(mine, others[i].curves.ensemble, first.device, others[i].device) for i in steep}
     second = max(pairs, key=lambda index: len(pairs[index].points_mm))
     best = pairs[second]
-    spare = redundancy([best], devices, axis, widest_gap_px=_WIDEST_GAP_PX)
-    joined = merged([best], first.device.centre_mm, widest_gap_px=_WIDEST_GAP_PX)
+    gap = widest_gap_px(None, axis)
+    spare = redundancy([best], devices, axis, widest_gap_px=gap)
+    joined = merged([best], first.device.centre_mm, widest_gap_px=gap)
     return Triangulated(joined, spare, cameras, crossing[second], 1 + second)
 
 
-def widest_gap_px(projector: Pinhole, axis: Axis) -> float:
-    """Steps along a light sheet between two points of one camera up to which the curve between them counts as seen.
+def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:
+    """Steps along a light sheet between two points of one camera up to which the curve between them counts as seen;
+    without a projector, camera pixels.
 
     Where the projector is addressed more finely along the sheet than across it, a camera's pixel covers more of them.
     """
+    if projector is None:
+        return _WIDEST_GAP_PX
     across, along = (0, 1) if axis is Axis.COLUMN else (1, 0)
     return _WIDEST_GAP_PX * max(1.0, float(projector.matrix[along, along] / projector.matrix[across, across]))
 

@@ -16,6 +16,7 @@ from slrig.meshing.initial import initial_mesh
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import Optimised, optimised
 from slrig.meshing.quality import smallest_angles_deg
+from slrig.meshing.runs import whole_curves
 from slrig.meshing.strips import strip_neighbours, strips
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
@@ -34,10 +35,10 @@ class Scan(NamedTuple):
     step_mm: float
 
     @property
-    def pairs(self) -> IntArray:
-        """(c - 1, 2) int32: each curve and the next."""
+    def runs(self) -> IntArray:
+        """(c - 1, 4) int32: each curve and the next."""
         first = np.arange(len(self.offsets) - 2, dtype=np.int32)
-        return np.stack([first, first + 1], axis=1)
+        return whole_curves(np.stack([first, first + 1], axis=1), self.offsets)
 
 
 def _median_s(work: Callable[[], object]) -> float:
@@ -53,9 +54,8 @@ def _median_s(work: Callable[[], object]) -> float:
 
 def _local_and_global(scan: Scan) -> Optimised:
     """The paper's sections 3.2 and 3.3."""
-    pairs = scan.pairs
-    faces = strips(scan.points_mm, scan.offsets, pairs)
-    return optimised(scan.points_mm, faces, adjacency=strip_neighbours(faces, scan.offsets, pairs))
+    faces = strips(scan.points_mm, scan.runs)
+    return optimised(scan.points_mm, faces, adjacency=strip_neighbours(faces, scan.runs, len(scan.points_mm)))
 
 
 def _grid_mesh(scan: Scan) -> IntArray:
@@ -121,9 +121,9 @@ def test_strips_and_global_optimisation(scans: dict[str, Scan]) -> None:
 def test_stages(scans: dict[str, Scan]) -> None:
     _show("\nms             strips  adjacency  global  initial_mesh  normals")
     for name, scan in scans.items():
-        points, offsets, pairs = scan.points_mm, scan.offsets, scan.pairs
-        faces = strips(points, offsets, pairs)
-        across = strip_neighbours(faces, offsets, pairs)
+        points, offsets, runs = scan.points_mm, scan.offsets, scan.runs
+        faces = strips(points, runs)
+        across = strip_neighbours(faces, runs, len(points))
         whole = partial(
             initial_mesh, points, offsets, np.arange(len(offsets) - 1.0), np.zeros(len(points), dtype=np.bool_),
             np.ones(len(points)), np.zeros(3), widest_step_px=1.0, depth_edge_ratio=60.0, keep_holes=False,
@@ -131,8 +131,8 @@ def test_stages(scans: dict[str, Scan]) -> None:
         times_ms = [
             1e3 * _median_s(work)
             for work in (
-                partial(strips, points, offsets, pairs),
-                partial(strip_neighbours, faces, offsets, pairs),
+                partial(strips, points, runs),
+                partial(strip_neighbours, faces, runs, len(points)),
                 partial(optimised, points, faces, adjacency=across),
                 whole,
                 partial(vertex_normals, points, faces),

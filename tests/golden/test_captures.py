@@ -34,11 +34,28 @@ def test_the_skull_covers_its_reference_points(shared: Path, tmp_path: Path) -> 
     vertices = np.asarray(trimesh.load(tmp_path / "out" / "mesh.ply", process=False).vertices)
     to_points = _distances(reference, points)
     to_vertices = _distances(reference, vertices)
-    assert (to_points < 1.0).mean() >= 0.85
-    assert (to_vertices < 1.0).mean() >= 0.85
+    assert (to_points < 1.0).mean() >= 0.95
+    assert (to_vertices < 1.0).mean() >= 0.95
     assert np.median(to_points) <= 0.25
     assert np.percentile(to_points, 95) <= 0.8
-    assert (_distances(vertices, reference) > 10.0).mean() <= 0.01
+    # The authors cut their points out. Vertices far from them are of the table and the wall, or there are too many.
+    far = vertices[_distances(vertices, reference) > 10.0]
+    for _ in range(2):
+        far = _off_plane(far, within_mm=1.5)
+    assert len(far) <= 0.003 * len(vertices)
+
+
+def _off_plane(points: FloatArray, *, within_mm: float) -> FloatArray:
+    """The points that do not lie on the plane that most of them lie on."""
+    rng = np.random.default_rng(0)
+    off = np.ones(len(points), dtype=bool)
+    for _ in range(500):
+        a, b, c = points[rng.choice(len(points), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        apart = np.abs((points - a) @ normal) > within_mm * np.linalg.norm(normal)
+        if apart.sum() < off.sum():
+            off = apart
+    return points[off]
 
 
 @pytest.mark.parametrize("pose", [0, *(pytest.param(pose, marks=pytest.mark.slow) for pose in (1, 2, 3))])

@@ -12,7 +12,8 @@ from scipy.sparse.csgraph import connected_components
 
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary import longest_boundary_edge_mm, shrunk, smoothed
-from slrig.meshing.strips import neighbouring_curves, strips
+from slrig.meshing.runs import neighbouring_curves, whole_curves
+from slrig.meshing.strips import strips
 from slrig.meshing.topology import boundary_edges, boundary_vertex_count, topology_counts
 from slrig.model import FloatArray, IntArray
 
@@ -46,7 +47,7 @@ def ragged_strips(draw: st.DrawFn) -> tuple[FloatArray, IntArray]:
     offsets = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
     points = np.concatenate([np.zeros((0, 3)), *curves])
     pairs = neighbouring_curves(np.arange(len(lengths), dtype=np.float64), offsets, widest_step_px=1.0)
-    return points, strips(points, offsets, pairs)
+    return points, strips(points, whole_curves(pairs, offsets))
 
 
 meshes = torn_grids() | ragged_strips()

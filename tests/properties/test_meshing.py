@@ -14,7 +14,8 @@ from slrig.meshing.adjacency import neighbours
 from slrig.meshing.flips import prefers_flip
 from slrig.meshing.initial import initial_mesh
 from slrig.meshing.optimisation import NO_FLIPS, optimised
-from slrig.meshing.strips import neighbouring_curves, strips, to_drop
+from slrig.meshing.runs import neighbouring_curves, whole_curves
+from slrig.meshing.strips import strips, to_drop
 from slrig.meshing.topology import boundary_edges, topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
 
@@ -56,7 +57,7 @@ def surface(lengths: list[int], seed: int) -> tuple[FloatArray, IntArray]:
 @given(st.integers(1, 40), st.integers(1, 40), seeds)
 def test_a_strip_has_exactly_i_plus_j_minus_two_triangles(ours: int, theirs: int, seed: int) -> None:
     points, offsets = surface([ours, theirs], seed)
-    faces = strips(points, offsets, np.array([[0, 1]], dtype=np.int32))
+    faces = strips(points, whole_curves(np.array([[0, 1]]), offsets))
     assert len(faces) == ours + theirs - 2
     directed = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in faces for k in range(3))
     assert max(directed.values(), default=1) == 1
@@ -74,7 +75,7 @@ def test_any_curves_make_a_manifold(lengths: list[int], widest: int, seed: int) 
     filled = [k for k, n in enumerate(lengths) if n]
     wanted = [[a, b] for a, b in pairwise(filled) if position[b] - position[a] <= widest]
     assert pairs.tolist() == wanted
-    faces = strips(points, offsets, pairs)
+    faces = strips(points, whole_curves(pairs, offsets))
     assert len(faces) == sum(lengths[a] + lengths[b] - 2 for a, b in wanted)
     found = topology_counts(faces)
     assert found.nonmanifold_edges == found.misoriented_edges == 0
@@ -123,7 +124,7 @@ def test_unmeasured_points_leave_the_mesh(ours: int, theirs: int, seed: int) -> 
     points, offsets = surface([ours, theirs], seed)
     missing = seed % len(points)
     points[missing] = np.nan
-    faces = strips(points, offsets, np.array([[0, 1]], dtype=np.int32))
+    faces = strips(points, whole_curves(np.array([[0, 1]]), offsets))
     assert len(faces) == ours + theirs - 2
     drop = to_drop(
         points, faces, np.zeros(len(points), dtype=np.bool_), np.ones(len(points)),
@@ -139,7 +140,7 @@ def test_unmeasured_points_leave_the_mesh(ours: int, theirs: int, seed: int) -> 
 def test_optimisation_keeps_what_makes_a_surface(lengths: list[int], seed: int, rule: FlipRule, share: float) -> None:
     points, offsets = surface(lengths, seed)
     pairs = neighbouring_curves(np.arange(len(lengths), dtype=np.float64), offsets, widest_step_px=1.0)
-    everything = strips(points, offsets, pairs)
+    everything = strips(points, whole_curves(pairs, offsets))
     # What is left has holes and pinched vertices.
     faces = everything[np.random.default_rng(seed).random(len(everything)) < share]
     found = optimised(points, faces, rule=rule)

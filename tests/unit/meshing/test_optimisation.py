@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.optimisation import INDEX, NO_FLIPS, TURN_LIMIT, Optimised, optimised
 from slrig.meshing.quality import harmonic_indices, smallest_angles_deg
+from slrig.meshing.runs import whole_curves
 from slrig.meshing.strips import strips
 from slrig.meshing.topology import boundary_edges, topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
@@ -23,7 +24,7 @@ from tests.unit.meshing.test_flips import delaunay, verdict
 def all_strips(points: FloatArray, offsets: IntArray) -> IntArray:
     """Strips between each curve and the next."""
     count = len(offsets) - 1
-    return strips(points, offsets, np.stack([np.arange(count - 1), np.arange(1, count)], axis=1).astype(np.int32))
+    return strips(points, whole_curves(np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), offsets))
 
 
 def face_depth_mm(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.meshing.adjacency import neighbours
-from slrig.meshing.strips import neighbouring_curves, strip_neighbours, strips, to_drop
+from slrig.meshing.runs import neighbouring_curves, whole_curves
+from slrig.meshing.strips import strip_neighbours, strips, to_drop
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.test_flips import verdict
 
@@ -26,7 +27,7 @@ def offsets_of(*curves: FloatArray) -> IntArray:
 def between(*curves: FloatArray) -> IntArray:
     """Strips between each curve and the next."""
     pairs = np.stack([np.arange(len(curves) - 1), np.arange(1, len(curves))], axis=1).astype(np.int32)
-    return strips(np.concatenate(curves), offsets_of(*curves), pairs)
+    return strips(np.concatenate(curves), whole_curves(pairs, offsets_of(*curves)))
 
 
 def wandering(seed: int, x: float, count: int) -> FloatArray:
@@ -115,9 +116,9 @@ def test_neighbouring_strips_meet_without_a_seam() -> None:
 
 
 def test_no_pairs_give_no_triangles() -> None:
-    none = np.zeros((0, 2), dtype=np.int32)
-    assert strips(np.zeros((0, 3)), np.zeros(1, dtype=np.int32), none).shape == (0, 3)
-    assert strips(curve(0.0, np.arange(4.0)), np.array([0, 4], dtype=np.int32), none).shape == (0, 3)
+    none = whole_curves(np.zeros((0, 2), dtype=np.int32), np.zeros(1, dtype=np.int32))
+    assert strips(np.zeros((0, 3)), none).shape == (0, 3)
+    assert strips(curve(0.0, np.arange(4.0)), none).shape == (0, 3)
 
 
 def pairs_of(position_px: list[float], counts: list[int], *, widest_step_px: float = 1.0) -> list[list[int]]:
@@ -218,7 +219,7 @@ def test_inputs_are_left_alone() -> None:
     first, second = wandering(1, 0.0, 12), wandering(2, 1.0, 9)
     points, offsets = np.concatenate([first, second]), offsets_of(first, second)
     before = points.copy(), offsets.copy()
-    faces = strips(points, offsets, np.array([[0, 1]], dtype=np.int32))
+    faces = strips(points, whole_curves(np.array([[0, 1]]), offsets))
     kept = faces.copy()
     dropped(points, faces, keep_holes=True)
     np.testing.assert_array_equal(points, before[0])
@@ -234,8 +235,9 @@ def test_strips_know_their_neighbours(seed: int) -> None:
     position = np.cumsum(rng.integers(1, 3, 9)).astype(np.float64)
     for widest in (1.0, 2.0):
         pairs = neighbouring_curves(position, offsets, widest_step_px=widest)
-        faces = strips(points, offsets, pairs)
-        found = strip_neighbours(faces, offsets, pairs)
+        runs = whole_curves(pairs, offsets)
+        faces = strips(points, runs)
+        found = strip_neighbours(faces, runs, len(points))
         assert found.dtype == np.int32
         np.testing.assert_array_equal(found, neighbours(faces, vertex_count=len(points)))
 

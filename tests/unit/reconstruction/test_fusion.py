@@ -287,7 +287,7 @@ def test_shares_of_one_are_frames_as_they_are() -> None:
     none = np.zeros(SHAPE, dtype=np.bool_)
     code = CodeMap(np.zeros(SHAPE, dtype=np.int32), np.zeros(SHAPE, dtype=np.int32), np.zeros(SHAPE, dtype=np.uint8))
     images = [
-        _normalised_line(_Coded(frames, noise, code, none, ones), index)
+        _normalised_line(_Coded(frames, noise, code, none, ones, None), index)
         for index in (0, 5)
         for noise in (plain, shared)
     ]

@@ -1,0 +1,66 @@
+"""How much of what a camera decoded the mesh covers. A scan that lost most of it says so; one that lost all fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from slrig.errors import NothingToReconstructError
+from slrig.meshing.rasteriser import rasterised
+from slrig.model import Mesh, Refusal, Size
+from slrig.reconstruction.optics import project
+from slrig.scan.stream import Seen
+
+LEAST_SHARE = 0.6
+"""Sound scans of real rigs have 0.8 and more, borders of two pixels that are refused included."""
+_PICTURE_PX = 480
+"""Wide enough for a share, and a tenth of the work at full size."""
+
+
+def covered_share(mesh: Mesh, seen: Seen) -> float | None:
+    """The share of the pixels that the camera decoded whose ray meets the mesh; None where it decoded none.
+
+    Counted on a picture of at most 480 pixels' width. A pixel of it is decoded where half of its camera pixels are.
+    """
+    shape = seen.curves.refusal.shape
+    step = max(1, -(-shape[1] // _PICTURE_PX))
+    rows, columns = (extent // step for extent in shape)
+    decoded = seen.curves.refusal[: rows * step, : columns * step] == Refusal.NONE
+    decoded = decoded.reshape(rows, step, columns, step).mean(axis=(1, 3)) >= 0.5
+    if not decoded.any():
+        return None
+    device, points = seen.device, mesh.vertices_mm.astype(np.float64)
+    depth_mm = points @ device.rotation[2] + device.translation_mm[2]
+    pixels = (project(device, points) + 0.5) / step - 0.5
+    view = rasterised(pixels, depth_mm, mesh.normals, mesh.faces, Size(columns, rows))
+    return float((np.isfinite(view.depth_mm) & decoded).sum() / decoded.sum())
+
+
+def coverage_notes(name: str, share: float | None) -> list[str]:
+    """One sentence if the mesh covers much less than was decoded."""
+    if share is None or share >= LEAST_SHARE:
+        return []
+    return [
+        f"the mesh covers {share:.0%} of what camera '{name}' decoded. Look at the picture of causes: the finest "
+        "patterns may not resolve (wider cells: --gray-cell-px; wider lines: --line-width-px), or the limit "
+        "at depth edges be too low (--depth-edge-ratio)"
+    ]
+
+
+def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[Seen]) -> None:
+    """Refuse a scan that holds no surface (NothingToReconstructError), with the figures that tell why."""
+    if holds:
+        return
+    figures = "; ".join(
+        f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
+        f"{seen.largest_contrast:.0f} above black, {(seen.curves.refusal != Refusal.NOT_LIT).mean():.1%} of the image "
+        f"lit, {seen.curves.decoded_pixels} pixels decoded"
+        for seen in cameras
+    )
+    message = (
+        f"{folder}: {what}. {figures}. Look whether the projector lit the object, the lens cap is off, and the "
+        "exposure leaves white below full scale and well above black"
+    )
+    raise NothingToReconstructError(message)

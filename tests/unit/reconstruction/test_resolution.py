@@ -1,0 +1,110 @@
+"""Which of the finest bits a camera resolves: told by the frames alone, block by block."""
+
+from __future__ import annotations
+
+from itertools import groupby, pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.model import Axis, Gray, Size
+from slrig.patterns.gray import gray_profile
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.resolution import BLOCK_PX, _tally, unresolved_bits
+
+PROJECTOR = Size(1024, 32)
+BITS = 10
+
+
+def frames(column: NDArray[np.float64], *, noise: float = 1.0, down: bool = False) -> AxisFrames:
+    """What a camera sees whose pixels show these projector columns, (H, W), each the mean light of what it covers."""
+    rng = np.random.default_rng(3)
+    wide = np.maximum(np.abs(np.gradient(column, axis=1)), 0.5)
+    seen = []
+    for inverted in (False, True):
+        for bit in range(BITS):
+            profile = gray_profile(Gray(Axis.COLUMN, bit, BITS, inverted=inverted), PROJECTOR)[0] / 255.0
+            total = np.concatenate([[0.0], np.cumsum(profile)])
+            ends = (np.interp(column + sign * wide / 2 + 0.5, np.arange(len(total)), total) for sign in (1, -1))
+            light = np.subtract(*ends) / wide
+            seen.append(10 + 150 * light + rng.normal(0, noise, column.shape))
+    images = np.array(seen, dtype=np.float32)
+    white, black = np.full(column.shape, 160, np.float32), np.full(column.shape, 10, np.float32)
+    if down:
+        images, white, black = np.swapaxes(images, 1, 2), white.T, black.T
+    images = np.ascontiguousarray(images)
+    gray = Gray(Axis.COLUMN, 0, BITS)
+    none = np.zeros((0, *white.shape), np.float32)
+    return AxisFrames(Axis.COLUMN, white, black, images[:BITS], images[BITS:], gray, none, (), 255.0)
+
+
+def ramp(*columns_per_px: float, rows: int = 128, width: int = 192) -> NDArray[np.float64]:
+    """Projector columns that pass at one rate in the upper part of an image, at another below."""
+    parts = [
+        np.broadcast_to(100.3 + rate * np.arange(width), (rows // len(columns_per_px), width))
+        for rate in columns_per_px
+    ]
+    return np.concatenate(parts)
+
+
+LIT = np.ones((128, 192), dtype=np.bool_)
+
+
+@pytest.mark.parametrize(("columns_per_px", "bits"), [(0.3, 0), (0.8, 0), (1.4, 1), (2.6, 2)])
+def test_a_bit_is_resolved_where_two_of_its_edges_have_two_pixels(columns_per_px: float, bits: int) -> None:
+    assert (unresolved_bits(frames(ramp(columns_per_px)), LIT) == bits).mean() > 0.95
+
+
+def test_each_part_of_an_image_has_its_own() -> None:
+    found = unresolved_bits(frames(ramp(0.6, 1.4)), LIT)
+    assert (found[: 64 - BLOCK_PX] == 0).all()
+    assert (found[64 + BLOCK_PX :] == 1).all()
+
+
+def test_a_bit_lost_in_noise_is_not_resolved_however_wide_its_cells() -> None:
+    seen = frames(ramp(0.3))
+    assert seen.inverses is not None
+    rng = np.random.default_rng(0)
+    for images in (seen.bits, seen.inverses):
+        images[-1] = 85 + rng.normal(0, 2, LIT.shape)
+    assert (unresolved_bits(seen, LIT) == 1).all()
+
+
+def test_it_is_the_same_for_stripes_that_lie() -> None:
+    upright, lying = frames(ramp(0.6, 1.4)), frames(ramp(0.6, 1.4), down=True)
+    np.testing.assert_array_equal(unresolved_bits(upright, LIT), unresolved_bits(lying, LIT.T.copy()).T)
+
+
+def test_light_from_elsewhere_leaves_out_nothing() -> None:
+    seen = frames(ramp(0.5))
+    assert seen.inverses is not None
+    rng = np.random.default_rng(0)
+    for images in (seen.bits, seen.inverses):
+        images[:] = 85 + rng.normal(0, 2, images.shape)
+    assert not unresolved_bits(seen, LIT).any()
+
+
+def test_the_tally_is_that_of_plain_python() -> None:
+    rng = np.random.default_rng(7)
+    index = np.cumsum(rng.choice([-1, 0, 1, 2], (BLOCK_PX, 3 * BLOCK_PX), p=[0.1, 0.5, 0.3, 0.1]), axis=1) % 1024
+    word = (index ^ (index >> 1)).astype(np.int32)
+    lit = rng.random(word.shape) < 0.97
+    for finest in (0, 1, 2):
+        expected = np.zeros((4, 1, 3), dtype=np.int64)
+        for y in range(BLOCK_PX):
+            cells = [int(index[y, x]) >> (finest + 1) if lit[y, x] else -1 for x in range(word.shape[1])]
+            runs = [
+                (cell, [x for _, x in group])
+                for cell, group in groupby(zip(cells, range(len(cells)), strict=True), key=lambda each: each[0])
+            ]
+            for before, (cell, pixels), after in zip(runs, runs[1:], runs[2:], strict=False):
+                if min(before[0], cell, after[0]) < 0 or (before[0] < cell) != (cell < after[0]):
+                    continue
+                halves = [int(index[y, x]) >> finest & 1 for x in pixels]
+                steps = [b - a for a, b in pairwise(halves) if a != b]
+                block = (pixels[0] + pixels[-1]) // 2 // BLOCK_PX
+                several = len(pixels) > 1
+                right = several and steps == [1 if before[0] < cell else -1]
+                expected[:, 0, block] += (1, len(pixels), several, right)
+        np.testing.assert_array_equal(_tally(word, lit, finest), expected)
