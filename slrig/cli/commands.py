@@ -223,10 +223,17 @@ def reconstruct(
     max_code_gap: MaxCodeGap = None,
     flip_rule: FlipRuleName = None,
     smooth_boundary: SmoothBoundary = None,
+    decode_only: Annotated[
+        bool,
+        typer.Option("--decode-only", help="Only decode: positions, causes, what to change. Needs no calibration."),
+    ] = False,
 ) -> None:
     """Make a mesh from a recorded scan. Needs no service and no rig."""
-    from slrig.cli.reconstruct import reconstruct_with_progress
+    from slrig.cli.reconstruct import decode_and_tell, reconstruct_with_progress
 
+    if decode_only:
+        decode_and_tell(bundle, output)
+        return
     options = _given(
         keep_holes=keep_holes,
         depth_edge_ratio=depth_edge_ratio,

@@ -19,6 +19,22 @@ from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.records import report_summary
 
 
+def decode_and_tell(bundle: Path, output: Path) -> None:
+    """Decode a bundle without a calibration, and print what was found and what to change. Raises as decoding does."""
+    from slrig.scan.decoding_only import decode_bundle
+
+    set_up_logs_for_a_person()
+    with progress_shown() as display:
+        display("decode", 0.0, str(bundle))
+        found = decode_bundle(bundle, output)
+        display("done", 1.0, "")
+    for each in found:
+        typer.echo(f"{'decoded':<10}{each}")
+        for advice in each.advice:
+            typer.echo(f"{'':<10}{advice}")
+    typer.echo(f"{'pictures':<10}{output}")
+
+
 def reconstruct_with_progress(
     bundle: Path, output: Path, *, calibration: Path | None, formats: Sequence[str] = (), options: Mapping[str, Any]
 ) -> None:

@@ -1,0 +1,87 @@
+"""Decoding without a calibration: positions, causes and what to change, for people who are setting up a rig."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from slrig.bundle import write_bundle
+from slrig.cli.commands import app
+from slrig.errors import PatternError
+from slrig.model import Capture, Gray, Pixels
+from slrig.scan.decoding_only import decode_bundle
+from slrig.scan.preparation import sample_scan
+
+
+def recorded(folder: Path, change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None) -> Path:
+    """A made-up scan without its calibration, each frame changed."""
+    capture, _ = sample_scan()
+    if change is not None:
+        shots = []
+        for shot in capture.shots:
+            image: Pixels = np.clip(change(shot.image.astype(np.float64)), 0, 255).astype(np.uint8)
+            shots.append(replace(shot, image=image))
+        capture = replace(capture, shots=tuple(shots))
+    write_bundle(folder, capture, None)
+    return folder
+
+
+def test_positions_are_those_of_the_projector(tmp_path: Path) -> None:
+    (found,) = decode_bundle(recorded(tmp_path / "bundle"), tmp_path / "out")
+    assert found.lit > 0.5
+    assert found.decoded > 0.9
+    assert found.advice == []
+    position = tifffile.imread(tmp_path / "out" / "position-sample-column.tiff")
+    assert position.dtype == np.float32
+    known = np.isfinite(position)
+    assert known.mean() == pytest.approx(found.lit * found.decoded, abs=0.02)
+    # Columns rise to the right on a sheet that has no cliff.
+    assert (np.diff(position[20], axis=0)[known[20, 1:] & known[20, :-1]] > -0.5).all()
+    assert {each.name for each in (tmp_path / "out").iterdir()} == {
+        "position-sample-column.tiff", "position-sample-column.png", "rejected-sample-column.png", "report.json",
+    }  # fmt: skip
+    (told,) = json.loads((tmp_path / "out" / "report.json").read_text())["decoded"]
+    assert told["camera"] == "sample"
+    assert told["axis"] == "column"
+    assert told["decoded"] == found.decoded
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda image: 2.5 * image, "saturated"),
+        (lambda image: 12 + 0.04 * image, "weak"),
+    ],
+)
+def test_it_says_what_to_change(
+    tmp_path: Path, change: Callable[[NDArray[np.float64]], NDArray[np.float64]], words: str
+) -> None:
+    (found,) = decode_bundle(recorded(tmp_path / "bundle", change), tmp_path / "out")
+    assert any(words in advice for advice in found.advice), found
+
+
+def test_the_command_needs_no_calibration(tmp_path: Path) -> None:
+    bundle, out = recorded(tmp_path / "bundle"), tmp_path / "out"
+    told = CliRunner().invoke(app, ["reconstruct", str(bundle), "--output", str(out), "--decode-only"])
+    assert told.exit_code == 0
+    assert "camera 'sample', columns" in told.stdout
+    assert (out / "position-sample-column.png").exists()
+
+
+def test_frames_without_a_code_are_refused(tmp_path: Path) -> None:
+    capture, _ = sample_scan()
+    kept = [index for index, pattern in enumerate(capture.patterns) if not isinstance(pattern, Gray)]
+    shots = tuple(replace(s, pattern=kept.index(s.pattern)) for s in capture.shots if s.pattern in kept)
+    bare = Capture(capture.projector, tuple(capture.patterns[index] for index in kept), capture.cameras, shots)
+    write_bundle(tmp_path / "bundle", bare, None)
+    with pytest.raises(PatternError, match="no Gray-code"):
+        decode_bundle(tmp_path / "bundle", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
