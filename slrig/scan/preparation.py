@@ -73,8 +73,8 @@ class _MeshingCompiler:
         self._late = config.NUMBA_NUM_THREADS < 2
 
     def start(self) -> None:
-        """Begin, unless that was done or is too late."""
-        if self._late:
+        """Begin, unless that was done, is too late, or no core is idle: where the rig is rendered, it compiles, too."""
+        if self._late or not _has_idle_core():
             return
         self._late = True
         try:
@@ -100,6 +100,15 @@ class _MeshingCompiler:
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
+
+
+def _has_idle_core() -> bool:
+    """Whether fewer threads run now, this one among them, than there are cores; so it is where nobody can tell."""
+    try:
+        running, _ = Path("/proc/loadavg").read_text().split()[3].split("/")
+        return int(running) < config.NUMBA_NUM_THREADS
+    except (OSError, ValueError, IndexError):
+        return True
 
 
 def sample_scan() -> tuple[Capture, Calibration]:

@@ -67,3 +67,46 @@ def test_a_disk_that_refuses_the_made_up_scan_keeps_nobody_from_scanning(monkeyp
 
     monkeypatch.setattr(preparation, "write_bundle", refuse)
     prepare_kernels(pipeline.reconstruct_bundle, lambda _: None)
+
+
+def test_a_second_process_compiles_only_where_a_core_is_idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[list[str]] = []
+
+    class Begun:
+        def __init__(self, command: list[str], **_: object) -> None:
+            begun.append(command)
+
+        def kill(self) -> None:
+            begun.append(["kill"])
+
+        def wait(self) -> None:
+            begun.append(["wait"])
+
+        communicate = wait
+
+    monkeypatch.setattr(preparation.subprocess, "Popen", Begun)
+    monkeypatch.setattr(preparation.config, "NUMBA_NUM_THREADS", 2)
+    monkeypatch.setattr(preparation, "_has_idle_core", lambda: False)
+    with preparation._MeshingCompiler() as beside:
+        beside.start()
+        assert begun == []
+        # The rig that was being rendered is open now.
+        monkeypatch.setattr(preparation, "_has_idle_core", lambda: True)
+        beside.start()
+        beside.start()
+        assert len(begun) == 1
+        beside.join()
+    assert [each[0] for each in begun[1:]] == ["wait", "kill", "wait"]
+    begun.clear()
+    with preparation._MeshingCompiler() as beside:
+        beside.join()
+        beside.start()
+    assert begun == []
+
+
+def test_a_busy_machine_has_no_idle_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    # At least this thread runs.
+    monkeypatch.setattr(preparation.config, "NUMBA_NUM_THREADS", 1)
+    assert not preparation._has_idle_core() or not Path("/proc/loadavg").exists()
+    monkeypatch.setattr(preparation.config, "NUMBA_NUM_THREADS", 10**6)
+    assert preparation._has_idle_core()
