@@ -18,7 +18,7 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, Setting
 from slrig.bundle.description import CameraName
 from slrig.bundle.faults import Strict, explain, keys_of, read_text
 from slrig.errors import ConfigError
-from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, FlipRule, bracket_fault
+from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, bracket_fault
 
 MOST_CONFIG_BYTES = 2**20
 
@@ -56,6 +56,7 @@ class ScanDefaults(Strict):
     max_code_gap: Annotated[int, Field(ge=1)] | None = None
     flip_rule: Annotated[FlipRule, Field(strict=False)] | None = None
     smooth_boundary: bool | None = None
+    axis: Annotated[Axis, Field(strict=False)] | None = None
     exposure_s: ExposureSeconds | None = None
     exposures_s: BracketSeconds | None = Field(
         default=None,

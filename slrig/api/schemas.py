@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, WithJsonSchem
 
 from slrig.api.problems import fault_problem
 from slrig.config import BracketSeconds, ScanDefaults
-from slrig.model import FlipRule
+from slrig.model import Axis, FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 
@@ -68,6 +68,11 @@ class ReconstructionRequest(Strict):
     )
     smooth_boundary: bool | None = Field(
         default=None, description="shrink and smooth the boundary of the mesh. Default true"
+    )
+    axis: Annotated[Axis, Field(strict=False)] | None = Field(
+        default=None,
+        description="of the light to triangulate by; it is played. Default: the one that crosses the baseline more "
+        "steeply",
     )
 
 

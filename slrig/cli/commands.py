@@ -76,6 +76,9 @@ FlipRuleName = Annotated[
     str | None,
     typer.Option("--flip-rule", help="How edges of the mesh are flipped: constrained (default) or delaunay."),
 ]
+LightAxis = Annotated[
+    str | None, typer.Option("--axis", help="Triangulate by column or row. Default: what crosses the baseline.")
+]
 SmoothBoundary = Annotated[
     bool | None,
     typer.Option(
@@ -175,6 +178,7 @@ def scan(
     max_code_gap: MaxCodeGap = None,
     flip_rule: FlipRuleName = None,
     smooth_boundary: SmoothBoundary = None,
+    axis: LightAxis = None,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
@@ -199,6 +203,7 @@ def scan(
             max_code_gap=max_code_gap,
             flip_rule=flip_rule,
             smooth_boundary=smooth_boundary,
+            axis=axis,
         ),
     }
     with ServiceClient(url, read_key(key_file)) as client:
@@ -223,6 +228,7 @@ def reconstruct(
     max_code_gap: MaxCodeGap = None,
     flip_rule: FlipRuleName = None,
     smooth_boundary: SmoothBoundary = None,
+    axis: LightAxis = None,
     decode_only: Annotated[
         bool,
         typer.Option("--decode-only", help="Only decode: positions, causes, what to change. Needs no calibration."),
@@ -240,6 +246,7 @@ def reconstruct(
         max_code_gap=max_code_gap,
         flip_rule=flip_rule,
         smooth_boundary=smooth_boundary,
+        axis=axis,
     )
     formats = [each.value for each in mesh_format or ()]
     reconstruct_with_progress(bundle, output, calibration=calibration, formats=formats, options=options)

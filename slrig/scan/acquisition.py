@@ -55,7 +55,9 @@ def capture_bundle(
     StorageError
         The disk refused. In these cases nothing is left in `folder`. In every case the projector is dark.
     """
-    sequence = pattern_sequence(plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras)
+    sequence = pattern_sequence(
+        plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras, axis=plan.reconstruction.axis
+    )
     rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
     for words in told:
         _log.info(words, rig=rig.name)

@@ -223,10 +223,18 @@ def _guarded(rig: Rig, calls: Calls) -> Rig:
 
 
 def pattern_sequence(
-    plan: PatternPlan, size: Size, calibration: Calibration | None = None, cameras: Iterable[str] = ()
+    plan: PatternPlan,
+    size: Size,
+    calibration: Calibration | None = None,
+    cameras: Iterable[str] = (),
+    *,
+    axis: Axis | None = None,
 ) -> PatternSequence:
-    """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError."""
-    axes = played_axes(plan.rows, calibration, cameras)
+    """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError.
+
+    axis : the one to triangulate by, if that was asked for.
+    """
+    axes = played_axes(plan.rows, calibration, cameras, axis=axis)
     patterns = scan_patterns(
         size,
         line_shift=plan.line_shift,
@@ -251,7 +259,8 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
         A camera cannot expose that long, or that briefly, or the frames are more than a bundle holds.
     """
     exposures_s = plan.rising_exposures_s
-    sequence = pattern_sequence(plan.patterns, facts.projector.size, calibration, facts.cameras)
+    axis = plan.reconstruction.axis
+    sequence = pattern_sequence(plan.patterns, facts.projector.size, calibration, facts.cameras, axis=axis)
     count = len(sequence) * max(len(exposures_s), 1)
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0

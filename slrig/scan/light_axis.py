@@ -18,24 +18,31 @@ FAIR_SHARE = 0.5
 _BOTH = 'Scan with both axes: "rows": true in a request\'s patterns, --rows on the command line'
 
 
-def played_axes(rows: bool | None, calibration: Calibration | None, names: Iterable[str]) -> tuple[Axis, ...]:
+def played_axes(
+    rows: bool | None, calibration: Calibration | None, names: Iterable[str], *, axis: Axis | None = None
+) -> tuple[Axis, ...]:
     """The axes that a scan with the cameras `names` plays.
 
     rows : True plays both, False columns alone; None the one that the calibration asks for, and columns without one.
+    axis : the one to triangulate by, if that was asked for.
 
     Raises
     ------
     PatternError
-        Columns alone were asked for, and by the calibration they tell no depth.
+        The axis asked for tells no depth by the calibration, or columns alone are to be played and rows to be used.
     """
     if rows:
         return tuple(Axis)
+    if axis is Axis.ROW and rows is False:
+        message = '"rows": false plays columns alone, and "axis": "row" triangulates by rows; leave one of them out'
+        raise PatternError(message)
     cameras = _known(calibration, names)
+    wanted = Axis.COLUMN if rows is False else axis
     if calibration is None or not cameras:
-        return (Axis.COLUMN,)
-    if rows is None:
+        return (wanted or Axis.COLUMN,)
+    if wanted is None:
         return (triangulated_axis(cameras, calibration.projector),)
-    return (chosen_axis((Axis.COLUMN,), cameras, calibration.projector),)
+    return (chosen_axis((wanted,), cameras, calibration.projector),)
 
 
 def chosen_axis(shown: Collection[Axis], cameras: Sequence[Pinhole], projector: Pinhole | None) -> Axis:

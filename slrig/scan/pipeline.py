@@ -132,10 +132,10 @@ def reconstruct_bundle(
 
     with compilations_told(compiling), staged_folder(output) as staging:
         entered("read bundle", 0.0, str(bundle))
-        walked = _walked(bundle, calibration, live, entered)
+        walked = _walked(bundle, calibration, live, entered, axis=plan.axis)
         found = _triangulated(walked, bundle, entered)
         (other,) = set(Axis) - {walked.axis}
-        if found.share_across < FAIR_SHARE and other in walked.shown:
+        if plan.axis is None and found.share_across < FAIR_SHARE and other in walked.shown:
             # The projector does not stand as was assumed: its stripes run the other way.
             walked = _walked(bundle, calibration, None, entered, axis=other)
             found = _triangulated(walked, bundle, entered)
@@ -216,7 +216,12 @@ def _walked(
             share = (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names)
             entered(stage, 0.1 + 0.5 * share, f"camera '{name}'")
 
-    if live is not None and live.evidence is not None and _is_of(live, folder, calibration_file):
+    if (
+        live is not None
+        and live.evidence is not None
+        and axis in (None, live.stream.axis)
+        and _is_of(live, folder, calibration_file)
+    ):
         names += live.stream.outline.cameras
         devices, stream, evidence = live.calibration, live.stream, live.evidence
         _require_calibration(folder, names, devices)

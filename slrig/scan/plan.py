@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from slrig.errors import ConfigError
-from slrig.model import FlipRule, bracket_fault
+from slrig.model import Axis, FlipRule, bracket_fault
 
 
 class Progress(Protocol):
@@ -45,11 +45,13 @@ class ReconstructionPlan:
     max_code_gap : neighbouring curves whose columns differ by at most this many column steps are meshed together.
     flip_rule : when an edge is exchanged for the other diagonal of its two triangles; `FlipRule` or its value.
     smooth_boundary : shrink and smooth the boundary of the mesh (paper, section 3.4).
+    axis : of the light to triangulate by, `Axis` or its value; None the one that crosses the baseline more steeply.
 
     Raises
     ------
     ConfigError
-        depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, or flip_rule is none of `FlipRule`.
+        depth_edge_ratio is not above 1 and finite, max_code_gap is below 1, flip_rule is none of `FlipRule`, or axis
+        none of `Axis`.
     """
 
     keep_holes: bool = False
@@ -57,6 +59,7 @@ class ReconstructionPlan:
     max_code_gap: int = 1
     flip_rule: FlipRule = FlipRule.CONSTRAINED
     smooth_boundary: bool = True
+    axis: Axis | None = None
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:
@@ -75,6 +78,11 @@ class ReconstructionPlan:
             object.__setattr__(self, "flip_rule", FlipRule(self.flip_rule))
         except ValueError as cause:
             message = f"flip_rule: expected {' or '.join(FlipRule)}, found {self.flip_rule!r}; constrained is usual"
+            raise ConfigError(message) from cause
+        try:
+            object.__setattr__(self, "axis", None if self.axis is None else Axis(self.axis))
+        except ValueError as cause:
+            message = f"axis: expected {' or '.join(Axis)}, found {self.axis!r}; left out, the calibration decides"
             raise ConfigError(message) from cause
 
 

@@ -106,7 +106,7 @@ def _has_idle_core() -> bool:
     """Whether fewer threads run now, this one among them, than there are cores; so it is where nobody can tell."""
     try:
         running, _ = Path("/proc/loadavg").read_text().split()[3].split("/")
-        return int(running) < config.NUMBA_NUM_THREADS
+        return bool(int(running) < config.NUMBA_NUM_THREADS)
     except (OSError, ValueError, IndexError):
         return True
 

@@ -20,7 +20,8 @@ from slrig.meshing.rasteriser import rasterised
 from slrig.model import Axis, FloatArray, Pinhole
 from slrig.reconstruction.frames import axis_frames
 from slrig.reconstruction.optics import project
-from slrig.scan.plan import PatternPlan
+from slrig.scan.pipeline import reconstruct_bundle
+from slrig.scan.plan import PatternPlan, ReconstructionPlan
 from tests.golden.test_light_axis import Device, rig_file, scanned
 
 CAMERA: Device = {
@@ -89,3 +90,22 @@ def test_both_halves_are_covered(tmp_path: Path, side_by_side: bool) -> None:
         f"{report['cameras']['camera0']['lit_by_unresolved_bits']}\n" + "\n".join(report["notes"]) + "\n"
     )
     assert min(shares) >= 0.95
+    assert truth["rms_mm"] <= 0.003
+    assert 0.8 <= truth["error_over_sigma_p68"] <= 1.25
+    assert truth["false_area_0.5mm"] == 0
+    assert truth["nonmanifold_edges"] == truth["misoriented_edges"] == 0
+    assert report["mesh"]["covers_of_decoded"] >= 0.95
+    assert any("does not resolve the finest Gray bit" in note for note in report["notes"])
+    assert not any("the mesh covers" in note for note in report["notes"])
+    if side_by_side:
+        _thin_mesh_is_told(bundle, tmp_path / "thin")
+
+
+def _thin_mesh_is_told(bundle: Path, output: Path) -> None:
+    """With a limit at depth edges that takes most triangles for such."""
+    report = reconstruct_bundle(
+        bundle, output, plan=ReconstructionPlan(depth_edge_ratio=1.2), progress=lambda *_: None, cancelled=lambda: False
+    )
+    notes = report["notes"]
+    assert isinstance(notes, list)
+    assert any("of what camera 'camera0' decoded" in note for note in notes), notes

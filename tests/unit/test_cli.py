@@ -299,6 +299,7 @@ def test_reconstruction_option_out_of_range_is_told_by_the_plan(tmp_path: Path) 
         (["--close-holes", "--raw-boundary"], {"keep_holes": False, "smooth_boundary": False}),
         (["--smooth-boundary", "--flip-rule", "delaunay"], {"smooth_boundary": True, "flip_rule": "delaunay"}),
         (["--depth-edge-ratio", "9", "--max-code-gap", "2"], {"depth_edge_ratio": 9.0, "max_code_gap": 2}),
+        (["--axis", "row"], {"axis": "row"}),
     ],
 )
 def test_a_scan_asks_the_service_for_the_options_that_were_given(

@@ -49,6 +49,17 @@ def test_the_cameras_of_the_rig_count_and_not_all_of_the_calibration() -> None:
     assert played_axes(None, three, "xy") == (Axis.COLUMN,)
 
 
+def test_an_axis_that_was_asked_for_is_played_and_used() -> None:
+    assert played_axes(None, PAIR, "ab", axis=Axis.ROW) == (Axis.ROW,)
+    assert played_axes(None, None, "ab", axis=Axis.ROW) == (Axis.ROW,)
+    assert played_axes(True, PAIR, "ab", axis=Axis.ROW) == BOTH
+    assert played_axes(False, BESIDE, "a", axis=Axis.COLUMN) == (Axis.COLUMN,)
+    with pytest.raises(PatternError, match="leave one of them out"):
+        played_axes(False, PAIR, "ab", axis=Axis.ROW)
+    with pytest.raises(PatternError, match=r"rows alone.* beside the projector"):
+        played_axes(None, BESIDE, "a", axis=Axis.ROW)
+
+
 def test_columns_that_were_asked_for_are_played_unless_they_tell_nothing() -> None:
     slanting = rig((math.sin(math.radians(13)), math.cos(math.radians(13))), projector=True)
     assert played_axes(False, slanting, "a") == (Axis.COLUMN,)

@@ -55,6 +55,11 @@ def run(bundle: Path, output: Path, **options: object) -> dict[str, object]:
     return reconstruct_bundle(bundle, output, plan=plan, progress=lambda *_: None, cancelled=lambda: False)
 
 
+def test_an_axis_that_was_not_played_is_named(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(PatternError, match="no Gray-code frames of the row axis"):
+        run(recorded, tmp_path / "out", axis=Axis.ROW)
+
+
 def changed(recorded: Path, folder: Path, change: Callable[[Shot, Capture], Shot | None]) -> Path:
     """A copy of the bundle with each frame changed, or left out."""
     bundle = read_bundle(recorded)

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from slrig.errors import ConfigError
-from slrig.model import FlipRule
+from slrig.model import Axis, FlipRule
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.records import plan_from_json, plan_json
 
@@ -43,6 +43,12 @@ def test_a_plan_of_earlier_days_has_the_usual_mesh_and_a_stored_one_comes_back()
 def test_exposure_is_positive_and_finite(exposure_s: float) -> None:
     with pytest.raises(ConfigError, match=f"exposure_s: expected a finite time above 0 s, found {exposure_s:g} s"):
         ScanPlan(exposure_s=exposure_s)
+
+
+def test_an_axis_is_a_column_or_a_row() -> None:
+    assert ReconstructionPlan(axis="row").axis is Axis.ROW  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="axis: expected column or row, found 'diagonal'"):
+        ReconstructionPlan(axis="diagonal")  # type: ignore[arg-type]
 
 
 def test_least_plan_is_accepted() -> None:

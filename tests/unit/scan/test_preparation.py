@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import config
 
 from slrig.errors import StorageError
 from slrig.kernels import Prepared, compilations_told, prepared
@@ -84,8 +86,8 @@ def test_a_second_process_compiles_only_where_a_core_is_idle(monkeypatch: pytest
 
         communicate = wait
 
-    monkeypatch.setattr(preparation.subprocess, "Popen", Begun)
-    monkeypatch.setattr(preparation.config, "NUMBA_NUM_THREADS", 2)
+    monkeypatch.setattr(subprocess, "Popen", Begun)
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 2)
     monkeypatch.setattr(preparation, "_has_idle_core", lambda: False)
     with preparation._MeshingCompiler() as beside:
         beside.start()
@@ -106,7 +108,7 @@ def test_a_second_process_compiles_only_where_a_core_is_idle(monkeypatch: pytest
 
 def test_a_busy_machine_has_no_idle_core(monkeypatch: pytest.MonkeyPatch) -> None:
     # At least this thread runs.
-    monkeypatch.setattr(preparation.config, "NUMBA_NUM_THREADS", 1)
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 1)
     assert not preparation._has_idle_core() or not Path("/proc/loadavg").exists()
-    monkeypatch.setattr(preparation.config, "NUMBA_NUM_THREADS", 10**6)
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", 10**6)
     assert preparation._has_idle_core()
