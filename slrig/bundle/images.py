@@ -1,4 +1,4 @@
-"""Frame files: PNG and TIFF, their headers read before a pixel is decoded.
+"""Frame files: PNG, TIFF and BMP, their headers read before a pixel is decoded.
 
 A few hundred kilobytes can declare an image of gigabytes, so extent and depth come from the header, and only a file
 that fits what bundle.json declares is decoded. A PNG's chunks are walked with their checksums: a cut or damaged file is
@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import tifffile
 
+from slrig.bundle.bitmaps import SIGNATURE, Bitmap
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Pixels
 
@@ -61,9 +62,13 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     elif data.startswith(TIFF_SIGNATURES):
         _check_tiff(path, data, pages, camera)
         images = {page: _tiff_page(data, page) for page in dict.fromkeys(pages)}
+    elif data.startswith(SIGNATURE):
+        if set(pages) != {0}:
+            _refuse(path, "page 0 only, for a BMP holds one image", f"page {max(pages)}", "write page 0 or use a TIFF")
+        images = {0: _bitmap(path, data, camera)}
     else:
         found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
-        _refuse(path, "a PNG or TIFF file", found, "save the frame as PNG")
+        _refuse(path, "a PNG, TIFF or BMP file", found, "save the frame as PNG")
     return {page: _grey(path, page, image, camera) for page, image in images.items()}
 
 
@@ -125,6 +130,15 @@ def _check_png(path: Path, data: bytes, camera: CameraFormat) -> None:
         if kind_of_chunk == b"IEND":
             return
         place = end
+
+
+def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
+    try:
+        found = Bitmap.of(data)
+        _check_header(path, found.width, found.height, 8, camera)
+        return found.decoded(data)
+    except ValueError as cause:
+        _refuse(path, "a whole, uncompressed BMP of 8 or 24 bits", str(cause), "save the frame as PNG")
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
