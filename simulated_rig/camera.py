@@ -58,7 +58,7 @@ class SimulatedCamera:
         self._settings = AppliedSettings(options.exposure_s, 1.0)
         self._trigger: Trigger | None = None
         self._pending: deque[_Exposure] = deque()
-        self._made = 0
+        self._made = self._armed_at = 0
         self._dropped = 0
         self._t_armed_ns = 0
         self._t_busy_ns = 0
@@ -118,6 +118,7 @@ class SimulatedCamera:
         self._dropped = self._free_index = 0
         self._t_armed_ns = self._t_busy_ns = self._clock.now_ns()
         self._trigger = trigger
+        self._armed_at = self._made
 
     def trigger(self) -> None:
         """See `Camera`. A trigger during an exposure starts the next one right after it."""
@@ -256,8 +257,15 @@ class SimulatedCamera:
 
     def _rendered(self, exposure: _Exposure) -> Pixels:
         mean = self._view.image(self._lights(exposure), ambient=self._ambient(exposure))
-        electrons = self._sensor.electrons(mean, self._settings.exposure_s)
+        exposure_s = self._settings.exposure_s * self._crept(exposure.number)
+        electrons = self._sensor.electrons(mean, exposure_s)
         return self._sensor.read_out(electrons, gain=self._settings.gain, rng=self._rng(_NOISE, exposure.number))
+
+    def _crept(self, number: int) -> float:
+        """How much more light a frame has than the settings say."""
+        steps = sum(number >= first for first in self._faults.exposure_step_frames) if self._is_faulty else 0
+        drift = (1 + self._options.exposure_drift) ** max(number - self._armed_at, 0)
+        return float(drift * self._faults.exposure_step**steps)
 
     def _lights(self, exposure: _Exposure) -> Sequence[tuple[float | Float32Array, LightTable]]:
         """Each light that an exposure saw, with its fraction: one number, or (H, 1) when each row saw its own."""

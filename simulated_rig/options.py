@@ -163,6 +163,12 @@ class CameraOptions(Device):
     pedestal_dn: NotNegative = 0.0
     """The value of a dark sample."""
 
+    response: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """Values grow with light to the power of this: 0.45 as a webcam's, made for displays."""
+
+    exposure_drift: Annotated[float, Field(gt=-0.1, lt=0.1)] = 0.0
+    """Each frame since the camera was armed has this share more light than the one before: its exposure creeps."""
+
     trigger_latency_s: NotNegative = 0.0002
     """From `trigger` to the exposure's start."""
 
@@ -210,6 +216,7 @@ class CameraOptions(Device):
             read_noise_e=self.read_noise_e,
             saturation_s=self.saturation_s,
             pedestal_dn=self.pedestal_dn,
+            response=self.response,
         )
 
 
@@ -245,6 +252,12 @@ class Faults(Table, use_attribute_docstrings=True):
 
     jitter_s: NotNegative = 0.0
     """Each exposure starts, and each frame comes, up to this much later."""
+
+    exposure_step_frames: Counts = ()
+    """Automatic exposure that was not switched off: from each of these frames on, exposure_step times the light."""
+
+    exposure_step: Annotated[float, Field(gt=0, le=10)] = 0.7
+    """By how much."""
 
     unplug_camera_at_frame: Count | None = None
     """The camera is gone from then on."""

@@ -13,9 +13,11 @@ from slrig.model import Pixels
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """A linear sensor.
+    """A linear sensor, and the camera's own processing behind it, if there is any.
 
-    value = pedestal_dn + gain * electrons * (full scale - pedestal_dn) / full_well_e, rounded and clipped.
+    value = pedestal_dn + gain * electrons * (full scale - pedestal_dn) / full_well_e, clipped; then
+    full scale * (value / full scale) ^ response, rounded. response : 1 of machine vision cameras, about 0.45 of
+    webcams, whose pictures are made for displays.
 
     saturation_s : the exposure at which a white diffuser, at the working distance and facing the projector, fills
     the well under a white pattern.
@@ -26,6 +28,7 @@ class Sensor:
     read_noise_e: float
     saturation_s: float
     pedestal_dn: float
+    response: float = 1.0
 
     @property
     def full_scale(self) -> int:
@@ -55,6 +58,7 @@ class Sensor:
             np.float32(self.dn_per_electron(gain)),
             np.float32(self.pedestal_dn),
             np.float32(self.full_scale),
+            np.float32(self.response),
             out,
         )
         return out
@@ -69,6 +73,7 @@ def _digitise(
     dn_per_electron: np.float32,
     pedestal: np.float32,
     full_scale: np.float32,
+    response: np.float32,
     out: Pixels,
 ) -> None:
     for r in range(electrons.shape[0]):
@@ -76,5 +81,8 @@ def _digitise(
             # The well clips the electrons, shot noise included; read noise comes after it.
             mean = electrons[r, c]
             held = min(mean + np.sqrt(mean + read_variance) * draws[r, c], full_well)
-            value = pedestal + dn_per_electron * held + np.float32(0.5)
-            out[r, c] = int(min(max(value, np.float32(0)), full_scale))
+            value = pedestal + dn_per_electron * held
+            if response != np.float32(1):
+                share = min(max(value, np.float32(0)), full_scale) / full_scale
+                value = full_scale * share**response
+            out[r, c] = int(min(max(value + np.float32(0.5), np.float32(0)), full_scale))

@@ -31,6 +31,9 @@ _LIT_SAMPLES = 40
 _EDGE_PX = 8.0
 """Breadth of an edge that a scaler blurred, projector pixels: from end to end of a Gaussian of 2 px, ± 2 deviations."""
 
+_EVEN = 0.08
+"""Spread of what an even change of light leaves, by noise: damage and other patterns leave light and dark."""
+
 _STEEPEST_GAMMA = 2.4
 """Of displays: ITU-R BT.1886."""
 
@@ -187,6 +190,13 @@ def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, 
     apart = float(np.median(np.abs((bit - inverse)[ref.judged]) / ref.contrast[ref.judged]))
     if apart < 0.25:
         return f"the frame and its inverse show the same on {worst}: one of them is stale; scan again"
+    together = float(np.median(u + v))
+    if float(np.median(np.abs(u + v - together))) < _EVEN * together:
+        return (
+            f"the frame and its inverse have {together:.0%} of the light of white and black, evenly on all of the "
+            "image: the exposure or the lamp changed since: switch off automatic exposure and gain, dynamic contrast "
+            "and power saving, and scan again"
+        )
     return (
         f"the frame and its inverse do not add up to white and black on {worst}: one of them shows another pattern or "
         f"was damaged, or something moved, or {_contrast(ref)}; scan again"

@@ -38,6 +38,7 @@ def _compiled_by(module: str, name: str, given: str = "") -> set[str]:
     return set(found.stdout.splitlines())
 
 
+@pytest.mark.slow
 def test_it_compiles_what_a_scan_needs() -> None:
     beside = _compiled_by("slrig.meshing.preparation", "mesh_sample")
     needed = _compiled_by("slrig.scan.pipeline", "warm_kernels", "lambda _: None")

@@ -435,3 +435,19 @@ def test_row_patterns_are_shown_along_rows(tmp_path: Path) -> None:
     assert SIZE.along(Axis.ROW) == 60
     assert image[:18].mean() > 40
     assert image[30:].mean() < 2
+
+
+def test_exposure_that_creeps_gives_each_frame_more_light_than_the_one_before(tmp_path: Path) -> None:
+    head, camera = armed(tmp_path, camera={"exposure_drift": 0.02, "bit_depth": 12})
+    first, *others = [float(taken(head, camera, 0).image[20:28, 28:36].mean()) for _ in range(6)]
+    assert others[-1] / first == pytest.approx(1.02**5, rel=0.01)
+    camera.disarm()
+    camera.arm(10, Trigger.SOFTWARE)
+    assert float(taken(head, camera, 0).image[20:28, 28:36].mean()) == pytest.approx(first, rel=0.01)
+
+
+def test_automatic_exposure_steps_at_its_frames(tmp_path: Path) -> None:
+    faults = {"exposure_step_frames": [2, 4], "exposure_step": 0.8}
+    head, camera = armed(tmp_path, camera={"bit_depth": 12}, faults=faults)
+    means = [float(taken(head, camera, 0).image[20:28, 28:36].mean()) for _ in range(5)]
+    np.testing.assert_allclose(np.array(means) / means[0], [1, 1, 0.8, 0.8, 0.64], rtol=0.01)

@@ -73,7 +73,7 @@ def test_values_are_rounded_to_the_nearest_number() -> None:
     camera = sensor(bit_depth=8, full_well_e=255.0, read_noise_e=0.0)
     image = np.array([[0.0, 0.49, 0.51, 7.2, 254.6, 300.0]], np.float32)
     out = np.zeros(image.shape, np.uint8)
-    arguments = (image, np.zeros_like(image), *(np.float32(a) for a in (255.0, 0.0, 1.0, 0.0, 255.0)), out)
+    arguments = (image, np.zeros_like(image), *(np.float32(a) for a in (255.0, 0.0, 1.0, 0.0, 255.0, 1.0)), out)
     sensor_module._digitise(*arguments)
     np.testing.assert_array_equal(out, [[0, 0, 1, 7, 255, 255]])
     assert camera.dn_per_electron(1.0) == 1
@@ -96,3 +96,13 @@ def test_electrons_follow_exposure_and_saturate_at_the_stated_one() -> None:
     white = np.ones((2, 2), np.float32)
     np.testing.assert_allclose(camera.electrons(white, 0.02), 12000, rtol=1e-6)
     np.testing.assert_allclose(camera.electrons(white, 0.005), 3000, rtol=1e-6)
+
+
+@pytest.mark.parametrize("response", [0.45, 1.0, 2.2])
+def test_values_grow_with_light_to_the_power_of_the_response(response: float) -> None:
+    camera = sensor(response=response, read_noise_e=0.0, full_well_e=1e6, bit_depth=16, pedestal_dn=500.0)
+    for share in (0.05, 0.3, 0.8):
+        read = camera.read_out(flat(share * 1e6), gain=1.0, rng=np.random.default_rng(0))
+        linear = (500 + share * (65535 - 500)) / 65535
+        assert read.mean() == pytest.approx(65535 * linear**response, rel=2e-3)
+    assert (camera.read_out(flat(2e6), gain=1.0, rng=np.random.default_rng(0)) == 65535).all()
