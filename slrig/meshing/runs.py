@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -43,7 +44,7 @@ def parts_of_curves(
         for piece in mine:
             # Where along the piece there is nobody beside it yet.
             open_px = [(-np.inf, np.inf)]
-            for other in (each for there in pieces[curve + 1 : last] for each in there):
+            for other in (each for there in pieces[curve + 1 : last] for each in _overlapping(there, piece)):
                 left: list[tuple[float, float]] = []
                 for bounds in open_px:
                     taken = piece.beside(other, *bounds)
@@ -134,6 +135,13 @@ class _Piece:
     def last_to(self, place: float) -> int:
         """The last point not beyond a place, or the first of all."""
         return max(int(np.searchsorted(self.along_px, place, side="right")) - 1, 0)
+
+
+def _overlapping(pieces: list[_Piece], piece: _Piece) -> list[_Piece]:
+    """Those of a curve's pieces, which follow one another, that are there where another piece is."""
+    first = bisect_left(pieces, piece.along_px[0], key=lambda each: each.along_px[-1])
+    last = bisect_right(pieces, piece.along_px[-1], key=lambda each: each.along_px[0])
+    return pieces[first:last]
 
 
 def _pieces(along_px: FloatArray, begin: int, end: int, widest_gap_px: float) -> list[_Piece]:
