@@ -20,12 +20,14 @@ class BoardView:
     """The corners of the board that one camera sees.
 
     corner : (n,) int32, their numbers, rising; points_px : (n, 2) float64; sigma_px : (n,) float64, the standard
-    deviation of each coordinate as the detector states it.
+    deviation of each coordinate as the detector states it. light_first : the square up and left of corner 0 is light,
+    as OpenCV before 4.6 printed ChArUco boards with an even number of rows of squares.
     """
 
     corner: IntArray
     points_px: FloatArray
     sigma_px: FloatArray
+    light_first: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.corner)

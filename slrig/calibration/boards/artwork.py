@@ -35,8 +35,9 @@ class Artwork:
     circles_mm: FloatArray
 
 
-def artwork(board: Board) -> Artwork:
-    """Every dark shape of a board: the squares (the one up and left of corner 0 is dark), the markers, the circles.
+def artwork(board: Board, *, light_first: bool = False) -> Artwork:
+    """Every dark shape of a board: the squares (the one up and left of corner 0 is dark, unless `light_first`), the
+    markers, the circles.
 
     Raises
     ------
@@ -49,17 +50,20 @@ def artwork(board: Board) -> Artwork:
         radius = np.full((len(centres), 1), CIRCLE_RADIUS * board.square_mm)
         return Artwork(no_rectangles, np.zeros(0, dtype=np.int32), np.hstack([centres, radius]))
     row, column = np.mgrid[: board.rows + 1, : board.columns + 1]
-    dark = (row + column) % 2 == 0
+    dark = (row + column) % 2 == int(light_first)
     least = np.column_stack([column[dark], row[dark]]) - 1.0
     shapes = [np.stack([least, least + 1], axis=1) * board.square_mm]
     if board.kind is BoardKind.CHARUCO:
-        shapes += _markers(board)
+        shapes += _markers(board, light_first)
     group = np.repeat(np.arange(len(shapes), dtype=np.int32), [len(shape) for shape in shapes])
     return Artwork(np.concatenate(shapes), group, no_circles)
 
 
-def charuco_board(board: Board) -> Any:
+def charuco_board(board: Board, *, light_first: bool = False) -> Any:
     """OpenCV's own description of a ChArUco board: `cv2.aruco.CharucoBoard`, its origin one square up and left of ours.
+
+    light_first : the layout of OpenCV before 4.6 (`setLegacyPattern`); another one only where the number of rows of
+    squares is even.
 
     Raises
     ------
@@ -75,7 +79,9 @@ def charuco_board(board: Board) -> Any:
         )
         raise CalibrationError(message)
     squares = (board.columns + 1, board.rows + 1)
-    return cv2.aruco.CharucoBoard(squares, board.square_mm, float(board.marker_mm or 0), markers)
+    described = cv2.aruco.CharucoBoard(squares, board.square_mm, float(board.marker_mm or 0), markers)
+    described.setLegacyPattern(light_first)
+    return described
 
 
 def marker_dictionary(name: str) -> Any:
@@ -92,9 +98,9 @@ def marker_dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def _markers(board: Board) -> list[FloatArray]:
+def _markers(board: Board, light_first: bool) -> list[FloatArray]:
     """The dark cells of each marker, runs within a row joined: (n, 2, 2) float64 each, mm."""
-    described = charuco_board(board)
+    described = charuco_board(board, light_first=light_first)
     dictionary = described.getDictionary()
     cells = int(dictionary.markerSize) + 2
     shapes = []

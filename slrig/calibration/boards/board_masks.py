@@ -40,7 +40,7 @@ def light_squares(view: BoardView, board: Board, shape: tuple[int, int], /) -> M
     circles. A pixel that an edge passes counts as dark.
     """
     board_map = _map(view, board)
-    return _region(board_map, board, shape) & ~_dark(board_map, board, shape)
+    return _region(board_map, board, shape) & ~_dark(board_map, view, board, shape)
 
 
 def square_interior(view: BoardView, board: Board, shape: tuple[int, int], /, *, margin_px: float) -> Mask:
@@ -48,7 +48,7 @@ def square_interior(view: BoardView, board: Board, shape: tuple[int, int], /, *,
     print's own border, be they light or dark. With `light_squares` it gives the paper that no edge's blur reaches.
     """
     board_map = _map(view, board)
-    region, dark = _region(board_map, board, shape), _dark(board_map, board, shape)
+    region, dark = _region(board_map, board, shape), _dark(board_map, view, board, shape)
     far = np.zeros(shape, dtype=bool)
     for part in (region & dark, region & ~dark):
         # A ring of nothing about the image, so that its border is no edge of the print.
@@ -67,7 +67,7 @@ def blur_sigma_px(image: NDArray[Any], view: BoardView, board: Board, /, *, full
     if board.kind is BoardKind.CIRCLES:
         blur = circle_blur_px(level, view, board)
     else:
-        placed = placed_corners(level, board, view.corner, view.points_px)
+        placed = placed_corners(level, board, view.corner, view.points_px, light_first=view.light_first)
         blur = np.zeros(0) if placed is None else placed.blur_px
     blur = blur[np.isfinite(blur)]
     return float(np.median(blur)) if len(blur) else float("nan")
@@ -87,8 +87,8 @@ def _region(board_map: BoardMap, board: Board, shape: tuple[int, int]) -> Mask:
     return _filled(board_map, [_outline(left, top, right, bottom, count)], shape)
 
 
-def _dark(board_map: BoardMap, board: Board, shape: tuple[int, int]) -> Mask:
-    drawn = artwork(board)
+def _dark(board_map: BoardMap, view: BoardView, board: Board, shape: tuple[int, int]) -> Mask:
+    drawn = artwork(board, light_first=view.light_first)
     outlines = [
         _outline(left, top, right, bottom, _ALONG if group == 0 else 1)
         for ((left, top), (right, bottom)), group in zip(drawn.rectangles_mm, drawn.group, strict=True)

@@ -47,7 +47,7 @@ def placed_again(image: NDArray[Any], view: BoardView, board: Board, /, *, full_
     grey = Grey.of(image, full_scale)
     if board.kind is BoardKind.CIRCLES:
         return circles_again(grey, board, view)
-    placed = placed_corners(grey.level, board, view.corner, view.points_px)
+    placed = placed_corners(grey.level, board, view.corner, view.points_px, light_first=view.light_first)
     if placed is None:
         return BoardView(np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0))
     return placed.view

@@ -31,17 +31,19 @@ class PlacedCorners:
     blur_px: FloatArray
 
 
-def placed_corners(level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray) -> PlacedCorners | None:
+def placed_corners(
+    level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray, *, light_first: bool = False
+) -> PlacedCorners | None:
     """Corners of a chessboard or ChArUco board from rough places: those that a fit could place. None if too few.
 
-    level : (H, W) float64; corner : (n,) int32, rising; rough_px : (n, 2) float64.
+    level : (H, W) float64; corner : (n,) int32, rising; rough_px : (n, 2) float64; light_first : as of `BoardView`.
     """
     squares = board.points_mm[:, :2] / board.square_mm
     for again in (False, True):
         board_map = fitted_map(squares[corner], rough_px)
         if board_map is None:
             return None
-        fit = _fit(level, board, corner, rough_px, board_map)
+        fit = _fit(level, board, corner, rough_px, board_map, light_first)
         if fit is None:
             return None
         good = np.isfinite(fit.sigma_px) & (fit.sigma_px < _WORST_SIGMA_PX)
@@ -56,7 +58,7 @@ def placed_corners(level: FloatArray, board: Board, corner: IntArray, rough_px: 
     final = fitted_map(squares[corner], rough_px)
     if final is None:
         return None
-    view = BoardView(corner.astype(np.int32), rough_px, np.hypot(sigma, FLOOR_PX))
+    view = BoardView(corner.astype(np.int32), rough_px, np.hypot(sigma, FLOOR_PX), light_first)
     return PlacedCorners(view, final, blur)
 
 
@@ -76,7 +78,7 @@ def _on_the_map(squares: FloatArray, points_px: FloatArray) -> np.ndarray[tuple[
 
 
 def _fit(
-    level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray, board_map: BoardMap
+    level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray, board_map: BoardMap, light_first: bool
 ) -> FittedPlaces | None:
     """The fit at each corner; None where squares would be smaller than can be told, or the map has a fold in them."""
     squares = board.points_mm[corner, :2] / board.square_mm
@@ -99,7 +101,7 @@ def _fit(
         # Of the two squares on this diagonal, light or dark by the corner's number, only the light ones hold a marker.
         row, column = np.divmod(corner, board.columns)
         same_sign = (local[..., 0] > 0) == (local[..., 1] > 0)
-        light = same_sign == ((row + column) % 2 == 1)[:, None]
+        light = same_sign == ((row + column) % 2 != int(light_first))[:, None]
         usable &= ~(light & (clear.min(axis=-1) > -1.0))
     edges = slope.transpose(0, 2, 1) / sides[..., None]
     return fitted_corners(level, rough_px, edges, usable, half_px=half_px)

@@ -5,10 +5,19 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from slrig.calibration.board import Board
+from slrig.calibration.boards.artwork import charuco_board
 from slrig.model import FloatArray, IntArray
 
 _WIDTHS = range(3, 31)
 _FEWEST = 6
+_SAME = 0.1
+"""Of a marker's side: what rests on the layout that the markers are printed in, lens and bow included. On the other
+layout it is a quarter of a side and more, unless all markers in view lie in rows that are shifted alike."""
+
+
+_OFF = 0.5
+"""Of a marker's side: more than this rests only where the markers are another board's."""
 
 
 def rest_px(places: FloatArray, points_px: FloatArray) -> float:
@@ -18,6 +27,25 @@ def rest_px(places: FloatArray, points_px: FloatArray) -> float:
         return float("inf")
     seen = cv2.perspectiveTransform(places[:, None], homography)[:, 0]
     return float(np.median(np.linalg.norm(seen - points_px, axis=1)))
+
+
+def stands_light_first(board: Board, ids: IntArray, outlines: FloatArray) -> bool | None:
+    """Whether markers, (n,) with their outlines (n, 4, 2) px, stand as OpenCV before 4.6 printed this board, with a
+    light square up and left of corner 0; None where they stand so in both layouts, a step of one square apart.
+
+    With an odd number of rows of squares there is one layout.
+    """
+    if board.rows % 2 == 0:
+        return False
+    known = ids < (board.columns + 1) * (board.rows + 1) // 2
+    side = float(np.median(np.linalg.norm(np.roll(outlines, 1, axis=1) - outlines, axis=2)))
+    rests = []
+    for light_first in (False, True):
+        places = np.asarray(charuco_board(board, light_first=light_first).getObjPoints())[ids[known], :, :2]
+        rests.append(_rms_px(places.reshape(-1, 2), outlines[known].reshape(-1, 2)))
+    if max(rests) < _SAME * side:
+        return None
+    return rests[1] < min(rests[0], _OFF * side)
 
 
 def fitting_width(ids: IntArray, outlines: FloatArray) -> int | None:
@@ -34,6 +62,15 @@ def fitting_width(ids: IntArray, outlines: FloatArray) -> int | None:
     best = min(rests, key=lambda columns: rests[columns])
     side = float(np.median(np.linalg.norm(np.roll(outlines, 1, axis=1) - outlines, axis=2)))
     return best if rests[best] < 0.15 * side else None
+
+
+def _rms_px(places: FloatArray, points_px: FloatArray) -> float:
+    """Rms distance, px, of all points from their homography. A median would not see the third that stands aside."""
+    homography = cv2.findHomography(places, points_px)[0] if len(places) >= 4 else None
+    if homography is None:
+        return float("inf")
+    off = cv2.perspectiveTransform(places.astype(np.float64)[:, None], homography)[:, 0] - points_px
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
 def _marker_places(width: int, count: int) -> tuple[IntArray, IntArray]:

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board
-from slrig.calibration.boards.artwork import charuco_board
+from slrig.calibration.boards.artwork import charuco_board, marker_dictionary
 from slrig.calibration.boards.board_map import fitted_map
 from slrig.calibration.boards.grey import Grey
 from slrig.calibration.boards.grid_fit import PlacedCorners, placed_corners
-from slrig.calibration.boards.marker_layout import fitting_width, rest_px
+from slrig.calibration.boards.marker_layout import fitting_width, rest_px, stands_light_first
 from slrig.calibration.boards.sightings import describe_other, marker_numbers, markers_seen
 from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError
@@ -27,20 +27,28 @@ _SHARE_OFF = 0.06
 
 def charuco_view(grey: Grey, board: Board) -> BoardView:
     """See `slrig.calibration.boards.detection.find_board`."""
-    printed = charuco_board(board)
-    corners, numbers, marker_corners, marker_ids = cv2.aruco.CharucoDetector(printed).detectBoard(grey.eight)
+    marker_corners, marker_ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(str(board.dictionary))).detectMarkers(
+        grey.eight
+    )
     ids = np.zeros(0, dtype=int) if marker_ids is None else np.asarray(marker_ids).ravel()
     outlines = np.asarray(marker_corners, dtype=np.float64).reshape(-1, 4, 2)
     if len(ids) < _FEWEST_MARKERS:
         raise PoseRefusedError(_nothing(grey, board))
+    light_first = stands_light_first(board, ids, outlines)
+    if light_first is None:
+        raise PoseRefusedError(_few(grey, board, 0, len(ids)))
+    printed = charuco_board(board, light_first=light_first)
     _refuse_another(board, printed, ids, outlines)
+    corners, numbers, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(
+        grey.eight, markerCorners=marker_corners, markerIds=marker_ids
+    )
     if numbers is None or len(numbers) < 4:
         found = 0 if numbers is None else len(numbers)
         raise PoseRefusedError(_few(grey, board, found, len(ids)))
     corner = np.asarray(numbers).ravel().astype(np.int32)
     order = np.argsort(corner)
     rough = np.asarray(corners, dtype=np.float64).reshape(-1, 2)[order]
-    placed = placed_corners(grey.level, board, corner[order], rough)
+    placed = placed_corners(grey.level, board, corner[order], rough, light_first=light_first)
     before = 0
     while placed is not None and len(placed.view.corner) > before:
         before = len(placed.view.corner)
@@ -66,13 +74,14 @@ def _with_neighbours(level: FloatArray, board: Board, placed: PlacedCorners) -> 
     corner = np.concatenate([placed.view.corner, beside[inside]])
     rough = np.concatenate([placed.view.points_px, guessed[inside]])
     order = np.argsort(corner)
-    more = placed_corners(level, board, corner[order], rough[order])
+    more = placed_corners(level, board, corner[order], rough[order], light_first=placed.view.light_first)
     if more is None:
         return placed
     # A guess is worth as much as what was found only where its fit is as good as theirs.
     known = np.isin(more.view.corner, placed.view.corner)
     good = known | (more.view.sigma_px < 3 * np.median(placed.view.sigma_px))
-    view = BoardView(more.view.corner[good], more.view.points_px[good], more.view.sigma_px[good])
+    seen = more.view
+    view = BoardView(seen.corner[good], seen.points_px[good], seen.sigma_px[good], seen.light_first)
     return PlacedCorners(view, more.board_map, more.blur_px[good])
 
 

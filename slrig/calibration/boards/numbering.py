@@ -87,4 +87,4 @@ def _towards(points_px: FloatArray, board: Board) -> FloatArray:
 
 def _renumbered(view: BoardView, corner: IntArray) -> BoardView:
     order = np.argsort(corner)
-    return BoardView(corner[order].astype(np.int32), view.points_px[order], view.sigma_px[order])
+    return BoardView(corner[order].astype(np.int32), view.points_px[order], view.sigma_px[order], view.light_first)

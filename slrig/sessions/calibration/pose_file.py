@@ -44,12 +44,16 @@ def read_reading(path: Path) -> ReadPose:
             camera: ViewFigures(**{field: float(value) for field, value in values.items()})
             for camera, values in found["figures"].items()
         }
-        views = {camera: BoardView(**values) for camera, values in found["view"].items()}
+        views = {camera: _view(**values) for camera, values in found["view"].items()}
         light = {camera: Correspondences(**values) for camera, values in found["light"].items()}
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         message = f"{path} cannot be read ({error}). Drop that pose (DELETE …/pose/N) and shoot it again."
         raise StorageError(message) from error
     return ReadPose(PoseObservation(name, views, light), figures)
+
+
+def _view(light_first: Any = False, **values: Any) -> BoardView:
+    return BoardView(**values, light_first=bool(light_first))
 
 
 def _parts(pose: ReadPose) -> Iterator[tuple[str, str, Any]]:

@@ -53,6 +53,7 @@ class Print:
     paper_squares: float = 1.0
     mirrored: bool = False
     swapped: bool = False
+    light_first: bool = False
     shading: tuple[float, float] = field(default=(0.0, 0.0))
 
 
@@ -166,7 +167,7 @@ def _reflectance(board: Board, look: Print, x_mm: Array, y_mm: Array) -> Array:
         across = (width - 1) - across
     border = look.paper_squares
     paper = (across > -1 - border) & (across < width + border) & (down > -1 - border) & (down < height + border)
-    dark = _circles(board, look, across, down) if circles else _squares(board, across, down)
+    dark = _circles(board, look, across, down) if circles else _squares(board, across, down, int(look.light_first))
     if look.swapped:
         dark = ~dark & (across > -1) & (across < width) & (down > -1) & (down < height)
     return np.where(paper, np.where(dark, look.dark, look.white), look.beyond)
@@ -182,12 +183,12 @@ def _circles(board: Board, look: Print, across: Array, down: Array) -> NDArray[n
     return dark
 
 
-def _squares(board: Board, across: Array, down: Array) -> NDArray[np.bool_]:
+def _squares(board: Board, across: Array, down: Array, first: int) -> NDArray[np.bool_]:
     column, row = np.floor(across).astype(int) + 1, np.floor(down).astype(int) + 1
     inside = (column >= 0) & (column <= board.columns) & (row >= 0) & (row <= board.rows)
-    dark = inside & ((column + row) % 2 == 0)
+    dark = inside & ((column + row) % 2 == first)
     if board.kind is BoardKind.CHARUCO:
-        cells = _cells(board)
+        cells = _cells(board, first)
         count = cells.shape[-1]
         share = (board.marker_mm or 0) / board.square_mm
         column, row = np.clip(column, 0, board.columns), np.clip(row, 0, board.rows)
@@ -199,7 +200,7 @@ def _squares(board: Board, across: Array, down: Array) -> NDArray[np.bool_]:
     return np.asarray(dark)
 
 
-def _cells(board: Board) -> NDArray[np.bool_]:
+def _cells(board: Board, first: int) -> NDArray[np.bool_]:
     """(rows + 1, columns + 1, cells, cells): dark cells of the marker in each white square, counted row by row."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(board.dictionary)))
     count = dictionary.markerSize + 2
@@ -207,7 +208,7 @@ def _cells(board: Board) -> NDArray[np.bool_]:
     number = 0
     for row in range(board.rows + 1):
         for column in range(board.columns + 1):
-            if (row + column) % 2:
+            if (row + column) % 2 != first:
                 cells[row, column] = cv2.aruco.generateImageMarker(dictionary, number, count) == 0
                 number += 1
     return cells
