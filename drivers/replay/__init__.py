@@ -7,8 +7,10 @@ begins the recording anew; a bracket (one sequence per exposure) goes on in it f
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
+import structlog
 from pydantic import Field, ValidationError, field_validator
 
 from drivers.replay.camera import ReplayCamera, Stage
@@ -18,9 +20,11 @@ from slrig.bundle import Bundle, read_bundle
 from slrig.bundle.faults import Strict, explain, keys_of
 from slrig.devices import Camera, Head, Projector
 from slrig.errors import BundleError, ConfigError
-from slrig.model import Calibration, Truth
+from slrig.model import Calibration, Truth, without_missing_bits
 
 __all__ = ["ReplayCamera", "ReplayClock", "ReplayHead", "ReplayOptions", "ReplayProjector", "open_head"]
+
+_log = structlog.get_logger(__name__)
 
 _SPEEDS = (0.05, 1000.0)
 
@@ -109,4 +113,7 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
     if not bundle.capture.shots:
         message = f"{path / 'bundle.json'}: the recording has no frames; there is nothing to replay"
         raise BundleError(message)
-    return ReplayHead(bundle, ReplayClock(table.speed))
+    capture, told = without_missing_bits(bundle.capture)
+    for words in told:
+        _log.warning(words, recording=str(path))
+    return ReplayHead(replace(bundle, capture=capture), ReplayClock(table.speed))

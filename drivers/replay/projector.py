@@ -24,6 +24,11 @@ class ReplayProjector:
             plays=False,
             latency_s=0.0,
             limits=COMPUTED,
+            recorded=tuple(
+                pattern
+                for pattern in bundle.capture.patterns
+                if all(camera.frames_of(pattern) for camera in cameras.values())
+            ),
         )
         self._recorded = tuple(dict.fromkeys(bundle.capture.patterns))
         self._cameras = cameras
@@ -52,8 +57,9 @@ class ReplayProjector:
                 recorded = "; ".join(dict.fromkeys(map(_family, self._recorded)))
                 message = (
                     f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
-                    f"{', '.join(lacking)}; it has {recorded}. Ask for what was recorded: gray_cell_px, "
-                    "line_shift_period_px and their like, in the request or in the rig file's [scan]"
+                    f"{', '.join(lacking)}; it has {recorded}. Leave the patterns out of the "
+                    "request and of the rig file's [scan], and all that was recorded is played; or ask for some of it: "
+                    "--gray-cell-px (gray_cell_px in a request), --period-px (line_shift_period_px) and their like"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()

@@ -82,4 +82,5 @@ def _sequence(config: RigConfig) -> PatternSequence:
     """The patterns of a scan on this rig as its file describes it."""
     with open_rig(config) as rig:
         patterns = scan_plan(ScanRequest(), config.scan).patterns
-        return pattern_sequence(patterns, rig.projector.info.size, rig.calibration, rig.cameras)
+        projector = rig.projector.info
+        return pattern_sequence(patterns, projector.size, rig.calibration, rig.cameras, recorded=projector.recorded)

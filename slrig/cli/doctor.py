@@ -42,10 +42,12 @@ def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float,
         displays = found_displays()
         display("opening the rig", 0.0, "")
         with open_rig(config) as rig:
-            plan = scan_plan(ScanRequest(), config.scan).patterns
+            plan, projector = scan_plan(ScanRequest(), config.scan).patterns, rig.projector.info
             diagnosis = examine(
                 _as_scanned(rig, config),
-                own_sequence=pattern_sequence(plan, rig.projector.info.size, rig.calibration, rig.cameras),
+                own_sequence=pattern_sequence(
+                    plan, projector.size, rig.calibration, rig.cameras, recorded=projector.recorded
+                ),
                 displays=displays,
                 period_px=plan.line_shift_period_px,
                 search_s=search_s,

@@ -26,12 +26,14 @@ def decode_and_tell(bundle: Path, output: Path) -> None:
     set_up_logs_for_a_person()
     with progress_shown() as display:
         display("decode", 0.0, str(bundle))
-        found = decode_bundle(bundle, output)
+        found, notes = decode_bundle(bundle, output)
         display("done", 1.0, "")
     for each in found:
         typer.echo(f"{'decoded':<10}{each}")
         for advice in each.advice:
             typer.echo(f"{'':<10}{advice}")
+    for note in notes:
+        typer.echo(f"{'note':<10}{note}")
     typer.echo(f"{'pictures':<10}{output}")
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from slrig.devices.limits import USUAL, CallLimits
-from slrig.model import PatternSequence, Size
+from slrig.model import Pattern, PatternSequence, Size
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +16,8 @@ class ProjectorInfo:
     `plays` says whether it can step through a loaded sequence by itself, triggering the cameras by wire.
     `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
     is steady over whole ones only; None where exposures may have any length. `limits` say how long its calls may take.
+    `recorded` are the patterns of a recording, in its order: a scan that asks for none plays them. Empty where any
+    pattern can be shown.
     """
 
     name: str
@@ -26,6 +28,7 @@ class ProjectorInfo:
     latency_s: float
     refresh_s: float | None = None
     limits: CallLimits = USUAL
+    recorded: tuple[Pattern, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

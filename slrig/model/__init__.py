@@ -16,6 +16,7 @@ from slrig.model.frames import (
     exposure_groups,
 )
 from slrig.model.light_axis import share_across, triangulated_axis
+from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, White
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, Pinhole, Size, Solved
 from slrig.model.surfaces import CameraTruth, FlipRule, Mesh, PointCurves, Refusal, Source, Surface, Truth
@@ -54,4 +55,5 @@ __all__ = [
     "exposure_groups",
     "share_across",
     "triangulated_axis",
+    "without_missing_bits",
 ]

@@ -56,7 +56,12 @@ def capture_bundle(
         The disk refused. In these cases nothing is left in `folder`. In every case the projector is dark.
     """
     sequence = pattern_sequence(
-        plan.patterns, rig.projector.info.size, rig.calibration, rig.cameras, axis=plan.reconstruction.axis
+        plan.patterns,
+        rig.projector.info.size,
+        rig.calibration,
+        rig.cameras,
+        axis=plan.reconstruction.axis,
+        recorded=rig.projector.info.recorded,
     )
     rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
     for words in told:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from slrig.bundle.reading import read_capture
 from slrig.bundle.storage import refusals_of
 from slrig.errors import PatternError
-from slrig.model import Axis, Capture, Gray, Refusal
+from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
 from slrig.patterns.positions import cell_positions, index_of_word
 from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.frames import AxisFrames, axis_frames, exposure_count
@@ -78,8 +78,8 @@ class Decoded:
         return told
 
 
-def decode_bundle(bundle: Path, output: Path) -> list[Decoded]:
-    """Decode a recorded bundle into `output`, which appears whole or not at all.
+def decode_bundle(bundle: Path, output: Path) -> tuple[list[Decoded], tuple[str, ...]]:
+    """Decode a recorded bundle into `output`, which appears whole or not at all. With words for codes cut short.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def decode_bundle(bundle: Path, output: Path) -> list[Decoded]:
     InvalidInputError, StorageError
         `output` holds something else, or the disk refused.
     """
-    capture = read_capture(bundle)
+    capture, cut_short = without_missing_bits(read_capture(bundle))
     axes = [axis for axis in Axis if any(isinstance(p, Gray) and p.axis is axis for p in capture.patterns)]
     if not axes:
         message = f"{bundle}: no Gray-code frames: nothing can be decoded"
@@ -99,10 +99,11 @@ def decode_bundle(bundle: Path, output: Path) -> list[Decoded]:
             "format": REPORT_FORMAT,
             "version": 1,
             "method": "decoding only",
+            "notes": list(cut_short),
             "decoded": [asdict(each) | {"axis": each.axis.value, "advice": each.advice} for each in found],
         }
         write_report(report, staging / REPORT)
-    return found
+    return found, cut_short
 
 
 def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded:

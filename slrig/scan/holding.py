@@ -13,7 +13,7 @@ from slrig.bundle.calibration_file import check_calibration
 from slrig.bundle.description import MOST_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
-from slrig.model import Axis, Calibration, PatternSequence, Size
+from slrig.model import Axis, Calibration, Pattern, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.scan.faults import UNEXPECTED, ScanFault, fault_of
 from slrig.scan.guarding import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
@@ -229,11 +229,15 @@ def pattern_sequence(
     cameras: Iterable[str] = (),
     *,
     axis: Axis | None = None,
+    recorded: tuple[Pattern, ...] = (),
 ) -> PatternSequence:
     """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError.
 
-    axis : the one to triangulate by, if that was asked for.
+    axis : the one to triangulate by, if that was asked for. recorded : of `ProjectorInfo`; they are played unless the
+    plan asks for patterns of its own.
     """
+    if recorded and plan == PatternPlan():
+        return encode(recorded, size)
     axes = played_axes(plan.rows, calibration, cameras, axis=axis)
     patterns = scan_patterns(
         size,
@@ -260,7 +264,10 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
     """
     exposures_s = plan.rising_exposures_s
     axis = plan.reconstruction.axis
-    sequence = pattern_sequence(plan.patterns, facts.projector.size, calibration, facts.cameras, axis=axis)
+    projector = facts.projector
+    sequence = pattern_sequence(
+        plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded
+    )
     count = len(sequence) * max(len(exposures_s), 1)
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0

@@ -24,7 +24,7 @@ from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import brightness, compact_mesh
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves, without_missing_bits
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
@@ -207,6 +207,7 @@ def _walked(
 ) -> _Walked:
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
+    cut_short: tuple[str, ...] = ()
     last = ""
 
     def stage_entered(stage: str, name: str) -> None:
@@ -228,12 +229,13 @@ def _walked(
         seen = live.finish(stage_entered)
     else:
         recorded = read_bundle(folder, calibration_file=calibration_file)
-        names += recorded.capture.cameras
+        capture, cut_short = without_missing_bits(recorded.capture)
+        names += capture.cameras
         devices = _require_calibration(folder, names, recorded.calibration)
         try:
-            stream = ScanStream(Outline.of(recorded.capture), devices, entered=stage_entered, axis=axis)
+            stream = ScanStream(Outline.of(capture), devices, entered=stage_entered, axis=axis)
             for name in names:
-                for shot in recorded.capture.shots:
+                for shot in capture.shots:
                     if shot.camera == name:
                         stream.take(shot)
             seen = stream.finish()
@@ -241,10 +243,10 @@ def _walked(
             message = f"{folder}: {cause}"
             raise PatternError(message) from cause
         entered("check frames", 0.58, "")
-        evidence = check_exposures(recorded.capture, read_refused(folder))
+        evidence = check_exposures(capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
     step = step_px(stream.outline.shown, stream.axis)
-    notes = [*capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step)]
+    notes = [*cut_short, *capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step)]
     return _Walked(devices, stream.axis, stream.outline.axes, seen, step, sections, notes)
 
 

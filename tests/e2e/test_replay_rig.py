@@ -14,7 +14,7 @@ from slrig.devices import CameraSettings, Rig
 from slrig.model import Capture
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.pipeline import reconstruct_bundle
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from tests.e2e.conftest import Start, write_rig
 
 SECOND_CAMERA = """
@@ -87,7 +87,7 @@ def test_a_scan_of_somebody_elses_recording_gives_its_mesh(shared: Path, tmp_pat
     bundle = shared / "bundles" / "gauge"
     head = open_head({"bundle": str(bundle)}, tmp_path)
     settings = {name: CameraSettings(camera.info.exposure_range_s[0]) for name, camera in head.cameras.items()}
-    plan = ScanPlan(PatternPlan(gray_cell_px=1))
+    plan = ScanPlan()
     again = tmp_path / "again"
     with Rig("replayed", head.cameras, head.projector, settings, head.calibration, head) as rig:
         capture_bundle(rig, plan, again, progress=lambda *_: None, cancelled=lambda: False)

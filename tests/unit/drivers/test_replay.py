@@ -14,8 +14,10 @@ from slrig.bundle import read_bundle, write_bundle
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Head, Rig, Trigger
 from slrig.errors import BundleError, ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
-from slrig.model import Axis, Black, CameraFormat, Capture, Gray, Pattern, Shot, Size, White
+from slrig.model import Axis, Black, CameraFormat, Capture, Gray, LineShift, Pattern, Shot, Size, White
 from slrig.patterns.sequence import encode
+from slrig.scan.holding import pattern_sequence
+from slrig.scan.plan import PatternPlan
 
 PROJECTOR = Size(16, 8)
 CAMERA = Size(6, 4)
@@ -165,6 +167,24 @@ def test_a_pattern_that_was_not_recorded_is_named_with_those_that_were(tmp_path:
         match=r"no frame of bit 1 of a column Gray code of 4 bits.*has white; black; a column Gray",
     ):
         head.projector.load(encode([White(), Gray(Axis.COLUMN, 1, 4)], PROJECTOR))
+
+
+def test_what_was_recorded_is_played_unless_a_plan_asks_for_patterns_of_its_own(tmp_path: Path) -> None:
+    bits = [Gray(Axis.COLUMN, bit, 4) for bit in range(4)]
+    patterns: list[Pattern] = [White(), Black(), *bits, LineShift(Axis.ROW, 0, 8, 1), White()]
+    shots = [shot(index, 10 * index) for index in (0, 1, 2, 3, 4, 5, 7)]
+    recorded = head_of(tmp_path, shots, patterns).projector.info.recorded
+    assert recorded == tuple(each for each in patterns if not isinstance(each, LineShift))
+    assert pattern_sequence(PatternPlan(), PROJECTOR, recorded=recorded).patterns == recorded
+    asked = pattern_sequence(PatternPlan(line_shift=False), PROJECTOR, recorded=recorded)
+    assert asked.patterns == pattern_sequence(PatternPlan(line_shift=False), PROJECTOR).patterns
+
+
+def test_a_recording_that_lacks_a_fine_bit_is_one_of_fewer_bits(tmp_path: Path) -> None:
+    patterns: list[Pattern] = [White(), Black(), *(Gray(Axis.COLUMN, bit, 4) for bit in range(4))]
+    head = head_of(tmp_path, [shot(index, 10 * index) for index in range(5)], patterns)
+    assert head.projector.info.recorded[2:] == tuple(Gray(Axis.COLUMN, bit, 3, 2) for bit in range(3))
+    assert values(head, [Gray(Axis.COLUMN, 1, 3, 2)]) == [30]
 
 
 def test_a_pattern_that_one_camera_lacks_names_the_camera(tmp_path: Path) -> None:

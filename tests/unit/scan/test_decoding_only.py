@@ -10,14 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+import trimesh
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from slrig.bundle import write_bundle
 from slrig.cli.commands import app
 from slrig.errors import PatternError
-from slrig.model import Capture, Gray, Pixels
+from slrig.model import Capture, Gray, LineShift, Pixels
 from slrig.scan.decoding_only import decode_bundle
+from slrig.scan.pipeline import reconstruct_bundle
+from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import sample_scan
 
 
@@ -34,8 +37,42 @@ def recorded(folder: Path, change: Callable[[NDArray[np.float64]], NDArray[np.fl
     return folder
 
 
+def without_finest_bit(folder: Path) -> Path:
+    """A made-up Gray-only scan of which nobody copied the finest bit."""
+    capture, calibration = sample_scan()
+    kept = [
+        shot
+        for shot in capture.shots
+        if not isinstance(shown := capture.patterns[shot.pattern], LineShift)
+        and not (isinstance(shown, Gray) and shown.bit == shown.bits - 1)
+    ]
+    write_bundle(folder, replace(capture, shots=tuple(kept)), calibration)
+    return folder
+
+
+def test_a_missing_bit_is_told_and_the_others_are_decoded(tmp_path: Path) -> None:
+    result = CliRunner().invoke(
+        app, ["reconstruct", str(without_finest_bit(tmp_path / "b")), "--decode-only", "--output", str(tmp_path / "o")]
+    )
+    assert result.exit_code == 0, result.output
+    words = " ".join(result.output.split())
+    assert "note a camera has no frame of bit 6 of the 6 of the column code: the first 5 are used" in words
+    report = json.loads((tmp_path / "o" / "report.json").read_text())
+    assert len(report["notes"]) == 1
+    assert report["decoded"][0]["decoded"] > 0.9
+
+
+def test_a_missing_bit_leaves_a_mesh_of_the_others(tmp_path: Path) -> None:
+    bundle = without_finest_bit(tmp_path / "b")
+    report = reconstruct_bundle(
+        bundle, tmp_path / "out", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
+    )
+    assert "bit 6 of the 6" in str(report["notes"])
+    assert len(trimesh.load_mesh(tmp_path / "out" / "mesh.ply", process=False).faces) > 200
+
+
 def test_positions_are_those_of_the_projector(tmp_path: Path) -> None:
-    (found,) = decode_bundle(recorded(tmp_path / "bundle"), tmp_path / "out")
+    (found,), _ = decode_bundle(recorded(tmp_path / "bundle"), tmp_path / "out")
     assert found.lit > 0.5
     assert found.decoded > 0.9
     assert found.advice == []
@@ -64,7 +101,7 @@ def test_positions_are_those_of_the_projector(tmp_path: Path) -> None:
 def test_it_says_what_to_change(
     tmp_path: Path, change: Callable[[NDArray[np.float64]], NDArray[np.float64]], words: str
 ) -> None:
-    (found,) = decode_bundle(recorded(tmp_path / "bundle", change), tmp_path / "out")
+    (found,), _ = decode_bundle(recorded(tmp_path / "bundle", change), tmp_path / "out")
     assert any(words in advice for advice in found.advice), found
 
 
