@@ -11,10 +11,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from slrig.bundle.calibration_file import write_calibration
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import COLUMN, ROW, Correspondences
 from slrig.calibration.solution import PARAMETERS, PROJECTOR
+from slrig.cli.commands import app
 from slrig.model import FloatArray
 from slrig.sessions.calibration.pose_frames import bundle_device_sizes
 from slrig.sessions.calibration.pose_reading import read_pose
@@ -103,10 +106,31 @@ def test_the_projectors_lens_is_shifted_and_its_row_is_known_so_well(result: Cal
     assert projector is not None
     row = len(PARAMETERS) + PARAMETERS.index("cy")
     sigma_px = float(np.sqrt(result.solution.covariance[row, row]))
-    # Below the 768 rows of its image; others found 860 to 877.
+    # Below the 768 rows of its image; others found 860 to 877, and three of the four poses alone 839 to 880.
     assert projector.matrix[1, 2] > projector.size.height_px
-    assert 1 < sigma_px < 30
+    assert 1 < sigma_px < 50
     assert abs(projector.matrix[1, 2] - 868.5) < 3 * sigma_px
     assert abs(projector.matrix[0, 0] - 1890) < 30
     assert abs(result.calibration.cameras["cam0"].matrix[0, 0] - 3450) < 60
     assert result.calibration.solved is not None
+
+
+@pytest.mark.parametrize("number", range(len(POSES)))
+def test_a_pose_that_nobody_touched_is_not_stale(
+    shared: Path, tmp_path: Path, result: CalibrationResult, number: int
+) -> None:
+    """Four poses leave the projector's lens to bend: 4.6 times the residual at held-out ones. By a covariance without
+    that the first pose, of those that the calibration was made of, was stale.
+    """
+    write_calibration(tmp_path / "calibration.json", result.calibration)
+    told = CliRunner().invoke(
+        app,
+        [
+            "verify", str(shared / "captures" / "boards" / POSES[number]), "--calibration",
+            str(tmp_path / "calibration.json"), "--board", "chessboard", "--corners", "7x9", "--square-mm", "75",
+        ],
+    )  # fmt: skip
+    assert told.exit_code == 0, told.output
+    assert "the calibration holds" in told.output
+    assert result.expected.point_mm > 0.3
+    assert result.expected.point_mm < 1.5

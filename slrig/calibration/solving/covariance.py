@@ -8,17 +8,21 @@ small.
 A lens term that was left out was set to 0, not known to be 0, and so was the bend of a board that nobody said is flat.
 So the covariance is that of the solve with all of them, plus the square of the shift by which leaving some out moved
 the rest: what an estimate is wrong by is its distance from that solve, and what that solve is wrong by.
+
+Where few poses leave a lens to bend between them, residuals are small at the poses that were seen and large at others,
+and a covariance that comes from the former is too small. Poses that were held out tell by how much: `allowing_for`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from slrig.calibration.solution import Bow
+from slrig.calibration.solution import Bow, DeviceResiduals
 from slrig.calibration.solving.adjustment import Prior, adjusted, kept_of, normal_equations, weights_of
 from slrig.calibration.solving.deviations import deviations_of
 from slrig.calibration.solving.parameters import LENS_TERMS, difference
@@ -68,6 +72,17 @@ def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, 
     solved = problem.prior is not None
     bow = None if bend is None else bow_of(fit.geometry if solved else wide.geometry, bent, solved=solved)
     return Known(devices + np.outer(shift, shift), bow)
+
+
+def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /) -> FloatArray:
+    """The covariance, (15 d, 15 d) float64, with all deviations as many times as large as residuals are larger at
+    held-out poses than at those that were seen, of the device where that is most.
+
+    One factor for all: devices err together, and a point by a hundredth of what each of them does. A solve that holds
+    no poses out tells nothing of this, and its covariance stays.
+    """
+    ratios = [left.held_out_rms_px / left.rms_px for left in residuals]
+    return covariance * max([1.0, *(ratio for ratio in ratios if np.isfinite(ratio))]) ** 2
 
 
 def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:

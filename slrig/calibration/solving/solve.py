@@ -13,7 +13,7 @@ from slrig.calibration.observations import Observations
 from slrig.calibration.solution import PROJECTOR, Solution
 from slrig.calibration.solving.adjustment import Prior, kept_of
 from slrig.calibration.solving.consistency import most_left_out, refuse_bump, worst_pose
-from slrig.calibration.solving.covariance import covariance_of
+from slrig.calibration.solving.covariance import allowing_for, covariance_of
 from slrig.calibration.solving.deviations import deviations_of
 from slrig.calibration.solving.held_out import LADDER, chosen_terms, folds_of, held_out
 from slrig.calibration.solving.held_out import LEAST_POSES as LEAST_HELD_OUT
@@ -123,13 +123,14 @@ def _finished(
         name: to_pinhole(row, sizes[name]) for name, row in zip(problem.devices, fit.geometry.devices, strict=True)
     }
     used = [int(number) for number in np.flatnonzero(problem.used)]
+    residuals = residuals_of_devices(problem, fit, sizes, held)
     solution = Solution(
         calibration=Calibration({name: devices[name] for name in observations.cameras}, devices.get(PROJECTOR)),
-        covariance=known.devices,
+        covariance=allowing_for(known.devices, [residuals[name] for name in problem.devices]),
         distortion={name: terms[name] for name in problem.devices},
         poses={problem.pose_names[number]: to_board_pose(fit.geometry.poses[number]) for number in used},
         outliers=outliers,
-        residuals=residuals_of_devices(problem, fit, sizes, held),
+        residuals=residuals,
         board_shape_mm=None if problem.prior is None else fit.geometry.shape_mm(),
         bow=known.bow,
     )

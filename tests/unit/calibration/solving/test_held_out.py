@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slrig.calibration.solution import CELLS, DeviceResiduals
+from slrig.calibration.solving.covariance import allowing_for
 from slrig.calibration.solving.held_out import LADDER, chosen_terms, climbed, folds_of
 from slrig.calibration.solving.problem import Problem, fitted
 from slrig.calibration.solving.solve import SolveOptions
@@ -57,3 +59,24 @@ def test_a_rung_must_be_better_than_the_best_below_it() -> None:
     assert climbed([100.0, 99.5, 40.0, 30.0, 30.0], 1.0) == 3
     assert climbed([100.0, 101.0, 102.0, 103.0, 10.0], 1.0) == 4
     assert climbed([1.0, 1.0, 1.0, 1.0, 1.0], 1.0) == 0
+
+
+@pytest.mark.parametrize(
+    ("ratios", "factor"),
+    [((1.02, 4.5), 4.5), ((0.98, 0.9), 1.0), ((np.nan, np.nan), 1.0), ((1.5, np.nan), 1.5)],
+)
+def test_deviations_allow_for_what_is_left_at_poses_that_were_not_seen(
+    ratios: tuple[float, float], factor: float
+) -> None:
+    devices = 15 * len(ratios)
+    random = np.random.default_rng(1).normal(size=(devices, devices))
+    covariance = random @ random.T
+    no_map = np.zeros((CELLS, CELLS))
+    residuals = [
+        DeviceResiduals(0.2, 0.2, 0.2 * ratio, 100, 0, {}, no_map, np.zeros((CELLS, CELLS, 2)), no_map.astype(np.int32))
+        for ratio in ratios
+    ]
+    allowed = allowing_for(covariance, residuals)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(allowed)), factor * np.sqrt(np.diagonal(covariance)))
+    # Correlations stay: devices that err together are a small error between them.
+    np.testing.assert_allclose(allowed / covariance, factor**2)
