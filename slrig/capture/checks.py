@@ -28,14 +28,8 @@ BAND_SAMPLES = 300
 
 _LIT_SAMPLES = 40
 
-_EDGE_PX = 8.0
-"""Breadth of an edge that a scaler blurred, projector pixels: from end to end of a Gaussian of 2 px, ± 2 deviations."""
-
-_EVEN = 0.08
-"""Spread of what an even change of light leaves, by noise: damage and other patterns leave light and dark."""
-
-_STEEPEST_GAMMA = 2.4
-"""Of displays: ITU-R BT.1886."""
+_ALIKE = 0.02
+"""Of a frame's own variation: lines that are blurred to three times their width differ by more from step to step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,11 +134,19 @@ def _darker(contrast: Samples, high: float, row: NDArray[np.intp]) -> str | None
     return _worst(wrong, band, row, whole=0.05, quarter=0.1, of="pixels")
 
 
-def noise_dn(bit: Samples, inverse: Samples, ref: Reference) -> float:
-    """Noise of one frame, DN: bit + inverse − white − black is the noise of four."""
-    rest = (bit + inverse - ref.white - ref.black)[ref.judged]
+def noise_dn(bit: Samples, inverse: Samples, ref: Reference, *, sums: Sequence[Samples] = ()) -> float:
+    """Noise of one frame, DN: bit + inverse − white − black is the noise of four.
+
+    sums : of other pairs. The least that a difference from one of them tells counts, too: if white or black was
+    damaged, the difference from these is that damage, and noise so large would hide all else.
+    """
+    pair = bit + inverse
+    return min(_noise_of_four((pair - other)[ref.judged]) for other in (ref.white + ref.black, *sums))
+
+
+def _noise_of_four(rest: Samples) -> float:
     # Whole numbers have a coarse median; spread over the interval that each stands for, they have a fine one.
-    rest += np.linspace(-0.5, 0.5, len(rest), dtype=np.float32)
+    rest = rest + np.linspace(-0.5, 0.5, len(rest), dtype=np.float32)
     spread = 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
     return max(NOISE_FLOOR_DN, math.sqrt(max(spread**2 - 1 / 12, 0.0)) / 2)
 
@@ -157,76 +159,14 @@ def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str |
     u = ref.relative(frame)
     slack = np.maximum(0.3, 6 * noise / ref.contrast[ref.judged]) if noise is not None else np.float32(0.6)
     outside = (u < -slack) | (u > 1 + slack)
-    worst = _worst_judged(outside, ref, whole=0.05)
+    worst = worst_judged(outside, ref, whole=0.05)
     if worst is None:
         return None
     return (
         f"{worst} lie outside the range between the black and the white frame: the frame was damaged in transfer, the "
-        f"room's light changed, the projector's light comes later than it says, or {_contrast(ref)}; check the cable, "
-        "the light and the projector's latency, and scan again"
+        f"room's light changed, the projector's light comes later than it says, or {contrast_words(ref)}; check the "
+        "cable, the light and the projector's latency, and scan again"
     )
-
-
-def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, run_px: int) -> str | None:
-    """Light is additive: a bit and its inverse add up to white and black.
-
-    Limits leave room for noise; for a camera that is not linear, whose blurred edges add up to more than white; and for
-    a projector behind a scaler. That blurs the pattern's values before gamma makes light of them, and then both frames
-    are dark at an edge. There a pair may fall short by as much as its own swing explains (`_least_sum`). How much of
-    the image lies at edges follows from run_px, the length of the bit's runs of equal pixels in the projector.
-    """
-    u, v = ref.relative(bit), ref.relative(inverse)
-    excess = u + v - 1
-    slack = np.clip(8 * max(noise, noise_dn(bit, inverse, ref)) / ref.contrast[ref.judged], 0.2, 0.5)
-    above = excess > 0.8
-    at_edges = min(1.0, _EDGE_PX / run_px)
-    dark = _in_dark_bands(u, v, ref)
-    worst = _worst_judged(above | dark | (u + v < _least_sum(np.abs(u - v)) - slack), ref, whole=0.1)
-    if worst is None and at_edges < 1.0:
-        wrong = above | (excess < -slack)
-        worst = _worst_judged(wrong, ref, whole=0.1 + at_edges, quarter=0.25 + at_edges)
-    if worst is None:
-        return None
-    apart = float(np.median(np.abs((bit - inverse)[ref.judged]) / ref.contrast[ref.judged]))
-    if apart < 0.25:
-        return f"the frame and its inverse show the same on {worst}: one of them is stale; scan again"
-    together = float(np.median(u + v))
-    if float(np.median(np.abs(u + v - together))) < _EVEN * together:
-        return (
-            f"the frame and its inverse have {together:.0%} of the light of white and black, evenly on all of the "
-            "image: the exposure or the lamp changed since: switch off automatic exposure and gain, dynamic contrast "
-            "and power saving, and scan again"
-        )
-    return (
-        f"the frame and its inverse do not add up to white and black on {worst}: one of them shows another pattern or "
-        f"was damaged, or something moved, or {_contrast(ref)}; scan again"
-    )
-
-
-def _in_dark_bands(u: Samples, v: Samples, ref: Reference) -> Chosen:
-    """Which pixels lie in bands where one frame of a pair has hardly any light and the other does not make up for it.
-
-    What a scaler takes from the edges it takes from both.
-    """
-    band = ref.band[ref.judged]
-    counts = np.bincount(band, minlength=BANDS)
-    means = np.stack([np.bincount(band, weights=each, minlength=BANDS) for each in (u, v)]) / np.maximum(counts, 1)
-    dark = (means.sum(axis=0) < 0.8) & (means.min(axis=0) < 0.3 * means.max(axis=0))
-    return np.asarray(dark[band], dtype=np.bool_)
-
-
-_SIGNAL = np.linspace(0.5, 1.0, 257)
-_SWING = _SIGNAL**_STEEPEST_GAMMA - (1 - _SIGNAL) ** _STEEPEST_GAMMA
-_SUM = _SIGNAL**_STEEPEST_GAMMA + (1 - _SIGNAL) ** _STEEPEST_GAMMA
-
-
-def _least_sum(swing: Samples) -> Samples:
-    """What a bit and its inverse add up to, at least, where they differ by `swing`; all on the scale of `u`.
-
-    A blurred bit has the value s where its inverse has 1 - s: they differ by s^g - (1 - s)^g and add up to
-    s^g + (1 - s)^g, least for the steepest gamma g.
-    """
-    return np.asarray(np.interp(swing, _SWING, _SUM), dtype=np.float32)
 
 
 def variation(frame: Samples, ref: Reference) -> float:
@@ -247,7 +187,9 @@ def repeated(frame: Samples, earlier: Sequence[Samples], ref: Reference, *, nois
     here = frame[ref.judged]
     distance = [float(np.mean((here - other[ref.judged]) ** 2)) for other in earlier]
     nearest = int(np.argmin(distance))
-    return nearest if distance[nearest] < 6 * noise**2 else None
+    # The noise is that of bright pixels. A camera whose values are made for displays has several times as much in dark.
+    alike = max(6 * noise**2, _ALIKE * variation(frame, ref))
+    return nearest if distance[nearest] < alike else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,7 +264,8 @@ def changed_fault(
     )
 
 
-def _worst_judged(wrong: Chosen, ref: Reference, *, whole: float, quarter: float = 0.25) -> str | None:
+def worst_judged(wrong: Chosen, ref: Reference, *, whole: float, quarter: float = 0.25) -> str | None:
+    """Words for the share of judged pixels that are wrong: None below `whole` of all and below `quarter` of a band."""
     return _worst(wrong, ref.band[ref.judged], ref.row[ref.judged], whole=whole, quarter=quarter)
 
 
@@ -347,7 +290,8 @@ def _worst(
     return f"{shares[top]:.0%} of the {of} in {_rows(inside)}" if shares[top] > quarter else None
 
 
-def _contrast(ref: Reference) -> str:
+def contrast_words(ref: Reference) -> str:
+    """Words for the case that it is noise after all."""
     return (
         f"noise hides the pattern (white − black is {float(np.median(ref.contrast[ref.judged])):.0f} DN: if that is "
         "little, lengthen the exposure)"

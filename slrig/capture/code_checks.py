@@ -10,11 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.checks import BAND_SAMPLES, BANDS, Chosen, Reference, Samples, rows_of, variation
+from slrig.capture.checks import BAND_SAMPLES, BANDS, Chosen, Reference, Samples, rows_of, variation, worst_judged
+from slrig.capture.pair_checks import rougher
 
 _CROSSINGS = 12
 _SPAN_PERIODS = 3
 _BAND_LINES = 4
+
+_LEAST_SUM_OFF = 0.25
+"""Of white: sums of line frames that differ by less are those of sharp lines on pixels as wide as theirs."""
+
+_AS_MUCH_TO_BLAME = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +134,9 @@ def line_fault(
             f"the frame holds {share:.1%} of white's light, the other line frames {typical:.1%}: it shows another "
             "pattern or was damaged; scan again"
         )
+    rough = rougher(frame, others, ref, noise=noise) if others else None
+    if rough is not None:
+        return True, rough
     # Lines that noise or blur hides cannot be judged. Sharp ones would vary by duty · (1 − duty).
     hidden = 0.03 * duty * (1 - duty) * float(np.mean(ref.contrast[ref.judged] ** 2))
     if variation(frame, ref) < max(3 * noise**2, hidden):
@@ -154,6 +163,31 @@ def line_fault(
                 "transfer; check the cable, and scan again"
             )
     return True, None
+
+
+def line_sum(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tuple[tuple[int, ...], str] | None:
+    """Judge the sum of the n line frames of one axis, given by shift: those to blame and what is wrong, or None.
+
+    Each place is lit by one frame as every other place is by another, so the sum is the same everywhere, also where a
+    camera is not linear or a scaler blurs. To blame is a frame that the sum's error can be taken from with light left
+    between black and white.
+    """
+    light = np.stack([ref.relative(frame) for frame in frames])
+    total = light.sum(axis=0)
+    off = total - np.median(total)
+    spread = 1.4826 * float(np.median(np.abs(off)))
+    slack = np.maximum(max(_LEAST_SUM_OFF, 6 * spread), 8 * noise * len(frames) ** 0.5 / ref.contrast[ref.judged])
+    wrong = np.abs(off) > slack
+    where = worst_judged(wrong, ref, whole=0.1)
+    if where is None:
+        return None
+    without = (light - off)[:, wrong]
+    outside = np.mean((without < -slack[wrong]) | (without > 1 + slack[wrong]), axis=1)
+    blamed = tuple(int(each) for each in np.flatnonzero(outside <= outside.min() + _AS_MUCH_TO_BLAME))
+    return blamed, (
+        f"on {where} the line frames do not add up to what they do elsewhere: one of them was damaged in transfer or "
+        "shows another pattern, or something moved; check the cable, and scan again"
+    )
 
 
 def line_order(frames: Sequence[Samples], ref: Reference, *, noise: float) -> tuple[bool, int | None]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.capture import checks, code_checks
+from slrig.capture import checks, code_checks, pair_checks
 from slrig.capture.checks import Lighting, Reference, Samples
 from slrig.capture.code_checks import Code
 from slrig.capture.identity import Contradiction, named, place
@@ -20,13 +20,15 @@ from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pix
 class _Findings:
     """What the frames told so far: all of it follows from the frames, and is found again when one is taken back.
 
-    sound : a pair of a bit and its inverse has added up to white and black, which vouches for these two.
+    sums : of the last pair of a bit and its inverse. sound : a pair of a bit and its inverse has added up to white and
+    black, which vouches for these two.
     lined : axes of which a line frame lay where the Gray code says, which vouches for the code.
     """
 
     firsts: dict[Pattern, int] = field(default_factory=dict)
     verified: set[int] = field(default_factory=set)
     noises: list[float] = field(default_factory=list)
+    sums: list[Samples] = field(default_factory=list)
     codes: dict[Axis, tuple[Code, Gray]] = field(default_factory=dict)
     waiting_lines: list[int] = field(default_factory=list)
     light_drift: float | None = None
@@ -242,11 +244,12 @@ class Witness:
         # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
         if partner is not None:
             bit, inverse = self._frames[index], self._frames[partner]
-            fault = checks.pair_fault(bit, inverse, ref, noise=self._noise, run_px=_run_px(pattern))
+            fault = pair_checks.pair_fault(bit, inverse, ref, noise=self._noise, run_px=_run_px(pattern))
             if fault is not None:
                 words = f"beside {named(partner, self._patterns[partner])}, {fault}"
                 return [self._says(index, words, [index, partner], self._unproven_reference)]
-            self._found.noises.append(checks.noise_dn(bit, inverse, ref))
+            self._found.noises.append(checks.noise_dn(bit, inverse, ref, sums=self._found.sums))
+            self._found.sums = [bit + inverse]
             found = self._range([partner, index], ref)
             if not found:
                 self._found.verified |= {index, partner}
@@ -341,14 +344,18 @@ class Witness:
         return self._line_order(index, pattern, ref)
 
     def _line_order(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
-        """Judge the order of the line frames once the last one is in."""
+        """Judge the sum and the order of the line frames once the last one is in."""
         family = [replace(pattern, shift=shift) for shift in range(pattern.period_px)]
         firsts = self._found.firsts
         if any(firsts.get(line) not in self._frames for line in family):
             return []
         frames = [self._frames[firsts[line]] for line in family]
-        shows, shift = code_checks.line_order(frames, ref, noise=self._noise)
         members = [firsts[line] for line in family]
+        unequal = code_checks.line_sum(frames, ref, noise=self._noise)
+        if unequal is not None:
+            blamed, fault = unequal
+            return [self._says(index, fault, [members[each] for each in blamed], members)]
+        shows, shift = code_checks.line_order(frames, ref, noise=self._noise)
         if shift is None:
             # One frame that lies where the code says, and the right order, place them all.
             if shows and set(members) & self._found.verified:

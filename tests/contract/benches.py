@@ -49,22 +49,33 @@ def _eye(name: str, x_mm: float, **options: object) -> dict[str, object]:
     }
 
 
+def eyes(**options: object) -> list[dict[str, object]]:
+    """Two cameras, one of 8 and one of 12 bit."""
+    return [_eye("left", -60.0, **options), _eye("right", 180.0, bit_depth=12, **options)]
+
+
+def beamer(**options: object) -> dict[str, object]:
+    """The projector between them."""
+    return {
+        "size_px": [PROJECTOR.width_px, PROJECTOR.height_px],
+        "focal_px": [440.0, 440.0],
+        "position_mm": [90.0, 0.0, -500.0],
+        "target_mm": [0.0, 0.0, 0.0],
+        "blur_px": 0.4,
+        "latency_s": 0.005,
+        **options,
+    }
+
+
 def simulated(folder: Path, *, realtime: bool = False, **head: object) -> Bench:
-    """The rendered rig: two cameras, one of 8 and one of 12 bit, before a plate."""
+    """The rendered rig before a plate."""
     (folder / "plate.toml").write_text(PLATE)
     options: dict[str, object] = {
         "scene": "plate.toml",
         "realtime": realtime,
         "ambient": 0.02,
-        "projector": {
-            "size_px": [PROJECTOR.width_px, PROJECTOR.height_px],
-            "focal_px": [440.0, 440.0],
-            "position_mm": [90.0, 0.0, -500.0],
-            "target_mm": [0.0, 0.0, 0.0],
-            "blur_px": 0.4,
-            "latency_s": 0.005,
-        },
-        "camera": [_eye("left", -60.0), _eye("right", 180.0, bit_depth=12)],
+        "projector": beamer(),
+        "camera": eyes(),
         **head,
     }
     return Bench(partial(device.open_head, options, folder), sequence())

@@ -20,7 +20,7 @@ from slrig.capture.identity import Contradiction
 from slrig.capture.sequencer import capture
 from slrig.devices import Head, Projector, ProjectorInfo, Rig, Shown
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
-from slrig.model import PatternSequence, Pixels, Shot
+from slrig.model import Pattern, PatternSequence, Pixels, Shot
 from tests.contract.suite import rig_of
 
 _BANDS = 12
@@ -179,6 +179,7 @@ class Truths:
     """What one camera should see of each pattern: images (N, H, W) float32; contrast, the scene's, in its units."""
 
     camera: str
+    patterns: tuple[Pattern, ...]
     images: NDArray[np.float32]
     contrast: float
 
@@ -187,7 +188,7 @@ class Truths:
         """Ask for all of them."""
         images = np.stack([expected(camera, index) for index in range(len(sequence))]).astype(np.float32)
         contrast = float(np.percentile(images.max(axis=0) - images.min(axis=0), 95))
-        return cls(camera, images, contrast)
+        return cls(camera, sequence.patterns, images, contrast)
 
     def wrong(self, shot: Shot) -> str | None:
         """Words for a frame that is nearer to another pattern than to its own, or is damaged; None for a sound one."""
@@ -195,6 +196,8 @@ class Truths:
         distance = np.mean(rest**2, axis=(1, 2))
         own = shot.pattern
         nearest = int(np.argmin(distance))
+        if self.patterns[nearest] == self.patterns[own]:
+            nearest = own
         # Patterns may look alike where the camera looks: nearer by as much as their difference is nearer in truth.
         apart = float(np.mean((self.images[nearest] - self.images[own]) ** 2))
         if distance[own] - distance[nearest] > 0.1 * apart > 0:

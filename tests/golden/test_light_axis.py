@@ -169,13 +169,18 @@ def test_two_cameras_meet_on_fine_rows_as_on_coarse_ones(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_cameras_above_one_another_need_no_projector_calibration_either(tmp_path: Path) -> None:
-    beside = scanned(rig_file(tmp_path / "beside", BALL, CENTRAL, LEFT, RIGHT), projector_known=False)
+    # Lying stripes with one axis played; standing ones with both, of which the right one is taken.
     above = scanned(rig_file(tmp_path / "above", BALL, *map(exchanged, (CENTRAL, LEFT, RIGHT))), projector_known=False)
+    rig = rig_file(tmp_path / "beside", BALL, CENTRAL, LEFT, RIGHT)
+    beside = scanned(rig, plan=PatternPlan(rows=True), projector_known=False)
     sys.stdout.write(f"\n{HEADING}{row('pair, beside', beside)}{row('pair, above', above)}")
     assert (beside["axis"], above["axis"]) == ("column", "row")
     assert beside["truth"]["rms_mm"] < 0.012
     alike(beside, above)
     assert beside["notes"] == above["notes"] == []
+    for report in (beside, above):
+        assert 0.8 < report["truth"]["error_over_sigma_p68"] < 1.25
+        assert report["truth"]["facing_camera_area"] == 1
 
 
 @pytest.mark.slow
