@@ -103,8 +103,11 @@ class ReconstructionWorker:
             self._condition = f"{PREPARING}, {told}"
         elif isinstance(told, Ready):
             self._condition, self._loading = READY, False
-        elif self._loading and not self._closed:
+        elif self._loading:
+            # Of a process that is gone, and nothing more is to be read from its pipe, whoever ended it.
             self._loading = False
+            if self._closed:
+                return
             cause = told.cause if isinstance(told, Unloadable) else "its process ended"
             self._condition = f"the reconstruction cannot be loaded: {cause}; the service's log has the details"
             _log.error("the reconstruction cannot be loaded", cause=cause)

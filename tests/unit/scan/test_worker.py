@@ -199,6 +199,18 @@ def test_closed_worker_starts_no_process(tmp_path: Path) -> None:
     assert closed.process_id is None
 
 
+def test_condition_comes_back_from_a_worker_that_was_closed_while_it_loaded() -> None:
+    """Its pipe is at its end for good, and whoever read on there kept everybody from the worker."""
+    closed = ReconstructionWorker(TASK)
+    closed.start()
+    closed.close()
+    asking = threading.Thread(target=lambda: closed.condition, daemon=True)
+    asking.start()
+    asking.join(WAIT_S)
+    assert not asking.is_alive()
+    assert not closed.loading
+
+
 def test_kernel_cache_moves_only_when_the_package_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
