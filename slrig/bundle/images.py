@@ -1,9 +1,9 @@
-"""Frame files: PNG, TIFF and BMP, their headers read before a pixel is decoded.
+"""Frame files: PNG, TIFF, BMP and JPEG, their headers read before a pixel is decoded.
 
 A few hundred kilobytes can declare an image of gigabytes, so extent and depth come from the header, and only a file
 that fits what bundle.json declares is decoded. A PNG's chunks are walked with their checksums: a cut or damaged file is
 told as that, not as a strange image. So are TIFF pages without compression or with zlib; a fault inside LZW data, which
-has no checksum, shows only where the decoder stumbles.
+has no checksum, shows only where the decoder stumbles, and one inside a JPEG as a strange image.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ import cv2
 import numpy as np
 import tifffile
 
-from slrig.bundle.bitmaps import SIGNATURE, Bitmap
+from slrig.bundle import bitmaps, jpegs
+from slrig.bundle.bitmaps import Bitmap
+from slrig.bundle.jpegs import Jpeg
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Pixels
 
@@ -62,14 +64,28 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     elif data.startswith(TIFF_SIGNATURES):
         _check_tiff(path, data, pages, camera)
         images = {page: _tiff_page(data, page) for page in dict.fromkeys(pages)}
-    elif data.startswith(SIGNATURE):
+    elif data.startswith((bitmaps.SIGNATURE, jpegs.SIGNATURE)):
         if set(pages) != {0}:
-            _refuse(path, "page 0 only, for a BMP holds one image", f"page {max(pages)}", "write page 0 or use a TIFF")
-        images = {0: _bitmap(path, data, camera)}
+            _refuse(path, "page 0 only, for it holds one image", f"page {max(pages)}", "write page 0 or use a TIFF")
+        images = {0: (_bitmap if data.startswith(bitmaps.SIGNATURE) else _jpeg)(path, data, camera)}
     else:
         found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
-        _refuse(path, "a PNG, TIFF or BMP file", found, "save the frame as PNG")
+        _refuse(path, "a PNG, TIFF, BMP or JPEG file", found, "save the frame as PNG")
     return {page: _grey(path, page, image, camera) for page, image in images.items()}
+
+
+def compression_dn(path: Path) -> float:
+    """Standard deviation that the compression of a frame file adds, in its units; 0 where that is lossless.
+
+    A file that cannot be read has none here: `read_pages` says what is wrong with it.
+    """
+    try:
+        with path.open("rb") as file:
+            if file.read(len(jpegs.SIGNATURE)) != jpegs.SIGNATURE:
+                return 0.0
+        return Jpeg.of(path.read_bytes()).noise_dn
+    except (OSError, ValueError):
+        return 0.0
 
 
 def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
@@ -139,6 +155,15 @@ def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
         return found.decoded(data)
     except ValueError as cause:
         _refuse(path, "a whole, uncompressed BMP of 8 or 24 bits", str(cause), "save the frame as PNG")
+
+
+def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
+    try:
+        found = Jpeg.of(data)
+    except ValueError as cause:
+        _refuse(path, "a whole JPEG of 8 bits, grey or in colour", str(cause), "copy the frame again")
+    _check_header(path, found.width, found.height, 8, camera)
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:

@@ -108,7 +108,7 @@ def fused_frames(capture: Capture, camera: str, axis: Axis) -> FusedFrames:
         repeats = {pattern: by_exposure[time_s] for pattern, by_exposure in seen.items()}
         exposed.append(_exposed(repeats, patterns, unseen, **scales))
         unseen &= ~exposed[-1].usable
-    noise = fitted_noise(each.samples for each in exposed)
+    noise = fitted_noise((each.samples for each in exposed), compression_dn=form.compression_dn)
     light = _measured_light(exposed, exposures_s, noise)
     weights = _weights(exposed, 1 / light, noise)
     gains = weights * (1 / light).astype(np.float32)[:, np.newaxis, np.newaxis]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
@@ -56,13 +56,20 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     (Immerkær 1996, DOI 10.1006/cviu.1996.0060) tells the noise of the dark. Without inverses that scatter of white and
     black stands alone.
     """
-    return fitted_noise([noise_samples(frames)])
+    return fitted_noise([noise_samples(frames)], compression_dn=frames.compression_dn)
 
 
-def fitted_noise(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> NoiseModel:
-    """Fit the noise model to what `noise_samples` found in the frames of each exposure of one camera."""
+def fitted_noise(
+    samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]], *, compression_dn: float = 0.0
+) -> NoiseModel:
+    """Fit the noise model to what `noise_samples` found in the frames of each exposure of one camera.
+
+    compression_dn : of `CameraFormat`. A compressed frame errs where light changes, and alike wherever it does not:
+    scatter tells nothing of that.
+    """
     levels, variances = zip(*samples, strict=True)
-    return _fitted(np.concatenate(levels), np.concatenate(variances))
+    found = _fitted(np.concatenate(levels), np.concatenate(variances))
+    return replace(found, read_variance=found.read_variance + compression_dn**2)
 
 
 def noise_samples(

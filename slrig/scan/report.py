@@ -221,6 +221,12 @@ def capture_notes(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> li
         notes.append(
             "Gray-only: no line-shift frames, so points lie on the edges of the Gray code, located to sub-pixel"
         )
+    notes += [
+        f"camera '{name}': its frames are JPEG, whose compression is taken to err by {form.compression_dn:.1f} grey "
+        "levels where light changes: record PNG, TIFF or BMP for finer surfaces"
+        for name, form in capture.cameras.items()
+        if form.compression_dn
+    ]
     notes += [f"an exposure was {words}" for words in left_out(evidence.causes)]
     notes += [f"the frames contradict their patterns: {fault}" for fault in evidence.faults]
     return notes

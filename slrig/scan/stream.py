@@ -141,7 +141,11 @@ class _Eye:
         if all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
             form = outline.cameras[name]
             stacks = FrameStacks(
-                patterns, form.size.shape, full_scale=float(form.full_scale), ends_repeats=ends_repeats(used, axis)
+                patterns,
+                form.size.shape,
+                full_scale=float(form.full_scale),
+                ends_repeats=ends_repeats(used, axis),
+                compression_dn=form.compression_dn,
             )
             tables = _tables(patterns.gray, patterns.lines, outline.projector)
             self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered)
