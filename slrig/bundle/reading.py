@@ -79,8 +79,8 @@ def _capture(folder: Path, description: Description) -> Capture:
         for frame in description.frames
     )
     for name, form in cameras.items():
-        worst = max((compression_dn(paths[file]) for camera, file in pages if camera == name), default=0.0)
-        cameras[name] = replace(form, compression_dn=worst)
+        files = (compression_dn(paths[file]) for camera, file in pages if camera == name)
+        cameras[name] = replace(form, compression_dn=max([form.compression_dn, *files]))
     return Capture(description.projector_size(), description.pattern_list(), cameras, shots)
 
 

@@ -165,8 +165,8 @@ def test_a_png_with_alpha_is_refused(folder: Path, shape: tuple[int, ...], kind:
 
 
 def test_another_kind_of_file_is_refused(folder: Path) -> None:
-    (folder / "frames/left/000.png").write_bytes(b"\xff\xd8\xff\xe0 a photograph")
-    _fault(folder, "expected a PNG, TIFF or BMP file", "begins with", "save the frame as PNG")
+    (folder / "frames/left/000.png").write_bytes(b"GIF89a a film")
+    _fault(folder, "expected a PNG, TIFF, BMP or JPEG file", "begins with", "save the frame as PNG")
 
 
 def _with_tiff(folder: Path, page: int, **writing: Any) -> Path:

@@ -73,7 +73,11 @@ def test_a_bundle_tells_it_of_its_cameras(tmp_path: Path) -> None:
     jpeg_file = written(frame.parent, jpeg(picture()))
     description = tmp_path / "b" / DESCRIPTION
     description.write_text(description.read_text().replace(frame.name, jpeg_file.name))
-    assert read_bundle(tmp_path / "b").capture.cameras["eye"].compression_dn == compression_dn(jpeg_file) > 0
+    seen = read_bundle(tmp_path / "b").capture
+    assert seen.cameras["eye"].compression_dn == compression_dn(jpeg_file) > 0
+    # A bundle made of these frames, by a scan of the replayed recording for one, remembers it.
+    write_bundle(tmp_path / "again", seen)
+    assert read_bundle(tmp_path / "again").capture.cameras == seen.cameras
 
 
 def without_end(data: bytes) -> bytes:

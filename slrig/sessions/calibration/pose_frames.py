@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slrig.bundle.description import read_description
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import PoseRefusedError
-from slrig.model import Axis, Black, CameraFormat, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
+from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
 from slrig.reconstruction.frames import exposure_count
 
 Image = NDArray[np.float32]
@@ -111,7 +111,7 @@ def cut_capture(capture: Capture, camera: str, window: Window) -> Capture:
     shots = tuple(replace(shot, image=shot.image[window]) for shot in capture.shots if shot.camera == camera)
     rows, columns = window
     size = Size(columns.stop - columns.start, rows.stop - rows.start)
-    return Capture(capture.projector, capture.patterns, {camera: CameraFormat(size, form.bit_depth)}, shots)
+    return Capture(capture.projector, capture.patterns, {camera: replace(form, size=size)}, shots)
 
 
 def _views(patterns: tuple[Pattern, ...], shots: list[Shot], black: Image | None) -> list[Image]:
