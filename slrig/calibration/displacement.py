@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.solution import PARAMETERS
-from slrig.model import Axis, FloatArray, Pinhole, triangulated_axis
+from slrig.model import Axis, FloatArray, Pinhole, told_depth, triangulated_axis
 
 _EACH = len(PARAMETERS)
 
@@ -61,10 +61,17 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
     if projector is None:
         return _by_two_cameras(cameras, views, points_mm)
     light = _projected(projector, points_mm)
-    coordinate = 0 if triangulated_axis(cameras, projector) is Axis.COLUMN else 1
+    axis = triangulated_axis(cameras, projector)
+    coordinate = 0 if axis is Axis.COLUMN else 1
     ray = points_mm - projector.centre_mm
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    weights = np.stack([np.where(view.inside, _squares(view.by_point, ray), 0.0) for view in views])
+    told = told_depth(axis, cameras, projector)
+    weights = np.stack(
+        [
+            np.where(view.inside & tells, _squares(view.by_point, ray), 0.0)
+            for view, tells in zip(views, told, strict=True)
+        ]
+    )
     total = weights.sum(axis=0)
     weights = weights / np.where(total > 0, total, 1.0)
     by_parameter = np.zeros((len(points_mm), 3, _EACH * (len(cameras) + 1)))

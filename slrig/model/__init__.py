@@ -15,7 +15,7 @@ from slrig.model.frames import (
     bracket_fault,
     exposure_groups,
 )
-from slrig.model.light_axis import share_across, triangulated_axis
+from slrig.model.light_axis import LEAST_SHARE, share_across, told_depth, triangulated_axis
 from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, White
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, Pinhole, Size, Solved
@@ -24,6 +24,7 @@ from slrig.model.surfaces import CameraTruth, FlipRule, Mesh, PointCurves, Refus
 __all__ = [
     "DEVICE_PARAMETERS",
     "FEWEST_EXPOSURES",
+    "LEAST_SHARE",
     "MOST_EXPOSURES",
     "Axis",
     "Black",
@@ -54,6 +55,7 @@ __all__ = [
     "bracket_fault",
     "exposure_groups",
     "share_across",
+    "told_depth",
     "triangulated_axis",
     "without_missing_bits",
 ]

@@ -54,8 +54,8 @@ class Truth:
 class Refusal(IntEnum):
     """Why a camera pixel gave no surface point, one cause each: the first in the walk that refused it.
 
-    The last three say what became of a ray on its way to the light sheet: they meet where the projector has no pixel,
-    behind the camera or the projector, or nowhere that Newton's method finds.
+    The last four say what became of a ray on its way to the light sheet: they meet where the projector has no pixel,
+    behind the camera or the projector, or nowhere that Newton's method finds; or the sheet holds the camera, too.
     """
 
     NONE = 0
@@ -71,6 +71,7 @@ class Refusal(IntEnum):
     OFF_PROJECTOR = 10
     BEHIND_DEVICE = 11
     NO_INTERSECTION = 12
+    SHEET_SEEN_ALONG = 13
 
 
 class FlipRule(StrEnum):

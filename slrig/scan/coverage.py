@@ -13,7 +13,7 @@ from slrig.model import Mesh, Refusal, Size
 from slrig.reconstruction.optics import project
 from slrig.scan.stream import Seen
 
-LEAST_SHARE = 0.6
+FAIR_SHARE = 0.6
 """Sound scans of real rigs have 0.8 and more, borders of two pixels that are refused included."""
 _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""
@@ -40,7 +40,7 @@ def covered_share(mesh: Mesh, seen: Seen) -> float | None:
 
 def coverage_notes(name: str, share: float | None) -> list[str]:
     """One sentence if the mesh covers much less than was decoded."""
-    if share is None or share >= LEAST_SHARE:
+    if share is None or share >= FAIR_SHARE:
         return []
     return [
         f"the mesh covers {share:.0%} of what camera '{name}' decoded. Look at the picture of causes: the finest "

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from math import asin, degrees
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Calibration, Pinhole, share_across, triangulated_axis
+from slrig.model import LEAST_SHARE, Axis, Calibration, Pinhole, share_across, told_depth, triangulated_axis
 
 _NEXT_TO_NONE = 0.01
-LEAST_SHARE = 0.2
-"""A baseline that lies across the stripes by less than this share of it (12°) makes errors five times as large as they
-need be, and what is seen of depth is mostly errors."""
 FAIR_SHARE = 0.5
 """By this share of it (30°), errors are twice as large as they need be."""
 
@@ -76,6 +73,19 @@ def weakness(axis: Axis, shown: Collection[Axis], share: float) -> str | None:
         f"the light of the {axis}s crosses the baseline at {degrees(asin(share)):.0f}° only, and depth is {times} "
         f"times as uncertain as it would be across it. {cure}"
     )
+
+
+def left_out_notes(axis: Axis, cameras: Mapping[str, Pinhole], projector: Pinhole | None) -> list[str]:
+    """One sentence for each camera that the axis tells no depth, where it tells others."""
+    if projector is None:
+        return []
+    told = told_depth(axis, list(cameras.values()), projector)
+    return [
+        f"camera '{name}' is left out: its baseline to the projector lies along the {axis}s of light, which tell it no "
+        "depth; the other cameras measure by them"
+        for name, tells in zip(cameras, told, strict=True)
+        if not tells
+    ]
 
 
 def _known(calibration: Calibration | None, names: Iterable[str]) -> list[Pinhole]:

@@ -55,6 +55,7 @@ _COLOURS: dict[Refusal, tuple[int, int, int]] = {
     Refusal.OFF_PROJECTOR: (60, 90, 140),
     Refusal.BEHIND_DEVICE: (150, 150, 0),
     Refusal.NO_INTERSECTION: (120, 40, 120),
+    Refusal.SHEET_SEEN_ALONG: (90, 90, 200),
 }
 
 

@@ -13,59 +13,36 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle import read_bundle, read_calibration, read_truth
-from slrig.bundle.description import read_description
+from slrig.bundle import read_truth
 from slrig.bundle.health import read_health
-from slrig.bundle.reading import CALIBRATION
-from slrig.bundle.refused import read_refused
-from slrig.capture.exposure import check_exposures
-from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, ScanCancelledError
+from slrig.errors import ScanCancelledError
 from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import brightness, compact_mesh
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves, without_missing_bits
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
 from slrig.scan.calibration_report import calibration_report
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
-from slrig.scan.light_axis import FAIR_SHARE, LEAST_SHARE, weakness
+from slrig.scan.measured import Walked, measured
 from slrig.scan.offered import rejected_picture
-from slrig.scan.outline import Outline
 from slrig.scan.output import REPORT, staged_folder
 from slrig.scan.pictures import preview, rejection_picture, write_png
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
-    calibration_id,
     camera_report,
-    capture_notes,
-    capture_report,
     mesh_report,
     redundancy_report,
     with_seconds,
 )
-from slrig.scan.resolved import steps, unresolved_notes
-from slrig.scan.stream import LiveScan, ScanStream, Seen, step_px
-from slrig.scan.triangulated import Triangulated, triangulated, widest_gap_px
-
-_STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
-
-
-@dataclass(frozen=True, slots=True)
-class _Walked:
-    """What the frames told: the curves of every camera, and their part of the report."""
-
-    devices: Calibration
-    axis: Axis
-    shown: frozenset[Axis]
-    seen: list[Seen]
-    step_px: float
-    sections: dict[str, object]
-    notes: list[str]
+from slrig.scan.resolved import steps
+from slrig.scan.stream import LiveScan, Seen
+from slrig.scan.triangulated import Triangulated, widest_gap_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,14 +109,7 @@ def reconstruct_bundle(
 
     with compilations_told(compiling), staged_folder(output) as staging:
         entered("read bundle", 0.0, str(bundle))
-        walked = _walked(bundle, calibration, live, entered, axis=plan.axis)
-        found = _triangulated(walked, bundle, entered)
-        (other,) = set(Axis) - {walked.axis}
-        if plan.axis is None and found.share_across < FAIR_SHARE and other in walked.shown:
-            # The projector does not stand as was assumed: its stripes run the other way.
-            walked = _walked(bundle, calibration, None, entered, axis=other)
-            found = _triangulated(walked, bundle, entered)
-        depth = _told_depth(found, walked, bundle)
+        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
@@ -154,7 +124,7 @@ def reconstruct_bundle(
         seconds = watch.finished()
         report = {
             **walked.sections,
-            "notes": [*walked.notes, *depth, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
+            "notes": [*walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
@@ -174,118 +144,10 @@ def warm_kernels(told: Callable[[Prepared], None]) -> None:
     prepare_kernels(reconstruct_bundle, told)
 
 
-def _require_calibration(folder: Path, names: list[str], found: Calibration | None) -> Calibration:
-    if found is None:
-        message = (
-            f"{folder}: no calibration.json beside the frames, and without one nothing can be measured; "
-            "put one there, or name one with --calibration FILE"
-        )
-        raise CalibrationError(message)
-    missing = [name for name in names if name not in found.cameras]
-    if missing:
-        message = (
-            f"{folder}: the calibration knows cameras {sorted(found.cameras)}, the frames are of {names}; "
-            f"calibrate {missing}, or use the names of the calibration"
-        )
-        raise CalibrationError(message)
-    if found.projector is None and len(names) < 2:
-        message = (
-            f"{folder}: the calibration has no projector, and the bundle one camera ('{names[0]}'): one of "
-            "them is needed as the second ray; calibrate the projector, or add a camera"
-        )
-        raise CalibrationError(message)
-    return found
-
-
-def _walked(
-    folder: Path,
-    calibration_file: Path | None,
-    live: LiveScan | None,
-    entered: Callable[[str, float, str], None],
-    *,
-    axis: Axis | None = None,
-) -> _Walked:
-    """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
-    names: list[str] = []
-    cut_short: tuple[str, ...] = ()
-    last = ""
-
-    def stage_entered(stage: str, name: str) -> None:
-        nonlocal last
-        if last != stage + name:
-            last = stage + name
-            share = (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names)
-            entered(stage, 0.1 + 0.5 * share, f"camera '{name}'")
-
-    if (
-        live is not None
-        and live.evidence is not None
-        and axis in (None, live.stream.axis)
-        and _is_of(live, folder, calibration_file)
-    ):
-        names += live.stream.outline.cameras
-        devices, stream, evidence = live.calibration, live.stream, live.evidence
-        _require_calibration(folder, names, devices)
-        seen = live.finish(stage_entered)
-    else:
-        recorded = read_bundle(folder, calibration_file=calibration_file)
-        capture, cut_short = without_missing_bits(recorded.capture)
-        names += capture.cameras
-        devices = _require_calibration(folder, names, recorded.calibration)
-        try:
-            stream = ScanStream(Outline.of(capture), devices, entered=stage_entered, axis=axis)
-            for name in names:
-                for shot in capture.shots:
-                    if shot.camera == name:
-                        stream.take(shot)
-            seen = stream.finish()
-        except PatternError as cause:
-            message = f"{folder}: {cause}"
-            raise PatternError(message) from cause
-        entered("check frames", 0.58, "")
-        evidence = check_exposures(capture, read_refused(folder))
-    sections = capture_report(stream.capture, stream.axis, evidence)
-    step = step_px(stream.outline.shown, stream.axis)
-    notes = [*cut_short, *capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step)]
-    return _Walked(devices, stream.axis, stream.outline.axes, seen, step, sections, notes)
-
-
-def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
-    """Whether the frames taken live are those that the bundle lists, for the calibration that it is measured by."""
-    description = read_description(folder)
-    listed = Outline(
-        description.projector_size(), description.pattern_list(), description.camera_formats(),
-        tuple((frame.pattern, frame.camera) for frame in description.frames),
-    )  # fmt: skip
-    path = folder / CALIBRATION if calibration_file is None else calibration_file
-    return (
-        Outline.of(live.stream.capture) == listed
-        and path.exists()
-        and calibration_id(read_calibration(path)) == calibration_id(live.calibration)
-    )
-
-
-def _triangulated(walked: _Walked, folder: Path, entered: Callable[[str, float, str], None]) -> Triangulated:
-    seen = walked.seen
-    require_surface(any(each.curves.decoded_pixels > 0 for each in seen), folder, "no pixel could be decoded", seen)
-    require_surface(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
-    entered("triangulate", 0.6, "")
-    return triangulated(seen, walked.devices.projector, walked.axis)
-
-
-def _told_depth(found: Triangulated, walked: _Walked, folder: Path) -> tuple[str, ...]:
-    """A note on light that crosses the baseline obliquely. Light along it is refused."""
-    words = weakness(walked.axis, walked.shown, found.share_across)
-    if words is not None and found.share_across < LEAST_SHARE:
-        message = f"{folder}: {words}"
-        raise NothingToReconstructError(message)
-    return () if words is None else (words,)
-
-
 def _meshed(
     folder: Path,
     found: Triangulated,
-    walked: _Walked,
+    walked: Walked,
     plan: ReconstructionPlan,
     entered: Callable[[str, float, str], None],
 ) -> _Meshed:

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Axis, Pinhole, Refusal, share_across
+from slrig.model import Axis, Pinhole, Refusal, share_across, told_depth
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.epipolar import stripe_crossing
 from slrig.reconstruction.merging import MergedCurves, merged
 from slrig.reconstruction.redundancy import Redundancy, redundancy
+from slrig.reconstruction.sheet_curves import selected
 from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
 from slrig.scan.stream import Seen
 
@@ -38,12 +39,18 @@ class Triangulated:
 def triangulated(cameras: list[Seen], projector: Pinhole | None, axis: Axis) -> Triangulated:
     """Triangulate the curves of an axis; without a projector, of at least two cameras.
 
+    With a projector, a camera is left out whose baseline lies along the stripes: it sees them edge on, and where others
+    measure, its errors of depth are no use.
+
     Without a projector one pair of cameras is used, since the light sheet has no rows to merge several by: of the pairs
     with the first camera whose stripes cross the epipolar lines steeply, the one that gives most points.
     """
     devices = {seen.name: seen.device for seen in cameras}
     if projector is not None:
-        met = [camera_projector(seen.curves.ensemble, seen.device, projector, axis) for seen in cameras]
+        met = [
+            _on_sheets(seen, projector, axis, told=told)
+            for seen, told in zip(cameras, told_depth(axis, list(devices.values()), projector), strict=True)
+        ]
         told = [
             replace(seen, curves=replace(seen.curves, refusal=_with_left_out(seen.curves, part, cause)))
             for seen, (part, cause) in zip(cameras, met, strict=True)
@@ -76,6 +83,17 @@ def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:
         return _WIDEST_GAP_PX
     across, along = (0, 1) if axis is Axis.COLUMN else (1, 0)
     return _WIDEST_GAP_PX * max(1.0, float(projector.matrix[along, along] / projector.matrix[across, across]))
+
+
+def _on_sheets(seen: Seen, projector: Pinhole, axis: Axis, *, told: bool) -> tuple[SheetCurves, NDArray[np.uint8]]:
+    """`camera_projector`, with nothing kept of a camera that the axis tells no depth."""
+    part, cause = camera_projector(seen.curves.ensemble, seen.device, projector, axis)
+    if told:
+        return part, cause
+    return (
+        selected(part, np.zeros(len(part.points_mm), dtype=np.bool_)),
+        np.where(cause == Refusal.NONE, np.uint8(Refusal.SHEET_SEEN_ALONG), cause),
+    )
 
 
 def _with_left_out(curves: CameraCurves, triangulated: SheetCurves, cause: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -26,8 +26,9 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, LineShift, Mesh
 from slrig.scan.acquisition import capture_bundle
+from slrig.scan.measured import Walked
 from slrig.scan.outline import Outline
-from slrig.scan.pipeline import _meshed, _Walked
+from slrig.scan.pipeline import _meshed
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.report import Stopwatch
 from slrig.scan.stream import ScanStream, step_px
@@ -96,7 +97,7 @@ class Run:
         watch.enter("triangulate")
         step = step_px(stream.outline.shown, stream.axis)
         found = triangulated(seen, calibration.projector, stream.axis)
-        walked = _Walked(calibration, stream.axis, stream.outline.axes, seen, step, {}, [])
+        walked = Walked(calibration, stream.axis, stream.outline.axes, seen, step, {}, [])
         meshed = _meshed(
             folder, found, walked, ReconstructionPlan(), lambda stage, _fraction, _detail: watch.enter(stage)
         )  # fmt: skip

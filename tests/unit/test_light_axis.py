@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.model import Axis, FloatArray, Pinhole, Size, share_across, triangulated_axis
+from slrig.model import Axis, FloatArray, Pinhole, Size, share_across, told_depth, triangulated_axis
 
 MIDDLE_MM = np.array([0.0, 0.0, 600.0])
 
@@ -52,8 +52,21 @@ def test_finer_rows_do_not_make_a_sheet_of_them_steeper() -> None:
     assert share_across(Axis.ROW, [standing(100.0, 60.0)], diamond) == pytest.approx(60 / math.hypot(100, 60))
 
 
-def test_with_a_projector_the_first_camera_decides() -> None:
-    assert triangulated_axis([standing(0.0, 50.0), standing(300.0, 0.0)], standing(0.0, 0.0)) is Axis.ROW
+def test_with_a_projector_all_cameras_decide_by_what_they_resolve() -> None:
+    projector = standing(0.0, 0.0)
+    assert triangulated_axis([standing(0.0, 50.0), standing(300.0, 0.0)], projector) is Axis.COLUMN
+    # Seven times the resolution outweighs six times the baseline.
+    sharp = standing(0.0, 50.0, focal_px=(6300.0, 6300.0))
+    assert triangulated_axis([sharp, standing(300.0, 0.0)], projector) is Axis.ROW
+    two = [standing(0.0, 60.0), standing(80.0, 0.0)]
+    assert share_across(Axis.ROW, two, projector) == pytest.approx(0.6)
+
+
+def test_an_axis_tells_depth_to_cameras_whose_baseline_lies_across_it() -> None:
+    cameras, projector = [standing(10.0, 90.0), standing(80.0, 80.0), standing(120.0, 0.0)], standing(0.0, 0.0)
+    assert told_depth(Axis.COLUMN, cameras, projector) == [False, True, True]
+    assert told_depth(Axis.ROW, cameras, projector) == [True, True, False]
+    assert told_depth(Axis.ROW, cameras[2:], projector) == [True]
 
 
 def test_of_several_cameras_the_longest_baseline_of_the_first_decides() -> None:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Calibration, Gray, LineShift, Pinhole, Size
+from slrig.model import LEAST_SHARE, Axis, Calibration, Gray, LineShift, Pinhole, Size
 from slrig.scan.holding import pattern_sequence
-from slrig.scan.light_axis import FAIR_SHARE, LEAST_SHARE, chosen_axis, played_axes, weakness
+from slrig.scan.light_axis import FAIR_SHARE, chosen_axis, played_axes, weakness
 from slrig.scan.plan import PatternPlan
 
 BOTH = tuple(Axis)

@@ -105,6 +105,22 @@ def test_points_left_out_are_refused_pixels_with_their_own_cause() -> None:
     assert np.count_nonzero(refusal) == 1 + np.count_nonzero(expected)
 
 
+@pytest.mark.parametrize("first", ["above", "beside"])
+def test_a_camera_that_sees_the_sheets_edge_on_is_left_out(first: str) -> None:
+    x, y, z = PROJECTOR.centre_mm
+    above = looking(
+        (x + 5.0, y - 240.0, z), (0.0, 0.0, 0.0), size=CAMERA.size, focal_px=(1380.0, 1390.0), distortion=(0.0,) * 5
+    )
+    cameras = [seen("above", above, curves_in(above, MANY)), seen("beside", CAMERA, curves_in(CAMERA, FEW))]
+    found = triangulated(cameras if first == "above" else cameras[::-1], PROJECTOR, Axis.COLUMN)
+    assert len(found.joined.curves.points_mm) == len(FEW) * len(COLUMNS)
+    assert np.abs(BALL.distance_mm(found.joined.curves.points_mm)).max() < 0.01
+    refused = {each.name: set(np.unique(each.curves.refusal)) for each in found.cameras}
+    assert refused == {"above": {Refusal.NONE, Refusal.SHEET_SEEN_ALONG}, "beside": {Refusal.NONE}}
+    (alone,) = triangulated(cameras[:1], PROJECTOR, Axis.COLUMN).cameras
+    assert not alone.curves.refusal.any()
+
+
 @pytest.mark.parametrize("axis", list(Axis))
 def test_with_a_projector_the_crossing_is_that_of_the_calibration(axis: Axis) -> None:
     found = triangulated([seen("only", CAMERA, curves_in(CAMERA, FEW))], PROJECTOR, axis)

@@ -1,0 +1,222 @@
+"""From the frames of a scan to triangulated points, by the axis of light that tells most of depth.
+
+Where both axes were played the calibration names one of them (`slrig.model.light_axis`). What the frames hold may speak
+for the other: the projector stands otherwise than was assumed, or the camera resolves its patterns better. Where the
+first axis is weak both are tried, and the one that decodes more pixels to a smaller error is used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from slrig.bundle import read_bundle, read_calibration
+from slrig.bundle.description import read_description
+from slrig.bundle.reading import CALIBRATION
+from slrig.bundle.refused import read_refused
+from slrig.capture.exposure import check_exposures
+from slrig.errors import CalibrationError, NothingToReconstructError, PatternError
+from slrig.model import LEAST_SHARE, Axis, Calibration, Refusal, without_missing_bits
+from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
+from slrig.scan.coverage import require_surface
+from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
+from slrig.scan.outline import Outline
+from slrig.scan.report import calibration_id, capture_notes, capture_report
+from slrig.scan.resolved import unresolved_notes
+from slrig.scan.stream import LiveScan, ScanStream, Seen, step_px
+from slrig.scan.triangulated import Triangulated, triangulated
+
+_STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
+
+Entered = Callable[[str, float, str], None]
+"""Told the name of a stage, how far the whole is, and a detail."""
+
+
+@dataclass(frozen=True, slots=True)
+class Walked:
+    """What the frames told along one axis: the curves of every camera, and their part of the report."""
+
+    devices: Calibration
+    axis: Axis
+    shown: frozenset[Axis]
+    seen: list[Seen]
+    step_px: float
+    sections: dict[str, object]
+    notes: list[str]
+
+
+def measured(
+    folder: Path, calibration_file: Path | None, live: LiveScan | None, entered: Entered, *, axis: Axis | None
+) -> tuple[Walked, Triangulated]:
+    """The points of a recorded bundle: of the frames that came while it was captured, or else of its files.
+
+    axis : the one that was asked for; None for that which tells most of depth.
+
+    Raises
+    ------
+    BundleError, CalibrationError, PatternError
+        The bundle cannot be used as it is.
+    NothingToReconstructError
+        No pixel could be decoded, no stripe be found, or the light tells no depth.
+    """
+    walked = _walked(folder, calibration_file, live, entered, axis=axis)
+    tries = [_tried(walked, folder, entered)]
+    others = walked.shown - {walked.axis} if axis is None else frozenset()
+    for other in others:
+        if _is_weak(tries[0]):
+            tries.append(_tried(_walked(folder, calibration_file, None, entered, axis=other), folder, entered))
+    sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
+    if not sound:
+        raise next(each for each in tries if isinstance(each, NothingToReconstructError))
+    best, found = max(sound, key=lambda each: _depth_known(*each))
+    best.notes.extend(_chosen_notes(walked, best, found))
+    best.notes.extend(left_out_notes(best.axis, {seen.name: seen.device for seen in best.seen}, best.devices.projector))
+    words = weakness(best.axis, best.shown, found.share_across)
+    if words is not None:
+        if found.share_across < LEAST_SHARE:
+            message = f"{folder}: {words}"
+            raise NothingToReconstructError(message)
+        best.notes.append(words)
+    return best, found
+
+
+def _tried(walked: Walked, folder: Path, entered: Entered) -> tuple[Walked, Triangulated] | NothingToReconstructError:
+    """The points along one axis, or why there are none."""
+    seen = walked.seen
+    try:
+        require_surface(any(each.curves.decoded_pixels > 0 for each in seen), folder, "no pixel could be decoded", seen)
+        require_surface(any(each.curves.stripe_count > 0 for each in seen), folder, "no stripe was found", seen)
+    except NothingToReconstructError as error:
+        return error
+    entered("triangulate", 0.6, "")
+    return walked, triangulated(seen, walked.devices.projector, walked.axis)
+
+
+def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> bool:
+    """Whether the other axis, if it was played, may tell more."""
+    if isinstance(tried, NothingToReconstructError):
+        return True
+    walked, found = tried
+    return found.share_across < FAIR_SHARE or _decoded_share(walked.seen) < FAIR_DECODED
+
+
+def _decoded_share(cameras: Sequence[Seen]) -> float:
+    """Of the pixels that are lit."""
+    lit = sum(np.count_nonzero(seen.curves.refusal != Refusal.NOT_LIT) for seen in cameras)
+    return sum(seen.curves.decoded_pixels for seen in cameras) / max(lit, 1)
+
+
+def _depth_known(walked: Walked, found: Triangulated) -> float:
+    """The square of the decoded pixels over the usual standard deviation of a point: half of a surface is worth the
+    whole only where it is four times as precise. Coarse bits alone are precise, too.
+    """
+    deviation_mm = found.joined.curves.deviation_mm
+    if len(deviation_mm) == 0:
+        return 0.0
+    usual_mm = float(np.median(np.linalg.norm(deviation_mm, axis=1)))
+    return float(sum(seen.curves.decoded_pixels for seen in walked.seen)) ** 2 / usual_mm
+
+
+def _chosen_notes(first: Walked, best: Walked, found: Triangulated) -> list[str]:
+    """What to say where the calibration with a projector had named another axis than the one that is used."""
+    if best.axis is first.axis or best.devices.projector is None:
+        return []
+    usual_mm = float(np.median(np.linalg.norm(found.joined.curves.deviation_mm, axis=1)))
+    return [
+        f"triangulated by {best.axis}s, which decode {_decoded_share(best.seen):.0%} of what is lit ({usual_mm:.3g} mm "
+        f"of noise): the {first.axis}s, which cross the baseline more steeply, decode {_decoded_share(first.seen):.0%}"
+    ]
+
+
+def _require_calibration(folder: Path, names: list[str], found: Calibration | None) -> Calibration:
+    if found is None:
+        message = (
+            f"{folder}: no calibration.json beside the frames, and without one nothing can be measured; "
+            "put one there, or name one with --calibration FILE"
+        )
+        raise CalibrationError(message)
+    missing = [name for name in names if name not in found.cameras]
+    if missing:
+        message = (
+            f"{folder}: the calibration knows cameras {sorted(found.cameras)}, the frames are of {names}; "
+            f"calibrate {missing}, or use the names of the calibration"
+        )
+        raise CalibrationError(message)
+    if found.projector is None and len(names) < 2:
+        message = (
+            f"{folder}: the calibration has no projector, and the bundle one camera ('{names[0]}'): one of "
+            "them is needed as the second ray; calibrate the projector, or add a camera"
+        )
+        raise CalibrationError(message)
+    return found
+
+
+def _walked(
+    folder: Path,
+    calibration_file: Path | None,
+    live: LiveScan | None,
+    entered: Entered,
+    *,
+    axis: Axis | None = None,
+) -> Walked:
+    """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
+    names: list[str] = []
+    cut_short: tuple[str, ...] = ()
+    last = ""
+
+    def stage_entered(stage: str, name: str) -> None:
+        nonlocal last
+        if last != stage + name:
+            last = stage + name
+            share = (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names)
+            entered(stage, 0.1 + 0.5 * share, f"camera '{name}'")
+
+    if (
+        live is not None
+        and live.evidence is not None
+        and axis in (None, live.stream.axis)
+        and _is_of(live, folder, calibration_file)
+    ):
+        names += live.stream.outline.cameras
+        devices, stream, evidence = live.calibration, live.stream, live.evidence
+        _require_calibration(folder, names, devices)
+        seen = live.finish(stage_entered)
+    else:
+        recorded = read_bundle(folder, calibration_file=calibration_file)
+        capture, cut_short = without_missing_bits(recorded.capture)
+        names += capture.cameras
+        devices = _require_calibration(folder, names, recorded.calibration)
+        try:
+            stream = ScanStream(Outline.of(capture), devices, entered=stage_entered, axis=axis)
+            for name in names:
+                for shot in capture.shots:
+                    if shot.camera == name:
+                        stream.take(shot)
+            seen = stream.finish()
+        except PatternError as cause:
+            message = f"{folder}: {cause}"
+            raise PatternError(message) from cause
+        entered("check frames", 0.58, "")
+        evidence = check_exposures(capture, read_refused(folder))
+    sections = capture_report(stream.capture, stream.axis, evidence)
+    step = step_px(stream.outline.shown, stream.axis)
+    notes = [*cut_short, *capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step)]
+    return Walked(devices, stream.axis, stream.outline.axes, seen, step, sections, notes)
+
+
+def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
+    """Whether the frames taken live are those that the bundle lists, for the calibration that it is measured by."""
+    description = read_description(folder)
+    listed = Outline(
+        description.projector_size(), description.pattern_list(), description.camera_formats(),
+        tuple((frame.pattern, frame.camera) for frame in description.frames),
+    )  # fmt: skip
+    path = folder / CALIBRATION if calibration_file is None else calibration_file
+    return (
+        Outline.of(live.stream.capture) == listed
+        and path.exists()
+        and calibration_id(read_calibration(path)) == calibration_id(live.calibration)
+    )
