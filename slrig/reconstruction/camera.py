@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from slrig.reconstruction.linking import StripeEnsemble, link
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.refinement import refined
-from slrig.reconstruction.resolution import unresolved_bits
+from slrig.reconstruction.resolution import lost_lines, unresolved_bits
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -40,12 +40,14 @@ _LEAST_SMOOTHED_PX = 1.4
 @dataclass(frozen=True, slots=True)
 class CodeTables:
     """What the patterns mean. index_of_word : (2^bits,) int32; cell_position : (cells,) float64, px;
-    position_of : (frames, cells) float64, px, of lines or of code edges.
+    position_of : (frames, cells) float64, px, of lines or of code edges; edges_of : (bits, cells) float64, px, of the
+    code edges that stand for lines where those are not resolved, None where nothing does.
     """
 
     index_of_word: IntArray
     cell_position: FloatArray
     position_of: FloatArray
+    edges_of: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,8 @@ class CameraCurves:
 
     refined : the points are those of `refinement.refined`; disagreement_px : as of `refinement.Refinement`, empty where
     there was no phase. unresolved : (H, W) uint8, how many of the finest bits are left out at each pixel; None where
-    lines were shown, that the bits only number.
+    bits only number lines. lost_lines : (H, W) bool, where code edges stand for lines that the camera does not resolve;
+    None if nowhere.
     """
 
     ensemble: StripeEnsemble
@@ -84,6 +87,7 @@ class CameraCurves:
     refined: bool
     disagreement_px: FloatArray
     unresolved: NDArray[np.uint8] | None = None
+    lost_lines: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,9 +241,7 @@ def _curves(
     points, disagreement_px, steady = found, np.zeros(0), False
     entered("refine stripes")
     seen = position_map(frames, noise, code, tables.cell_position)
-    resolution_px: float | NDArray[np.float32] = float(frames.gray.cell_px)
-    if coded.unresolved is not None:
-        resolution_px = frames.gray.cell_px * np.exp2(coded.unresolved, dtype=np.float32)
+    resolution_px = _resolution_px(coded)
     if has_phase(frames):
         resolution_px = 0.0
         seen = at_pixel_centres(seen, frames.contrast, coded.contrast_deviation, limits.camera_blur_px)
@@ -255,10 +257,27 @@ def _curves(
         # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
         near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))
     entered("identify stripes")
+    shortest = limits.stripes.shortest_points
     stripes = chained(points, code.refusal.shape)
-    numbered, refusal = identify(
-        stripes, code, tables.position_of, near_shadow, near_step, shortest_points=limits.stripes.shortest_points
-    )
+    numbered, refusal = identify(stripes, code, tables.position_of, near_shadow, near_step, shortest_points=shortest)
+    lost = None
+    if tables.edges_of is not None:
+        per_cell = len(found) * frames.gray.cell_px / frames.line_patterns[0].period_px
+        lost = lost_lines(numbered.stripes.points_px, coded.code, ~(near_shadow | near_step), per_cell)
+    if lost is not None and tables.edges_of is not None:
+        entered("locate stripes")
+        coded, code = _with_fewer_bits(coded, code, lost, tables, limits)
+        edges = _edge_points(coded, limits.stripes, scales.filter_px, within=lost)
+        beside = limits.edges.for_filters(scales.blur_px)
+        middles = position_map(frames, noise, code, tables.cell_position, by_phase=False)
+        shadow, step = near_edges(middles, coded.unlit, _resolution_px(coded), beside)
+        near_shadow, near_step = np.where(lost, shadow, near_shadow), np.where(lost, step, near_step)
+        entered("identify stripes")
+        stripes = chained([*(_outside(each, lost) for each in points), *edges], code.refusal.shape)
+        numbered, refusal = identify(
+            stripes, code, np.vstack([tables.position_of, tables.edges_of]), near_shadow, near_step,
+            shortest_points=shortest,
+        )  # fmt: skip
     entered("link stripes")
     return CameraCurves(
         ensemble=link(numbered),
@@ -271,6 +290,37 @@ def _curves(
         refined=steady,
         disagreement_px=disagreement_px,
         unresolved=coded.unresolved,
+        lost_lines=lost,
+    )
+
+
+def _resolution_px(coded: _Coded) -> float | NDArray[np.float32]:
+    """Width of a decoded cell, px: for all pixels, or (H, W)."""
+    cell_px = coded.frames.gray.cell_px
+    return float(cell_px) if coded.unresolved is None else cell_px * np.exp2(coded.unresolved, dtype=np.float32)
+
+
+def _with_fewer_bits(
+    coded: _Coded, code: CodeMap, lost: NDArray[np.bool_], tables: CodeTables, limits: Limits
+) -> tuple[_Coded, CodeMap]:
+    """The code without bits that do not resolve, where its edges stand for lines; and the code map with that."""
+    frames, noise = coded.frames, coded.noise
+    bits = unresolved_bits(frames, lit_pixels(frames, noise, limits.decoding))
+    bits[~lost] = 0
+    cells = len(tables.cell_position)
+    fewer = decode(frames, noise, tables.index_of_word, cells, limits.decoding, unresolved=bits)
+    code = CodeMap(*(np.where(lost, one, other) for one, other in (
+        (fewer.lowest, code.lowest), (fewer.highest, code.highest), (fewer.refusal, code.refusal),
+    )))  # fmt: skip
+    return replace(coded, code=fewer, unresolved=bits), code
+
+
+def _outside(points: LinePoints, lost: NDArray[np.bool_]) -> LinePoints:
+    """The points of one frame where lines are not lost."""
+    columns, rows = np.rint(points.points_px).astype(np.intp).T
+    kept = ~lost[rows, columns]
+    return LinePoints(
+        points.points_px[kept], points.normals[kept], points.strength[kept], points.strong[kept], points.sigma_px[kept]
     )
 
 
@@ -299,8 +349,10 @@ def _matched_scale_px(stripe_sigma_px: float) -> float:
     return float(np.clip(max(stripe_sigma_px, more), _FINEST_SCALE_PX, _COARSEST_SCALE_PX))
 
 
-def _edge_points(coded: _Coded, limits: StripeLimits, scale_px: float) -> list[LinePoints]:
-    """Points of each code bit's edges, where the bit resolves."""
+def _edge_points(
+    coded: _Coded, limits: StripeLimits, scale_px: float, *, within: NDArray[np.bool_] | None = None
+) -> list[LinePoints]:
+    """Points of each code bit's edges, where the bit resolves. within : (H, W) bool, to look for them nowhere else."""
     frames, noise = coded.frames, coded.noise
     contrast, lit = frames.contrast, ~coded.unlit
     none = np.zeros_like(contrast)
@@ -316,5 +368,7 @@ def _edge_points(coded: _Coded, limits: StripeLimits, scale_px: float) -> list[L
             variance = 4 * noise.variance(bit) + ends_variance
         image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
         read = lit if coded.unresolved is None else lit & (index < len(frames.bits) - coded.unresolved)
+        if within is not None:
+            read &= within
         parts.append(edge_points(image, deviation, read, limits, sigma_px=scale_px))
     return parts

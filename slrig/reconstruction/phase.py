@@ -40,15 +40,17 @@ def has_phase(frames: AxisFrames, /) -> bool:
     return len(patterns) > 0 and len(patterns) == patterns[0].period_px
 
 
-def position_map(frames: AxisFrames, noise: NoiseModel, code: CodeMap, cell_position: FloatArray, /) -> PositionMap:
+def position_map(
+    frames: AxisFrames, noise: NoiseModel, code: CodeMap, cell_position: FloatArray, /, *, by_phase: bool = True
+) -> PositionMap:
     """The projector position at every decoded pixel.
 
     cell_position : (cells,) float64, centre of each code cell. The code tells the period, the phase of the line frames
-    the position within it; without line frames the middle of the code interval stands. A pixel of which a line frame
-    is clipped has no position: its phase is bent.
+    the position within it; without line frames, or not by_phase, the middle of the code interval stands. A pixel of
+    which a line frame is clipped has no position by phase: it is bent.
     """
     patterns = frames.line_patterns
-    phase = has_phase(frames)
+    phase = by_phase and has_phase(frames)
     # An interval of more than half a period may hold the phase twice, and does not tell which.
     widest_px = 0.5 * patterns[0].period_px if phase else np.inf
     middle = np.full(code.lowest.shape, np.nan, dtype=np.float32)

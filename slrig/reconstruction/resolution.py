@@ -1,9 +1,9 @@
-"""Which of the finest code bits a camera resolves, block by block of its image.
+"""Which of the finest code bits a camera resolves, and whether it resolves lines, block by block of its image.
 
 Every cell of the bits above is halved by the next finer one: on the way across it that bit changes once, in the
 direction that the code tells. Where the camera does not resolve the bit, it changes at random, or a cell passes within
 one pixel. So the frames tell by themselves where a bit counts, whatever took it: blur, a projector finer than the
-camera, a scaler, noise.
+camera, a scaler, noise. Of lines the code tells how many there are to be found.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
+from slrig.model import FloatArray
+from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 
 BLOCK_PX = 32
@@ -25,6 +27,13 @@ _LEAST_RIGHT = 0.7
 _LEAST_PASSAGE_PX = 2.0
 """Of both halves of a cell: each pixel then sees one edge of the code at most."""
 _MOST_BITS = 3
+_LEAST_FOUND = 0.5
+"""Of the lines' points. Resolved blocks of rendered plates have 0.9 to 1.0, those where lines blur into one another
+0.02 to 0.15, and where the one passes into the other 0.6."""
+_FEWEST_LINES = 200
+"""Points to be found in a block and its neighbours; fewer tell nothing."""
+_WIDEST_STEP = 2.0  # cells from pixel to pixel; more is a step of depth
+_DRAWN = 4  # every so many rows and columns are counted
 
 
 def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np.uint8]:
@@ -56,6 +65,38 @@ def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np
     return unresolved[np.ix_(rows, columns)]
 
 
+def lost_lines(
+    points_px: FloatArray, code: CodeMap, usable: NDArray[np.bool_], lines_per_cell: float, /
+) -> NDArray[np.bool_] | None:
+    """(H, W) bool: where the camera does not resolve the lines that the code says are there; None if nowhere.
+
+    points_px : (n, 2), the points of lines that were found and numbered; usable : (H, W) bool, where light of two
+    surfaces does not mix; lines_per_cell : frames' lines whose centres lie in one code cell. On the way along a row of
+    pixels each line makes one point, or along a column where stripes run rather across the image.
+    """
+    shape = code.refusal.shape
+    cell = np.where(usable & (code.refusal == 0), code.lowest + code.highest, np.float32(np.nan)) / 2
+    wanted = np.maximum(_passed(cell), _passed(cell.T).T) * lines_per_cell
+    columns, rows = (np.rint(points_px[::_DRAWN]).astype(np.intp) // BLOCK_PX).T
+    drawn = np.bincount(rows * wanted.shape[1] + columns, minlength=wanted.size)
+    found = _DRAWN * drawn.reshape(wanted.shape)
+    wanted, found = _with_neighbours(wanted), _with_neighbours(found)
+    lost = (found < _LEAST_FOUND * wanted) & (wanted >= _FEWEST_LINES)
+    if not lost.any():
+        return None
+    rows, columns = (np.arange(extent) // BLOCK_PX for extent in shape)
+    return lost[np.ix_(rows, columns)]
+
+
+def _passed(cell: FloatArray) -> FloatArray:
+    """(block rows, block columns): cells of the code passed on the way along the rows of each block."""
+    drawn = cell[::_DRAWN]
+    steps = np.abs(np.diff(drawn, axis=1, prepend=np.nan))
+    steps[~(steps <= _WIDEST_STEP)] = 0
+    starts = [np.arange(0, extent, BLOCK_PX // each) for extent, each in zip(drawn.shape, (_DRAWN, 1), strict=True)]
+    return _DRAWN * np.add.reduceat(np.add.reduceat(steps, starts[0], axis=0), starts[1], axis=1).astype(np.float64)
+
+
 def _tally(word: NDArray[np.int32], lit: NDArray[np.bool_], finest: int) -> NDArray[np.int64]:
     """(4, block rows, block columns) int64: passages, their pixels, passages of several pixels, right ones."""
     counts = np.zeros((4, *(-(-extent // BLOCK_PX) for extent in word.shape)), dtype=np.int64)
@@ -63,7 +104,7 @@ def _tally(word: NDArray[np.int32], lit: NDArray[np.bool_], finest: int) -> NDAr
     return counts
 
 
-def _with_neighbours(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+def _with_neighbours(counts: NDArray[Any]) -> NDArray[Any]:
     """The sums over each block and the eight about it."""
     wide = np.pad(counts, 1)
     down = wide[:-2] + wide[1:-1] + wide[2:]

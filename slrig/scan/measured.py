@@ -26,7 +26,7 @@ from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.outline import Outline
 from slrig.scan.report import calibration_id, capture_notes, capture_report
 from slrig.scan.resolved import unresolved_notes
-from slrig.scan.stream import LiveScan, ScanStream, Seen, step_px
+from slrig.scan.stream import LiveScan, ScanStream, Seen, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, triangulated
 
 _STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
@@ -37,13 +37,17 @@ Entered = Callable[[str, float, str], None]
 
 @dataclass(frozen=True, slots=True)
 class Walked:
-    """What the frames told along one axis: the curves of every camera, and their part of the report."""
+    """What the frames told along one axis: the curves of every camera, and their part of the report.
+
+    step_px : distance of neighbouring curves where all that was shown resolves; cell_px : of neighbouring code edges.
+    """
 
     devices: Calibration
     axis: Axis
     shown: frozenset[Axis]
     seen: list[Seen]
     step_px: float
+    cell_px: float
     sections: dict[str, object]
     notes: list[str]
 
@@ -202,9 +206,9 @@ def _walked(
         entered("check frames", 0.58, "")
         evidence = check_exposures(capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
-    step = step_px(stream.outline.shown, stream.axis)
-    notes = [*cut_short, *capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step)]
-    return Walked(devices, stream.axis, stream.outline.axes, seen, step, sections, notes)
+    step, cell = (each(stream.outline.shown, stream.axis) for each in (step_px, cell_px))
+    notes = [*cut_short, *capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step, cell)]
+    return Walked(devices, stream.axis, stream.outline.axes, seen, step, cell, sections, notes)
 
 
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:

@@ -159,7 +159,7 @@ def _meshed(
     count = f"{len(points.points_mm)} points"
     projector = walked.devices.projector
     gap_px = widest_gap_px(projector, axis)
-    beside = steps(cameras, joined_curves, step_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
+    beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
     sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
     surface = finished_mesh(
         points.points_mm, points.offsets, points.position_px, points.bridge_after,

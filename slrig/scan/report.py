@@ -79,6 +79,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "decoded_pixels": curves.decoded_pixels,
         "refused_pixels": {cause.name.lower(): int(counts[cause]) for cause in Refusal if cause is not Refusal.NONE},
         "lit_by_unresolved_bits": share_by_bits(curves),
+        "lit_without_lines": round(lit_share(curves, curves.lost_lines), 4),
         "noise": {"read_variance": curves.noise.read_variance, "slope": curves.noise.slope},
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,
@@ -93,12 +94,20 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
 
 def share_by_bits(curves: CameraCurves) -> list[float] | None:
     """Of the lit pixels, the shares where every bit of the code resolves, all but the finest, and so on; None where
-    lines were shown.
+    bits only number lines.
     """
     if curves.unresolved is None:
         return None
     counts = np.bincount(curves.unresolved[curves.refusal != Refusal.NOT_LIT], minlength=1)
     return [round(float(each), 4) for each in counts / max(counts.sum(), 1)]
+
+
+def lit_share(curves: CameraCurves, where: NDArray[np.bool_] | None) -> float:
+    """The share of the lit pixels that `where`, (H, W), marks; None marks none."""
+    if where is None:
+        return 0.0
+    lit = curves.refusal != Refusal.NOT_LIT
+    return float((lit & where).sum() / max(lit.sum(), 1))
 
 
 def redundancy_report(curves: MergedCurves, source: NDArray[np.uint8], spare: Redundancy) -> dict[str, object]:

@@ -214,6 +214,11 @@ def step_px(shown: Collection[Pattern], axis: Axis) -> float:
     if lines:
         shifts = [p.shift for p in lines]
         return float(np.diff([*shifts, shifts[0] + lines[0].period_px]).max())
+    return cell_px(shown, axis)
+
+
+def cell_px(shown: Collection[Pattern], axis: Axis) -> float:
+    """Width of a cell of the code."""
     return float(next(p.cell_px for p in shown if isinstance(p, Gray) and p.axis is axis))
 
 
@@ -222,4 +227,5 @@ def _tables(gray: Gray, lines: tuple[LineShift, ...], size: Size) -> CodeTables:
         index_of_word=index_of_word(gray),
         cell_position=cell_positions(gray, size),
         position_of=line_positions(lines, gray, size) if lines else edge_positions(gray, size),
+        edges_of=edge_positions(gray, size) if lines else None,
     )

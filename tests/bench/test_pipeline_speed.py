@@ -31,7 +31,7 @@ from slrig.scan.outline import Outline
 from slrig.scan.pipeline import _meshed
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.report import Stopwatch
-from slrig.scan.stream import ScanStream, step_px
+from slrig.scan.stream import ScanStream, cell_px, step_px
 from slrig.scan.triangulated import triangulated
 
 RUNS = 5
@@ -95,9 +95,9 @@ class Run:
             stream.take(shot)
         seen = stream.finish()
         watch.enter("triangulate")
-        step = step_px(stream.outline.shown, stream.axis)
+        step, cell = (each(stream.outline.shown, stream.axis) for each in (step_px, cell_px))
         found = triangulated(seen, calibration.projector, stream.axis)
-        walked = Walked(calibration, stream.axis, stream.outline.axes, seen, step, {}, [])
+        walked = Walked(calibration, stream.axis, stream.outline.axes, seen, step, cell, {}, [])
         meshed = _meshed(
             folder, found, walked, ReconstructionPlan(), lambda stage, _fraction, _detail: watch.enter(stage)
         )  # fmt: skip

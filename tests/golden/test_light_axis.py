@@ -75,7 +75,7 @@ def exchanged(device: Device) -> Device:
     return other | {"position_mm": (y, x, z), "distortion": (k1, k2, p2, p1, k3)}
 
 
-def rig_file(folder: Path, scene: str, projector: Device, *cameras: Device) -> Path:
+def rig_file(folder: Path, scene: str, projector: Device, *cameras: Device, samples_per_axis: int = 2) -> Path:
     """A rig of these devices before a scene."""
     folder.mkdir()
     (folder / "scene.toml").write_text(scene)
@@ -86,6 +86,7 @@ def rig_file(folder: Path, scene: str, projector: Device, *cameras: Device) -> P
         )
 
     head = 'name = "twins"\n[head]\ndriver = "simulated"\nscene = "scene.toml"\nseed = 5\nambient = 0.01\n'
+    head += f"samples_per_axis = {samples_per_axis}\n"
     parts = [head, "[head.projector]", table(projector)]
     for number, camera in enumerate(cameras):
         parts += ["[[head.camera]]", f'name = "camera{number}"', table(camera)]

@@ -16,6 +16,7 @@ from slrig.model import (
     CameraFormat,
     Capture,
     FloatArray,
+    Gray,
     LineShift,
     Pattern,
     Refusal,
@@ -77,13 +78,14 @@ def patterns(*, line_shift: bool = True, cell_px: int | None = None) -> tuple[Pa
     )  # fmt: skip
 
 
-def walk(capture: Capture, *, limits: Limits | None = None) -> tuple[CameraCurves, list[str]]:
+def walk(capture: Capture, *, limits: Limits | None = None, edges: bool = False) -> tuple[CameraCurves, list[str]]:
     frames = axis_frames(capture, "eye", Axis.COLUMN)
     lines = frames.line_patterns
     tables = CodeTables(
         index_of_word(frames.gray),
         cell_positions(frames.gray, PROJECTOR),
         line_positions(lines, frames.gray, PROJECTOR) if lines else edge_positions(frames.gray, PROJECTOR),
+        edge_positions(frames.gray, PROJECTOR) if edges else None,
     )
     stages: list[str] = []
     return camera_curves(frames, tables, limits or Limits(), entered=stages.append), stages
@@ -113,6 +115,40 @@ def test_a_slanted_plate_gives_every_column_once_to_a_fraction_of_a_pixel() -> N
     assert curves.stripe_points >= len(errors)
     assert curves.stripe_count == len(position)
     assert 1.0 <= curves.scale_px <= 2.5
+
+
+def test_code_edges_stand_for_lines_where_those_are_not_resolved() -> None:
+    capture = rendered(slope, patterns())
+    shots = []
+    for shot in capture.shots:
+        image = shot.image.copy()
+        if isinstance(capture.patterns[shot.pattern], LineShift):
+            image[:, 105:] = cv2.GaussianBlur(image, (0, 0), sigmaX=15)[:, 105:]
+        shots.append(replace(shot, image=image))
+    blurred = replace(capture, shots=tuple(shots))
+    without, _ = walk(blurred)
+    assert without.lost_lines is None
+    assert (without.ensemble.points_px[:, 0] > 130).sum() < 300
+    curves, stages = walk(blurred, edges=True)
+    code = next(pattern for pattern in capture.patterns if isinstance(pattern, Gray))
+    assert curves.lost_lines is not None
+    assert not curves.lost_lines[:, :64].any()
+    assert curves.lost_lines[:, 160:].all()
+    column = np.repeat(curves.ensemble.position_px, np.diff(curves.ensemble.offsets))
+    x, y = np.rint(curves.ensemble.points_px).astype(int).T
+    lost = curves.lost_lines[y, x]
+    # Edges lie between columns, four of them apart, and lines at them. A point may lie in the next pixel.
+    assert set(np.unique(column[lost])) <= set(edge_positions(code, PROJECTOR).ravel())
+    assert (column[~lost] % 1 == 0).mean() > 0.99
+    assert lost.sum() > 0.8 * curves.lost_lines.sum() * 0.52 / 4
+    errors = errors_px(curves, slope)
+    assert np.sqrt(np.mean(errors[lost] ** 2)) < 0.05
+    assert np.sqrt(np.mean(errors[~lost] ** 2)) < 0.03
+    assert stages[-3:] == ["locate stripes", "identify stripes", "link stripes"]
+    sharp, _ = walk(capture, edges=True)
+    plain, _ = walk(capture)
+    assert sharp.lost_lines is None
+    assert sharp.ensemble.points_px.tobytes() == plain.ensemble.points_px.tobytes()
 
 
 @pytest.mark.parametrize("noise", [2.0, 4.0])

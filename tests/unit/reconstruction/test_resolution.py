@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from slrig.model import Axis, Gray, Size
 from slrig.patterns.gray import gray_profile
+from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.resolution import BLOCK_PX, _tally, unresolved_bits
+from slrig.reconstruction.resolution import BLOCK_PX, _passed, _tally, lost_lines, unresolved_bits
 
 PROJECTOR = Size(1024, 32)
 BITS = 10
@@ -108,3 +109,44 @@ def test_the_tally_is_that_of_plain_python() -> None:
                 right = several and steps == [1 if before[0] < cell else -1]
                 expected[:, 0, block] += (1, len(pixels), several, right)
         np.testing.assert_array_equal(_tally(word, lit, finest), expected)
+
+
+def lines_of(column: NDArray[np.float64], period_px: float) -> tuple[CodeMap, NDArray[np.float64]]:
+    """The code of cells of 4 columns that pixels of these columns show, and a point on each row where a line passes."""
+    cell = np.floor(column / 4).astype(np.int32)
+    points = []
+    for y, row in enumerate(column / period_px):
+        places = np.arange(np.ceil(row[0]), row[-1])
+        points += [(x, y) for x in np.interp(places, row, np.arange(len(row)))]
+    return CodeMap(cell, cell, np.zeros(cell.shape, dtype=np.uint8)), np.array(points)
+
+
+@pytest.mark.parametrize("down", [False, True])
+def test_lines_are_lost_where_less_than_half_of_their_points_are_found(down: bool) -> None:
+    code, points = lines_of(ramp(0.7, rows=192, width=256), 1.0)
+    some = np.random.default_rng(1).random(len(points))
+    kept = np.where(points[:, 0] < 128, some < 0.7, some < 0.3)
+    if down:
+        points = points[:, ::-1]
+        code = CodeMap(code.lowest.T.copy(), code.highest.T.copy(), code.refusal.T.copy())
+    every = np.ones(code.refusal.shape, dtype=np.bool_)
+    assert lost_lines(points, code, every, 4.0) is None
+    assert lost_lines(points[kept], code, every, 4.0 / 3) is None
+    lost = lost_lines(points[kept], code, every, 4.0)
+    assert lost is not None
+    lost = lost.T if down else lost
+    assert not lost[:, : 128 - BLOCK_PX].any()
+    assert lost[:, 128 + BLOCK_PX :].all()
+    assert lost_lines(points[kept], code, ~every, 4.0) is None
+
+
+def test_cells_passed_are_counted_in_each_block() -> None:
+    rng = np.random.default_rng(2)
+    cell = np.cumsum(rng.choice([0.0, 0.5, 1.0, 9.0, np.nan], (70, 100), p=[0.5, 0.2, 0.2, 0.05, 0.05]), axis=1)
+    cell[np.isnan(cell)] = 0
+    expected = np.zeros((3, 4))
+    for y in range(0, 70, 4):
+        for x in range(1, 100):
+            step = abs(cell[y, x] - cell[y, x - 1])
+            expected[y // BLOCK_PX, x // BLOCK_PX] += 4 * step if step <= 2 else 0
+    np.testing.assert_allclose(_passed(cell), expected)

@@ -139,7 +139,7 @@ def test_frames_of_one_level_are_refused_with_their_figures(recorded: Path, tmp_
     assert str(bundle) in message
 
 
-def test_lines_that_were_never_shown_are_refused(recorded: Path, tmp_path: Path) -> None:
+def test_lines_that_were_never_shown_are_made_up_for_by_code_edges_and_told(recorded: Path, tmp_path: Path) -> None:
     dark = {shot.camera: shot.image for shot in read_bundle(recorded).capture.shots if shot.pattern == 1}
 
     def no_lines(shot: Shot, capture: Capture) -> Shot:
@@ -147,7 +147,9 @@ def test_lines_that_were_never_shown_are_refused(recorded: Path, tmp_path: Path)
         return replace(shot, image=dark[shot.camera]) if is_line else shot
 
     bundle = changed(recorded, tmp_path / "no-lines", no_lines)
-    assert "no stripe was found" in refused(NothingToReconstructError, bundle, tmp_path / "out")
+    report = run(bundle, tmp_path / "out")
+    assert any("does not resolve the shifted lines on 100%" in note for note in report["notes"])  # type: ignore[attr-defined]
+    assert all(camera["lit_without_lines"] > 0.99 for camera in report["cameras"].values())  # type: ignore[attr-defined]
 
 
 def test_a_missing_bit_is_named(recorded: Path, tmp_path: Path) -> None:
