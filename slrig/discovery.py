@@ -17,7 +17,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from slrig.bundle.calibration_file import check_calibration, read_calibration
+from slrig.bundle.calibration_file import check_calibration, check_rays, read_calibration
 from slrig.bundle.faults import explain
 from slrig.config import DriverTable, RigConfig
 from slrig.devices import (
@@ -262,6 +262,7 @@ def _calibration(
     if calibration is not None:
         sizes = {name: camera.info.format.size for name, camera in cameras.items()}
         check_calibration(calibration, projector.info.size, sizes, source)
+        check_rays(calibration, sizes, source)
     return calibration
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -135,6 +135,25 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
     if faults:
         lines = "\n".join(f"  {fault}" for fault in faults)
         message = f"{source}: the calibration is for other devices; calibrate these or name the right file:\n{lines}"
+        raise CalibrationError(message)
+
+
+def check_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
+    """See that with these cameras the calibration has two rays for each point. `source` says where it came from.
+
+    Raises
+    ------
+    CalibrationError
+        It has no projector, and one of the cameras.
+    """
+    known = [name for name in cameras if name in calibration.cameras]
+    if calibration.projector is None and len(known) < 2:
+        whose = f"camera '{known[0]}'" if known else "none of these cameras"
+        message = (
+            f"{source}: expected a calibration with two rays for each point, found that of {whose} alone, without a "
+            "projector: it tells no depth, and cannot scan; calibrate the camera together with the projector or with a "
+            "second camera"
+        )
         raise CalibrationError(message)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import structlog
 
-from slrig.bundle.calibration_file import check_calibration
+from slrig.bundle.calibration_file import check_calibration, check_rays
 from slrig.bundle.description import MOST_CAPTURE_BYTES
 from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
@@ -120,6 +120,7 @@ class HeldRig:
         try:
             source = f"calibration {active.name}"
             check_calibration(active.calibration, self.facts.projector.size, self.facts.sizes, source)
+            check_rays(active.calibration, self.facts.sizes, source)
         except CalibrationError as error:
             return error
         return None

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slrig.bundle import read_bundle, read_calibration
+from slrig.bundle.calibration_file import check_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import read_refused
@@ -149,12 +150,7 @@ def _require_calibration(folder: Path, names: list[str], found: Calibration | No
             f"calibrate {missing}, or use the names of the calibration"
         )
         raise CalibrationError(message)
-    if found.projector is None and len(names) < 2:
-        message = (
-            f"{folder}: the calibration has no projector, and the bundle one camera ('{names[0]}'): one of "
-            "them is needed as the second ray; calibrate the projector, or add a camera"
-        )
-        raise CalibrationError(message)
+    check_rays(found, names, str(folder))
     return found
 
 

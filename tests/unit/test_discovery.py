@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -242,6 +243,13 @@ def test_the_rig_files_calibration_comes_before_the_heads(tmp_path: Path) -> Non
     calibration = open_rig(read_rig(tmp_path / "rig.toml")).calibration
     assert calibration is not None
     assert list(calibration.cameras) == ["right"]
+
+
+def test_a_calibration_of_one_camera_alone_is_refused_before_a_scan_fails_by_it(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "own.json", replace(sample_calibration(cameras=("right",)), projector=None))
+    (tmp_path / "rig.toml").write_text('name = "demo"\ncalibration = "own.json"\n[head]\ndriver = "fake"\n')
+    with pytest.raises(CalibrationError, match=r"own\.json: .*of camera 'right' alone, without a projector"):
+        open_rig(read_rig(tmp_path / "rig.toml"))
 
 
 def test_an_unknown_driver_is_told_with_those_installed(tmp_path: Path) -> None:

@@ -123,7 +123,8 @@ def test_one_camera_without_a_calibrated_projector_is_refused(recorded: Path, tm
     shutil.copytree(recorded, tmp_path / "bundle")
     path = tmp_path / "bundle" / "calibration.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"projector": None}))
-    assert "calibrate the projector" in refused(CalibrationError, tmp_path / "bundle", tmp_path / "out")
+    words = refused(CalibrationError, tmp_path / "bundle", tmp_path / "out")
+    assert "alone, without a projector: it tells no depth, and cannot scan; calibrate the camera together with" in words
 
 
 @pytest.mark.parametrize("level", [0, 255])
