@@ -1,4 +1,4 @@
-"""By how much a triangulated point moves when the devices are not quite what a calibration says.
+"""By how much a measured point moves when the devices are not quite what a calibration says.
 
 A point X is found from three equations h(X, θ) = m: its pixel (u, v) in a camera, and a third one, m fixed as it was
 measured. A small change of the devices' parameters θ moves it by
@@ -6,7 +6,8 @@ measured. A small change of the devices' parameters θ moves it by
     dX = -(∂h/∂X)⁻¹ ∂h/∂θ dθ
 
 (the implicit function theorem). The third equation is the projector's column (or row) of the light; without a
-projector, the second camera's coordinate along the epipolar line, as for a stripe that runs straight across it.
+projector, the second camera's coordinate along the epipolar line, as for a stripe that runs straight across it. One
+camera alone has no third measurement: there r · X = m with the viewing ray r, as if the distance were known.
 
 Where several cameras see the light of one projector pixel, a scan takes the mean of their points, weighted by inverse
 variance; with equal noise in all of them the weight is the square of how far a camera sees the point move, in pixels,
@@ -34,12 +35,15 @@ class Moved:
     """How n points move. by_parameter : (n, 3, p) float64, mm per unit of each of the p parameters of all devices.
 
     by_noise : (n, 3, e) float64, mm for each of e independent errors of one pixel of the light that a point is found
-    by. seen : (n,) bool, whether enough devices see the point; the numbers of the others mean nothing.
+    by; NaN where no light finds it. seen : (n,) bool, whether enough devices see the point; the numbers of the others
+    mean nothing. stated : (n, m, 3) float64, what of a displacement is stated as the error of a point, the part along
+    each of m rows: along the first camera's ray r, m = 1; of one camera alone across it, the m = 3 rows of 1 - r rᵀ.
     """
 
     by_parameter: FloatArray
     by_noise: FloatArray
     seen: NDArray[np.bool_]
+    stated: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,23 +59,21 @@ class _Projected:
 def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_mm: FloatArray, /) -> Moved:
     """How points (n, 3) in the world move with the parameters of the cameras, in order, then of the projector.
 
-    Without a projector, a point is found by the first camera and the one that shares most of the points with it.
+    Without a projector, a point is found by the first camera and the one that shares most of the points with it. One
+    camera alone moves it across its ray only.
     """
     views = [_projected(camera, points_mm) for camera in cameras]
+    sight = _unit(points_mm - cameras[0].centre_mm)
+    if projector is None and len(cameras) == 1:
+        return _by_one_camera(views[0], sight)
     if projector is None:
-        return _by_two_cameras(cameras, views, points_mm)
+        return _by_two_cameras(cameras, views, points_mm, sight)
     light = _projected(projector, points_mm)
     axis = triangulated_axis(cameras, projector)
     coordinate = 0 if axis is Axis.COLUMN else 1
-    ray = points_mm - projector.centre_mm
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    told = told_depth(axis, cameras, projector)
-    weights = np.stack(
-        [
-            np.where(view.inside & tells, _squares(view.by_point, ray), 0.0)
-            for view, tells in zip(views, told, strict=True)
-        ]
-    )
+    ray = _unit(points_mm - projector.centre_mm)
+    told = np.array(told_depth(axis, cameras, projector))
+    weights = np.stack([np.where(view.inside, _squares(view.by_point, ray), 0.0) for view in views]) * told[:, None]
     total = weights.sum(axis=0)
     weights = weights / np.where(total > 0, total, 1.0)
     by_parameter = np.zeros((len(points_mm), 3, _EACH * (len(cameras) + 1)))
@@ -84,7 +86,7 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
         by_parameter[:, :, own] = -inverse[:, :, :2] @ np.nan_to_num(view.by_parameter)
         by_parameter[:, :, -_EACH:] -= inverse[:, :, 2:] @ light.by_parameter[:, coordinate, None]
         noises.append(inverse[:, :, 2])
-    return Moved(by_parameter, np.stack(noises, axis=2), light.inside & (total > 0))
+    return Moved(by_parameter, np.stack(noises, axis=2), light.inside & (total > 0), sight[:, None])
 
 
 def rigid_free(points_mm: FloatArray, fields: FloatArray, /) -> FloatArray:
@@ -118,12 +120,24 @@ def modes_of(covariance: FloatArray, /) -> FloatArray:
     return modes
 
 
-def _by_two_cameras(cameras: Sequence[Pinhole], views: list[_Projected], points_mm: FloatArray) -> Moved:
+def stated_deviation(stated: FloatArray, fields: FloatArray, /) -> FloatArray:
+    """(n,): root of the sum of squares of what is `Moved.stated` of k independent fields of displacement (n, 3, k)."""
+    return np.asarray(np.sqrt(((stated @ fields) ** 2).sum(axis=(1, 2))))
+
+
+def _by_one_camera(view: _Projected, sight: FloatArray) -> Moved:
+    inverse = _inverses(np.concatenate([view.by_point, sight[:, None]], axis=1))
+    across = np.eye(3) - sight[:, :, None] * sight[:, None]
+    return Moved(-inverse[:, :, :2] @ view.by_parameter, np.full((len(sight), 3, 1), np.nan), view.inside, across)
+
+
+def _by_two_cameras(
+    cameras: Sequence[Pinhole], views: list[_Projected], points_mm: FloatArray, sight: FloatArray
+) -> Moved:
     shared = [view.inside & views[0].inside for view in views[1:]]
     other = 1 + int(np.argmax([each.sum() for each in shared]))
     first, second = views[0], views[other]
-    ray = points_mm - cameras[0].centre_mm
-    along = _unit(np.einsum("nij,nj->ni", second.by_point, ray))
+    along = _unit(np.einsum("nij,nj->ni", second.by_point, sight))
     back = points_mm - cameras[other].centre_mm
     across = _unit(np.einsum("nij,nj->ni", first.by_point, back))
     third = np.einsum("ni,nij->nj", along, second.by_point)
@@ -134,7 +148,7 @@ def _by_two_cameras(cameras: Sequence[Pinhole], views: list[_Projected], points_
     by_parameter[:, :, _EACH * other : _EACH * (other + 1)] = -inverse[:, :, 2:] * moved[:, None]
     # A stripe is found with an error across it in either image.
     own = np.einsum("nij,nj->ni", inverse[:, :, :2], across)
-    return Moved(by_parameter, np.stack([inverse[:, :, 2], own], axis=2), shared[other - 1])
+    return Moved(by_parameter, np.stack([inverse[:, :, 2], own], axis=2), shared[other - 1], sight[:, None])
 
 
 def _projected(device: Pinhole, points_mm: FloatArray) -> _Projected:

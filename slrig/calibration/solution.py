@@ -93,6 +93,8 @@ class ExpectedError:
     total_mm : both. length_share : of a length over that length, from the calibration alone, for lengths of half the
     volume's diagonal in all directions that occur in it.
     grid_mm : (n, 3) float64, places in the volume that the devices see; grid_point_mm : (n,) float64, point_mm there.
+    across : the calibration is of one camera alone, which tells no depth: point_mm is across its viewing ray, of points
+    whose distance is known from elsewhere, and noise_mm, total_mm and length_share are NaN.
     """
 
     volume_mm: FloatArray
@@ -102,6 +104,17 @@ class ExpectedError:
     length_share: float
     grid_mm: FloatArray
     grid_point_mm: FloatArray
+    across: bool = False
+
+    @property
+    def point_words(self) -> str:
+        """What `point_mm` is the error of."""
+        return "a point of known distance" if self.across else "a scanned point"
+
+    @property
+    def way_words(self) -> str:
+        """In which direction `point_mm` is, to be put behind it; empty where that need not be said."""
+        return " across the line of sight" if self.across else ""
 
 
 @dataclass(frozen=True, slots=True)

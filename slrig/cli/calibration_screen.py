@@ -97,7 +97,11 @@ def _figures(document: Mapping[str, Any]) -> Table:
     expected = document["expected"]
     low, high = expected["volume_mm"]
     sides = " × ".join(f"{most - least:.0f}" for least, most in zip(low, high, strict=True))
-    words = f"a point {_mm(expected['point_mm'])} (1 σ) by the calibration, {_mm(expected['total_mm'])} with its noise"
+    # Results on record from before one camera could be calibrated alone do not say across.
+    way = "across the line of sight " if expected.get("across") else ""
+    words = f"a point {_mm(expected['point_mm'])} (1 σ) {way}by the calibration"
+    if expected["total_mm"] is not None:
+        words += f", {_mm(expected['total_mm'])} with its noise"
     if expected["length_share"] is not None:
         words += f"; a length {rounded(1000 * expected['length_share'])} mm per metre"
     table.add_row("error", words)

@@ -107,8 +107,8 @@ class Solved:
     covariance : (15 d, 15 d) float64, of fx, fy, cx, cy, k1, k2, p1, p2, k3, a small turn (three angles, rad:
     R' = exp([turn]x) R) and the translation, mm, of each of the d devices: cameras in order, then the projector.
     volume_mm : (2, 3) float64, opposite corners of the box in the world in which the board was held.
-    expected_error_mm : standard deviation of a measured point along the surface normal in that volume, from the
-    calibration alone, root mean square.
+    expected_error_mm : standard deviation of a measured point along the first camera's line of sight in that volume,
+    from the calibration alone, root mean square; of one camera alone, of a point of known distance across that line.
     """
 
     id: str
@@ -149,3 +149,8 @@ class Calibration:
                 f"{len(self.solved.covariance)} rows; export the calibration again"
             )
             raise CalibrationError(message)
+
+    @property
+    def triangulates(self) -> bool:
+        """Whether it has two rays that meet in a point; one camera alone has a direction, and no depth."""
+        return self.projector is not None or len(self.cameras) > 1

@@ -17,6 +17,7 @@ from slrig.calibration.health.residuals import BoardScale, PairResidual, board_s
 from slrig.calibration.health.words import change_words, remedy_words, rival_words
 from slrig.calibration.observations import PoseObservation
 from slrig.calibration.solution import PROJECTOR, BoardPose
+from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray
 
 _LISTED = 5
@@ -28,8 +29,15 @@ def look_at_board(poses: Sequence[PoseObservation], board: Board, calibration: C
     Raises
     ------
     CalibrationError
-        None of the calibration's cameras sees the board.
+        None of the calibration's cameras sees the board, or it is of one camera alone.
     """
+    if not calibration.triangulates:
+        message = (
+            "expected a calibration of two devices, which a look holds against each other, found one of camera "
+            f"'{next(iter(calibration.cameras))}' alone: calibrate it again, and see what changed with slrig calibrate "
+            "compare"
+        )
+        raise CalibrationError(message)
     found = equations(poses, board, calibration)
     pairs = pair_residuals(poses, board, calibration, found.standing)
     scales = board_scales(poses, board, calibration, found.standing)

@@ -56,7 +56,8 @@ class Comparison:
     """Two calibrations, compared. devices : those that both have. missing : those that only one has.
 
     moved_rms_mm, moved_most_mm : by how much points in the volume move that are measured with the second in place of
-    the first, from the same pixels; NaN where neither names a volume. words : one sentence each, the moves first.
+    the first, from the same pixels; NaN where neither names a volume, or they have but one device in common. words :
+    one sentence each, the moves first.
     """
 
     devices: Mapping[str, DeviceDifference]
@@ -85,7 +86,7 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
     moved_mm = _moves(here, there, names, _volume(first, second, origin))
     rms, most = (float(np.sqrt((moved_mm**2).mean())), float(moved_mm.max())) if len(moved_mm) else (np.nan, np.nan)
     missing = tuple(sorted(set(_devices(first)) ^ set(_devices(second))))
-    words = [_move_words(rms, most)]
+    words = [_move_words(rms, most, shared=len(names))]
     words += [f"Only one of them has {name}; it is not compared." for name in missing]
     for each in devices.values():
         parts = (each.focal_percent, each.principal_px, each.rotation_deg, each.baseline_mm)
@@ -236,7 +237,9 @@ def _pixels(devices: Mapping[str, Pinhole], names: list[str], points_mm: FloatAr
     return np.concatenate(found, axis=1)
 
 
-def _move_words(rms_mm: float, most_mm: float) -> str:
+def _move_words(rms_mm: float, most_mm: float, *, shared: int) -> str:
+    if shared < 2:
+        return "By how much points move is not known: they have one device in common, and a point takes two."
     if not np.isfinite(rms_mm):
         return "By how much points move is not known: neither calibration names a working volume."
     return f"Points in the working volume move by {rms_mm:.3g} mm rms, by {most_mm:.3g} mm at most."

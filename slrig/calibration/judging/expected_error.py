@@ -5,6 +5,9 @@ column of M is one way, k, in which the devices may be wrong by one standard dev
 that it makes throughout the volume. The rigid motion nearest to F_k (least squares over the volume) is taken out, and
 the variance of a point along its viewing ray r is Σ_k (r · F_k)².
 
+One camera alone has no depth. There F_k moves the ray through the pixel of X at the distance of X, and the variance
+across the ray is Σ_k |F_k - r (r · F_k)|². Noise of light and lengths between points are not known from one ray.
+
 A length between two points p and q with direction e = (q - p)/L has the variance Σ_k (e · (F_k(q) - F_k(p)))²; a rigid
 motion changes none. As mrcal does for projections, the uncertainty is stated where things are measured, not in the
 image alone.
@@ -16,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from slrig.calibration.displacement import Moved, modes_of, moved_points, rigid_free
+from slrig.calibration.displacement import Moved, modes_of, moved_points, rigid_free, stated_deviation
 from slrig.calibration.observations import COLUMN, ROW, Observations
 from slrig.calibration.solution import ExpectedError, Solution
 from slrig.errors import CalibrationError
@@ -42,7 +45,7 @@ def expected_error(
     projector pixels, or without a projector of its stripe's place across it in camera pixels. Unless it is given, it is
     that of the board's paper: of one pixel's light the 5 % quantile (ink is many times darker, and its light known as
     much worse), times 0.4675, because a scan finds a point by a small surface that it fits to 5 x 5 pixels. Where no
-    light was observed, what rests on it is NaN.
+    light was observed, what rests on it is NaN; and for one camera alone, lengths too.
 
     Raises
     ------
@@ -53,22 +56,23 @@ def expected_error(
     volume_mm, places = volume_of(solution, observations)
     moved = _moved(calibration, places)
     fields = rigid_free(places, moved.by_parameter @ modes_of(solution.covariance))
-    first = next(iter(calibration.cameras.values()))
-    ray = places - first.centre_mm
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    point_mm = _deviation(np.einsum("ni,nik->nk", ray, fields))
+    point_mm = stated_deviation(moved.stated, fields)
     if noise_px is None:
         noise_px = _light_sigma_px(observations, calibration)
-    noise_mm = _rms(noise_px * _deviation(np.einsum("ni,nie->ne", ray, moved.by_noise)))
+    noise_mm = _rms(noise_px * stated_deviation(moved.stated, moved.by_noise))
     calibration_mm = _rms(point_mm)
+    length_share = float("nan")
+    if calibration.triangulates:
+        length_share = _length_share(places, fields, float(np.linalg.norm(volume_mm[1] - volume_mm[0])))
     return ExpectedError(
         volume_mm=volume_mm,
         point_mm=calibration_mm,
         noise_mm=noise_mm,
         total_mm=float(np.hypot(calibration_mm, noise_mm)),
-        length_share=_length_share(places, fields, float(np.linalg.norm(volume_mm[1] - volume_mm[0]))),
+        length_share=length_share,
         grid_mm=places,
         grid_point_mm=point_mm,
+        across=not calibration.triangulates,
     )
 
 
@@ -76,7 +80,7 @@ def volume_of(solution: Solution, observations: Observations, /) -> tuple[FloatA
     """The box of all corners of the board in the world, (2, 3) mm; and places in it, (n, 3), evenly spaced.
 
     The places lie in the convex hull of the corners, and where the first camera and the projector see them, or without
-    a projector two cameras.
+    a projector two cameras, or the one that there is.
 
     Raises
     ------
@@ -108,10 +112,11 @@ def volume_of(solution: Solution, observations: Observations, /) -> tuple[FloatA
             break
         wanted *= 4
     if len(places) < _FEWEST_PLACES:
+        other = "the projector" if solution.calibration.projector else "another camera"
+        whose = f" together with {other}" if solution.calibration.triangulates else ""
         message = (
-            f"expected places in the box of {_words(extent)} in which the board was held that the first camera sees "
-            f"together with {'the projector' if solution.calibration.projector else 'another camera'}, found "
-            f"{len(places)} of {counts.prod()}; hold the board where both see it"
+            f"expected places in the box of {_words(extent)} in which the board was held that the first camera sees"
+            f"{whose}, found {len(places)} of {counts.prod()}; hold the board where all of it is in view"
         )
         raise CalibrationError(message)
     return volume_mm, places

@@ -24,10 +24,17 @@ def check_scale(solution: Solution, earlier: Calibration, board: Board) -> tuple
 
     The distance of two devices is compared with what it was. All distances off by one ratio, by more than 1 % and more
     than their own uncertainty, while the devices look in the same directions: the board's squares are not as large as
-    they were said to be. Off otherwise: the rig was rebuilt. Devices that are not in both are left out.
+    they were said to be. Off otherwise: the rig was rebuilt. Devices that are not in both are left out. Fewer than two
+    in both have no distance, and that is said.
     """
     now, before = _devices(solution.calibration), _devices(earlier)
     common = [name for name in now if name in before]
+    if len(common) < 2:
+        shared = ", ".join(device_title(name) for name in common) or "no device"
+        return (
+            f"the scale is not checked: that takes two devices which the earlier calibration has too, found {shared}; "
+            "measure the printed ruler of the board",
+        )
     order = list(now)
     ratios: dict[tuple[str, str], float] = {}
     changed: list[str] = []

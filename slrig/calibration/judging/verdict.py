@@ -131,10 +131,15 @@ def _summary(grade: Grade, expected: ExpectedError | None, count: int) -> str:
     error = ""
     if expected is not None and np.isfinite(expected.point_mm) and expected.point_mm > 0:
         fraction = _diagonal_mm(expected) / expected.point_mm
-        error = f": a scanned point is expected within {expected.point_mm:.2g} mm (1 in {fraction:,.0f})"
+        error = (
+            f": {expected.point_words} is expected within {expected.point_mm:.2g} mm{expected.way_words} "
+            f"(1 in {fraction:,.0f})"
+        )
+    lone = expected is not None and expected.across
+    alone = "; it cannot scan alone: that takes a projector or a second camera, calibrated with it" if lone else ""
     if grade is Grade.GOOD:
-        return f"good{error}; nothing speaks against it"
-    return f"{grade.words}{error}; {count} thing{'s' if count > 1 else ''} to look at"
+        return f"good{error}; nothing speaks against it{alone}"
+    return f"{grade.words}{error}; {count} thing{'s' if count > 1 else ''} to look at{alone}"
 
 
 def _diagonal_mm(expected: ExpectedError) -> float:
@@ -151,11 +156,12 @@ def _expected_error(expected: ExpectedError | None) -> Iterator[Judgement]:
     usual = f"a good calibration has at most 1 in {1 / limit.good:,.0f}"
     cure = "add poses where the map of the expected error is worst, tilted and at several distances"
     length = expected.length_share / 2
+    noisy = f" ({expected.total_mm:.2g} mm with the noise of the light)" if np.isfinite(expected.total_mm) else ""
     for share, what in (
         (
             expected.point_mm / diagonal_mm,
-            f"a scanned point is expected {expected.point_mm:.2g} mm off by the calibration "
-            f"({expected.total_mm:.2g} mm with the noise of the light)",
+            f"{expected.point_words} is expected {expected.point_mm:.2g} mm off{expected.way_words} by the "
+            f"calibration{noisy}",
         ),
         (length, f"a length of half the volume's diagonal is expected {length * diagonal_mm:.2g} mm wrong"),
     ):

@@ -78,6 +78,7 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
             "noise_mm": expected.noise_mm,
             "total_mm": expected.total_mm,
             "length_share": expected.length_share,
+            "across": expected.across,
             "volume_mm": expected.volume_mm,
         },
         "verdict": {

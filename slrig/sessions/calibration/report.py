@@ -126,6 +126,9 @@ def _tiles(result: CalibrationResult, devices: Sequence[DeviceFigures]) -> Marku
         _tile("Both together", expected.total_mm, "mm", MEANINGS["both together"], "total_mm"),
         _tile("Expected error of a length", per_metre, "mm per metre", length_words, "length_mm_per_m"),
     ]
+    if expected.across:
+        name = "error across the line of sight"
+        tiles = [_tile(f"Expected {name}", expected.point_mm, "mm", MEANINGS[name], "point_mm")]
     tiles += [
         _tile(
             f"{device_title(each.name)}: rms",
@@ -173,9 +176,10 @@ def _volume(result: CalibrationResult) -> Markup:
         tag("h2", "Expected error over the working volume"),
         tag(
             "p",
-            f"The board was held in a volume of {sides} mm. The colour says by how much a scanned point may lie wrong "
-            "there, one standard deviation, because of the calibration alone: slices across the volume, as the first "
-            f"camera sees them. From {rounded(least)} mm where it is best to {rounded(most)} mm where it is worst. "
+            f"The board was held in a volume of {sides} mm. The colour says by how much {expected.point_words} may lie "
+            f"wrong{expected.way_words} there, one standard deviation, because of the calibration alone: slices across "
+            f"the volume, as the first camera sees them. From {rounded(least)} mm where it is best to {rounded(most)} "
+            "mm where it is worst. "
             "Outside the volume the error grows, and nothing is promised.",
             class_="lead",
         ),

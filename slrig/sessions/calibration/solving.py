@@ -60,25 +60,20 @@ def solve_poses(
 ) -> CalibrationResult:
     """Solve the poses, say how far the result may be trusted, and give it an identity.
 
-    cameras : the first one's frame becomes the world. projector : None where no light was captured. earlier : a
-    calibration of the same devices, to compare the scale with. board_shape : whether the board may be bowed.
+    cameras : the first one's frame becomes the world; one is enough, also without a projector. projector : None where
+    no light was captured. earlier : a calibration of the same devices, to compare the scale with. board_shape : whether
+    the board may be bowed.
 
     Raises
     ------
     SolveRefusedError
-        The poses determine no calibration, or none that could measure.
+        The poses determine no calibration, or do not span a volume to state an error for.
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
     from slrig.calibration.judging.expected_error import expected_error
     from slrig.calibration.solving.solve import SolveOptions, solve
 
     observed = tuple(pose.observation for pose in poses)
-    if projector is None and len(cameras) < 2:
-        message = (
-            "one camera was seen and no projector's light: nothing could be triangulated with that; shoot the poses "
-            "with white, black, Gray code and shifted lines on both axes, or with a second camera"
-        )
-        raise SolveRefusedError(message)
     observations = Observations(board, cameras, projector, observed)
     solution = solve(
         observations,

@@ -9,6 +9,11 @@ MEANINGS = {
         "How far, one standard deviation, a scanned point lies from where it is, along the camera's line of sight, "
         "because the calibration is not perfect; the same for every point nearby, so that averaging does not help."
     ),
+    "error across the line of sight": (
+        "How far, one standard deviation, a point whose distance is known lies from where it is, across the camera's "
+        "line of sight, because the calibration is not perfect. One camera alone tells no distance and cannot scan: "
+        "that takes a projector or a second camera, calibrated with it."
+    ),
     "noise of a point": (
         "How much the light's own noise moves one point, independently of its neighbours; smoothing or averaging "
         "lowers it."

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free
 from slrig.calibration.judging.expected_error import expected_error, volume_of
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
 from slrig.calibration.solution import BoardPose, Solution
+from slrig.calibration.solving.solve import SolveOptions, solve
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole
 from slrig.reconstruction.surface_fit import stencils
@@ -28,6 +29,7 @@ from tests.unit.calibration.perturbed import (
     ray_directions,
     right_camera,
 )
+from tests.unit.calibration.synthetic import Recipe, made
 
 FITTED = float(np.sqrt((stencils()[0][0].astype(np.float64) ** 2).sum()))
 """What the fit of a scan makes of the noise of one pixel."""
@@ -146,6 +148,58 @@ def test_two_cameras_without_a_projector() -> None:
     assert np.sqrt(squares.mean()) == pytest.approx(stated.point_mm, rel=0.06)
 
 
+def across_rays(points: FloatArray, of: FloatArray, camera: Pinhole) -> FloatArray:
+    off, ray = points - of, of - camera.centre_mm
+    return np.asarray(np.linalg.norm(np.cross(off, ray), axis=1) / np.linalg.norm(ray, axis=1))
+
+
+def held_at_its_distance(camera: Pinhole, pixels_px: FloatArray, places: FloatArray) -> FloatArray:
+    """(n, 3): points as far from a camera as the places are, on its rays through these pixels."""
+    directions = ray_directions(camera, pixels_px)
+    far = np.linalg.norm(places - camera.centre_mm, axis=1) / np.linalg.norm(directions, axis=1)
+    return np.asarray(camera.centre_mm + far[:, None] * directions)
+
+
+def test_the_error_of_one_camera_alone_is_across_its_rays() -> None:
+    camera = left_camera()
+    solution, observations = solved({"left": camera}, None)
+    stated = expected_error(solution, observations)
+    assert stated.across
+    places = stated.grid_mm
+    squares = np.zeros(len(places))
+    count = 200
+    for change in draws(solution.covariance, count, 6):
+        found = held_at_its_distance(changed(camera, change), pixels(camera, places), places)
+        squares += across_rays(aligned(found, places), places, camera) ** 2 / count
+    assert np.sqrt(squares.mean()) == pytest.approx(stated.point_mm, rel=0.06)
+    assert np.median(np.abs(np.sqrt(squares) / stated.grid_point_mm - 1)) < 0.06
+
+
+def test_what_one_camera_alone_cannot_tell_is_no_number() -> None:
+    solution, observations = solved({"left": left_camera()}, None)
+    for noise_px in (None, 0.03):
+        stated = expected_error(solution, observations, noise_px=noise_px)
+        assert stated.point_mm > 0
+        assert np.isnan([stated.noise_mm, stated.total_mm, stated.length_share]).all()
+    assert not expected_error(*solved({"left": left_camera()}, light_source())).across
+
+
+@pytest.mark.slow
+def test_solves_of_one_camera_are_as_far_off_as_they_state() -> None:
+    """The truth is a made-up camera that the solve does not know, and its noise another one each time."""
+    ratios = []
+    for seed in range(16):
+        observations, truth = made(Recipe(poses=12, projector=False, seed=seed))
+        solution = solve(observations, options=SolveOptions(board_shape=BoardShape.FLAT))
+        stated = expected_error(solution, observations)
+        true, places = truth.cameras["left"], stated.grid_mm
+        found = held_at_its_distance(solution.calibration.cameras["left"], pixels(true, places), places)
+        off = across_rays(aligned(found, places), places, true)
+        ratios.append(np.sqrt((off**2).mean()) / stated.point_mm)
+    assert 0.7 <= np.sqrt(np.mean(np.square(ratios))) <= 1.4, ratios
+    assert max(ratios) < 3, ratios
+
+
 def test_several_cameras_are_better_than_each_of_them() -> None:
     left, right, projector = left_camera(), right_camera(), light_source()
     alone = expected_error(*solved({"left": left}, projector), noise_px=0.03)
@@ -210,6 +264,11 @@ def test_a_board_held_where_the_projector_does_not_shine_is_refused_with_words()
     aside = {name: BoardPose(pose.rotation, up + pose.translation_mm) for name, pose in solution.poses.items()}
     with pytest.raises(CalibrationError, match=r"sees together with the projector, found 0 of .*hold the board where"):
         expected_error(replace(solution, poses=aside), observations)
+    alone, observations = solved({"left": left_camera()}, None)
+    with pytest.raises(
+        CalibrationError, match=r"that the first camera sees, found 0 of .*hold the board where all of it"
+    ):
+        expected_error(replace(alone, poses=aside), observations)
 
 
 def test_a_board_that_never_left_one_plane_is_refused_with_words() -> None:
