@@ -96,6 +96,7 @@ def open_calibration(
     patterns = pattern_plan(request.patterns, service.scan_defaults)
     if request.patterns.rows is None:
         patterns = replace(patterns, rows=True)
+    patterns = replace(patterns, codes=request.projector)
     board = USUAL_BOARD if request.board is None else board_of(request.board)
     record = service.calibrations.open(board, label=request.label, patterns=patterns)
     response.headers["Location"] = f"/calibration/{record.id}"

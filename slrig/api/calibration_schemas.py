@@ -47,6 +47,10 @@ class CalibrationRequest(Strict):
         default_factory=PatternRequest,
         description="what each pose is lit with. Default: as the rig file says, with both axes",
     )
+    projector: bool = Field(
+        default=True,
+        description="false: calibrate the cameras alone, one or several. Poses are lit white and black, without codes",
+    )
 
 
 class PoseRequestBody(Strict):
@@ -169,7 +173,8 @@ class CalibrationBody(CalibrationSummary):
     error: FaultBody = Field(description="why the last solve failed")
     result: dict[str, Any] | None = Field(
         description="of the last solve that went well: devices with rms and values, each with its standard deviation; "
-        "the expected error in mm; how far the board is out of flat; the verdict and why"
+        "the expected error in mm, of one camera alone `across` its line of sight; how far the board is out of flat; "
+        "the verdict and why"
     )
     last_event: int = Field(description="to follow `links.events` from here: send it as Last-Event-ID")
 

@@ -134,8 +134,9 @@ def pattern_plan(request: PatternRequest, defaults: ScanDefaults) -> PatternPlan
 def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict[str, Any]:
     chosen = {}
     for field in fields(plan):
-        asked = getattr(request, field.name)
-        value = asked if asked is not None else getattr(defaults, field.name)
+        # Not every part of a plan can be asked for in a request, or set in a rig file.
+        asked = getattr(request, field.name, None)
+        value = asked if asked is not None else getattr(defaults, field.name, None)
         if value is not None:
             chosen[field.name] = value
     return chosen

@@ -119,6 +119,9 @@ def run(
     marker_mm: MarkerMm = None,
     dictionary: Dictionary = None,
     board_shape: Shape = ShapeName.AUTO,
+    cameras_alone: Annotated[
+        bool, typer.Option("--cameras-alone", help="Calibrate cameras, or one, without the projector: light is white.")
+    ] = False,
     resume: Annotated[str | None, typer.Option("--id", help="Take up a session again that was left.")] = None,
     scripted: Annotated[
         bool,
@@ -145,7 +148,7 @@ def run(
     chosen = None if resume is not None else chosen_board(kind, corners, square_mm, marker_mm, dictionary)
     with _client(url, key_file) as client:
         session = (
-            opened(client, chosen, label=label)
+            opened(client, chosen, label=label, projector=not cameras_alone)
             if chosen is not None
             else client.get(f"/calibration/{whole_id(client, str(resume))}")
         )

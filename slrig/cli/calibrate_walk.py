@@ -28,8 +28,8 @@ _STATES = {"queued": "waiting for the rig", "shooting": "shooting", "reading": "
 _KEYS = "[bold]Enter[/bold] shoot   [bold]s[/bold] solve   [bold]d[/bold] drop the last   [bold]q[/bold] leave"
 
 
-def opened(client: ServiceClient, board: Board, *, label: str | None) -> dict[str, Any]:
-    """A new session for a board. Raises ServiceError."""
+def opened(client: ServiceClient, board: Board, *, label: str | None, projector: bool = True) -> dict[str, Any]:
+    """A new session for a board; without the projector, of the cameras alone. Raises ServiceError."""
     asked: dict[str, Any] = {
         "kind": str(board.kind),
         "corners": [board.columns, board.rows],
@@ -37,7 +37,7 @@ def opened(client: ServiceClient, board: Board, *, label: str | None) -> dict[st
         "marker_mm": board.marker_mm,
         "dictionary": board.dictionary,
     }
-    return client.post("/calibration", {"board": asked, "label": label})
+    return client.post("/calibration", {"board": asked, "label": label, "projector": projector})
 
 
 def walk(
@@ -216,10 +216,8 @@ class Walk:
         """Show what is covered, and what to do next."""
         session = self._session()
         if session["coverage"] is None:
-            self._console.print(
-                "Hold the board where every camera sees it and the projector's light falls on it, and keep it still.",
-                markup=False,
-            )
+            light = " and the projector's light falls on it" if session["patterns"]["codes"] else ""
+            self._console.print(f"Hold the board where every camera sees it{light}, and keep it still.", markup=False)
             return
         self._console.print()
         if picture:

@@ -247,8 +247,8 @@ def pattern_sequence(
         line_width_px=plan.line_width_px,
         gray_cell_px=plan.gray_cell_px,
         gray_offset_px=plan.gray_offset_px,
-        rows=Axis.ROW in axes,
-        columns=Axis.COLUMN in axes,
+        rows=plan.codes and Axis.ROW in axes,
+        columns=plan.codes and Axis.COLUMN in axes,
     )
     return encode(patterns, size)
 

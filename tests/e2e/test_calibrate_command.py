@@ -56,3 +56,41 @@ def test_positioner_shoots_solves_and_scans_use_the_result(
     first, second = (each["id"] for each in json.loads(calibrate("list", "--json"))["calibrations"])
     compared = json.loads(calibrate("compare", first, second, "--json"))
     assert compared["moved_most_mm"] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.slow
+def test_camera_is_calibrated_alone_by_the_service_and_again_from_its_poses(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = start(write_rig(tmp_path))
+    with Caller(service) as call:
+        call.ready()
+    monkeypatch.setenv("SLRIG_API_KEY", KEY)
+    monkeypatch.setenv("SLRIG_URL", service.url)
+
+    def calibrate(*arguments: str, code: int = 0) -> str:
+        done = CliRunner().invoke(app, ["calibrate", *arguments])
+        assert done.exit_code == code, done.output
+        return done.stdout if code == 0 else " ".join(done.stderr.split())
+
+    refused = calibrate("run", *BOARD, "--cameras-alone", "--scripted", "--activate", code=2)
+    assert "of camera 'left' alone, without a projector: it tells no depth, and cannot scan" in refused
+    (listed,) = json.loads(calibrate("list", "--json"))["calibrations"]
+    assert (listed["state"], listed["active"]) == ("solved", False)
+    assert "across the line of sight" in listed["verdict"]
+    shown = json.loads(calibrate("show", listed["id"][:8], "--json"))["result"]
+    assert set(shown["devices"]) == {"left"}
+    for name, truth in (("fx", 475.0), ("fy", 475.5), ("cx", 160.6), ("cy", 126.1)):
+        value, sigma = shown["devices"]["left"]["values"][name]
+        assert abs(value - truth) < 5 * sigma, name
+    assert "across the line of sight" in " ".join(calibrate("show", listed["id"][:8]).split())
+    calibrate("export", listed["id"], str(tmp_path / "report.html"))
+    assert "data:image/jpeg" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+    poses = service.data / "calibrations" / listed["id"] / "poses"
+    output, report = tmp_path / "camera.json", tmp_path / "again.html"
+    again = calibrate("solve", str(poses), *BOARD, "--output", str(output), "--report", str(report), "--json")
+    assert json.loads(again)["expected"]["point_mm"] == pytest.approx(shown["expected"]["point_mm"], rel=1e-3)
+    found = read_calibration(output)
+    assert (list(found.cameras), found.projector) == (["left"], None)
+    assert "Expected error across the line of sight" in report.read_text(encoding="utf-8")

@@ -172,6 +172,7 @@ class Desk:
                 "gray_offset_px": 0,
                 "line_shift": True,
                 "rows": True,
+                "codes": True,
             },
             "shot": self.shot,
             "script": list(range(max(self.script - 1, 0))),

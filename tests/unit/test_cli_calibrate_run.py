@@ -47,7 +47,7 @@ def test_walk_opens_a_session_for_the_board() -> None:
     desk = Desk()
     text, _ = walked(desk, "q")
     board = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0, "marker_mm": None, "dictionary": None}
-    assert desk.asked == [("POST", "/calibration", {"board": board, "label": None})]
+    assert desk.asked == [("POST", "/calibration", {"board": board, "label": None, "projector": True})]
     assert "Hold the board where every camera sees it" in text
     assert f"slrig calibrate run --id {ID[:8]}" in text
 

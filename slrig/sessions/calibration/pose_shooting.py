@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 from uuid import UUID
@@ -18,6 +18,7 @@ from slrig.errors import (
     SlrigError,
     UnsupportedByDeviceError,
 )
+from slrig.model import Size
 from slrig.scan.folder import DataFolder
 from slrig.scan.holding import RigFacts, check_plan
 from slrig.scan.plan import ScanPlan
@@ -216,9 +217,8 @@ class PoseDesk:
         record = self._register.get(session_id)
         require_same_rig(record, facts)
         if not record.cameras:
-            self._register.change(
-                session_id, lambda found: replace(found, cameras=facts.sizes, projector=facts.projector.size)
-            )
+            projector = _projector(record, facts)
+            self._register.change(session_id, lambda found: replace(found, cameras=facts.sizes, projector=projector))
 
     def _shot(self, session_id: UUID, number: int, error: Exception | None) -> None:
         """The rig is free: read the pose on a thread of its own, or tell why there is nothing to be read."""
@@ -253,15 +253,24 @@ class PoseDesk:
 
 def require_same_rig(record: SessionRecord, facts: RigFacts) -> None:
     """Raise CalibrationError unless the rig's devices are those of the session's poses."""
-    if not record.cameras or (dict(record.cameras) == dict(facts.sizes) and record.projector == facts.projector.size):
+    projector = _projector(record, facts)
+    if not record.cameras or (dict(record.cameras) == dict(facts.sizes) and record.projector == projector):
         return
-    had = ", ".join(f"{name} {size}" for name, size in record.cameras.items())
-    has = ", ".join(f"{name} {size}" for name, size in facts.sizes.items())
     message = (
-        f"The poses of calibration {record.id} were shot with {had} and a projector of {record.projector}; the rig now "
-        f"has {has} and a projector of {facts.projector.size}. Open a new calibration for it."
+        f"The poses of calibration {record.id} were shot with {_devices(record.cameras, record.projector)}; the rig "
+        f"now has {_devices(facts.sizes, projector)}. Open a new calibration for it."
     )
     raise CalibrationError(message)
+
+
+def _projector(record: SessionRecord, facts: RigFacts) -> Size | None:
+    """The extent of the rig's projector; None in a session of cameras alone, whose poses carry no codes."""
+    return facts.projector.size if record.patterns.codes else None
+
+
+def _devices(cameras: Mapping[str, Size], projector: Size | None) -> str:
+    had = ", ".join(f"{name} {size}" for name, size in cameras.items())
+    return had if projector is None else f"{had} and a projector of {projector}"
 
 
 def _refuse_closed(record: SessionRecord) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -12,7 +14,8 @@ from fastapi.testclient import TestClient
 
 from slrig.bundle.calibration_file import write_calibration
 from slrig.errors import SolveRefusedError
-from slrig.model import Size
+from slrig.model import Calibration, Size
+from slrig.scan.holding import pattern_sequence
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.api.test_scans import events_of
 from tests.unit.scan.fakes import WAIT_S
@@ -141,6 +144,26 @@ def test_board_that_no_request_names_is_the_usual_one(
         "dictionary": "DICT_5X5_250",
         "title": "charuco 11x8, 12 mm",
     }
+
+
+def test_cameras_are_calibrated_alone_where_that_is_asked_for(calibrating: TestClient, served: ServedBench) -> None:
+    made = opened(calibrating, projector=False)
+    assert made["patterns"]["codes"] is False
+    assert shot(calibrating, made["id"])["state"] == "accepted"
+    assert set(calibrating.get(made["links"]["self"]).json()["links"]["coverage"]) == {"cam0"}
+    _, plan = served.tame.captured[-1]
+    assert {str(each.kind) for each in pattern_sequence(plan.patterns, Size(64, 40)).patterns} == {"white", "black"}
+
+
+def test_one_camera_alone_is_kept_and_no_scan_uses_it(calibrating: TestClient, tmp_path: Path) -> None:
+    camera = Calibration(tame_calibration().cameras, None)
+    write_calibration(tmp_path / "camera.json", camera)
+    kept = calibrating.post("/calibration/import", json=json.loads((tmp_path / "camera.json").read_bytes())).json()
+    assert kept["state"] == "solved"
+    refused = calibrating.post(kept["links"]["activate"])
+    assert (refused.status_code, refused.json()["type"]) == (422, "/problems/calibration")
+    assert "of camera 'cam0' alone, without a projector: it tells no depth, and cannot scan" in refused.json()["detail"]
+    assert calibrating.get("/calibration").json()["active"] is None
 
 
 def test_solve_is_told_what_the_board_is_taken_for(calibrating: TestClient, served: ServedBench) -> None:
