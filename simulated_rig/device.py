@@ -44,6 +44,7 @@ class SimulatedHead:
                 camera.pinhole(),
                 self._stage,
                 blur_px=camera.blur_px,
+                focus=(options.projector.focus, camera.focus),
                 ambient=options.ambient,
                 samples_per_axis=options.samples_per_axis,
                 jitter=options.jitter,

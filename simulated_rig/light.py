@@ -7,7 +7,7 @@ one along the rows. So the light of a pattern at any projector position is two t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
+from simulated_rig.defocus import ALWAYS_SHARP, LEVELS_PX, Focus
 from simulated_rig.transport import Paths
 from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, Pixels, Size
@@ -34,13 +35,14 @@ class Response:
 
     `blur_px` is the standard deviation of the lens's Gaussian spread; each pixel is a square before it.
     `signal_blur_px` is that of the values on their way to the pixels, before gamma: a scaler, or an analogue cable.
-    Without it a pattern of black and white alone has no value that gamma could bend.
+    Without it a pattern of black and white alone has no value that gamma could bend. `focus` : where the lens is sharp.
     """
 
     gamma: float
     leak: float
     blur_px: float
     signal_blur_px: float = 0.0
+    focus: Focus = ALWAYS_SHARP
 
     def signal(self, values: Pixels) -> FloatArray:
         """(H, W) float64, 0..255: the values that reach the pixels, of a pattern (H, W) whose border goes on."""
@@ -57,13 +59,15 @@ class LightTable:
     """The light of one pattern: along(columns) * along(rows), NODES_PER_PX samples per projector pixel.
 
     columns, rows : (n,) float32; node i lies at the projector coordinate i / NODES_PER_PX - margin_px. glow : light
-    that falls on everything alike, from elsewhere.
+    that falls on everything alike, from elsewhere. softer : the same out of focus, for each of `defocus.LEVELS_PX` but
+    the first; none where the projector is sharp at every distance.
     """
 
     columns: Float32Array
     rows: Float32Array
     margin_px: int
     glow: float = 0.0
+    softer: tuple[LightTable, ...] = ()
 
     @property
     def peak(self) -> float:
@@ -79,8 +83,12 @@ def light_table(profile: Pixels, projector: Size, response: Response) -> LightTa
         raise ValueError(message)
     across = np.broadcast_to(light[0], projector.width_px) if light.shape[0] == 1 else np.ones(projector.width_px)
     down = np.broadcast_to(light[:, 0], projector.height_px) if light.shape[0] > 1 else np.ones(projector.height_px)
-    margin = _margin_px(response.blur_px)
-    return LightTable(_spread(across, response.blur_px), _spread(down, response.blur_px), margin)
+    beyond = LEVELS_PX[1:] if response.focus.far_px else ()
+    sharp, *softer = (
+        LightTable(_spread(across, blur_px), _spread(down, blur_px), _margin_px(blur_px))
+        for blur_px in (response.blur_px, *(math.hypot(response.blur_px, level) for level in beyond))
+    )
+    return replace(sharp, softer=tuple(softer))
 
 
 def no_light(projector: Size) -> LightTable:
@@ -137,7 +145,7 @@ def _margin_px(blur_px: float) -> int:
     return int(np.ceil(_WIDEST_SIGMAS * blur_px)) + 1
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _spread_of_one_pixel(blur_px: float) -> FloatArray:
     """A unit square pixel blurred by a Gaussian, sampled at the nodes from -margin to +margin."""
     margin = _margin_px(blur_px)

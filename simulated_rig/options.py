@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
+from simulated_rig.defocus import Focus
 from simulated_rig.disturbing import PROJECTOR, Bump, Drift, Moving
 from simulated_rig.light import Response
 from simulated_rig.optics import look_at
@@ -60,6 +61,12 @@ class Device(Table, use_attribute_docstrings=True):
     blur_px: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Standard deviation of the lens's Gaussian spread."""
 
+    focus_mm: Positive | None = None
+    """Distance from the lens at which it is sharp; else that of the world's origin."""
+
+    defocus_px: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Standard deviation of the further spread of a point far away; at a distance d it is that times |1 - focus/d|."""
+
     @model_validator(mode="after")
     def _posed(self) -> Device:
         look = (self.position_mm is not None, self.target_mm is not None)
@@ -77,6 +84,11 @@ class Device(Table, use_attribute_docstrings=True):
     def size(self) -> Size:
         """The extent of the image."""
         return Size(*self.size_px)
+
+    @property
+    def focus(self) -> Focus:
+        """Where the lens is sharp."""
+        return Focus(self.focus_mm or float(np.linalg.norm(self.pinhole().centre_mm)), self.defocus_px)
 
     def pinhole(self) -> Pinhole:
         """Return the device as a calibration describes it. Raises CalibrationError."""
@@ -127,7 +139,9 @@ class ProjectorOptions(Device):
 
     def response(self) -> Response:
         """Return how grey values become light."""
-        return Response(gamma=self.gamma, leak=self.leak, blur_px=self.blur_px, signal_blur_px=self.signal_blur_px)
+        return Response(
+            gamma=self.gamma, leak=self.leak, blur_px=self.blur_px, signal_blur_px=self.signal_blur_px, focus=self.focus
+        )
 
 
 class CameraOptions(Device):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 
@@ -10,10 +11,15 @@ from numpy.typing import NDArray
 
 from simulated_rig import transport
 from simulated_rig.casting import Caster, caster
+from simulated_rig.defocus import ALWAYS_SHARP, LEVELS_PX, Focus, level_weights
 from simulated_rig.light import Float32Array, LightTable, blurred, radiance
+from simulated_rig.optics import lens_array, world_directions
 from simulated_rig.scene import SceneSurface
 from simulated_rig.transport import Paths
 from slrig.model import CameraTruth, Pinhole
+
+Weights = dict[int, Float32Array]
+"""(H, W) by the index of a level of `defocus.LEVELS_PX`: how much of its image each pixel takes."""
 
 
 class Setting:
@@ -67,6 +73,7 @@ class _Seen:
     """What was traced of one setting by a camera in one place.
 
     room : its image under the room's light alone; last : under the projector's light that was asked for last.
+    softness : how much of each level of defocus every pixel takes, of the projector's and of the camera's.
     """
 
     def __init__(self, setting: Setting, camera: Pinhole) -> None:
@@ -75,6 +82,7 @@ class _Seen:
         self.paths: Paths | None = None
         self.room: Float32Array | None = None
         self.last: tuple[LightTable, Float32Array] | None = None
+        self.softness: tuple[Weights, Weights] | None = None
         self.truth: CameraTruth | None = None
 
 
@@ -87,6 +95,7 @@ class View:
         stage: Stage,
         *,
         blur_px: float,
+        focus: tuple[Focus, Focus] = (ALWAYS_SHARP, ALWAYS_SHARP),
         ambient: float,
         samples_per_axis: int,
         jitter: bool,
@@ -96,6 +105,7 @@ class View:
         self._camera = camera
         self._stage = stage
         self._blur_px = blur_px
+        self._focus = focus
         self._ambient = ambient
         self._samples_per_axis = samples_per_axis
         self._jitter = jitter
@@ -169,11 +179,42 @@ class View:
     def _under(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
         if seen.last is None or seen.last[0] is not light:
-            image = radiance(paths, light, blur_px=self._blur_px)
+            image = self._defocused(seen, paths, light)
             if light.glow > 0:
                 image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
             seen.last = (light, image)
         return seen.last[1]
+
+    def _defocused(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
+        """The light of the projector on each pixel, blended from images at several levels of defocus."""
+        if not any(focus.far_px for focus in self._focus):
+            return radiance(paths, light, blur_px=self._blur_px)
+        if seen.softness is None:
+            seen.softness = self._softness(seen)
+        image = np.zeros(paths.albedo.shape, np.float32)
+        tables = (light, *light.softer)
+        for of_light, weight in seen.softness[0].items():
+            for of_lens, share in seen.softness[1].items():
+                taken = weight * share
+                if taken.any():
+                    blur_px = math.hypot(self._blur_px, LEVELS_PX[of_lens])
+                    # A lamp that is off has no levels.
+                    image += taken * radiance(paths, tables[min(of_light, len(tables) - 1)], blur_px=blur_px)
+        return image
+
+    def _softness(self, seen: _Seen) -> tuple[Weights, Weights]:
+        """The levels of the projector and of the camera at each pixel, by the distance of what its centre sees."""
+        if seen.truth is None:
+            seen.truth = self._traced_truth(seen)
+        camera, projector = seen.camera, seen.setting.projector
+        centres = [(u, v) for _, u, v in transport.pixel_centres(camera)]
+        u, v = (np.concatenate(each) for each in zip(*centres, strict=True))
+        towards = world_directions(u, v, lens_array(camera), camera.rotation)
+        from_eye = towards * (seen.truth.depth_mm.reshape(-1) / (towards @ camera.rotation[2]))[:, None]
+        of_light, of_lens = self._focus
+        light_mm = np.linalg.norm(from_eye + camera.centre_mm - projector.centre_mm, axis=1).reshape(camera.size.shape)
+        lens_mm = np.linalg.norm(from_eye, axis=1).reshape(camera.size.shape)
+        return level_weights(of_light.spread_px(light_mm)), level_weights(of_lens.spread_px(lens_mm))
 
     def truth(self) -> CameraTruth:
         """Return depth, projector coordinates and visible points of what stands there, by rays at the pixel centres."""

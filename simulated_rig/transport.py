@@ -1,7 +1,7 @@
 """Ray-traced paths projector -> surface -> camera: where each camera sample is lit from, and how strongly.
 
 One pose of the world is traced once; each pattern is then a table look-up (`simulated_rig.light`).
-Only direct light is traced: no light from one surface to another, no defocus with depth.
+Only direct light is traced: no light from one surface to another.
 """
 
 from __future__ import annotations

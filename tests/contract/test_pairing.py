@@ -28,6 +28,7 @@ LIGHTS: dict[str, dict[str, Any]] = {
     "rolling bands": {"camera": eyes(line_time_s=3e-5), "ambient": 0.1, "ambient_flicker_depth": 0.3},
     "unresolved": {"camera": eyes(size_px=[80, 60], focal_px=[400.0, 400.0])},
     "out of focus": {"camera": eyes(blur_px=1.5)},
+    "focus over depth": {"projector": beamer(focus_mm=400.0, defocus_px=5.0), "camera": eyes(defocus_px=8.0)},
 }
 FREE = frozenset({Trigger.FREE})
 
