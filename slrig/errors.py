@@ -6,6 +6,18 @@ reads it. Status codes and exit codes are decided at the edges (`slrig.api.probl
 
 from __future__ import annotations
 
+_FLAGS = {"exposures_s": "exposure-s", "kind": "board", "line_shift_period_px": "period-px"}
+"""Flags of the command line that are not called as the setting is."""
+
+
+def setting(name: str) -> str:
+    """A setting in a message that may be read on a terminal or over HTTP: its key in requests and rig files, its flag.
+
+    >>> setting("gray_cell_px")
+    'gray_cell_px (--gray-cell-px)'
+    """
+    return f"{name} (--{_FLAGS.get(name, name.replace('_', '-'))})"
+
 
 class SlrigError(Exception):
     """Base of the tree. Catch it at an edge; raise one of its children."""

@@ -8,7 +8,7 @@ from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
 from slrig.devices import COMPUTED, ProjectorInfo, Shown
-from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.errors import DeviceStateError, UnsupportedByDeviceError, setting
 from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, White
 
 
@@ -59,7 +59,7 @@ class ReplayProjector:
                     f"the recording '{self._info.serial}' has no frame of {_member(pattern)} from camera "
                     f"{', '.join(lacking)}; it has {recorded}. Leave the patterns out of the "
                     "request and of the rig file's [scan], and all that was recorded is played; or ask for some of it: "
-                    "--gray-cell-px (gray_cell_px in a request), --period-px (line_shift_period_px) and their like"
+                    f"{setting('gray_cell_px')}, {setting('line_shift_period_px')} and their like"
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.errors import NothingToReconstructError
+from slrig.errors import NothingToReconstructError, setting
 from slrig.meshing.rasteriser import rasterised
 from slrig.model import Mesh, Refusal, Size
 from slrig.reconstruction.optics import project
@@ -44,8 +44,8 @@ def coverage_notes(name: str, share: float | None) -> list[str]:
         return []
     return [
         f"the mesh covers {share:.0%} of what camera '{name}' decoded. Look at the picture of causes: the finest "
-        "patterns may not resolve (wider cells: --gray-cell-px; wider lines: --line-width-px), or the limit "
-        "at depth edges be too low (--depth-edge-ratio)"
+        f"patterns may not resolve (wider cells: {setting('gray_cell_px')}; wider lines: {setting('line_width_px')}), "
+        f"or the limit at depth edges be too low: {setting('depth_edge_ratio')}"
     ]
 
 

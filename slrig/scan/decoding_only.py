@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle.reading import read_capture
 from slrig.bundle.storage import refusals_of
-from slrig.errors import PatternError
+from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
 from slrig.patterns.positions import cell_positions, index_of_word
 from slrig.reconstruction.decoding import DecodingLimits, decode, lit_pixels
@@ -62,13 +62,13 @@ class Decoded:
             told.append("the light is weak: lengthen the exposure, open the lens, or darken the room")
         if self.saturated > _FEW:
             told.append(
-                f"{self.saturated:.0%} is saturated: shorten the exposure, or scan with several (--exposure-s "
-                "more than once)"
+                f"{self.saturated:.0%} is saturated: shorten the exposure, or scan with "
+                f"several: {setting('exposures_s')}"
             )
         if self.unresolved > _FEW:
             told.append(
                 f"the finest bit does not resolve on {self.unresolved:.0%}: look at the focus of camera and projector, "
-                "or play wider cells (--gray-cell-px)"
+                f"or play wider cells: {setting('gray_cell_px')}"
             )
         if self.ambiguous > _MANY:
             told.append(

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from math import asin, degrees
 
-from slrig.errors import PatternError
+from slrig.errors import PatternError, setting
 from slrig.model import LEAST_SHARE, Axis, Calibration, Pinhole, share_across, told_depth, triangulated_axis
 
 _NEXT_TO_NONE = 0.01
 FAIR_SHARE = 0.5
 """By this share of it (30°), errors are twice as large as they need be."""
 
-_BOTH = 'Scan with both axes: "rows": true in a request\'s patterns, --rows on the command line'
+_BOTH = f"Scan with both axes: {setting('rows')}"
 
 
 def played_axes(
@@ -31,7 +31,10 @@ def played_axes(
     if rows:
         return tuple(Axis)
     if axis is Axis.ROW and rows is False:
-        message = '"rows": false plays columns alone, and "axis": "row" triangulates by rows; leave one of them out'
+        message = (
+            f"{setting('rows')} as false plays columns alone, and {setting('axis')} as row triangulates by rows; leave "
+            "one of them out"
+        )
         raise PatternError(message)
     cameras = _known(calibration, names)
     wanted = Axis.COLUMN if rows is False else axis

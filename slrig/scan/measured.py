@@ -19,7 +19,7 @@ from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import read_refused
 from slrig.capture.exposure import check_exposures
-from slrig.errors import CalibrationError, NothingToReconstructError, PatternError
+from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import LEAST_SHARE, Axis, Calibration, Refusal, without_missing_bits
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
@@ -140,7 +140,7 @@ def _require_calibration(folder: Path, names: list[str], found: Calibration | No
     if found is None:
         message = (
             f"{folder}: no calibration.json beside the frames, and without one nothing can be measured; "
-            "put one there, or name one with --calibration FILE"
+            f"calibrate the rig, put one there, or name a file with {setting('calibration')}"
         )
         raise CalibrationError(message)
     missing = [name for name in names if name not in found.cameras]

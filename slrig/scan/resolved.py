@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.errors import setting
 from slrig.meshing.runs import parts_of_curves
 from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.camera import CameraCurves
@@ -76,7 +77,8 @@ def unresolved_notes(cameras: Sequence[Seen], step_px: float, cell_px: float) ->
             notes.append(
                 f"camera '{seen.name}' does not resolve the shifted lines on {share:.0%} of what is lit: the edges of "
                 f"the code stand for them there, every {cell_px:g} projector pixels or wider instead of every "
-                f"{step_px:g}. Look at focus and resolution, or play lines further apart (--period-px)"
+                f"{step_px:g}. Look at focus and resolution, or play lines further apart: "
+                f"{setting('line_shift_period_px')}"
             )
         elif seen.curves.unresolved is not None and seen.curves.lost_lines is None:
             share = lit_share(seen.curves, seen.curves.unresolved > 0)
@@ -84,6 +86,6 @@ def unresolved_notes(cameras: Sequence[Seen], step_px: float, cell_px: float) ->
                 notes.append(
                     f"camera '{seen.name}' does not resolve the finest Gray bit on {share:.0%} of what is lit: "
                     f"it is left out there, and the surface is sampled every {2 * step_px:g} projector pixels or "
-                    "wider. Look at focus and resolution, or play wider cells (--gray-cell-px)"
+                    f"wider. Look at focus and resolution, or play wider cells: {setting('gray_cell_px')}"
                 )
     return notes

@@ -15,7 +15,7 @@ from slrig.calibration.boards.lattice import Lattice, right_handed
 from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
 from slrig.calibration.boards.sightings import MarkersSeen, describe_other, markers_seen
 from slrig.calibration.observations import BoardView
-from slrig.errors import PoseRefusedError
+from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray
 
 _QUICK_PX = 800
@@ -123,8 +123,8 @@ def _cause(grey: Grey, board: Board, seen: Lattice | None) -> str:
 def _with_markers(board: Board, markers: MarkersSeen | None) -> str:
     found = f"the markers of a ChArUco board ({markers.dictionary})" if markers else "something printed in its squares"
     return (
-        f"another board: expected a {board.title}, found a chessboard with {found}: give --board charuco, or put the "
-        "chessboard there"
+        f"another board: expected a {board.title}, found a chessboard with {found}: give {setting('kind')} "
+        "charuco, or put the chessboard there"
     )
 
 
@@ -132,7 +132,7 @@ def _another(board: Board, seen: Lattice) -> str:
     return (
         f"another board: expected {board.columns} x {board.rows} inner corners, found a chessboard of "
         f"{max(seen.columns, seen.rows)} x {min(seen.columns, seen.rows)}: take the other board, or give its corners "
-        f"as --corners (those inside, where four squares meet)"
+        f"as {setting('corners')} (those inside, where four squares meet)"
     )
 
 
@@ -145,5 +145,6 @@ def _half(board: Board, seen: Lattice, sides: list[str]) -> str:
         )
     return (
         f"half a board: only {part} are found, though the image does not end there: take away what covers the "
-        "rest or throws a reflection on it; if nothing does, this is another board and --corners is wrong"
+        "rest or throws a reflection on it; if nothing does, this is another board and "
+        f"{setting('corners')} is wrong"
     )

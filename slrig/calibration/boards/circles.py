@@ -24,7 +24,7 @@ from slrig.calibration.boards.lattice import Lattice, right_handed
 from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
 from slrig.calibration.boards.sightings import describe_other
 from slrig.calibration.observations import BoardView
-from slrig.errors import PoseRefusedError
+from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray
 
 _TURNS = 3
@@ -221,12 +221,14 @@ def _another(board: Board, seen: Lattice) -> str:
     if found == sorted((2 * board.rows, board.columns)):
         return (
             f"another board: expected circles in {board.rows} rows of {board.columns}, found {board.columns} rows of "
-            f"{board.rows}: turn them round, --corners {board.rows}x{board.columns} (circles in a row, then rows)"
+            f"{board.rows}: turn them round, {setting('corners')} {board.rows}x{board.columns} (circles in a row, "
+            "then rows)"
         )
     return (
         f"another board: expected circles in {board.rows} rows of {board.columns}, found a grid of circles over "
         f"{found[1]} by {found[0]} half distances where this one goes over {wanted[1]} by {wanted[0]}: take the other "
-        "board, or give its circles as --corners (circles in a row, then rows), or take away what covers a part"
+        f"board, or give its circles as {setting('corners')} (circles in a row, then rows), or take away what covers a "
+        "part"
     )
 
 
@@ -258,5 +260,5 @@ def _cause(grey: Grey, board: Board, blobs: Blobs, seen: Lattice | None) -> str:
         )
     return (
         f"half a board: only {part} are found, though the image does not end there: take away what covers the rest or "
-        "throws a reflection on it; if nothing does, this is another board and --corners is wrong"
+        f"throws a reflection on it; if nothing does, this is another board and {setting('corners')} is wrong"
     )

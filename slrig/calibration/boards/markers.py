@@ -15,7 +15,7 @@ from slrig.calibration.boards.grid_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.marker_layout import fitting_width, rest_px, stands_light_first
 from slrig.calibration.boards.sightings import describe_other, marker_numbers, markers_seen
 from slrig.calibration.observations import BoardView
-from slrig.errors import PoseRefusedError
+from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray, IntArray
 
 FEWEST_CORNERS = 8
@@ -123,7 +123,8 @@ def _refuse_another(board: Board, printed: Any, ids: IntArray, outlines: FloatAr
     if abs(share - expected) > _SHARE_OFF + 1.5 / float(np.median(slope)):
         message = (
             f"another board: its markers are {share:.2f} of a square wide, and those of a {board.title} with markers "
-            f"of {board.marker_mm:g} mm are {expected:.2f}: measure both and give --square-mm and --marker-mm"
+            f"of {board.marker_mm:g} mm are {expected:.2f}: measure both and give "
+            f"{setting('square_mm')} and {setting('marker_mm')}"
         )
         raise PoseRefusedError(message)
 
@@ -139,10 +140,10 @@ def _remedy(board: Board, width: int | None) -> str:
     if width == board.rows != board.columns:
         return (
             f": the board in view has {board.rows} corners in a row and {board.columns} rows, not the other way round: "
-            f"turn them round, --corners {board.rows}x{board.columns}"
+            f"turn them round, {setting('corners')} {board.rows}x{board.columns}"
         )
     said = "" if width in (None, board.columns) else f" (they fit a board with {width} corners in a row)"
-    return f"{said}: give that board's --corners, or take the other one"
+    return f"{said}: give that board's {setting('corners')}, or take the other one"
 
 
 def _few(grey: Grey, board: Board, corners: int, markers: int) -> str:
@@ -166,7 +167,7 @@ def _nothing(grey: Grey, board: Board) -> str:
     if markers is not None:
         return (
             f"another board: expected markers of {board.dictionary}, found {markers.count} of {markers.dictionary} or "
-            "a smaller dictionary of its family: give that one as --dictionary, or take the other board"
+            f"a smaller dictionary of its family: give that one as {setting('dictionary')}, or take the other board"
         )
     other = describe_other(grey, board.kind)
     if other:

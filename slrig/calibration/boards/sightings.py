@@ -14,6 +14,7 @@ from slrig.calibration.boards.blobs import circle_lattice
 from slrig.calibration.boards.chess_lattice import chessboard_lattice
 from slrig.calibration.boards.grey import Grey
 from slrig.calibration.boards.marker_layout import fitting_width
+from slrig.errors import setting
 
 _FAMILIES = (
     "DICT_5X5_250",
@@ -80,16 +81,16 @@ def describe_other(grey: Grey, asked: BoardKind) -> str | None:
     if markers is not None:
         return (
             f"the markers of a ChArUco board ({markers.dictionary}, number {markers.greatest} the greatest): "
-            "give --board charuco, or take the other board"
+            f"give {setting('kind')} charuco, or take the other board"
         )
     chess = chessboard_lattice(grey) if asked is not BoardKind.CHESSBOARD else None
     if chess is not None:
         return (
             f"a chessboard of {max(chess.columns, chess.rows)} x {min(chess.columns, chess.rows)} inner corners: "
-            "give --board chessboard, or take the other board"
+            f"give {setting('kind')} chessboard, or take the other board"
         )
     # In a blurred image squares are round.
     circles = circle_lattice(grey) if asked is not BoardKind.CIRCLES and not grey.blurred() else None
     if circles is not None:
-        return "rows of circles: give --board circles, or take the other board"
+        return f"rows of circles: give {setting('kind')} circles, or take the other board"
     return None

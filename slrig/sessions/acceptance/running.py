@@ -25,6 +25,7 @@ from slrig.errors import (
     ScanEvidenceError,
     SlrigError,
     UnsupportedByDeviceError,
+    setting,
 )
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_bundle
@@ -222,7 +223,7 @@ def by_positioner(rig: Rig, plan: AcceptancePlan) -> Place:
         has = f"a positioner with {', '.join(poses)}" if poses else "no positioner"
         message = (
             f"rig '{rig.name}' has {has}, and the test needs the positions {', '.join(missing)}; place the artefacts "
-            "by hand (without --scripted), or name the positioner's poses so"
+            f"by hand (without {setting('scripted')}), or name the positioner's poses so"
         )
         raise UnsupportedByDeviceError(message)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from slrig.bundle.storage import refusals_of, write_file
 from slrig.config import HeadTable, RigConfig
-from slrig.errors import UnsupportedByDeviceError
+from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import FloatArray
 from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Step
 
@@ -34,8 +34,8 @@ def scripted_config(config: RigConfig, plan: AcceptancePlan, folder: Path) -> Ri
     """
     if config.head is None or "scene" not in config.head.options:
         message = (
-            f"rig '{config.name}' is not rendered and nobody moves its artefacts by script; leave --scripted out and "
-            "place them by hand"
+            f"rig '{config.name}' is not rendered and nobody moves its artefacts by script; leave "
+            f"{setting('scripted')} out and place them by hand"
         )
         raise UnsupportedByDeviceError(message)
     path = (folder / SCENE).resolve()

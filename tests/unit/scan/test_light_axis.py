@@ -85,7 +85,7 @@ def test_a_weak_crossing_is_told_in_degrees_with_its_price_and_its_cure() -> Non
     assert told is not None
     assert "at 14° only" in told
     assert "4.0 times" in told
-    assert '"rows": true' in told
+    assert "Scan with both axes: rows (--rows)" in told
     assert "45°" in (weakness(Axis.ROW, BOTH, LEAST_SHARE) or "")
     assert "more than 100 times" in (weakness(Axis.ROW, BOTH, 0.0) or "")
 

@@ -116,7 +116,7 @@ def test_a_missing_calibration_is_asked_for(recorded: Path, tmp_path: Path) -> N
     (tmp_path / "bundle" / "calibration.json").unlink()
     message = refused(CalibrationError, tmp_path / "bundle", tmp_path / "out")
     assert "calibration.json" in message
-    assert "--calibration FILE" in message
+    assert "calibration (--calibration)" in message
 
 
 def test_one_camera_without_a_calibrated_projector_is_refused(recorded: Path, tmp_path: Path) -> None:

@@ -247,7 +247,7 @@ def test_another_board_is_refused_and_named(asked: Board, there: Board, words: s
 @pytest.mark.parametrize("there", [CHARUCO, CIRCLES], ids=title)
 def test_corners_that_were_given_the_wrong_way_round_are_named(there: Board) -> None:
     asked = Board(there.kind, there.rows, there.columns, there.square_mm)
-    words = f"another board.*turn them round, --corners {there.columns}x{there.rows}"
+    words = f"another board.*turn them round, corners .--corners. {there.columns}x{there.rows}"
     refused(shot(there, eye(there)), asked, words)
 
 
