@@ -23,7 +23,7 @@ class PatternPlan:
     """Which patterns to play: see `slrig.patterns.sequence.scan_patterns`.
 
     `line_shift_period_px` n; `gray_cell_px` defaults to ⌊n/2⌋, so that a code edge may be off by n/4 px.
-    `line_shift` False gives a Gray-only scan, whose cell defaults to 1 px. `rows` True plays columns and rows, False
+    `line_shift` False gives a Gray-only scan, whose cell defaults to 2 px. `rows` True plays columns and rows, False
     columns alone, and None what the calibration asks for: columns for devices side by side, rows for devices above one
     another; see `slrig.scan.light_axis.played_axes`. `codes` False plays white and black alone: enough for poses that
     calibrate cameras without the projector, and for no scan.

@@ -18,7 +18,7 @@ CONFIG = Path(__file__).parents[2] / "config"
 # The values of a bit with runs of two pixels go from 0.22 to 0.78; with gamma 2.2 it and its inverse add up to 0.6.
 SCALER = "gamma = 2.2\nsignal_blur_px = 0.65"
 PLANS = {
-    "Gray only": {"patterns": {"line_shift": False, "gray_cell_px": 1}},
+    "Gray only": {"patterns": {"line_shift": False}},
     "lines": {"patterns": {"line_width_px": 3}},
 }
 
@@ -57,5 +57,5 @@ def test_a_scan_behind_a_scaler_succeeds_and_nothing_is_shot_again(
     for report in (straight, scaled):
         assert 0.8 <= report["truth"]["error_over_sigma_p68"] <= 1.25
     assert scaled["truth"]["complete_0.3mm"] >= straight["truth"]["complete_0.3mm"] - 0.005
-    # 1.2 is asked for. Half of the code edges are those of the finest bit, and their slope is 0.55 of what it was.
-    assert scaled["truth"]["rms_mm"] <= 1.3 * straight["truth"]["rms_mm"]
+    # With cells of 1 px it is 1.28 times: half of the edges are the finest bit's, whose slope is 0.55 of what it was.
+    assert scaled["truth"]["rms_mm"] <= 1.2 * straight["truth"]["rms_mm"]

@@ -206,7 +206,7 @@ def test_a_coarse_bit_exchanged_with_its_inverse_is_refused_without_line_frames(
     scene = Scene(noise_dn=1.0, columns_per_px=0.2, first_column_px=40)
     patterns = patterns_for(line_shift=False)
     shots = scene.shots(patterns)
-    i = patterns.index(Gray(Axis.COLUMN, 1, 7))
+    i = patterns.index(Gray(Axis.COLUMN, 1, 6, 2))
     swapped = with_image(with_image(shots, i, shots[i + 1].image), i + 1, shots[i].image)
     with pytest.raises(ScanEvidenceError, match="bit 1 of the column code is exchanged with its inverse"):
         judged(scene, swapped, patterns)

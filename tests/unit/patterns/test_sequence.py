@@ -40,10 +40,10 @@ def test_every_shift_is_played_once() -> None:
     assert lines == [LineShift(Axis.COLUMN, shift, 5) for shift in range(5)]
 
 
-def test_gray_only_has_cells_of_one_pixel_and_no_lines() -> None:
+def test_gray_only_has_cells_of_two_pixels_and_no_lines() -> None:
     patterns = patterns_of(Size(64, 48), line_shift=False)
-    assert len(patterns) == 2 + 2 * 6 + 2
-    assert all(pattern.cell_px == 1 for pattern in patterns if isinstance(pattern, Gray))
+    assert len(patterns) == 2 + 2 * 5 + 2
+    assert all(pattern.cell_px == 2 for pattern in patterns if isinstance(pattern, Gray))
 
 
 def test_rows_follow_columns_with_bits_of_their_own() -> None:

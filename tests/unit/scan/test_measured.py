@@ -33,7 +33,7 @@ PROJECTOR: Device = {
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("slanted")
     with open_rig(read_rig(rig_file(folder / "rig", BALL, PROJECTOR, CAMERA))) as rig:
-        plan = ScanPlan(patterns=PatternPlan(rows=True, line_shift=False))
+        plan = ScanPlan(patterns=PatternPlan(rows=True, line_shift=False, gray_cell_px=1))
         capture_bundle(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False)
     return folder / "bundle"
 
