@@ -58,6 +58,7 @@ STATUS: Mapping[type[SlrigError], int] = {
     errors.StorageError: 507,
     errors.ServiceError: 502,
     faults.WorkerLostError: 500,
+    faults.OutOfMemoryError: 500,
     faults.ScanInterruptedError: 503,
     faults.KeyInFlightError: 409,
 }

@@ -29,7 +29,7 @@ from slrig.scan.holding import HeldRig
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
 from slrig.scan.sweep import sweep
-from slrig.scan.worker import LOADING, READY, ReconstructionWorker, prepare_kernel_cache
+from slrig.scan.worker import LOADING, READY, Worker, prepare_kernel_cache
 
 ADDRESS_FILE = "service.json"
 """Where in the data folder a running service tells its URL and process id."""
@@ -68,7 +68,7 @@ def open_service(
     ):
         for name in found:
             _log.warning("left by the last run", scan=str(name), found=what)
-    worker = ReconstructionWorker()
+    worker = Worker()
     runner = Runner(
         store,
         folder,

@@ -15,8 +15,8 @@ from slrig.scan.folder import DataFolder
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import ReconstructionWorker
-from slrig.scan.worker_process import Job
+from slrig.scan.walking import reconstruction
+from slrig.scan.worker import Worker
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.notices import NoticedHealth, Notices
 from slrig.scheduling.scheduler import Scheduler
@@ -90,7 +90,7 @@ def assembled_service(
     rig_name: str,
     calibration_tools: CalibrationTools | None = None,
     verification_tools: VerificationTools | None = None,
-    worker: ReconstructionWorker | None = None,
+    worker: Worker | None = None,
     refuse_when_stale: bool = False,
 ) -> Service:
     """A service of what scans, and of the rest made to go with it. Nothing is started but what sends notices.
@@ -138,13 +138,16 @@ def assembled_service(
     )
 
 
-def _elsewhere(worker: ReconstructionWorker) -> ReconstructBundle:
+def _elsewhere(worker: Worker) -> ReconstructBundle:
     """Reconstruction in the process that scans have theirs in. Both call it on the thread that owns the rig."""
 
     def reconstruct(
         bundle: Path, output: Path, /, *, plan: ReconstructionPlan, progress: Progress, cancelled: Callable[[], bool]
     ) -> Mapping[str, Any]:
-        return worker.run(Job(bundle, output, plan), progress=progress, cancelled=cancelled)
+        report: Mapping[str, Any] = worker.run(
+            reconstruction(worker.module, bundle, output, plan), progress=progress, cancelled=cancelled
+        )
+        return report
 
     return reconstruct
 

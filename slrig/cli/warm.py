@@ -10,7 +10,8 @@ from pathlib import Path
 import typer
 
 from slrig.cli.display import progress_shown
-from slrig.scan.worker import PREPARING, prepare_kernel_cache
+from slrig.scan.worker import prepare_kernel_cache
+from slrig.scan.worker_wait import PREPARING
 
 Display = Callable[[str, float, str], None]
 

@@ -9,14 +9,18 @@ from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import Connection, create_engine, event
+from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.orm import Session
 
 from slrig.errors import StorageError
 
-_WRITING = "slrig_writing"
+PATIENCE_S = 10.0
+"""How long a change waits for another program that has the file locked, as some backups do. A person who asked waits as
+long."""
+
+_PATIENCE = "slrig_patience_ms"
 
 
 class Database:
@@ -38,13 +42,15 @@ class Database:
         self._engine = create_engine(f"sqlite:///{path}")
         event.listen(self._engine, "connect", _set_up)
         event.listen(self._engine, "begin", _begin)
-        self._writer = self._engine.execution_options(**{_WRITING: True})
-        with self._refusals(), self._writer.begin() as connection:
+        with self._refusals(), self._writer(PATIENCE_S).begin() as connection:
             upgrade(connection)
 
     def close(self) -> None:
         """Let the file go. Idempotent."""
         self._engine.dispose()
+
+    def _writer(self, patience_s: float) -> Engine:
+        return self._engine.execution_options(**{_PATIENCE: int(1000 * patience_s)})
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -53,10 +59,14 @@ class Database:
             yield session
 
     @contextmanager
-    def changing(self) -> Iterator[Session]:
-        """A session whose changes are kept, all of them, when the block ends without an error."""
+    def changing(self, *, patience_s: float | None = None) -> Iterator[Session]:
+        """A session whose changes are kept, all of them, when the block ends without an error.
+
+        patience_s : how long to wait for another program that has the file locked; None stands for `PATIENCE_S`.
+        """
+        writer = self._writer(PATIENCE_S if patience_s is None else patience_s)
         # SQLite has one writer; a lock here keeps a second thread from ever seeing "database is locked".
-        with self._refusals(), self._writing, Session(self._writer, expire_on_commit=False) as session, session.begin():
+        with self._refusals(), self._writing, Session(writer, expire_on_commit=False) as session, session.begin():
             yield session
 
     @contextmanager
@@ -67,10 +77,13 @@ class Database:
             if not isinstance(error, OperationalError) and type(error) is not DatabaseError:
                 # A broken constraint or statement is a defect of ours, not the disk's.
                 raise
-            message = (
-                f"The service's records {self.path} could not be used: {error.orig}. "
-                "Check that its disk has free space and can be written."
-            )
+            remedy = "Check that its disk has free space and can be written."
+            if "locked" in str(error.orig):
+                remedy = (
+                    "Another program, perhaps a backup, keeps them locked: end it, or have it copy them with SQLite's "
+                    "own backup, which locks nothing."
+                )
+            message = f"The service's records {self.path} could not be used: {error.orig}. {remedy}"
             raise StorageError(message) from error
 
 
@@ -78,14 +91,16 @@ def _set_up(connection: DBAPIConnection, _record: object) -> None:
     # The driver begins no transactions of its own: `_begin` does.
     connection.isolation_level = None
     cursor = connection.cursor()
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", "busy_timeout=5000"):
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={int(1000 * PATIENCE_S)}"):
         cursor.execute(f"PRAGMA {pragma}")
     cursor.close()
 
 
 def _begin(connection: Connection) -> None:
-    writing = connection.get_execution_options().get(_WRITING, False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
+    patience_ms = connection.get_execution_options().get(_PATIENCE)
+    if patience_ms is not None:
+        connection.exec_driver_sql(f"PRAGMA busy_timeout={patience_ms}")
+    connection.exec_driver_sql("BEGIN" if patience_ms is None else "BEGIN IMMEDIATE")
 
 
 def run_migrations(connection: Connection, package: str) -> None:

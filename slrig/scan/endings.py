@@ -10,9 +10,13 @@ from uuid import UUID
 
 import structlog
 
+from slrig.errors import StorageError
 from slrig.scan.faults import ScanFault
 from slrig.scan.records import ScanState
 from slrig.scan.store import ScanStore
+
+RETRY_S = 2.0
+"""How long after a refusal the records are tried again: soon enough for whoever waits for the end of a scan."""
 
 _log = structlog.get_logger(__name__)
 
@@ -34,6 +38,8 @@ class Endings:
         self._store = store
         self._lock = threading.Lock()
         self._unrecorded: list[Ending] = []
+        self._again: threading.Timer | None = None
+        self._closed = False
 
     def __contains__(self, scan_id: object) -> bool:
         with self._lock:
@@ -44,17 +50,43 @@ class Endings:
         with self._lock:
             self._unrecorded.append(ending)
 
+    def close(self) -> None:
+        """Try once more, and never again. Whatever is not on record then is found at the next start."""
+        with self._lock:
+            self._closed = True
+            if self._again is not None:
+                self._again.cancel()
+        self.settle()
+
     def settle(self) -> None:
-        """Record what is kept. What the disk refuses stays for the next time."""
+        """Record what is kept. What the disk refuses is tried again after a while."""
         with self._lock:
             endings = list(self._unrecorded)
         for ending in endings:
             try:
                 made = self._store.finish(ending.id, ending.state, fault=ending.fault, summary=ending.summary)
-            except Exception:  # noqa: BLE001 - whatever refuses the record, the ending is not lost
-                _log.exception("the end of a scan could not be recorded", scan=str(ending.id), state=str(ending.state))
+            except Exception as error:  # noqa: BLE001 - whatever refuses the record, the ending is not lost
+                _log.error(
+                    "the end of a scan could not be recorded",
+                    scan=str(ending.id), state=str(ending.state), exc_info=not isinstance(error, StorageError),
+                    cause=str(error),
+                )  # fmt: skip
+                self._try_again()
                 continue
             with self._lock:
                 self._unrecorded = [each for each in self._unrecorded if each is not ending]
             if made:
                 _log.info("scan finished", scan=str(ending.id), state=str(ending.state))
+
+    def _try_again(self) -> None:
+        with self._lock:
+            if self._again is None and not self._closed:
+                self._again = threading.Timer(RETRY_S, self._retry)
+                self._again.daemon = True
+                self._again.start()
+
+    def _retry(self) -> None:
+        with self._lock:
+            self._again = None
+        if not self._closed:
+            self.settle()

@@ -13,11 +13,18 @@ from slrig.errors import IdempotencyError, SlrigError, StorageError
 UNEXPECTED = "UnexpectedError"
 """The kind of a fault that is a defect of slrig: its message is for people, its cause is in the service's log."""
 
+_OPENCV_NO_MEMORY = -4
+"""`cv::Error::StsNoMem`, the code of a `cv2.error`."""
+
 _DISK_REFUSALS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EFBIG}
 
 
 class WorkerLostError(SlrigError):
-    """The reconstruction process ended in the middle of its work: killed, or out of memory."""
+    """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
+
+
+class OutOfMemoryError(SlrigError):
+    """A computation asked for more memory than the machine gives."""
 
 
 class ScanInterruptedError(SlrigError):
@@ -59,6 +66,9 @@ def fault_of(error: BaseException) -> ScanFault:
     """
     if isinstance(error, SlrigError):
         return ScanFault(type(error).__name__, str(error))
+    if isinstance(error, MemoryError) or getattr(error, "code", None) == _OPENCV_NO_MEMORY:
+        message = f"The machine has too little memory for this: {error}. Free some, or use a camera of fewer pixels."
+        return ScanFault(OutOfMemoryError.__name__, message)
     if isinstance(error, OSError) and error.errno in _DISK_REFUSALS:
         return ScanFault(StorageError.__name__, disk_refusal(error, None))
     message = (

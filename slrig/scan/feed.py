@@ -164,12 +164,9 @@ def _bytes(message: Begin | Take | End) -> int:
 
 
 class FedFrames:
-    """The other end: the frames of the capture under way, as far as they have come.
+    """The other end: the frames of the capture under way, as far as they have come. begin : makes what takes them."""
 
-    begin : makes what takes them; None where nothing does.
-    """
-
-    def __init__(self, begin: Callable[..., Any] | None) -> None:
+    def __init__(self, begin: Callable[..., Any]) -> None:
         self._begin = begin
         self._live: Any = None
 
@@ -177,7 +174,7 @@ class FedFrames:
         """Take a message of a feed. Frames that cannot be used are forgotten: reading the bundle will tell why."""
         try:
             match message:
-                case Begin(outline, calibration) if self._begin is not None:
+                case Begin(outline, calibration):
                     self._live = self._begin(outline, calibration)
                 case Take(shot) if self._live is not None:
                     self._live.take(shot)

@@ -27,6 +27,9 @@ from slrig.scan.faults import disk_errors
 
 _HOLDER = "holder"
 
+_PROMISED = ("mesh.ply", "report.json")
+"""What every scan has that succeeded."""
+
 
 def free_bytes(folder: Path) -> int:
     """Bytes that may still be written below `folder`."""
@@ -160,6 +163,11 @@ class DataFolder:
         if self.scan(scan_id).is_dir():
             with disk_errors(self.scans):
                 self.scan(scan_id).rename(self.staging(scan_id))
+
+
+def missing_files(scan: Path) -> list[str]:
+    """What a scan that succeeded must have, and is not in its folder."""
+    return [name for name in _PROMISED if not (scan / name).is_file()]
 
 
 def sync_tree(folder: Path) -> None:

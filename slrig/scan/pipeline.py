@@ -27,6 +27,7 @@ from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import write_mesh, write_points, write_report
 from slrig.scan.calibration_report import calibration_report
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.feed import FedFrames
 from slrig.scan.measured import Walked, measured
 from slrig.scan.offered import rejected_picture
 from slrig.scan.output import REPORT, staged_folder
@@ -137,6 +138,11 @@ def reconstruct_bundle(
         write_report(report, staging / REPORT)
     progress("done", 1.0, f"{len(mesh.faces)} triangles")
     return report
+
+
+def frame_receiver() -> FedFrames:
+    """What takes the frames of a capture while they come: see `slrig.scan.worker_process.serve`."""
+    return FedFrames(LiveScan)
 
 
 def warm_kernels(told: Callable[[Prepared], None]) -> None:

@@ -21,7 +21,7 @@ from slrig.scan.records import ScanRecord, ScanState, utc_now
 from slrig.scan.store import ScanStore
 from slrig.scan.walking import ScanTools, ScanWalk
 from slrig.scan.work import CaptureBundle, Holder, Loan, RunnerStatus, WatchesHealth
-from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker import Worker
 
 _log = structlog.get_logger(__name__)
 
@@ -37,7 +37,7 @@ class Runner:
         store: ScanStore,
         folder: DataFolder,
         rig: HeldRig,
-        worker: ReconstructionWorker,
+        worker: Worker,
         *,
         capture: CaptureBundle,
         queue_length: int = 8,
@@ -230,4 +230,4 @@ class Runner:
                 # The owner thread may be waiting for a reconstruction.
                 self._worker.close()
                 self._lender.join(timeout_s)
-                self._endings.settle()
+                self._endings.close()

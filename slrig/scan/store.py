@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
+import structlog
 from sqlalchemy import delete, select, text
 from sqlalchemy.orm import Session
 
-from slrig.errors import ScanNotFoundError
+from slrig.errors import ScanNotFoundError, StorageError
 from slrig.scan.database import Database
 from slrig.scan.faults import KeyInFlightError, ScanFault
 from slrig.scan.migrations import upgrade
@@ -33,10 +34,13 @@ from slrig.scan.records import (
 )
 from slrig.scan.tables import EventRow, KeyRow, ScanRow
 
+_log = structlog.get_logger(__name__)
+
 KEY_LIFE_S = 24 * 3600.0
 """How long an idempotency key is remembered unless told otherwise."""
 
 _LEAST_STEP = 0.01
+_PROGRESS_PATIENCE_S = 0.2  # the work waits meanwhile
 _DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
 
 
@@ -120,8 +124,8 @@ class ScanStore:
         return datetime.fromisoformat(now)
 
     def progress(self, scan_id: UUID, progress: ScanProgress) -> None:
-        """Record how far a running scan is."""
-        with self._database.changing() as session:
+        """Record how far a running scan is. Where that cannot be had at once it is refused: the next will be told."""
+        with self._database.changing(patience_s=_PROGRESS_PATIENCE_S) as session:
             row = _find(session, scan_id)
             row.stage, row.fraction, row.detail = progress.stage, progress.fraction, progress.detail
             _append(session, row, "progress", {**progress.as_json(), "state": row.state})
@@ -267,13 +271,16 @@ class ProgressRecorder:
         self._start, self._end = start, end
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """Take note, as `slrig.scan.plan.Progress` asks."""
+        """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
         goes_on = detail != self._told.detail and self._now_s() - self._told_s >= _DETAIL_S
         if goes_on or stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
             self._told = ScanProgress(stage, overall, detail.replace(self._hidden, ""))
             self._told_s = self._now_s()
-            self._store.progress(self._scan_id, self._told)
+            try:
+                self._store.progress(self._scan_id, self._told)
+            except StorageError as error:
+                _log.warning("how far a scan is could not be recorded", scan=str(self._scan_id), cause=str(error))
 
 
 def _find(session: Session, scan_id: UUID) -> ScanRow:

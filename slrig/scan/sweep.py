@@ -10,7 +10,7 @@ from uuid import UUID
 
 from slrig.errors import StorageError
 from slrig.scan.faults import fault_of, interruption
-from slrig.scan.folder import DataFolder
+from slrig.scan.folder import DataFolder, missing_files
 from slrig.scan.records import ScanState, report_summary
 from slrig.scan.store import ScanStore
 
@@ -28,18 +28,19 @@ class Swept:
 def sweep(store: ScanStore, folder: DataFolder) -> Swept:
     """Settle every scan that the last run left open. Only for the process that holds the folder, before it scans.
 
-    - A running scan whose folder is in place had only its record missing: succeeded.
+    - A running scan whose mesh and report are in place had only its record missing: succeeded.
     - Any other running scan is interrupted; its bundle is kept if the capture was complete.
     - A finished scan whose folder is back in staging was being deleted: the deletion is completed.
-    - A succeeded scan without files is recorded as failed.
+    - A succeeded scan without mesh or report is recorded as failed.
     - Files without a record are put aside in `.orphans`, not deleted.
     """
     store.release_keys()
     interrupted, recovered, lost = [], [], []
     for record in store.unfinished():
-        report = folder.scan(record.id) / "report.json"
-        if report.is_file():
-            store.finish(record.id, ScanState.SUCCEEDED, summary=report_summary(json.loads(report.read_bytes())))
+        placed = folder.scan(record.id)
+        if not missing_files(placed):
+            report = json.loads((placed / "report.json").read_bytes())
+            store.finish(record.id, ScanState.SUCCEEDED, summary=report_summary(report))
             recovered.append(record.id)
             continue
         # Reconstruction starts only after the bundle was made durable, so this bundle is whole.
@@ -48,11 +49,11 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
         store.finish(record.id, ScanState.INTERRUPTED, fault=fault_of(interruption()))
         interrupted.append(record.id)
     for scan_id, state in store.states().items():
-        if state is ScanState.SUCCEEDED and not folder.scan(scan_id).is_dir():
+        if state is ScanState.SUCCEEDED and (missing := missing_files(folder.scan(scan_id))):
             if folder.staging(scan_id).is_dir():
                 store.delete(scan_id)
                 continue
-            message = f"The files of this scan are gone from {folder.scan(scan_id)}. Scan again."
+            message = f"{' and '.join(missing)} of this scan is gone from {folder.scan(scan_id)}. Scan again."
             store.lose_files(scan_id, fault_of(StorageError(message)))
             lost.append(scan_id)
     for leftover in folder.incoming.iterdir():

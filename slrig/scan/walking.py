@@ -5,21 +5,23 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import structlog
 
 from slrig.bundle.health import write_health
-from slrig.errors import ScanCancelledError, SlrigError
+from slrig.errors import ScanCancelledError, SlrigError, StorageError
+from slrig.scan.channel import Call
 from slrig.scan.endings import Ending, Endings
 from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
-from slrig.scan.folder import DataFolder, sync_tree
+from slrig.scan.folder import DataFolder, missing_files, sync_tree
 from slrig.scan.holding import HeldRig, check_plan, driver_errors
+from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.records import ScanRecord, ScanState, report_summary
 from slrig.scan.store import ProgressRecorder, ScanStore
 from slrig.scan.work import CaptureBundle, Holder, WatchesHealth
-from slrig.scan.worker import ReconstructionWorker
-from slrig.scan.worker_process import Job
+from slrig.scan.worker import Worker
 
 CAPTURE_SHARE = 0.5
 """The part of a scan's progress that is capture."""
@@ -37,7 +39,7 @@ class ScanTools:
 
     store: ScanStore
     folder: DataFolder
-    worker: ReconstructionWorker
+    worker: Worker
     capture: CaptureBundle
     endings: Endings
     spare_bytes: int
@@ -138,14 +140,22 @@ class ScanWalk:
             feed.abandon()
             message = "The scan was cancelled."
             raise ScanCancelledError(message)
-        tools.store.advance(self.id, ScanState.RECONSTRUCTING)
+        self._reconstructing()
         progress.span(CAPTURE_SHARE, 1.0)
-        job = Job(bundle, staged / "result", self._plan.reconstruction)
-        report = tools.worker.run(job, progress=progress, cancelled=self.stop.is_set, feed=feed)
+        call = reconstruction(tools.worker.module, bundle, staged / "result", self._plan.reconstruction)
+        report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=self.stop.is_set, feed=feed)
+        _require_promised(staged / "result")
         tools.folder.commit(self.id)
         if health is not None:
             _noted(health, report)
         return report_summary(report)
+
+    def _reconstructing(self) -> None:
+        """Record that the bundle is whole. That record is for whoever looks on; the scan goes on without."""
+        try:
+            self._tools.store.advance(self.id, ScanState.RECONSTRUCTING)
+        except StorageError as error:
+            _log.warning("that a scan is reconstructed could not be recorded", scan=str(self.id), cause=str(error))
 
     def _keep_evidence(self, state: ScanState) -> None:
         """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
@@ -157,6 +167,27 @@ class ScanWalk:
             # The scan's own fault is the one to tell; without its bundle it is told all the same.
             _log.exception("the bundle of a failed scan could not be kept", scan=str(self.id))
         folder.discard(self.id)
+
+
+def reconstruction(pipeline: str, bundle: Path, output: Path, plan: ReconstructionPlan) -> Call:
+    """The worker's task of reconstructing a bundle. pipeline : `Worker.module`."""
+    return Call(
+        f"{pipeline}:reconstruct_bundle",
+        (bundle, output),
+        {"plan": plan},
+        what="reconstruction",
+        remedy="The bundle is kept: download bundle.zip and run `slrig reconstruct` on it, or scan again.",
+    )
+
+
+def _require_promised(result: Path) -> None:
+    """Raise StorageError unless the files are there without which no scan has succeeded."""
+    missing = missing_files(result)
+    if missing:
+        message = (
+            f"The reconstruction ended, and {' and '.join(missing)} is not on the disk. Check the disk; scan again."
+        )
+        raise StorageError(message)
 
 
 def _noted(health: WatchesHealth, report: Mapping[str, Any]) -> None:

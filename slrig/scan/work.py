@@ -162,7 +162,7 @@ class RunnerStatus:
 
     `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` is
     `Holder.name`. `opening` is what the rig's driver told last, while it is opened. `reconstruction` is
-    `ReconstructionWorker.condition`, `preparing` whether that is on its way to ready.
+    `Worker.condition`, `preparing` whether that is on its way to ready.
     """
 
     rig: str

@@ -1,4 +1,4 @@
-"""Reconstruction in a process of its own, so that it shares no interpreter lock with capture and HTTP.
+"""The mathematics in a process of its own: it shares no interpreter lock with capture and HTTP, and may end alone.
 
 One process and one pipe rather than a process pool: a pool can report no progress, cannot stop a running task, and
 joins it at exit. Here a lost process is seen at once, and the next job starts a fresh one.
@@ -6,96 +6,111 @@ joins it at exit. Here a lost process is seen at once, and the next job starts a
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
-import signal
 import threading
 import time
-from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection, wait
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from ctypes import c_double
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import RawValue
 from pathlib import Path
 from typing import Any
 
 import structlog
 
 from slrig.errors import ScanCancelledError
-from slrig.scan.faults import WorkerLostError, error_classes
-from slrig.scan.feed import FrameFeed
-from slrig.scan.worker_process import (
-    Done,
+from slrig.scan.channel import (
+    Call,
     Failed,
-    Job,
+    Fed,
     Preparing,
-    Progressed,
     Ready,
     Run,
-    Stop,
     Unloadable,
     received,
     sent,
-    serve,
 )
+from slrig.scan.faults import WorkerLostError, error_classes, interruption
+from slrig.scan.feed import FrameFeed
+from slrig.scan.worker_process import serve
+from slrig.scan.worker_wait import POLL_S, PREPARING, JobWait, Told
 
-RECONSTRUCT = "slrig.scan.pipeline:reconstruct_bundle"
-"""What the process runs, named rather than passed: the service itself need not load numba for it."""
+PIPELINE = "slrig.scan.pipeline"
+"""What the process prepares for: the reconstruction of scans, whose kernels are compiled once on each machine."""
 
-CANCEL_LIMIT_S = 10.0
-"""A job that has not stopped this long after it was asked to is stopped by ending its process."""
+SILENCE_TOLD_S = 5.0
+"""From when on `condition` tells that the process shows no sign of life."""
 
 LOADING = "loading"
 READY = "ok"
 
-PREPARING = "preparing kernels"
-"""The stage of compiling what numba has not compiled on this machine before."""
-
-_POLL_S = 0.1
-
-_Told = Callable[[str, float, str], None]
+WAITING = "waiting for the worker"
+"""The stage of a job while another one is computed."""
 
 _log = structlog.get_logger(__name__)
 
 
 class UnexpectedWorkerError(Exception):
-    """A defect in the reconstruction. Carries the traceback of the other process as its text."""
+    """A defect in a task. Carries the traceback of the other process as its text."""
 
 
-class ReconstructionWorker:
-    """Runs one reconstruction at a time in a child process. `run` belongs to one thread; `close` to any."""
+def _silent(_stage: str, _fraction: float, _detail: str) -> None:
+    pass
 
-    def __init__(self, task: str = RECONSTRUCT) -> None:
-        self._task = task
+
+def _never() -> bool:
+    return False
+
+
+class Worker:
+    """Runs one task at a time in a child process, in the order in which they come. Any thread may call."""
+
+    def __init__(self, module: str = PIPELINE) -> None:
+        """`module` : see `slrig.scan.worker_process.serve`."""
+        self.module = module
         self._spawning = multiprocessing.get_context("spawn")
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
+        self._stops: Connection | None = None
+        self._heartbeat: c_double = RawValue(c_double, 0.0)
         self._guard = threading.Lock()
         self._sending = threading.Lock()
-        self._fed: tuple[FrameFeed, Connection | None] | None = None
+        self._turns: deque[int] = deque()
+        self._turn = threading.Condition()
+        self._numbers = itertools.count(1)
+        self._fed: tuple[FrameFeed, Connection | None, int] | None = None
         self._closed = False
         self._running = False
         self._condition, self._loading = LOADING, True
 
     @property
     def condition(self) -> str:
-        """`READY` once the process has loaded its task, `LOADING` or how far that is, or why it cannot; never waits."""
+        """`READY` once the process has loaded its kernels, `LOADING` or how far that is, or why it cannot compute."""
         with self._guard:
             # While a job is under way `run` reads the pipe, and an answer read here would be lost.
             while self._loading and not self._running and self._pipe is not None and self._pipe.poll():
                 self._note(received(self._pipe))
+            silence_s = self._silence_s()
+            if self._condition == READY and silence_s > SILENCE_TOLD_S:
+                return (
+                    f"the worker shows no sign of life for {silence_s:.0f} s; a job that waits for it has it replaced"
+                )
             return self._condition
+
+    def _silence_s(self) -> float:
+        if self._process is None or not self._process.is_alive():
+            return 0.0
+        return time.monotonic() - self._heartbeat.value
 
     @property
     def loading(self) -> bool:
         """Whether the process is not ready yet, and there is hope, as `condition` found it last."""
         return self._loading
-
-    def _hear(self, told: object | None, progress: _Told) -> None:
-        """Take note of what is no answer, and pass on how far the kernels are."""
-        if told is None or isinstance(told, (Preparing, Ready, Unloadable)):
-            with self._guard:
-                self._note(told)
-        if isinstance(told, Preparing):
-            progress(PREPARING, 0.0, str(told))
 
     def _note(self, told: object | None) -> None:
         """Take what a process says before its first answer; None stands for its death."""
@@ -117,143 +132,139 @@ class ReconstructionWorker:
         """The process id of the child, None when there is none."""
         return None if self._process is None else self._process.pid
 
+    @property
+    def jobs(self) -> int:
+        """How many jobs are under way or wait."""
+        with self._turn:
+            return len(self._turns)
+
     def start(self) -> None:
-        """Start the process unless one lives. Returns at once; the process loads its task by itself."""
+        """Start the process unless one lives. Returns at once; the process loads its kernels by itself."""
         with self._guard:
             if self._closed or (self._process is not None and self._process.is_alive()):
                 return
-            if self._pipe is not None:
+            if self._pipe is not None and self._stops is not None:
                 # A feed may still be in the middle of a message to the process that ended.
                 with self._sending:
                     self._pipe.close()
+                    self._stops.close()
             self._condition, self._loading = LOADING, True
             self._pipe, far_end = self._spawning.Pipe()
+            stops, self._stops = self._spawning.Pipe(duplex=False)
+            self._heartbeat = RawValue(c_double, time.monotonic())
             self._process = self._spawning.Process(
-                target=serve, args=(far_end, self._task), name="slrig-reconstruction", daemon=True
+                target=serve, args=(far_end, stops, self._heartbeat, self.module), name="slrig-worker", daemon=True
             )
             self._process.start()
-            # The child holds the only other end now, so its death reads as end of file here.
+            # The child holds the only other ends now, so its death reads as end of file here.
             far_end.close()
+            stops.close()
 
     def feed(self) -> FrameFeed:
         """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards."""
         self.start()
+        number = next(self._numbers)
         with self._guard:
             pipe = self._pipe
 
         def send(message: object) -> bool:
             # A feed that was abandoned in the middle of a message finishes it before anyone sends the next.
             with self._sending:
-                return pipe is not None and sent(pipe, message)
+                return pipe is not None and sent(pipe, Fed(number, message))
 
-        self._fed = FrameFeed(send), pipe
+        self._fed = FrameFeed(send), pipe, number
         return self._fed[0]
 
     def run(
         self,
-        job: Job,
+        call: Call,
         *,
-        progress: _Told,
-        cancelled: Callable[[], bool],
+        progress: Told = _silent,
+        cancelled: Callable[[], bool] = _never,
         feed: FrameFeed | None = None,
-    ) -> Mapping[str, Any]:
-        """Reconstruct, and return the report. Frames that `feed` has sent, all of them, are not read again.
+    ) -> Any:
+        """Do a task when it is its turn, and return its result. Frames that `feed` has sent, all of them, are used.
+
+        Whatever but an answer ends the wait, the process is replaced: what it still computes belongs to nobody.
 
         Raises
         ------
         SlrigError
-            Whatever the reconstruction raised, by class and message.
+            Whatever the task raised, by class and message.
         ScanCancelledError
             `cancelled` turned true.
+        ScanInterruptedError
+            The worker was closed.
         WorkerLostError
-            The process ended.
+            The process ended, showed no sign of life, or told no progress for too long.
         UnexpectedWorkerError
-            The reconstruction has a defect.
+            The task has a defect.
         """
-        self.start()
-        with self._guard:
-            process, pipe = self._process, self._pipe
-            self._running = True
-        if process is None or pipe is None:
-            message = "The service is ending and reconstructs no more."
-            raise ScanCancelledError(message)
-        try:
+        with self._its_turn(call, progress, cancelled):
+            self.start()
+            with self._guard:
+                process, pipe, stops = self._process, self._pipe, self._stops
+                self._running = True
+            if process is None or pipe is None or stops is None:
+                raise interruption()
+            number, fed = next(self._numbers), False
             # A process that was started since the capture has not seen its frames.
-            fed = (
-                feed is not None
-                and self._fed == (feed, pipe)
-                and self._settled(feed, process, pipe, progress, cancelled)
-            )
-            return self._answered(process, pipe, Run(job, fed), progress, cancelled)
-        finally:
-            with self._guard:
-                self._running = False
-
-    def _settled(
-        self, feed: FrameFeed, process: BaseProcess, pipe: Connection, progress: _Told, cancelled: Callable[[], bool]
-    ) -> bool:
-        """Wait until the frames of a capture have been sent, or cannot be; return whether all were."""
-        stop_after: float | None = None
-        while not feed.settled(_POLL_S):
-            # A process that still prepares its kernels takes no frames, and tells how far it is.
-            while pipe.poll() and (told := received(pipe)) is not None:
-                self._hear(told, progress)
-            if cancelled():
-                if stop_after is None:
-                    stop_after = time.monotonic() + CANCEL_LIMIT_S
-                    feed.abandon()
-                elif time.monotonic() > stop_after:
-                    self._end(process)
-                    message = "The reconstruction was cancelled."
-                    raise ScanCancelledError(message)
-        return feed.whole
-
-    def _end(self, process: BaseProcess) -> None:
-        _log.warning("reconstruction did not stop when asked, ending its process", pid=process.pid)
-        process.kill()
-        process.join()
-
-    def _answered(
-        self,
-        process: BaseProcess,
-        pipe: Connection,
-        run: Run,
-        progress: _Told,
-        cancelled: Callable[[], bool],
-    ) -> Mapping[str, Any]:
-        with self._sending:
-            begun = sent(pipe, run)
-        if not begun:
-            # What it last said may lie in the pipe still: why it could not be loaded.
-            with self._guard:
-                self._note(received(pipe))
-            raise self._lost(process)
-        stop_after: float | None = None
-        while True:
-            if process.sentinel in wait([pipe, process.sentinel], timeout=_POLL_S) and not pipe.poll():
+            if feed is not None and self._fed is not None and self._fed[:2] == (feed, pipe):
+                number, fed = self._fed[2], True
+            job = JobWait(call, number, process, pipe, stops, self._heartbeat, progress, cancelled, self._noted)
+            try:
+                if fed and feed is not None:
+                    fed = job.settled(feed)
+                with self._sending:
+                    begun = sent(pipe, Run(number, call, fed))
+                if not begun:
+                    # What it last said may lie in the pipe still: why it could not be loaded.
+                    self._noted(received(pipe))
+                    raise job.lost()
+                answer = job.answer()
+            except WorkerLostError as error:
+                if self._closed:
+                    raise interruption() from error
+                if not self._loading and self._condition != READY:
+                    message = f"The {call.what} did not begin: {self._condition}. {call.remedy}"
+                    raise WorkerLostError(message) from error
+                raise
+            finally:
                 with self._guard:
-                    self._note(None)
-                raise self._lost(process)
-            while pipe.poll():
-                message_in = received(pipe)
-                self._hear(message_in, progress)
-                if message_in is None or isinstance(message_in, Unloadable):
-                    raise self._lost(process)
-                if isinstance(message_in, Progressed):
-                    progress(message_in.stage, message_in.fraction, message_in.detail)
-                elif isinstance(message_in, Done):
-                    return message_in.report
-                elif isinstance(message_in, Failed):
-                    raise _error(message_in)
-            if cancelled():
-                if stop_after is None:
-                    stop_after = time.monotonic() + CANCEL_LIMIT_S
-                    with self._sending:
-                        sent(pipe, Stop())
-                elif time.monotonic() > stop_after:
-                    self._end(process)
-                    message = "The reconstruction was cancelled."
+                    self._running = False
+                if not job.answered:
+                    process.kill()
+                    process.join()
+            if isinstance(answer, Failed):
+                raise _error(answer)
+            return answer.result
+
+    def _noted(self, told: object | None) -> None:
+        with self._guard:
+            self._note(told)
+
+    @contextmanager
+    def _its_turn(self, call: Call, progress: Told, cancelled: Callable[[], bool]) -> Iterator[None]:
+        """Wait until the jobs that came before are over."""
+        turn, told = next(self._numbers), False
+        with self._turn:
+            self._turns.append(turn)
+        try:
+            while True:
+                with self._turn:
+                    if self._turn.wait_for(lambda: self._turns[0] == turn, timeout=POLL_S):
+                        break
+                if not told:
+                    progress(WAITING, 0.0, "another job is computed first")
+                    told = True
+                if cancelled():
+                    message = f"The {call.what} was cancelled."
                     raise ScanCancelledError(message)
+            yield
+        finally:
+            with self._turn:
+                self._turns.remove(turn)
+                self._turn.notify_all()
 
     def close(self) -> None:
         """End the process, whatever it does. Idempotent."""
@@ -263,20 +274,6 @@ class ReconstructionWorker:
         if process is not None:
             process.kill()
             process.join()
-
-    def _lost(self, process: BaseProcess) -> WorkerLostError:
-        process.join()
-        if not self._loading and self._condition != READY:
-            message = f"No mesh was made: {self._condition}. The bundle is kept: scan again once that is put right."
-            return WorkerLostError(message)
-        code = process.exitcode
-        how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
-        message = (
-            f"The reconstruction process ended in the middle of its work ({how}). If the machine ran out of memory, "
-            "free some or use a camera of fewer pixels. The bundle is kept: download bundle.zip and run "
-            "`slrig reconstruct` on it, or scan again; a fresh process has been started."
-        )
-        return WorkerLostError(message)
 
 
 def prepare_kernel_cache(folder: Path) -> None:

@@ -1,156 +1,117 @@
-"""The reconstruction's own process: what it does, and the messages between it and the service."""
+"""The worker's own process: prepares its kernels once, and then does one job after another."""
 
 from __future__ import annotations
 
 import importlib
+import inspect
 import signal
+import threading
+import time
 import traceback
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from ctypes import c_double
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from slrig.scan.faults import ScanFault, fault_of
-from slrig.scan.feed import FedFrames
-from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.channel import (
+    Call,
+    Done,
+    Failed,
+    Fed,
+    Preparing,
+    Progressed,
+    Ready,
+    Run,
+    Unloadable,
+    received,
+    sent,
+)
+from slrig.scan.faults import fault_of
+
+HEARTBEAT_S = 0.5
+"""How often the process says that it runs: often enough that a person who asks `/readyz` sees a stop within seconds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One reconstruction: the arguments of `slrig.scan.pipeline.reconstruct_bundle`."""
+def serve(pipe: Connection, stops: Connection, heartbeat: c_double, module: str) -> None:
+    """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
 
-    bundle: Path
-    output: Path
-    plan: ReconstructionPlan
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """Parent to child: do this job, with the frames that were sent before if `fed`."""
-
-    job: Job
-    fed: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """Parent to child: the job under way is not wanted any more."""
-
-
-@dataclass(frozen=True, slots=True)
-class Preparing:
-    """Child to parent: a kernel is being compiled, after `done` of `total`."""
-
-    done: int
-    total: int
-
-    def __str__(self) -> str:
-        return f"first time only: {self.done} of {self.total}"
-
-
-@dataclass(frozen=True, slots=True)
-class Ready:
-    """Child to parent: the task is loaded."""
-
-
-@dataclass(frozen=True, slots=True)
-class Unloadable:
-    """Child to parent: the task cannot be loaded, and the process ends."""
-
-    cause: str
-
-
-@dataclass(frozen=True, slots=True)
-class Progressed:
-    """Child to parent: where the job under way is."""
-
-    stage: str
-    fraction: float
-    detail: str
-
-
-@dataclass(frozen=True, slots=True)
-class Done:
-    """Child to parent: the job ended well."""
-
-    report: Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """Child to parent: the job failed. trace : the traceback, for the log."""
-
-    fault: ScanFault
-    trace: str
-
-
-def sent(pipe: Connection, message: object) -> bool:
-    """Send a message; return whether somebody is there to receive it."""
-    try:
-        pipe.send(message)
-    except OSError:
-        return False
-    return True
-
-
-def received(pipe: Connection) -> object | None:
-    """Wait for the next message; None once the other end is gone."""
-    try:
-        message: object = pipe.recv()
-    except (EOFError, OSError):
-        return None
-    return message
-
-
-def serve(pipe: Connection, task: str) -> None:
-    """The child's life: load the task, then do jobs until the parent's end of the pipe is gone."""
+    stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
+    the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `frame_receiver()`,
+    what the frames of a capture are told to.
+    """
     # Ctrl-C reaches the whole foreground group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "SIGHUP"):  # not on Windows
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    module, _, name = task.partition(":")
+    _be_ended_first()
+    threading.Thread(target=_beat, args=(heartbeat,), name="slrig-heartbeat", daemon=True).start()
     try:
         loaded = importlib.import_module(module)
-        reconstruct, begin = getattr(loaded, name), loaded.LiveScan
+        frames = loaded.frame_receiver()
         loaded.warm_kernels(lambda prepared: sent(pipe, Preparing(prepared.done, prepared.total)))
     except Exception as error:
         sent(pipe, Unloadable(f"{type(error).__name__}: {error}"))
         # The traceback goes to the service's log.
         raise
     sent(pipe, Ready())
-    frames = FedFrames(begin)
+    capture = 0
     while (message := received(pipe)) is not None:
         if isinstance(message, Run):
-            live = frames.taken() if message.fed else None
+            live = frames.taken() if message.fed and message.number == capture else None
             frames.forget()
             try:
-                answer = _answer(pipe, reconstruct, message.job, live)
+                answer = _answer(pipe, stops, message, live)
             except (ConnectionError, EOFError):
                 return
             del live
             sent(pipe, answer)
-        else:
-            frames.hear(message)
+            del answer
+        elif isinstance(message, Fed) and message.number >= capture:
+            if message.number > capture:
+                capture = message.number
+                frames.forget()
+            frames.hear(message.message)
 
 
-def _answer(pipe: Connection, reconstruct: Callable[..., Mapping[str, Any]], job: Job, live: Any) -> Done | Failed:
+def _beat(heartbeat: c_double) -> None:
+    waiting = threading.Event()
+    while not waiting.wait(HEARTBEAT_S):
+        heartbeat.value = time.monotonic()
+
+
+def _be_ended_first() -> None:
+    """Have the kernel end this process rather than the service, which holds the rig, where memory runs out."""
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("500")
+
+
+def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | Failed:
     stopped = False
-    seen = {} if live is None else {"live": live}
 
     def progress(stage: str, fraction: float, detail: str) -> None:
-        pipe.send(Progressed(stage, fraction, detail))
+        pipe.send(Progressed(run.number, stage, fraction, detail))
 
     def cancelled() -> bool:
         nonlocal stopped
-        while pipe.poll():
-            stopped = isinstance(pipe.recv(), Stop) or stopped
+        while stops.poll():
+            stopped = stops.recv() == run.number or stopped
         return stopped
 
     try:
-        return Done(reconstruct(job.bundle, job.output, plan=job.plan, progress=progress, cancelled=cancelled, **seen))
+        given = {"progress": progress, "cancelled": cancelled}
+        if live is not None:
+            given["live"] = live
+        return Done(run.number, _called(run.call, given))
     except (ConnectionError, EOFError):
         # The parent is gone: nobody waits for an answer.
         raise
     except Exception as error:  # noqa: BLE001 - the traceback travels to the parent, which logs it
-        return Failed(fault_of(error), traceback.format_exc())
+        return Failed(run.number, fault_of(error), traceback.format_exc())
+
+
+def _called(call: Call, given: dict[str, Any]) -> Any:
+    module, _, name = call.function.partition(":")
+    function = getattr(importlib.import_module(module), name)
+    taken = inspect.signature(function).parameters
+    return function(*call.given, **call.options, **{name: each for name, each in given.items() if name in taken})

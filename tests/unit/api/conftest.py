@@ -18,7 +18,7 @@ from slrig.scan.folder import DataFolder
 from slrig.scan.holding import HeldRig
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker import Worker
 from tests.unit.scan.fakes import WAIT_S, TameBench
 from tests.unit.sessions.calibration.calibration_bench import TameCalibrating
 
@@ -36,7 +36,7 @@ class ServedBench(TameBench):
         )
         folder = DataFolder(root, free=lambda _: self.free_bytes)
         store = ScanStore(folder.database)
-        self.worker = ReconstructionWorker("tests.unit.scan.fake_pipeline:reconstruct_bundle")
+        self.worker = Worker("tests.unit.scan.fake_pipeline")
         rig = HeldRig("bench", self.open_rig)
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from slrig.api.scans import fingerprint
 from slrig.api.schemas import ScanRequest
-from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker import Worker
 from tests.unit.api.conftest import ServedBench, ended
 
 
@@ -45,7 +45,7 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     done = client.get(scan["links"]["self"]).json()
     assert done["state"] == "succeeded"
     assert done["error"] is None
-    assert done["summary"] == {"seconds": 1.5, "truth": {"rms_mm": 0.01}}
+    assert done["summary"] == {"bundle": done["id"], "seconds": 1.5, "truth": {"rms_mm": 0.01}}
     files = done["links"]["files"]
     assert set(files) == {
         "bundle.zip",
@@ -355,8 +355,8 @@ def test_service_is_not_ready_before_its_reconstruction_is(
     client: TestClient, monkeypatch: pytest.MonkeyPatch, condition: str, pending: list[str]
 ) -> None:
     ended(client, client.post("/scan").json()["id"])
-    monkeypatch.setattr(ReconstructionWorker, "condition", condition)
-    monkeypatch.setattr(ReconstructionWorker, "loading", bool(pending))
+    monkeypatch.setattr(Worker, "condition", condition)
+    monkeypatch.setattr(Worker, "loading", bool(pending))
     ready = client.get("/readyz")
     assert (ready.status_code, ready.json()["checks"]["reconstruction"]) == (503, condition)
     assert ready.json()["pending"] == pending

@@ -13,10 +13,10 @@ from slrig.scan.plan import ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import ReconstructionWorker
+from slrig.scan.worker import Worker
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
-TASK = "tests.unit.scan.fake_pipeline:reconstruct_bundle"
+PIPELINE = "tests.unit.scan.fake_pipeline"
 
 
 class Bench(TameBench):
@@ -28,7 +28,7 @@ class Bench(TameBench):
         self.given_up: list[InvalidInputError] = []
         self.folder = DataFolder(tmp_path / "data", free=lambda _: self.free_bytes)
         self.store = ScanStore(self.folder.database)
-        self.worker = ReconstructionWorker(TASK)
+        self.worker = Worker(PIPELINE)
         self.runner = Runner(
             self.store,
             self.folder,

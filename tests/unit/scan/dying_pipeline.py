@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import signal
 
-from tests.unit.scan.fake_pipeline import LiveScan, reconstruct_bundle
+from tests.unit.scan.fake_pipeline import frame_receiver
 
-__all__ = ["LiveScan", "reconstruct_bundle", "warm_kernels"]
+__all__ = ["frame_receiver", "warm_kernels"]
 
 
 def warm_kernels(_told: object) -> None:

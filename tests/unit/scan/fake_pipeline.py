@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import threading
 from collections.abc import Callable, Mapping
@@ -15,6 +16,7 @@ from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.model import Calibration, Mesh, Shot
 from slrig.scan.artefacts import write_mesh
+from slrig.scan.feed import FedFrames
 from slrig.scan.outline import Outline
 from slrig.scan.plan import ReconstructionPlan
 
@@ -55,8 +57,35 @@ class LiveScan:
         self.ended = True
 
 
+def frame_receiver() -> FedFrames:
+    """What takes frames."""
+    return FedFrames(LiveScan)
+
+
 def warm_kernels(_told: object) -> None:
     """Nothing is compiled here."""
+
+
+def process_id() -> int:
+    """The process that a task runs in."""
+    return os.getpid()
+
+
+def wait_for(gate: Path) -> str:
+    """Wait, without progress, until a file is there."""
+    while not gate.exists():
+        threading.Event().wait(0.01)
+    return gate.name
+
+
+def exhaust() -> None:
+    """Ask for more memory than this process may have."""
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (2**33, most))
+    try:
+        np.ones(2**33)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
 def reconstruct_bundle(
@@ -91,7 +120,12 @@ def reconstruct_bundle(
         (partial / name).write_bytes(f"{name} of {plan}".encode())
     # A real one, because other formats are made of it.
     write_mesh(TRIANGLE, partial)
-    report: dict[str, object] = {"seconds": 1.5, "stages": [1, 2], "truth": {"rms_mm": 0.01}}
+    report: dict[str, object] = {
+        "bundle": bundle.parent.name,
+        "seconds": 1.5,
+        "stages": [1, 2],
+        "truth": {"rms_mm": 0.01},
+    }
     if live is not None:
         report["live"] = [live.taken, live.listed, live.ended]
     (partial / "report.json").write_text(json.dumps(report))

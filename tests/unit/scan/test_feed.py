@@ -14,13 +14,13 @@ import pytest
 
 from slrig.errors import ScanCancelledError
 from slrig.model import Shot
-from slrig.scan import worker as worker_module
+from slrig.scan import worker_wait
 from slrig.scan.feed import Abandon, Begin, End, FrameFeed, Take
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.records import ScanState
-from slrig.scan.worker import ReconstructionWorker
-from slrig.scan.worker_process import Job
-from tests.unit.scan.bench import TASK, Bench
+from slrig.scan.walking import reconstruction
+from slrig.scan.worker import Worker
+from tests.unit.scan.bench import PIPELINE, Bench
 from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S
 
 DIE, RAISE, HANG = 1, 2, 3
@@ -152,8 +152,8 @@ def test_without_a_calibration_nothing_is_sent() -> None:
 
 
 @pytest.fixture(scope="module")
-def worker() -> Iterator[ReconstructionWorker]:
-    worker = ReconstructionWorker(TASK)
+def worker() -> Iterator[Worker]:
+    worker = Worker(PIPELINE)
     yield worker
     worker.close()
 
@@ -162,7 +162,7 @@ Ran = Callable[..., object]
 
 
 @pytest.fixture
-def run(worker: ReconstructionWorker, tmp_path: Path) -> Ran:
+def run(worker: Worker, tmp_path: Path) -> Ran:
     """Run a job after a capture; return what the reconstruction says of the frames that it was sent."""
 
     def ran(feed: FrameFeed, cancelled: Callable[[], bool] = lambda: False, order: str = "finish") -> object:
@@ -170,21 +170,22 @@ def run(worker: ReconstructionWorker, tmp_path: Path) -> Ran:
         bundle.mkdir(exist_ok=True)
         (bundle / "order").write_text(order)
         count = len(list(tmp_path.iterdir()))
-        job = Job(bundle, tmp_path / str(count) / "result", ReconstructionPlan())
-        job.output.parent.mkdir()
+        output = tmp_path / str(count) / "result"
+        output.parent.mkdir()
+        job = reconstruction(PIPELINE, bundle, output, ReconstructionPlan())
         return worker.run(job, progress=lambda *_: None, cancelled=cancelled, feed=feed).get("live")
 
     return ran
 
 
-def test_frames_are_there_when_the_job_comes(worker: ReconstructionWorker, run: Ran) -> None:
+def test_frames_are_there_when_the_job_comes(worker: Worker, run: Ran) -> None:
     for _ in range(2):
         feed = worker.feed()
         fed(feed, *SHOTS)
         assert run(feed) == [2, 2, True]
 
 
-def test_frames_of_a_capture_that_failed_reach_no_other_scan(worker: ReconstructionWorker, run: Ran) -> None:
+def test_frames_of_a_capture_that_failed_reach_no_other_scan(worker: Worker, run: Ran) -> None:
     failed = worker.feed()
     failed.begin(OUTLINE, CALIBRATION)
     failed.take(SHOTS[0])
@@ -195,9 +196,7 @@ def test_frames_of_a_capture_that_failed_reach_no_other_scan(worker: Reconstruct
     assert run(feed) == [2, 2, True]
 
 
-def test_process_that_is_killed_during_the_capture_costs_the_head_start_only(
-    worker: ReconstructionWorker, run: Ran
-) -> None:
+def test_process_that_is_killed_during_the_capture_costs_the_head_start_only(worker: Worker, run: Ran) -> None:
     feed = worker.feed()
     feed.begin(OUTLINE, CALIBRATION)
     feed.take(SHOTS[0])
@@ -209,7 +208,7 @@ def test_process_that_is_killed_during_the_capture_costs_the_head_start_only(
     assert run(feed) is None
 
 
-def test_frame_that_cannot_be_used_costs_the_head_start_only(worker: ReconstructionWorker, run: Ran) -> None:
+def test_frame_that_cannot_be_used_costs_the_head_start_only(worker: Worker, run: Ran) -> None:
     before = worker.process_id
     feed = worker.feed()
     fed(feed, telling(RAISE), SHOTS[1])
@@ -218,9 +217,9 @@ def test_frame_that_cannot_be_used_costs_the_head_start_only(worker: Reconstruct
 
 
 def test_cancel_ends_a_process_that_is_stuck_in_a_frame(
-    worker: ReconstructionWorker, run: Ran, monkeypatch: pytest.MonkeyPatch
+    worker: Worker, run: Ran, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker_module, "CANCEL_LIMIT_S", 0.0)
+    monkeypatch.setattr(worker_wait, "CANCEL_LIMIT_S", 0.0)
     feed = worker.feed()
     # More than the pipe holds, so that the feed is stuck as well.
     large = replace(SHOTS[1], image=np.zeros((4000, 4000), dtype=np.uint8))
@@ -239,7 +238,7 @@ def test_frames_that_wait_for_the_kernels_arrive_and_the_wait_is_told(
 ) -> None:
     gate = tmp_path / "go"
     monkeypatch.setenv("PREPARING_GATE", str(gate))
-    worker = ReconstructionWorker("tests.unit.scan.preparing_pipeline:reconstruct_bundle")
+    worker = Worker("tests.unit.scan.preparing_pipeline")
     feed = worker.feed()
     # More than the pipe holds, so that the feed waits for a process that prepares.
     fed(feed, SHOTS[0], replace(SHOTS[1], image=np.zeros((4000, 4000), dtype=np.uint8)))
@@ -253,7 +252,10 @@ def test_frames_that_wait_for_the_kernels_arrive_and_the_wait_is_told(
     bundle.mkdir()
     (bundle / "order").write_text("finish")
     report = worker.run(
-        Job(bundle, tmp_path / "result", ReconstructionPlan()), progress=hear, cancelled=lambda: False, feed=feed
+        reconstruction(worker.module, bundle, tmp_path / "result", ReconstructionPlan()),
+        progress=hear,
+        cancelled=lambda: False,
+        feed=feed,
     )
     worker.close()
     assert report["live"] == [2, 2, True]

@@ -95,6 +95,13 @@ def test_released_folder_may_be_taken_again(folder: DataFolder) -> None:
     DataFolder(folder.root).release()
 
 
+def finished(folder: DataFolder, scan_id: UUID) -> None:
+    """The files of a scan that succeeded."""
+    folder.scan(scan_id).mkdir()
+    (folder.scan(scan_id) / "mesh.ply").write_bytes(b"ply")
+    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"truth": {"rms_mm": 0.01}, "stages": []}))
+
+
 def test_space_is_asked_for_before_a_scan(tmp_path: Path) -> None:
     folder = DataFolder(tmp_path, free=lambda _: 1_000_000)
     folder.require_space(1_000_000)
@@ -153,8 +160,7 @@ def test_sweep_keeps_the_whole_bundle_of_a_cut_off_reconstruction(store: ScanSto
 
 def test_sweep_recognises_a_scan_that_lacked_only_its_last_record(store: ScanStore, folder: DataFolder) -> None:
     scan_id = running(store, ScanState.RECONSTRUCTING)
-    folder.scan(scan_id).mkdir()
-    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"truth": {"rms_mm": 0.01}, "stages": []}))
+    finished(folder, scan_id)
     assert sweep(store, folder).recovered == (scan_id,)
     assert store.get(scan_id).state is ScanState.SUCCEEDED
     assert store.get(scan_id).summary == {"truth": {"rms_mm": 0.01}}
@@ -162,7 +168,7 @@ def test_sweep_recognises_a_scan_that_lacked_only_its_last_record(store: ScanSto
 
 def test_sweep_completes_a_deletion_that_was_cut_off(store: ScanStore, folder: DataFolder) -> None:
     scan_id = running(store, ScanState.RECONSTRUCTING)
-    folder.scan(scan_id).mkdir()
+    finished(folder, scan_id)
     store.finish(scan_id, ScanState.SUCCEEDED)
     folder.withdraw(scan_id)
     sweep(store, folder)
@@ -170,11 +176,27 @@ def test_sweep_completes_a_deletion_that_was_cut_off(store: ScanStore, folder: D
     assert list(folder.incoming.iterdir()) == []
 
 
-def test_sweep_says_when_the_files_of_a_scan_are_gone(store: ScanStore, folder: DataFolder) -> None:
+@pytest.mark.parametrize("gone", [("mesh.ply",), ("report.json",), ("mesh.ply", "report.json")])
+def test_sweep_says_when_the_files_of_a_scan_are_gone(
+    store: ScanStore, folder: DataFolder, gone: tuple[str, ...]
+) -> None:
     scan_id = running(store, ScanState.RECONSTRUCTING)
     store.finish(scan_id, ScanState.SUCCEEDED)
+    finished(folder, scan_id)
+    for name in gone:
+        (folder.scan(scan_id) / name).unlink()
     assert sweep(store, folder).lost == (scan_id,)
-    assert store.get(scan_id).state is ScanState.FAILED
+    record = store.get(scan_id)
+    assert record.state is ScanState.FAILED
+    assert record.fault is not None
+    assert record.fault.message.startswith(f"{' and '.join(gone)} of this scan is gone")
+
+
+def test_sweep_takes_no_scan_without_a_mesh_for_a_finished_one(store: ScanStore, folder: DataFolder) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    finished(folder, scan_id)
+    (folder.scan(scan_id) / "mesh.ply").unlink()
+    assert sweep(store, folder).interrupted == (scan_id,)
 
 
 def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: ScanStore, folder: DataFolder) -> None:
@@ -187,7 +209,7 @@ def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: ScanSto
 
 def test_sweep_of_a_sound_folder_changes_nothing(store: ScanStore, folder: DataFolder) -> None:
     scan_id = running(store, ScanState.RECONSTRUCTING)
-    folder.scan(scan_id).mkdir()
+    finished(folder, scan_id)
     store.finish(scan_id, ScanState.SUCCEEDED)
     before = store.get(scan_id)
     swept = sweep(store, folder)

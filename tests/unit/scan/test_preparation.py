@@ -15,15 +15,17 @@ from slrig.kernels import Prepared, compilations_told, prepared
 from slrig.scan import pipeline, preparation
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels, sample_scan
-from slrig.scan.worker import RECONSTRUCT
+from slrig.scan.walking import reconstruction
+from slrig.scan.worker import PIPELINE
 
 
 def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:
-    module, _, task = RECONSTRUCT.partition(":")
-    loaded = importlib.import_module(module)
+    loaded = importlib.import_module(PIPELINE)
+    module, _, task = reconstruction(PIPELINE, Path(), Path(), ReconstructionPlan()).function.partition(":")
+    assert module == PIPELINE
     assert callable(getattr(loaded, task))
     assert callable(loaded.warm_kernels)
-    assert callable(loaded.LiveScan)
+    assert callable(loaded.frame_receiver)
 
 
 def test_the_made_up_scan_is_a_surface() -> None:

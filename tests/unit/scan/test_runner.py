@@ -32,7 +32,7 @@ def test_scan_walks_to_its_mesh(bench: Bench) -> None:
     record = bench.until(bench.scan().id)
     assert record.state is ScanState.SUCCEEDED
     assert record.progress.fraction == 1.0
-    assert record.summary == {"seconds": 1.5, "truth": {"rms_mm": 0.01}}
+    assert record.summary == {"bundle": str(record.id), "seconds": 1.5, "truth": {"rms_mm": 0.01}}
     files = {path.name for path in bench.folder.scan(record.id).iterdir()}
     assert files >= {"bundle", "mesh.ply", "report.json", "preview.png"}
     assert list(bench.folder.incoming.iterdir()) == []
