@@ -86,8 +86,8 @@ def open_service(
             folder,
             store,
             runner,
+            worker,
             rig_name=rig.name,
-            worker=worker,
             refuse_when_stale=rig.refuse_when_stale,
         )
     except BaseException:

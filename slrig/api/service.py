@@ -27,7 +27,9 @@ from slrig.sessions.acceptance.running import ReconstructBundle
 from slrig.sessions.calibration.calibrating import Calibrations
 from slrig.sessions.calibration.retention import Retention
 from slrig.sessions.calibration.tools import CalibrationTools
+from slrig.sessions.calibration.tools import calibration_tools as usual_calibration_tools
 from slrig.sessions.health.verification import VerificationDesk, VerificationTools
+from slrig.sessions.health.verification import verification_tools as usual_verification_tools
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
@@ -86,16 +88,16 @@ def assembled_service(
     folder: DataFolder,
     store: ScanStore,
     runner: Runner,
+    worker: Worker,
     *,
     rig_name: str,
     calibration_tools: CalibrationTools | None = None,
     verification_tools: VerificationTools | None = None,
-    worker: Worker | None = None,
     refuse_when_stale: bool = False,
 ) -> Service:
     """A service of what scans, and of the rest made to go with it. Nothing is started but what sends notices.
 
-    worker : the runner's, for the meshes of an acceptance test; None has them made in this process.
+    worker : the runner's, which computes for all of them.
 
     Raises
     ------
@@ -104,13 +106,21 @@ def assembled_service(
     """
     spare_bytes = settings.min_free_bytes
     lender = NamedLender(runner)
-    calibrations = Calibrations(folder, lender, rig_name=rig_name, tools=calibration_tools, spare_bytes=spare_bytes)
+    calibrations = Calibrations(
+        folder,
+        lender,
+        rig_name=rig_name,
+        tools=calibration_tools or usual_calibration_tools(worker),
+        spare_bytes=spare_bytes,
+    )
     schedules = ScheduleStore(folder.database)
     notices = Notices(settings.webhook_url, rig=rig_name)
     health = NoticedHealth(folder.database, notices)
-    verifications = VerificationDesk(folder, lender, health, tools=verification_tools, spare_bytes=spare_bytes)
+    verifications = VerificationDesk(
+        folder, lender, health, tools=verification_tools or usual_verification_tools(worker), spare_bytes=spare_bytes
+    )
     runner.watch_health(verifications)
-    acceptance = AcceptanceDesk(folder, lender, reconstruct=None if worker is None else _elsewhere(worker))
+    acceptance = AcceptanceDesk(folder, lender, reconstruct=_elsewhere(worker))
     retention = Retention(
         calibrations,
         folder,

@@ -11,7 +11,6 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
@@ -180,6 +179,9 @@ def _sphere(points_mm: FloatArray) -> tuple[FloatArray, float]:
         outwards = about - parameters[:3]
         outwards /= np.linalg.norm(outwards, axis=1)[:, None]
         return np.column_stack([-outwards, -np.ones(len(about))])
+
+    # Late: the service knows the values of this module, and loads no solver.
+    from scipy.optimize import least_squares
 
     found = least_squares(distances, start, jac=slopes, method="lm", xtol=1e-12, ftol=1e-12).x
     return middle + found[:3], float(found[3])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from slrig.calibration.artefacts import FEWEST_POINTS, fitted_plane, fitted_sphere
 from slrig.errors import NothingToReconstructError
@@ -104,6 +103,9 @@ def _ball(
     if len(voters) == 0:
         return None
     votes = points_mm[voters] - radius_mm * normals[voters]
+    # Late: as in `slrig.calibration.artefacts`.
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(votes)
     reach_mm = _VOTE_REACH * radius_mm
     counts = tree.query_ball_point(votes[::10], reach_mm, return_length=True)

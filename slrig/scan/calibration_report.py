@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.bundle.calibration_file import calibration_id
 from slrig.bundle.description import read_description
 from slrig.model import Calibration, FloatArray, Solved
-from slrig.scan.report import calibration_id
 
 _SECONDS_PER_DAY = 86_400.0
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slrig.bundle import read_bundle, read_calibration
-from slrig.bundle.calibration_file import check_rays
+from slrig.bundle.calibration_file import calibration_id, check_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import read_refused
@@ -25,7 +25,7 @@ from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.outline import Outline
-from slrig.scan.report import calibration_id, capture_notes, capture_report
+from slrig.scan.report import capture_notes, capture_report
 from slrig.scan.resolved import unresolved_notes
 from slrig.scan.stream import LiveScan, ScanStream, Seen, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, triangulated

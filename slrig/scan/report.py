@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -15,7 +13,7 @@ from slrig.capture.evidence import EvidenceSummary
 from slrig.capture.exposure import LEFT_OUT, left_out
 from slrig.meshing.optimisation import Optimised
 from slrig.meshing.surface import FinishedMesh, Stage
-from slrig.model import Axis, Calibration, Capture, LineShift, Mesh, Pinhole, PointCurves, Refusal, Source
+from slrig.model import Axis, Capture, LineShift, Mesh, PointCurves, Refusal, Source
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.fusion import ExposureUse
 from slrig.reconstruction.merging import MergedCurves
@@ -46,24 +44,6 @@ class Stopwatch:
             self.enter(self._stage)
         self._stage = None
         return {stage: round(seconds, 4) for stage, seconds in self._seconds.items()}
-
-
-def calibration_id(calibration: Calibration) -> str:
-    """Twelve hexadecimal digits that change with any number of the calibration."""
-    devices: dict[str, Pinhole | None] = {**calibration.cameras, "projector": calibration.projector}
-    text = json.dumps(
-        {
-            name: None
-            if device is None
-            else [
-                device.size.shape,
-                *(a.tolist() for a in (device.matrix, device.distortion, device.rotation, device.translation_mm)),
-            ]
-            for name, device in devices.items()
-        },
-        sort_keys=True,
-    )
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -> dict[str, object]:

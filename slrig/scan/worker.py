@@ -243,6 +243,14 @@ class Worker:
         with self._guard:
             self._note(told)
 
+    def task(self, function: str, what: str) -> Callable[..., Any]:
+        """A function of the mathematics, "module:function", done by the worker; `progress` is told how far it is."""
+
+        def call(*given: Any, progress: Told = _silent, **options: Any) -> Any:
+            return self.run(Call(function, given, options, what=what), progress=progress)
+
+        return call
+
     @contextmanager
     def _its_turn(self, call: Call, progress: Told, cancelled: Callable[[], bool]) -> Iterator[None]:
         """Wait until the jobs that came before are over."""

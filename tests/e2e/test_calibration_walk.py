@@ -39,7 +39,7 @@ scene = "scene.toml"
 seed = 6
 samples_per_axis = 2
 ambient = 0.01
-carries_calibration = false
+carries_calibration = {carries}
 {head}
 [[head.pose]]
 name = "behind the wall"
@@ -130,12 +130,12 @@ class Caller:
         raise AssertionError(message)
 
 
-def write_rig(folder: Path, *, head: str = "") -> Path:
+def write_rig(folder: Path, *, head: str = "", carries: str = "false") -> Path:
     """Write the rig and its scene."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.toml").write_text(SCENE)
     rig = folder / "rig.toml"
-    rig.write_text(RIG.format(head=head))
+    rig.write_text(RIG.format(head=head, carries=carries))
     return rig
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
@@ -157,6 +156,9 @@ def _device(
     )
     if is_origin:
         return DeviceDifference(focal, principal, None, None)
+    # Late: the service knows the values of this module, and computes none of them.
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_matrix(there.rotation @ here.rotation.T).as_rotvec()
     rotation = _difference(
         float(np.degrees(np.linalg.norm(turn))),

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from slrig.bundle.calibration_file import calibration_id
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import REJECTED_SHARE, Decision
 from slrig.calibration.segmentation import STEEPEST_DEG
 from slrig.scan.artefacts import write_report
-from slrig.scan.report import calibration_id
 from slrig.sessions.acceptance.charts import error_map, volume_view
 from slrig.sessions.acceptance.evaluation import BORDER_RINGS, Evidence, Reading
 from slrig.sessions.acceptance.plan import Artefact, Quantity

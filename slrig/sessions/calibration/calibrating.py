@@ -10,11 +10,11 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle.calibration_file import read_calibration, write_calibration
+from slrig.bundle.calibration_file import write_calibration
 from slrig.bundle.opencv_calibration import write_opencv_calibration
 from slrig.bundle.storage import write_durably
 from slrig.calibration.board import Board
-from slrig.calibration.judging.comparison import Comparison, comparison
+from slrig.calibration.judging.comparison import Comparison
 from slrig.errors import ArtefactNotReadyError, CalibrationError, CalibrationStateError, CameraNotFoundError
 from slrig.model import Calibration
 from slrig.scan.faults import disk_errors
@@ -28,7 +28,7 @@ from slrig.sessions.calibration.records import USUAL_PATTERNS, SessionRecord, Se
 from slrig.sessions.calibration.register import CalibrationRegister
 from slrig.sessions.calibration.solves import SolveDesk
 from slrig.sessions.calibration.store import CALIBRATION, ActivePointer, CalibrationStore
-from slrig.sessions.calibration.tools import CalibrationTools, calibration_tools, sizes_of
+from slrig.sessions.calibration.tools import CalibrationTools, sizes_of
 
 EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 """The forms in which a calibration can be had, and taken in."""
@@ -61,7 +61,7 @@ class Calibrations:
         rig: CalibratedRig,
         *,
         rig_name: str,
-        tools: CalibrationTools | None = None,
+        tools: CalibrationTools,
         clock: Clock = utc_now,
         spare_bytes: int = 0,
     ) -> None:
@@ -71,7 +71,7 @@ class Calibrations:
         self._rig = rig
         self._rig_name = rig_name
         self._clock = clock
-        self._tools = calibration_tools() if tools is None else tools
+        self._tools = tools
         self.answers = PoseAnswers(self.register, self._tools)
         self.poses = PoseDesk(
             self.register, folder, rig, self._tools, self.answers, clock=clock, spare_bytes=spare_bytes
@@ -109,7 +109,7 @@ class Calibrations:
             with disk_errors(staged):
                 write_durably(source, text)
             try:
-                calibration = read_calibration(source)
+                calibration = self._tools.parse(source)
             except CalibrationError as error:
                 message = str(error).replace(str(source), "the calibration sent")
                 raise CalibrationError(message) from error
@@ -254,7 +254,7 @@ class Calibrations:
 
     def compare(self, first: UUID, second: UUID) -> Comparison:
         """Return what the second says otherwise than the first. Raises as `calibration` does."""
-        return comparison(self.calibration(first), self.calibration(second))
+        return self._tools.compare(self.calibration(first), self.calibration(second))
 
     def latest(self) -> Sequence[SessionRecord]:
         """Return all calibrations, newest first."""

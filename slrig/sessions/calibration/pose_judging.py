@@ -19,7 +19,6 @@ from slrig.sessions.calibration.pose_pictures import white_frame
 from slrig.sessions.calibration.records import PoseState, SessionRecord, plain
 from slrig.sessions.calibration.report import report_html
 from slrig.sessions.calibration.solving import CalibrationResult, ReadPose
-from slrig.sessions.calibration.store import BUNDLE, CalibrationStore
 from slrig.sessions.calibration.tools import Judgement, Setting, Standing, sizes_of
 
 _ANSWER = (
@@ -100,15 +99,14 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
 
 
 def write_report(
-    path: Path, result: CalibrationResult, poses: Sequence[ReadPose], record: SessionRecord, store: CalibrationStore
+    path: Path, result: CalibrationResult, poses: Sequence[ReadPose], record: SessionRecord, bundles: Mapping[str, Path]
 ) -> None:
-    """Write the report of a solve, with a picture of each pose."""
+    """Write the report of a solve, with a picture of each pose. bundles : of the accepted poses, by name."""
     if record.board is None:
         raise TypeError(record)
-    pictures: dict[str, dict[str, Pixels]] = {}
-    for pose in record.accepted:
-        bundle = store.pose(record.id, pose.number) / BUNDLE
-        pictures[pose.name] = {camera: white_frame(bundle, camera) for camera in record.cameras}
+    pictures: dict[str, dict[str, Pixels]] = {
+        name: {camera: white_frame(bundle, camera) for camera in record.cameras} for name, bundle in bundles.items()
+    }
     refused = {pose.name: pose.fault.message for pose in record.poses if pose.state is PoseState.REFUSED and pose.fault}
     remarks = {pose.name: list((pose.answer or {}).get("warnings", ())) for pose in record.accepted}
     text = report_html(

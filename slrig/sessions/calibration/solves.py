@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from uuid import UUID
 
 import structlog
@@ -13,12 +14,12 @@ from slrig.bundle.calibration_file import check_calibration, write_calibration
 from slrig.calibration.board import BoardShape
 from slrig.errors import CalibrationError, CalibrationStateError, SlrigError, SolveRefusedError
 from slrig.model import Calibration
-from slrig.scan.faults import fault_of
+from slrig.scan.faults import ScanInterruptedError, fault_of
 from slrig.scan.records import Clock, ScanProgress
 from slrig.sessions.calibration.pose_answering import PoseAnswers, board_of, setting_of
 from slrig.sessions.calibration.records import SessionRecord, SessionState
 from slrig.sessions.calibration.register import CalibrationRegister
-from slrig.sessions.calibration.store import CALIBRATION, REPORT
+from slrig.sessions.calibration.store import BUNDLE, CALIBRATION, REPORT
 from slrig.sessions.calibration.tools import CalibrationTools
 
 _log = structlog.get_logger(__name__)
@@ -92,6 +93,9 @@ class SolveDesk:
         try:
             with self._solving:
                 self._solved(record, board_shape)
+        except ScanInterruptedError:
+            # The service ends: the register marks what is under way, now or at the next start.
+            return
         except Exception as error:  # noqa: BLE001 - whatever goes wrong, the session gets out of SOLVING
             fault = fault_of(error)
             if isinstance(error, SlrigError):
@@ -127,7 +131,7 @@ class SolveDesk:
         staged = self._store.stage_solve(record.id)
         try:
             write_calibration(staged / CALIBRATION, result.calibration)
-            self._tools.report(staged / REPORT, result, poses, record, self._store)
+            self._tools.report(staged / REPORT, result, poses, record, self._bundles(record))
             self._store.commit_solve(record.id, number, staged)
         except BaseException:
             self._store.discard(staged)
@@ -145,6 +149,9 @@ class SolveDesk:
             ),
         )
         _log.info("calibration solved", calibration=str(record.id), solve=number)
+
+    def _bundles(self, record: SessionRecord) -> dict[str, Path]:
+        return {pose.name: self._store.pose(record.id, pose.number) / BUNDLE for pose in record.accepted}
 
     def _comparable(self, record: SessionRecord) -> Calibration | None:
         """The calibration in use, if it is one of the same devices."""

@@ -1,26 +1,26 @@
 """What a calibration session works with: the shot, the reading, the judgement, the solve and its report.
 
-They are named here rather than imported: the service loads the mathematics when the first session opens, and a test
+They are named here rather than imported: the worker does them, the service loads none of their mathematics, and a test
 puts tame ones in their place.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 from slrig.calibration.board import Board, BoardShape
+from slrig.calibration.judging.comparison import Comparison
 from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
 from slrig.model import Calibration, Size
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.worker import Worker
 from slrig.sessions.calibration.records import SessionRecord, plain
 from slrig.sessions.calibration.solving import CalibrationResult, ReadPose
-from slrig.sessions.calibration.store import CalibrationStore
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,16 +92,19 @@ class WriteReport(Protocol):
         result: CalibrationResult,
         poses: Sequence[ReadPose],
         record: SessionRecord,
-        store: CalibrationStore,
+        bundles: Mapping[str, Path],
         /,
     ) -> None:
-        """Write it."""
+        """Write it. bundles : of the accepted poses, by name."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTools:
-    """Each part of the work. The signatures are those of the functions that `calibration_tools` names."""
+    """Each part of the work. The signatures are those of the functions that `calibration_tools` names.
+
+    parse : of a calibration's file that a stranger sent.
+    """
 
     capture: CapturePose
     read: Callable[[Path, Board, str], ReadPose]
@@ -111,6 +114,8 @@ class CalibrationTools:
     coverage_picture: Callable[[Setting, str, Sequence[ReadPose], Mapping[str, Any]], bytes]
     solve: SolvePoses
     report: WriteReport
+    compare: Callable[[Calibration, Calibration], Comparison]
+    parse: Callable[[Path], Calibration]
     summary: Callable[[CalibrationResult], Mapping[str, Any]] = plain
     warm: Callable[[], None] = lambda: None
 
@@ -120,26 +125,20 @@ def sizes_of(setting: Setting) -> Mapping[str, Size]:
     return setting.cameras if setting.projector is None else {**setting.cameras, PROJECTOR: setting.projector}
 
 
-def calibration_tools() -> CalibrationTools:
-    """The real ones. Loads the mathematics when they are first used, or by `warm`."""
+def calibration_tools(worker: Worker) -> CalibrationTools:
+    """The real ones: the shot is taken here, the mathematics is the worker's."""
+    room = "slrig.sessions.calibration"
     return CalibrationTools(
         capture=capture_bundle,
-        read=_later("slrig.sessions.calibration.pose_reading:read_pose"),
-        judge=_later("slrig.sessions.calibration.pose_judging:judgement"),
-        survey=_later("slrig.sessions.calibration.pose_judging:standing"),
-        picture=_later("slrig.sessions.calibration.pose_pictures:pose_png"),
-        coverage_picture=_later("slrig.sessions.calibration.pose_pictures:coverage_png"),
-        solve=_later("slrig.sessions.calibration.solving:solve_poses"),
-        report=_later("slrig.sessions.calibration.pose_judging:write_report"),
-        summary=_later("slrig.sessions.calibration.pose_judging:summary"),
-        warm=_later("slrig.sessions.calibration.pose_judging:warm"),
+        read=worker.task(f"{room}.pose_reading:read_pose", "reading of the pose"),
+        judge=worker.task(f"{room}.pose_judging:judgement", "judgement of the pose"),
+        survey=worker.task(f"{room}.pose_judging:standing", "survey of the poses"),
+        picture=worker.task(f"{room}.pose_pictures:pose_png", "picture of the pose"),
+        coverage_picture=worker.task(f"{room}.pose_pictures:coverage_png", "picture of the coverage"),
+        solve=worker.task(f"{room}.solving:solve_poses", "solve"),
+        report=worker.task(f"{room}.pose_judging:write_report", "report of the solve"),
+        summary=worker.task(f"{room}.pose_judging:summary", "summary of the solve"),
+        compare=worker.task("slrig.calibration.judging.comparison:comparison", "comparison"),
+        parse=worker.task("slrig.bundle.calibration_file:read_calibration", "reading of the calibration"),
+        warm=worker.task(f"{room}.pose_judging:warm", "preparation"),
     )
-
-
-def _later(name: str) -> Callable[..., Any]:
-    module, function = name.split(":")
-
-    def call(*given: Any, **options: Any) -> Any:
-        return getattr(importlib.import_module(module), function)(*given, **options)
-
-    return call

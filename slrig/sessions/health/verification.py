@@ -16,6 +16,7 @@ from uuid import UUID, uuid4
 
 import structlog
 
+from slrig.bundle.calibration_file import calibration_id
 from slrig.calibration.board import Board
 from slrig.calibration.health.look import Look, health_of_scan
 from slrig.calibration.health.verdict import Health, HealthState
@@ -36,6 +37,7 @@ from slrig.scan.holding import check_plan
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import Clock, utc_now
 from slrig.scan.work import Holder
+from slrig.scan.worker import Worker
 from slrig.sessions.calibration.pose_shooting import RigLender
 from slrig.sessions.calibration.records import USUAL_PATTERNS
 from slrig.sessions.calibration.tools import CapturePose
@@ -80,17 +82,21 @@ class VerificationJob:
     fault: ScanFault | None = None
 
 
+_READ, _LOOK = "slrig.sessions.calibration.pose_reading:read_pose", "slrig.calibration.health.looking:look_at_board"
+
+
 @dataclass(frozen=True, slots=True)
 class VerificationTools:
     """The shot, the reading and the judgement. The mathematics is loaded when it is first used."""
 
     capture: CapturePose = capture_bundle
-    read: Callable[[Path, Board, str], ReadPose] = field(
-        default_factory=lambda: _later("slrig.sessions.calibration.pose_reading:read_pose")
-    )
-    look: Callable[[Sequence[Any], Board, Calibration], Look] = field(
-        default_factory=lambda: _later("slrig.calibration.health.looking:look_at_board")
-    )
+    read: Callable[[Path, Board, str], ReadPose] = field(default_factory=lambda: _later(_READ))
+    look: Callable[[Sequence[Any], Board, Calibration], Look] = field(default_factory=lambda: _later(_LOOK))
+
+
+def verification_tools(worker: Worker) -> VerificationTools:
+    """Those of a service: the shot is taken here, the mathematics is the worker's."""
+    return VerificationTools(read=worker.task(_READ, "reading of the board"), look=worker.task(_LOOK, "verification"))
 
 
 def verify_bundle(
@@ -123,9 +129,6 @@ def solve_id(calibration: Calibration) -> str:
     """What a calibration's verifications are on record by: the id of its solve, else a digest of its numbers."""
     if calibration.solved is not None:
         return calibration.solved.id
-    # Late: the report's module brings the whole reconstruction with it.
-    from slrig.scan.report import calibration_id
-
     return calibration_id(calibration)
 
 

@@ -42,7 +42,14 @@ class ServedBench(TameBench):
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
         self.tame = TameCalibrating(self)
         self.service = assembled_service(
-            settings, defaults, folder, store, runner, rig_name="bench", calibration_tools=self.tame.tools()
+            settings,
+            defaults,
+            folder,
+            store,
+            runner,
+            self.worker,
+            rig_name="bench",
+            calibration_tools=self.tame.tools(),
         )
         self.app: FastAPI = create_app(self.service, key_digest=digest(KEY))
 

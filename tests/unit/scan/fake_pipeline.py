@@ -71,6 +71,11 @@ def process_id() -> int:
     return os.getpid()
 
 
+def crash(*_given: object, **_options: object) -> None:
+    """Touch what is not there, as a defect in compiled code does."""
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
 def wait_for(gate: Path) -> str:
     """Wait, without progress, until a file is there."""
     while not gate.exists():
@@ -78,7 +83,7 @@ def wait_for(gate: Path) -> str:
     return gate.name
 
 
-def exhaust() -> None:
+def exhaust(*_given: object, **_options: object) -> None:
     """Ask for more memory than this process may have."""
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (2**33, most))

@@ -13,6 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from slrig.bundle import BundleWriter, read_bundle, read_calibration, write_calibration
+from slrig.bundle.calibration_file import calibration_id
 from slrig.bundle.description import read_description
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -23,7 +24,6 @@ from slrig.scan.artefacts import write_converted
 from slrig.scan.calibration_report import calibration_report
 from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
-from slrig.scan.report import calibration_id
 
 RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
 BOX = np.array([[-40.0, -40, -40], [40, 40, 40]])

@@ -11,7 +11,9 @@ from uuid import UUID
 
 import numpy as np
 
+from slrig.bundle import read_calibration
 from slrig.calibration.board import Board, BoardKind, BoardShape
+from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.observations import BoardView, PoseObservation
 from slrig.calibration.poses.figures import ViewFigures
 from slrig.devices import Rig
@@ -103,6 +105,8 @@ class TameCalibrating:
             picture=lambda *_: PNG,
             coverage_picture=lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
             solve=self._solve,
+            compare=comparison,
+            parse=read_calibration,
             report=lambda path, *_: cast("None", path.write_text("<html>report</html>")),
             summary=lambda _: {"verdict": {"grade": "good", "summary": "good", "reasons": []}},
         )
@@ -168,13 +172,16 @@ class TameCalibrating:
 
 
 class CalibrationBench(Bench):
-    """A runner over a tame bench, and calibrations beside it."""
+    """A runner over a tame bench, and calibrations beside it. solve : a task of the worker, for the tame one."""
 
-    def __init__(self, tmp_path: Path, *, positioner: bool = False) -> None:
+    def __init__(self, tmp_path: Path, *, positioner: bool = False, solve: str | None = None) -> None:
         super().__init__(tmp_path)
         self.tame = TameCalibrating(self)
         self._positioner = positioner
-        self.calibrations = Calibrations(self.folder, self.runner, rig_name="bench", tools=self.tame.tools())
+        tools = self.tame.tools()
+        if solve is not None:
+            tools = replace(tools, solve=self.worker.task(solve, "solve"))
+        self.calibrations = Calibrations(self.folder, self.runner, rig_name="bench", tools=tools)
 
     def open_rig(self) -> Rig:
         rig = super().open_rig()

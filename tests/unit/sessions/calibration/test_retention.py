@@ -11,8 +11,7 @@ from uuid import UUID, uuid4
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.bundle.calibration_file import write_calibration
-from slrig.scan.report import calibration_id
+from slrig.bundle.calibration_file import calibration_id, write_calibration
 from slrig.sessions.calibration.retention import Retention, named_by_scans
 from tests.unit.sessions.calibration.calibration_bench import CalibrationBench, tame_calibration
 
