@@ -62,6 +62,7 @@ def open_service(
         raise
     for what, found in (
         ("interrupted", swept.interrupted),
+        ("taken up again", swept.resumed),
         ("recovered", swept.recovered),
         ("without files", swept.lost),
         ("put aside", swept.put_aside),
@@ -80,6 +81,7 @@ def open_service(
         give_up=give_up,
     )
     try:
+        runner.take_up(swept.resumed)
         return assembled_service(
             settings,
             rig.scan,

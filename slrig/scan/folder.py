@@ -148,11 +148,16 @@ class DataFolder:
 
     def keep_bundle(self, scan_id: UUID) -> None:
         """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it."""
+        self.clear_results(scan_id)
+        self.commit(scan_id)
+
+    def clear_results(self, scan_id: UUID) -> Path:
+        """Remove all that is staged for a scan but its bundle, and return the staging folder."""
         staged = self.staging(scan_id)
         for other in staged.iterdir():
             if other.name != "bundle":
                 shutil.rmtree(other) if other.is_dir() else other.unlink()
-        self.commit(scan_id)
+        return staged
 
     def discard(self, scan_id: UUID) -> None:
         """Remove what was staged for a scan. Idempotent."""

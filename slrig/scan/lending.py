@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import TypeVar
@@ -102,6 +102,10 @@ class Lender:
             self._changed.notify_all()
         self._previews.interrupt()
         return task
+
+    def take_up(self, tasks: Sequence[Task]) -> None:
+        """Put tasks of an earlier run in line, however many; before `start`."""
+        self._waiting.extend(tasks)
 
     def cancel(self, task_id: UUID) -> bool:
         """Have a task end early. Returns whether it is under way and was told; one that waited has ended."""

@@ -7,17 +7,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
+from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
+from slrig.bundle.storage import write_file
 from slrig.errors import IdempotencyError
 from slrig.scan.faults import ScanFault
 from slrig.scan.plan import ScanPlan
 
 Clock = Callable[[], datetime]
 """Gives the present moment with a time zone."""
+
+_RECORD = "record.json"
 
 _plan_adapter = TypeAdapter(ScanPlan)
 
@@ -83,6 +87,21 @@ class ScanRecord:
 
 
 @dataclass(frozen=True, slots=True)
+class KeptRecord:
+    """What a finished scan says of its own record, beside its files: enough to put it on record again."""
+
+    id: UUID
+    rig: str
+    label: str | None
+    plan: ScanPlan
+    created_at: datetime
+    started_at: datetime
+
+
+_record_adapter = TypeAdapter(KeptRecord)
+
+
+@dataclass(frozen=True, slots=True)
 class ScanEvent:
     """One thing that happened to a scan. `number` counts from 1 within the scan and never changes."""
 
@@ -104,6 +123,19 @@ def plan_json(plan: ScanPlan) -> dict[str, Any]:
 def plan_from_json(document: Mapping[str, Any]) -> ScanPlan:
     """The inverse of `plan_json`."""
     return _plan_adapter.validate_python(document)
+
+
+def write_record(folder: Path, record: KeptRecord) -> None:
+    """Write record.json into the folder of a scan. Raises StorageError."""
+    write_file(folder / _RECORD, _record_adapter.dump_json(record, indent=1))
+
+
+def read_record(folder: Path) -> KeptRecord | None:
+    """What the record.json of a scan's folder says; None where there is none that can be read."""
+    try:
+        return _record_adapter.validate_json((folder / _RECORD).read_bytes())
+    except (OSError, ValidationError):
+        return None
 
 
 def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from uuid import UUID, uuid4
 
 import structlog
@@ -66,9 +66,13 @@ class Runner:
         )
 
     def start(self) -> None:
-        """Start the owner thread, which opens the rig, and the reconstruction process, which loads its kernels."""
+        """Start the owner thread, which opens the rig, and the worker, which loads its kernels."""
         self._lender.start()
         self._worker.start()
+
+    def take_up(self, scans: Iterable[UUID]) -> None:
+        """Put scans in line that a kill of the service left unfinished, see `slrig.scan.sweep`; before `start`."""
+        self._lender.take_up([ScanWalk(self._store.get(scan), self._tools) for scan in scans])
 
     def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> ScanRecord:
         """Record a scan and have it done; `wait` lets it queue behind others.

@@ -23,6 +23,7 @@ from slrig.scan.migrations import upgrade
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import (
     Clock,
+    KeptRecord,
     ScanEvent,
     ScanProgress,
     ScanRecord,
@@ -84,6 +85,26 @@ class ScanStore:
                 held.scan_id = row.id
             _append(session, row, "state", {"state": row.state, "time": row.created_at})
             return _record(row)
+
+    def restore(self, record: KeptRecord, summary: Mapping[str, Any]) -> None:
+        """Put a scan that succeeded on record again. How it went is not known any more; its end is taken for now."""
+        row = ScanRow(
+            id=str(record.id),
+            state=ScanState.SUCCEEDED,
+            label=record.label,
+            rig=record.rig,
+            plan=plan_json(record.plan),
+            created_at=_stamp(record.created_at),
+            started_at=_stamp(record.started_at),
+            stage="",
+            fraction=0.0,
+            detail="",
+            last_event=0,
+        )
+        with self._database.changing() as session:
+            session.add(row)
+            session.flush()
+            self._close_row(session, row, ScanState.SUCCEEDED, None, summary)
 
     def get(self, scan_id: UUID) -> ScanRecord:
         """Return a scan. Raises ScanNotFoundError."""

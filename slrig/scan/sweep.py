@@ -11,15 +11,18 @@ from uuid import UUID
 from slrig.errors import StorageError
 from slrig.scan.faults import fault_of, interruption
 from slrig.scan.folder import DataFolder, missing_files
-from slrig.scan.records import ScanState, report_summary
+from slrig.scan.records import ScanState, read_record, report_summary
 from slrig.scan.store import ScanStore
 
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """What a sweep found: scans that were cut off, scans that had finished unrecorded, and strays on either side."""
+    """What a sweep found: scans that were cut off, those that go on, those whose record was lost in part or in all, and
+    strays on either side.
+    """
 
     interrupted: tuple[UUID, ...]
+    resumed: tuple[UUID, ...]
     recovered: tuple[UUID, ...]
     lost: tuple[UUID, ...]
     put_aside: tuple[str, ...]
@@ -29,13 +32,16 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
     """Settle every scan that the last run left open. Only for the process that holds the folder, before it scans.
 
     - A running scan whose mesh and report are in place had only its record missing: succeeded.
+    - A queued one waits again, and one that was being reconstructed is, once more, from its bundle: the runner takes
+      them up. What has ended the service in the middle of the second attempt, too, may lie in its frames.
     - Any other running scan is interrupted; its bundle is kept if the capture was complete.
     - A finished scan whose folder is back in staging was being deleted: the deletion is completed.
     - A succeeded scan without mesh or report is recorded as failed.
-    - Files without a record are put aside in `.orphans`, not deleted.
+    - A finished scan without a record, as beside a database that was lost, is on record again, as it says itself.
+    - Other files without a record are put aside in `.orphans`, not deleted.
     """
     store.release_keys()
-    interrupted, recovered, lost = [], [], []
+    interrupted, resumed, recovered, lost = [], [], [], []
     for record in store.unfinished():
         placed = folder.scan(record.id)
         if not missing_files(placed):
@@ -44,7 +50,11 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
             recovered.append(record.id)
             continue
         # Reconstruction starts only after the bundle was made durable, so this bundle is whole.
-        if record.state is ScanState.RECONSTRUCTING and (folder.staging(record.id) / "bundle").is_dir():
+        whole = record.state is ScanState.RECONSTRUCTING and (folder.staging(record.id) / "bundle").is_dir()
+        if record.state is ScanState.QUEUED or (whole and _attempts(store, record.id) == 1):
+            resumed.append(record.id)
+            continue
+        if whole:
             folder.keep_bundle(record.id)
         store.finish(record.id, ScanState.INTERRUPTED, fault=fault_of(interruption()))
         interrupted.append(record.id)
@@ -57,13 +67,34 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
             store.lose_files(scan_id, fault_of(StorageError(message)))
             lost.append(scan_id)
     for leftover in folder.incoming.iterdir():
-        shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
-    return Swept(tuple(interrupted), tuple(recovered), tuple(lost), _put_aside(store, folder))
+        if leftover.name not in map(str, resumed):
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+    recovered += _restored(store, folder)
+    return Swept(tuple(interrupted), tuple(resumed), tuple(recovered), tuple(lost), _put_aside(store, folder))
+
+
+def _attempts(store: ScanStore, scan_id: UUID) -> int:
+    """How often the reconstruction of a scan was begun."""
+    states = [event.data["state"] for event in store.events(scan_id, after=0) if event.kind == "state"]
+    return states.count(ScanState.RECONSTRUCTING)
+
+
+def _restored(store: ScanStore, folder: DataFolder) -> list[UUID]:
+    """Finished scans that tell what their record was, and have none; put on record in the order of their making."""
+    whole = [path for path in _strays(store, folder) if not missing_files(path)]
+    kept = [record for path in whole if (record := read_record(path)) is not None and str(record.id) == path.name]
+    for record in sorted(kept, key=lambda each: each.created_at):
+        store.restore(record, report_summary(json.loads((folder.scan(record.id) / "report.json").read_bytes())))
+    return [record.id for record in kept]
+
+
+def _strays(store: ScanStore, folder: DataFolder) -> list[Path]:
+    known = {str(scan_id) for scan_id in store.states()}
+    return [path for path in folder.scans.iterdir() if path.name not in known]
 
 
 def _put_aside(store: ScanStore, folder: DataFolder) -> tuple[str, ...]:
-    known = {str(scan_id) for scan_id in store.states()}
-    strays: list[Path] = [path for path in folder.scans.iterdir() if path.name not in known]
+    strays = _strays(store, folder)
     for stray in strays:
         folder.orphans.mkdir(exist_ok=True)
         stray.rename(folder.orphans / stray.name)

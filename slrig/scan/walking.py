@@ -15,10 +15,11 @@ from slrig.errors import ScanCancelledError, SlrigError, StorageError
 from slrig.scan.channel import Call
 from slrig.scan.endings import Ending, Endings
 from slrig.scan.faults import UNEXPECTED, ScanFault, ScanInterruptedError, disk_errors, fault_of, interruption
+from slrig.scan.feed import FrameFeed
 from slrig.scan.folder import DataFolder, missing_files, sync_tree
 from slrig.scan.holding import HeldRig, check_plan, driver_errors
 from slrig.scan.plan import ReconstructionPlan
-from slrig.scan.records import ScanRecord, ScanState, report_summary
+from slrig.scan.records import KeptRecord, ScanRecord, ScanState, report_summary, write_record
 from slrig.scan.store import ProgressRecorder, ScanStore
 from slrig.scan.work import CaptureBundle, Holder, WatchesHealth
 from slrig.scan.worker import Worker
@@ -51,6 +52,7 @@ class ScanWalk:
     """One scan that waits or is under way. Implements `slrig.scan.work.Task`."""
 
     def __init__(self, record: ScanRecord, tools: ScanTools) -> None:
+        self._record = record
         self.id = record.id
         self.holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
         self.since = record.created_at
@@ -113,6 +115,9 @@ class ScanWalk:
     def _walk(self, held: HeldRig) -> Mapping[str, Any]:
         tools = self._tools
         progress = ProgressRecorder(tools.store, self.id, hidden=f"{tools.folder.staging(self.id)}/")
+        if self._record.state is ScanState.RECONSTRUCTING:
+            # The service was killed in the middle of it: all that is needed lies there.
+            return self._reconstructed(tools.folder.clear_results(self.id), progress, None)
         self.since = tools.store.advance(self.id, ScanState.CAPTURING)
         rig = held.open()
         held.refuse_misfit()
@@ -140,13 +145,20 @@ class ScanWalk:
             feed.abandon()
             message = "The scan was cancelled."
             raise ScanCancelledError(message)
+        return self._reconstructed(staged, progress, feed)
+
+    def _reconstructed(self, staged: Path, progress: ProgressRecorder, feed: FrameFeed | None) -> Mapping[str, Any]:
+        """Make the mesh of the bundle in staging, put the scan in its place, and return the summary of its report."""
+        tools, bundle = self._tools, staged / "bundle"
         self._reconstructing()
         progress.span(CAPTURE_SHARE, 1.0)
         call = reconstruction(tools.worker.module, bundle, staged / "result", self._plan.reconstruction)
         report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=self.stop.is_set, feed=feed)
         _require_promised(staged / "result")
+        record = self._record
+        write_record(staged, KeptRecord(self.id, record.rig, record.label, record.plan, record.created_at, self.since))
         tools.folder.commit(self.id)
-        if health is not None:
+        if (health := tools.health()) is not None:
             _noted(health, report)
         return report_summary(report)
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import UUID, uuid4
 
@@ -18,7 +19,7 @@ from slrig.errors import StorageError
 from slrig.scan.faults import disk_errors
 from slrig.scan.folder import DataFolder
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import ScanState
+from slrig.scan.records import KeptRecord, ScanState, write_record
 from slrig.scan.store import ScanStore
 from slrig.scan.sweep import sweep
 
@@ -149,8 +150,21 @@ def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
     assert list(folder.incoming.iterdir()) == []
 
 
-def test_sweep_keeps_the_whole_bundle_of_a_cut_off_reconstruction(store: ScanStore, folder: DataFolder) -> None:
+def test_sweep_leaves_what_the_runner_takes_up_again(store: ScanStore, folder: DataFolder) -> None:
+    cut_off = running(store, ScanState.RECONSTRUCTING)
+    staged_bundle(folder, cut_off)
+    queued = store.create(ScanPlan(), rig="bench", label=None).id
+    swept = sweep(store, folder)
+    assert (swept.resumed, swept.interrupted) == ((cut_off, queued), ())
+    assert [record.id for record in store.unfinished()] == [cut_off, queued]
+    assert (folder.staging(cut_off) / "bundle").is_dir()
+
+
+def test_sweep_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice(
+    store: ScanStore, folder: DataFolder
+) -> None:
     scan_id = running(store, ScanState.RECONSTRUCTING)
+    store.advance(scan_id, ScanState.RECONSTRUCTING)
     staged_bundle(folder, scan_id)
     (folder.staging(scan_id) / "result.part").mkdir()
     sweep(store, folder)
@@ -197,6 +211,27 @@ def test_sweep_takes_no_scan_without_a_mesh_for_a_finished_one(store: ScanStore,
     finished(folder, scan_id)
     (folder.scan(scan_id) / "mesh.ply").unlink()
     assert sweep(store, folder).interrupted == (scan_id,)
+
+
+def test_sweep_puts_finished_scans_on_record_again_beside_a_database_that_was_lost(
+    store: ScanStore, folder: DataFolder
+) -> None:
+    plan = ScanPlan(exposure_s=0.02)
+    made = datetime(2026, 11, 23, 12, 0, tzinfo=UTC)
+    records = [KeptRecord(uuid4(), "bench", f"part {i}", plan, made - timedelta(hours=i), made) for i in range(3)]
+    for record in records:
+        finished(folder, record.id)
+        write_record(folder.scan(record.id), record)
+    (folder.scan(records[1].id) / "mesh.ply").unlink()
+    swept = sweep(store, folder)
+    assert set(swept.recovered) == {records[0].id, records[2].id}
+    assert swept.put_aside == (str(records[1].id),)
+    newest, oldest = store.page(before=None, limit=10)
+    assert (newest.id, oldest.id) == (records[0].id, records[2].id)
+    assert (newest.state, newest.label, newest.plan, newest.created_at) == (ScanState.SUCCEEDED, "part 0", plan, made)
+    assert newest.summary == {"truth": {"rms_mm": 0.01}}
+    assert [event.kind for event in store.events(newest.id, after=0)] == ["state"]
+    assert sweep(store, folder).recovered == ()
 
 
 def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: ScanStore, folder: DataFolder) -> None:

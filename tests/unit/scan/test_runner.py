@@ -22,10 +22,39 @@ from slrig.model import Calibration
 from slrig.scan.faults import ScanInterruptedError
 from slrig.scan.holding import ActiveCalibration
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.scan.records import ScanState
+from slrig.scan.records import ScanState, read_record
+from slrig.scan.sweep import sweep
 from tests.unit.scan.bench import Bench, fault_kind
 from tests.unit.scan.fakes import WAIT_S
 from tests.unit.sessions.calibration.calibration_bench import tame_calibration
+
+
+def test_scans_that_a_kill_left_are_taken_up_again(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    cut_off = bench.store.create(ScanPlan(), rig="bench", label="cut off").id
+    bench.store.advance(cut_off, ScanState.RECONSTRUCTING)
+    bundle = bench.folder.stage(cut_off) / "bundle"
+    bundle.mkdir()
+    (bundle / "order").write_text("finish")
+    (bundle.parent / "result.part").mkdir()
+    # More than may wait: whoever asked was answered long ago.
+    queued = [bench.store.create(ScanPlan(), rig="bench", label=None).id for _ in range(3)]
+    resumed = sweep(bench.store, bench.folder).resumed
+    assert resumed == (cut_off, *queued)
+    bench.runner.take_up(resumed)
+    bench.runner.start()
+    for scan_id in (cut_off, *queued):
+        record = bench.until(scan_id)
+        assert record.state is ScanState.SUCCEEDED, record.fault
+        assert record.summary is not None
+        assert record.summary["bundle"] == str(scan_id)
+    states = [event.data["state"] for event in bench.store.events(cut_off, after=0) if event.kind == "state"]
+    assert states == ["queued", "reconstructing", "reconstructing", "succeeded"]
+    kept = read_record(bench.folder.scan(cut_off))
+    assert kept is not None
+    assert (kept.id, kept.label) == (cut_off, "cut off")
+    assert not (bench.folder.scan(cut_off) / "result.part").exists()
+    bench.close()
 
 
 def test_scan_walks_to_its_mesh(bench: Bench) -> None:
