@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ from simulated_rig.light import Float32Array, LightTable
 from simulated_rig.options import CameraOptions, Faults
 from simulated_rig.rendering import View
 from simulated_rig.world import Flicker, Lamp, nanoseconds
-from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, Clock, Trigger
-from slrig.errors import DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, CameraState, Clock, Trigger
+from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import CameraFormat, Frame, Pixels
 
 _NOISE, _FATE, _GARBLE, _STALE, _CORRUPT, _START, _DELIVERY = range(7)
@@ -56,7 +55,7 @@ class SimulatedCamera:
         self._ambient_flicker = ambient_flicker
         self._sensor = options.sensor()
         self._settings = AppliedSettings(options.exposure_s, 1.0)
-        self._trigger: Trigger | None = None
+        self._state = CameraState(options.name)
         self._pending: deque[_Exposure] = deque()
         self._made = self._armed_at = 0
         self._dropped = 0
@@ -64,7 +63,6 @@ class SimulatedCamera:
         self._t_busy_ns = 0
         self._free_index = 0
         self._last_image: Pixels | None = None
-        self._closed = threading.Event()
         self._gone = False
 
     @property
@@ -85,47 +83,26 @@ class SimulatedCamera:
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`."""
         self._require_usable()
-        if self._trigger is not None:
-            message = f"camera '{self._options.name}' is armed; disarm it before changing its settings"
-            raise DeviceStateError(message)
-        info = self.info
-        for what, asked, (low, high) in (
-            ("exposure_s", settings.exposure_s, info.exposure_range_s),
-            ("gain", settings.gain, info.gain_range),
-        ):
-            if not low <= asked <= high:
-                message = f"camera '{info.name}': {what} {asked} is out of range, choose {low} to {high}"
-                raise UnsupportedByDeviceError(message)
+        self._state.check_settings(settings, self.info)
         self._settings = AppliedSettings(settings.exposure_s, settings.gain)
         return self._settings
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. Frames beyond `count` can be had: a caller may take one again."""
         self._require_usable()
-        if self._trigger is not None:
-            message = f"camera '{self._options.name}' is armed already; disarm it first"
-            raise DeviceStateError(message)
-        if count < 1 or trigger not in self.info.triggers:
-            offered = ", ".join(sorted(self.info.triggers))
-            message = (
-                f"camera '{self._options.name}': asked for {count} frames by {trigger} trigger, it takes 1 or more by "
-                f"one of: {offered}"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._state.check_arming(count, trigger, self.info)
         # Tracing takes seconds of real time; done here, it delays no frame.
         self._view.prepare()
         self._pending.clear()
         self._dropped = self._free_index = 0
         self._t_armed_ns = self._t_busy_ns = self._clock.now_ns()
-        self._trigger = trigger
+        self._state.armed = trigger
         self._armed_at = self._made
 
     def trigger(self) -> None:
         """See `Camera`. A trigger during an exposure starts the next one right after it."""
         self._require_usable()
-        if self._trigger is not Trigger.SOFTWARE:
-            message = f"camera '{self._options.name}' is not armed for software triggers; call arm first"
-            raise DeviceStateError(message)
+        self._state.require_armed(Trigger.SOFTWARE)
         latency_s = self._options.trigger_latency_s + self._jitter_s(_START, self._made)
         start_ns = max(self._clock.now_ns() + nanoseconds(latency_s), self._t_busy_ns)
         exposure = self._exposure(self._made, start_ns)
@@ -136,9 +113,7 @@ class SimulatedCamera:
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`."""
         self._require_usable()
-        if self._trigger is None:
-            message = f"camera '{self._options.name}' is not armed; call arm first"
-            raise DeviceStateError(message)
+        self._state.require_armed()
         asked_ns = self._clock.now_ns()
         deadline_ns = asked_ns + nanoseconds(timeout_s)
         while True:
@@ -147,7 +122,9 @@ class SimulatedCamera:
             if exposure is not None and ready and not self._is_dropped(exposure.number):
                 # Tracing its light takes a while of real time: better while it shines than after its read-out.
                 self._view.rehearse(self._lights(exposure))
-            self._clock.wait_until(exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._closed)
+            self._clock.wait_until(
+                exposure.t_ready_ns if exposure is not None and ready else deadline_ns, self._state.closed
+            )
             self._require_usable()
             if exposure is None or not ready:
                 message = (
@@ -163,16 +140,16 @@ class SimulatedCamera:
 
     def disarm(self) -> None:
         """See `Camera`."""
-        if self._trigger is Trigger.FREE:
+        if self._state.armed is Trigger.FREE:
             begun = (self._clock.now_ns() - self._t_armed_ns) // self._period_ns + 1
             self._made += max(begun, self._free_index)
-        self._trigger = None
+        self._state.armed = None
         self._pending.clear()
 
     def close(self) -> None:
         """See `Camera`."""
         self.disarm()
-        self._closed.set()
+        self._state.close()
 
     @property
     def _period_ns(self) -> int:
@@ -194,14 +171,14 @@ class SimulatedCamera:
         """Return the first exposure that lies wholly after `after_ns`, passing over earlier ones, or None."""
         earliest_ns = after_ns + nanoseconds(self._options.stamp_error_s)
         while True:
-            if not self._pending and self._trigger is Trigger.FREE:
+            if not self._pending and self._state.armed is Trigger.FREE:
                 self._run_free(earliest_ns, deadline_ns)
             if not self._pending:
                 return None
             upcoming = self._pending[0]
             unplug = self._faults.unplug_camera_at_frame
             if unplug is not None and self._is_faulty and upcoming.number >= unplug:
-                self._clock.wait_until(min(upcoming.t_ready_ns, deadline_ns), self._closed)
+                self._clock.wait_until(min(upcoming.t_ready_ns, deadline_ns), self._state.closed)
                 self._gone = True
                 self._require_usable()
             if upcoming.t_start_ns >= earliest_ns:
@@ -323,9 +300,7 @@ class SimulatedCamera:
         return float(self._rng(purpose, number).uniform(0, most_s)) if most_s else 0.0
 
     def _require_usable(self) -> None:
-        if self._closed.is_set():
-            message = f"camera '{self._options.name}' is closed; open the rig again"
-            raise DeviceStateError(message)
+        self._state.require_open()
         if self._gone:
             message = f"camera '{self._options.name}' is gone (unplugged or powered off); plug it in and open it again"
             raise DeviceGoneError(message)

@@ -20,8 +20,8 @@ from drivers.depthai.library import library
 from drivers.depthai.messages import Delivery, brightness
 from drivers.depthai.options import OakOptions, Stream, options_of
 from drivers.depthai.sensors import Sensor
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
-from slrig.errors import CalibrationError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Size
 
 LEAST_EXPOSURE_S = 100e-6
@@ -72,9 +72,8 @@ class OakCamera:
         except BaseException:
             self._board.close_unless_used()
             raise
-        self._armed: Trigger | None = None
+        self._state = CameraState(name)
         self._armed_ns = 0
-        self._closed = False
 
     @property
     def info(self) -> CameraInfo:
@@ -90,18 +89,8 @@ class OakCamera:
         FrameTimeoutError
             The camera delivers no frame.
         """
-        self._require_open()
-        if self._armed is not None:
-            message = f"camera '{self._name}' is armed; disarm it before changing its settings"
-            raise DeviceStateError(message)
-        for what, asked, (least, most) in (
-            ("exposure_s", settings.exposure_s, self._info.exposure_range_s),
-            ("gain", settings.gain, self._info.gain_range),
-        ):
-            if not least * (1 - 1e-9) <= asked <= most * (1 + 1e-9):
-                why = f" at {self._stream.fps:g} frames per second" if what == "exposure_s" else ""
-                message = f"camera '{self._name}': asked for {what} {asked:g}, it takes {least:g} to {most:g}{why}"
-                raise UnsupportedByDeviceError(message)
+        hint = f"exposures are that long at fps = {self._stream.fps:g}"
+        self._state.check_settings(settings, self._info, hint=hint)
         self._board.start()
         self._asked = (round(settings.exposure_s * 1e6), round(settings.gain * ISO_OF_GAIN_1))
         control = self._vendor.CameraControl()
@@ -122,29 +111,22 @@ class OakCamera:
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. Frames beyond `count` can be had."""
-        self._require_open()
-        if self._armed is not None:
-            message = f"camera '{self._name}' is armed already; disarm it first"
-            raise DeviceStateError(message)
-        if count < 1 or trigger not in self._info.triggers:
-            raise UnsupportedByDeviceError(self._no_trigger(count, trigger))
+        self._state.check_arming(count, trigger, self._info, hint=self._how_to_wire(trigger))
         self._board.start()
         # Edges that come while nobody reads must not be lost; a camera that runs by itself has newer frames.
         self._feed.begin(max(KEPT_FRAMES, 2 * count) if trigger is Trigger.HARDWARE else KEPT_FRAMES)
         self._armed_ns = time.monotonic_ns()
-        self._armed = trigger
+        self._state.armed = trigger
 
     def trigger(self) -> None:
         """See `Camera`. An OAK takes no software trigger."""
-        self._require_armed()
-        message = f"camera '{self._name}' is armed for {self._armed} triggers, and takes none by software; read it"
-        raise DeviceStateError(message)
+        self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`. A frame may have begun earlier than it says by the error of its time stamp: that is allowed
         for.
         """
-        self._require_armed()
+        self._state.require_armed()
         until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         stale = otherwise = 0
         while (delivery := self._feed.take(until_ns)) is not None:
@@ -163,19 +145,17 @@ class OakCamera:
         message = (
             f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s; passed over: "
             f"{stale} that began earlier, {otherwise} taken otherwise than asked; lost since it was armed: {lost}"
-            f"{damage}; check {'the trigger wire' if self._armed is Trigger.HARDWARE else 'cable and USB port'}"
+            f"{damage}; check {'the trigger wire' if self._state.armed is Trigger.HARDWARE else 'cable and USB port'}"
         )
         raise FrameTimeoutError(message)
 
     def disarm(self) -> None:
         """See `Camera`."""
-        self._armed = None
+        self._state.armed = None
 
     def close(self) -> None:
         """See `Camera`. The device is closed with the last of its cameras."""
-        self._armed = None
-        if not self._closed:
-            self._closed = True
+        if self._state.close():
             self._board.leave(self._stream.socket)
 
     def _chosen(self, options: OakOptions) -> Sensor:
@@ -302,27 +282,12 @@ class OakCamera:
         )
         return UnsupportedByDeviceError(message)
 
-    def _no_trigger(self, count: int, trigger: Trigger) -> str:
-        offered = ", ".join(sorted(self._info.triggers))
-        message = (
-            f"camera '{self._name}': asked for {count} frames by {trigger} trigger, it gives 1 or more by: {offered}"
-        )
-        if trigger is Trigger.HARDWARE and self._sensor.snapshot:
-            return f"{message}; write external_trigger = true into its table"
-        if trigger is Trigger.HARDWARE:
-            return f"{message}; its sensor {self._sensor.name} follows FSIN only at its own steady frame rate"
-        return message
-
-    def _require_open(self) -> None:
-        if self._closed:
-            message = f"camera '{self._name}' is closed; open the rig again"
-            raise DeviceStateError(message)
-
-    def _require_armed(self) -> None:
-        self._require_open()
-        if self._armed is None:
-            message = f"camera '{self._name}' is not armed; call arm first"
-            raise DeviceStateError(message)
+    def _how_to_wire(self, trigger: Trigger) -> str:
+        if trigger is not Trigger.HARDWARE:
+            return ""
+        if self._sensor.snapshot:
+            return "; write external_trigger = true into its table"
+        return f"; its sensor {self._sensor.name} follows FSIN only at its own steady frame rate"
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:  # noqa: ARG001 - every driver's form

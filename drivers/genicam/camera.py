@@ -24,7 +24,7 @@ from drivers.genicam.pixels import FORMATS
 from drivers.genicam.session import Session
 from drivers.genicam.setup import line_of, prepare, set_trigger
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
-from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.errors import UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame
 
 _RESENT_AFTER_NS = 400_000_000
@@ -55,7 +55,8 @@ class GenicamCamera:
         self._name = name
         self._options = options
         self._connection = Connection(name, options)
-        self._session: Session | None = None
+        self._state = self._connection.state
+        self._session: Session
         self._owes = False
         try:
             self._size = prepare(self._connection, options)
@@ -73,17 +74,8 @@ class GenicamCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`. A value that the camera rounds by more than 1 % is refused, with what it would use."""
-        self._require_open()
-        if self._session is not None:
-            message = f"camera '{self._name}' is armed; disarm it before changing its settings"
-            raise DeviceStateError(message)
-        for what, asked, (least, most) in (
-            ("exposure_s", settings.exposure_s, self._info.exposure_range_s),
-            ("gain", settings.gain, self._info.gain_range),
-        ):
-            if not least * (1 - 1e-9) <= asked <= most * (1 + 1e-9):
-                message = f"camera '{self._name}': asked for {what} {asked:g}, it takes {least:g} to {most:g}"
-                raise UnsupportedByDeviceError(message)
+        self._require_there()
+        self._state.check_settings(settings, self._info)
         with self._connection.asking("setting exposure and gain") as camera:
             camera.set_exposure_time(settings.exposure_s * 1e6)
             if camera.is_gain_available():
@@ -103,23 +95,15 @@ class GenicamCamera:
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. Opens a stream of its own, so no frame of an earlier arming can come."""
-        self._require_open()
-        if self._session is not None:
-            message = f"camera '{self._name}' is armed already; disarm it first"
-            raise DeviceStateError(message)
-        if count < 1 or trigger not in self._info.triggers:
-            offered = ", ".join(sorted(self._info.triggers))
-            message = (
-                f"camera '{self._name}': asked for {count} frames by {trigger} trigger, it gives 1 or more by: "
-                f"{offered}"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._require_there()
+        self._state.check_arming(count, trigger, self._info)
         source = {Trigger.FREE: None, Trigger.SOFTWARE: "Software", Trigger.HARDWARE: self._line}[trigger]
         set_trigger(self._connection, source, self._options)
         self._applied = self._in_use()
         session = Session(self._connection, self._options, FORMATS[self._options.pixel_format], self._size)
         session.begin(trigger, self._applied, _FEWEST_BUFFERS if trigger is Trigger.FREE else self._buffers(count))
         self._session = session
+        self._state.armed = trigger
         if self._owes and trigger is not Trigger.FREE:
             # A camera may keep a trigger that came while it was stopped, and expose now.
             session.drain(self._applied.exposure_s + _LATE_S)
@@ -127,28 +111,28 @@ class GenicamCamera:
 
     def trigger(self) -> None:
         """See `Camera`. While the frame of an earlier trigger is due, waits for that first."""
-        session = self._require_armed()
-        if session.trigger is not Trigger.SOFTWARE:
-            message = f"camera '{self._name}' is armed for {session.trigger} triggers; arm it for software triggers"
-            raise DeviceStateError(message)
-        session.settle()
+        self._require_there()
+        self._state.require_armed(Trigger.SOFTWARE)
+        self._session.settle()
         with self._connection.asking("triggering") as camera:
             begun_ns = time.monotonic_ns()
             camera.software_trigger()
             ended_ns = time.monotonic_ns()
         # A command whose answer was lost is sent again: the camera may have exposed twice.
-        session.triggered(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESENT_AFTER_NS else 1)
+        self._session.triggered(begun_ns, ended_ns, times=2 if ended_ns - begun_ns > _RESENT_AFTER_NS else 1)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`, and the head of this module. Exposure and gain are those read back when it was armed."""
-        return self._require_armed().read(after_ns, timeout_s)
+        self._require_there()
+        self._state.require_armed()
+        return self._session.read(after_ns, timeout_s)
 
     def disarm(self) -> None:
         """See `Camera`."""
-        session, self._session = self._session, None
-        if session is not None:
-            self._owes = self._owes or session.owed()
-            session.end()
+        if self._state.armed is not None:
+            self._state.armed = None
+            self._owes = self._owes or self._session.owed()
+            self._session.end()
 
     def close(self) -> None:
         """See `Camera`."""
@@ -188,19 +172,10 @@ class GenicamCamera:
             payload = int(camera.get_payload())
         return max(_FEWEST_BUFFERS, min(count + 2, _MOST_BUFFER_BYTES // max(payload, 1)))
 
-    def _require_open(self) -> None:
-        if not self._connection.is_open:
-            message = f"camera '{self._name}' is closed; open the rig again"
-            raise DeviceStateError(message)
+    def _require_there(self) -> None:
+        self._state.require_open()
         if self._connection.is_lost:
             raise self._connection.gone("noticed before")
-
-    def _require_armed(self) -> Session:
-        self._require_open()
-        if self._session is None:
-            message = f"camera '{self._name}' is not armed; call arm first"
-            raise DeviceStateError(message)
-        return self._session
 
 
 def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:

@@ -11,7 +11,8 @@ from typing import Any
 from drivers.genicam.features import Features
 from drivers.genicam.library import library, told
 from drivers.genicam.options import GenicamOptions
-from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
+from slrig.devices import CameraState
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
 
 PROTOCOLS = ("GigEVision", "USB3Vision")
 """What this driver opens of the things that Aravis lists."""
@@ -44,6 +45,7 @@ class Connection:
     def __init__(self, name: str, options: GenicamOptions) -> None:
         aravis = library().aravis
         self.name = name
+        self.state = CameraState(name)
         self._lost = threading.Event()
         self._camera = _opened(aravis, name, options.device)
         self._device = self._camera.get_device()
@@ -66,11 +68,6 @@ class Connection:
         """Whether the device has gone since it was opened."""
         return self._lost.is_set()
 
-    @property
-    def is_open(self) -> bool:
-        """Whether it has not been closed."""
-        return self._camera is not None
-
     @contextmanager
     def asking(self, doing: str) -> Iterator[Any]:
         """The `Aravis.Camera`, for the block.
@@ -84,9 +81,7 @@ class Connection:
         DeviceError
             What `told` makes of Aravis' errors.
         """
-        if self._camera is None:
-            message = f"camera '{self.name}' is closed; open the rig again"
-            raise DeviceStateError(message)
+        self.state.require_open()
         if self._lost.is_set():
             raise self.gone(doing)
         try:
@@ -132,7 +127,7 @@ class Connection:
 
     def close(self) -> None:
         """Let the device go. Idempotent; works after it is lost."""
-        if self._device is None:
+        if not self.state.close():
             return
         with suppress(Exception):
             self._device.disconnect(self._handler)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from dataclasses import dataclass
 
@@ -16,8 +15,8 @@ from drivers.opencv.pixels import Picture, decoded_picture, raw_picture
 from drivers.opencv.reader import Reader
 from drivers.opencv.timing import Arrivals
 from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, prepare
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Trigger
-from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Frame
 
 _Feed = DeviceFeed | LiveFeed | FilmFeed
@@ -61,8 +60,7 @@ class OpenCvCamera:
     def __init__(self, name: str, source: Source) -> None:
         self._name = name
         self._source = source
-        self._closed = threading.Event()
-        self._armed = False
+        self._state = CameraState(name)
         self._armed_ns = 0
         self._lost_before = 0
         self._corrupt = 0
@@ -94,21 +92,8 @@ class OpenCvCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`. A source that OpenCV has no control over takes what its table says, within 1 %."""
-        self._require_open()
-        if self._armed:
-            message = f"camera '{self._name}' is armed; disarm it before changing its settings"
-            raise DeviceStateError(message)
-        for what, asked, (least, most), unit in (
-            ("an exposure", settings.exposure_s, self._info.exposure_range_s, " s"),
-            ("gain", settings.gain, self._info.gain_range, ""),
-        ):
-            if least * (1 - _SAME) <= asked <= most * (1 + _SAME):
-                continue
-            has = f"the source gives {least:.6g}{unit} and OpenCV no control over it"
-            if least < most:
-                has = f"the device takes {least:.6g} to {most:.6g}{unit}"
-            message = f"camera '{self._name}': asked for {what} of {asked:.6g}{unit}, {has}; write such a value"
-            raise UnsupportedByDeviceError(message)
+        hint = "OpenCV has no control over such a source" if self._controls is None else "choose such a value"
+        self._state.check_settings(settings, self._info, within=_SAME, hint=hint)
         if self._controls is not None:
             self._require_idle()
             self._applied = self._controls.apply(settings)
@@ -124,16 +109,7 @@ class OpenCvCamera:
         DeviceGoneError, FrameTimeoutError
             No frames come.
         """
-        self._require_open()
-        if self._armed:
-            message = f"camera '{self._name}' is armed already; disarm it first"
-            raise DeviceStateError(message)
-        if count < 1 or trigger is not Trigger.FREE:
-            message = (
-                f"camera '{self._name}': asked for {count} frames by {trigger} trigger, OpenCV gives 1 or more of a "
-                "camera that runs free"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._state.check_arming(count, trigger, self._info)
         self._armed_ns = time.monotonic_ns()
         self._lost_before = self._corrupt = 0
         if self._source.kind is Kind.LIVE:
@@ -142,23 +118,21 @@ class OpenCvCamera:
         else:
             self._require_idle()
             self._start()
-        self._armed = True
+        self._state.armed = trigger
 
     def trigger(self) -> None:
         """See `Camera`. A camera that runs free has no software trigger."""
-        self._require_armed()
-        message = f"camera '{self._name}' runs free: there is nothing to trigger; read a frame"
-        raise DeviceStateError(message)
+        self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`. The exposure began after `after_ns` at the earliest, and after `arm`."""
-        self._require_armed()
+        self._state.require_armed()
         until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         after_ns = max(after_ns, self._armed_ns)
         passed = _PassedOver()
         while True:
             taken = self._reader.next(until_ns)
-            self._require_armed()
+            self._state.require_armed()
             if taken is None:
                 raise FrameTimeoutError(self._nothing_came(after_ns, timeout_s, passed))
             frame = self._judged(taken, after_ns, passed)
@@ -167,15 +141,13 @@ class OpenCvCamera:
 
     def disarm(self) -> None:
         """See `Camera`."""
-        self._armed = False
-        if self._source.kind is not Kind.LIVE and not self._closed.is_set():
+        self._state.armed = None
+        if self._source.kind is not Kind.LIVE and not self._state.closed.is_set():
             self._halt()
 
     def close(self) -> None:
         """See `Camera`. From another thread, it ends a `read` that waits."""
-        self._armed = False
-        if not self._closed.is_set():
-            self._closed.set()
+        if self._state.close():
             self._reader.close()
 
     def _judged(self, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
@@ -365,14 +337,3 @@ class OpenCvCamera:
         fault = self._reader.fault
         if fault is not None:
             raise fault
-
-    def _require_open(self) -> None:
-        if self._closed.is_set():
-            message = f"camera '{self._name}' is closed; open the rig again"
-            raise DeviceStateError(message)
-
-    def _require_armed(self) -> None:
-        self._require_open()
-        if not self._armed:
-            message = f"camera '{self._name}' is not armed; call arm first"
-            raise DeviceStateError(message)

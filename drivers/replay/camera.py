@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings
-from slrig.devices import Trigger as TriggerKind
+from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Black, Frame, Pattern, Shot
 
@@ -39,7 +38,7 @@ class ReplayCamera:
             model="recorded camera",
             serial=f"{bundle.folder.name}-{name}",
             format=capture.cameras[name],
-            triggers=frozenset({TriggerKind.SOFTWARE}),
+            triggers=frozenset({Trigger.SOFTWARE}),
             # A recording that does not tell its exposure agrees with every one.
             exposure_range_s=(exposures[0], exposures[-1]) if exposures else (1e-6, 3600.0),
             gain_range=(1.0, 1.0),
@@ -49,8 +48,7 @@ class ReplayCamera:
         self._clock = clock
         self._stage = stage
         self._pending: deque[Frame] = deque()
-        self._armed = False
-        self._closed = False
+        self._state = CameraState(name)
         self._number = 0
         self._busy_ns = 0
 
@@ -61,10 +59,7 @@ class ReplayCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`. Takes an exposure that was recorded, within 1 %, and gain 1."""
-        self._require_open()
-        if self._armed:
-            message = f"camera '{self._info.name}' is armed; disarm it before changing its settings"
-            raise DeviceStateError(message)
+        self._state.require_settable()
         nearest_s = min(self._exposures_s, key=lambda have: abs(have - settings.exposure_s), default=None)
         low_s, high_s = self._info.exposure_range_s
         if nearest_s is None:
@@ -86,23 +81,14 @@ class ReplayCamera:
         self._applied = AppliedSettings(nearest_s if nearest_s is not None else settings.exposure_s, 1.0)
         return self._applied
 
-    def arm(self, count: int, trigger: TriggerKind) -> None:
+    def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. Frames beyond `count` can be had: a caller may take one again."""
-        self._require_open()
-        if self._armed:
-            message = f"camera '{self._info.name}' is armed already; disarm it first"
-            raise DeviceStateError(message)
-        if count < 1 or trigger is not TriggerKind.SOFTWARE:
-            message = (
-                f"camera '{self._info.name}': asked for {count} frames by {trigger} trigger, a recording gives 1 or "
-                "more by software trigger"
-            )
-            raise UnsupportedByDeviceError(message)
-        self._armed = True
+        self._state.check_arming(count, trigger, self._info)
+        self._state.armed = trigger
 
     def trigger(self) -> None:
         """See `Camera`. Takes the recorded frame of what is shown now; in the dark, that of the black pattern."""
-        self._require_armed()
+        self._state.require_armed()
         shot = self._shot()
         exposure_s = self._applied.exposure_s if shot.exposure_s is None else shot.exposure_s
         start_ns = max(self._clock.now_ns(), self._busy_ns, self._clock.recorded_ns(shot.time_s))
@@ -126,13 +112,13 @@ class ReplayCamera:
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`. A frame that was not triggered will never come: without a pace nothing is waited for."""
-        self._require_armed()
+        self._state.require_armed()
         while self._pending:
             frame = self._pending[0]
             if frame.t_start_ns >= after_ns:
                 if not self._clock.reached(frame.t_end_ns, timeout_s):
                     break
-                self._require_armed()
+                self._state.require_armed()
                 return self._pending.popleft()
             self._pending.popleft()
         self._clock.idle(timeout_s)
@@ -144,14 +130,14 @@ class ReplayCamera:
 
     def disarm(self) -> None:
         """See `Camera`."""
-        self._armed = False
+        self._state.armed = None
         self._pending.clear()
 
     def close(self) -> None:
         """See `Camera`."""
         self.disarm()
         self._recorded.clear()
-        self._closed = True
+        self._state.close()
         self._clock.release()
 
     def frames_of(self, pattern: Pattern) -> Sequence[Shot]:
@@ -174,14 +160,3 @@ class ReplayCamera:
             raise DeviceStateError(message)
         # A pattern that is shown more often than it was recorded looks as it did the last time.
         return shots[min(showing, len(shots) - 1)]
-
-    def _require_open(self) -> None:
-        if self._closed:
-            message = f"camera '{self._info.name}' is closed; open the rig again"
-            raise DeviceStateError(message)
-
-    def _require_armed(self) -> None:
-        self._require_open()
-        if not self._armed:
-            message = f"camera '{self._info.name}' is not armed; call arm first"
-            raise DeviceStateError(message)

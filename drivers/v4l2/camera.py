@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 
 from drivers.v4l2 import controls as ctl
@@ -17,8 +17,8 @@ from drivers.v4l2.options import V4L2Options
 from drivers.v4l2.stream import Stream, Taken, Waker
 from drivers.v4l2.tally import Tally
 from drivers.v4l2.timing import Durations, Exposure, exposure_of
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, Trigger
-from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Pixels
 
 _SAME_PERIOD = 0.02
@@ -62,20 +62,22 @@ class V4L2Camera:
         self._node = node.path
         self._options = options
         self._lock = threading.RLock()
-        self._closing = threading.Event()
-        self._armed = False
+        self._state = CameraState(name)
         self._tally = Tally()
         try:
             self._handle = kernel.open_node(node.path)
         except OSError as error:
             raise kernel.fault(node.path, "opening", error) from error
-        self._waker = Waker()
-        self._stream: Stream | None = None
+        self._held = ExitStack()
+        self._held.callback(_close_quietly, self._handle)
         try:
+            self._waker = Waker()
+            self._held.callback(self._waker.close)
             identity = self._identity()
             self._agreed = agree(self._handle, node.path, options)
             prepare(self._agreed.layout)
             self._stream = Stream(self._handle, node.path, options.buffers, self._waker)
+            self._held.callback(self._stream.release)
             self._controls = self._known_controls()
             self._exposure = self._controls.get(ctl.EXPOSURE_ABSOLUTE)
             self._scale = ctl.GainScale(ctl.gain_control(self._controls), options.gain_unity)
@@ -83,7 +85,7 @@ class V4L2Camera:
             self._set(None, None)
             self._applied = self._read_back()
         except BaseException:
-            self._release()
+            self._held.close()
             raise
         self._info = self._described(identity, node)
 
@@ -105,20 +107,7 @@ class V4L2Camera:
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`. Exposure and gain are rounded to the device's steps, and every control is read back."""
         with self._lock:
-            self._require_open()
-            if self._armed:
-                message = f"camera '{self._name}' is armed; disarm it before changing its settings"
-                raise DeviceStateError(message)
-            for what, asked, (least, most), unit in (
-                ("an exposure", settings.exposure_s, self._info.exposure_range_s, " s"),
-                ("gain", settings.gain, self._info.gain_range, ""),
-            ):
-                if not least * (1 - 1e-9) <= asked <= most * (1 + 1e-9):
-                    message = (
-                        f"camera '{self._name}': asked for {what} of {asked:.6g}{unit}, the device takes {least:.6g} "
-                        f"to {most:.6g}{unit}; write a value in that range into the rig file"
-                    )
-                    raise UnsupportedByDeviceError(message)
+            self._state.check_settings(settings, self._info)
             units = None
             if self._exposure is not None:
                 units = max(self._exposure.nearest(settings.exposure_s / ctl.EXPOSURE_UNIT_S), 1)
@@ -139,42 +128,31 @@ class V4L2Camera:
             No frames come.
         """
         with self._lock:
-            stream = self._require_open()
-            if self._armed:
-                message = f"camera '{self._name}' is armed already; disarm it first"
-                raise DeviceStateError(message)
-            if count < 1 or trigger is not Trigger.FREE:
-                message = (
-                    f"camera '{self._name}': asked for {count} frames by {trigger} trigger, a V4L2 camera gives 1 or "
-                    "more, running free"
-                )
-                raise UnsupportedByDeviceError(message)
+            self._state.check_arming(count, trigger, self._info)
             self._tally.begin()
             try:
-                stream.start()
-                self._settle(stream)
+                self._stream.start()
+                self._settle()
             except BaseException:
-                stream.stop()
+                self._stream.stop()
                 raise
             self._tally.forget_losses()
-            self._armed = True
+            self._state.armed = trigger
 
     def trigger(self) -> None:
         """See `Camera`. A free-running camera has no software trigger."""
-        self._require_armed()
-        message = f"camera '{self._name}' runs free: there is nothing to trigger; read a frame"
-        raise DeviceStateError(message)
+        self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`. The exposure began after `after_ns` at the earliest, whatever the device's stamps mean."""
         with self._lock:
-            stream = self._require_armed()
+            self._state.require_armed()
             until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
             passed = _PassedOver()
             while True:
-                taken = stream.take(until_ns)
+                taken = self._stream.take(until_ns)
                 if taken is not None:
-                    frame = self._judged(stream, taken, after_ns, passed)
+                    frame = self._judged(taken, after_ns, passed)
                     if frame is not None:
                         return frame
                 if time.monotonic_ns() >= until_ns:
@@ -189,21 +167,17 @@ class V4L2Camera:
     def disarm(self) -> None:
         """See `Camera`."""
         with self._lock:
-            self._armed = False
-            if self._stream is not None:
-                self._stream.stop()
+            self._state.armed = None
+            self._stream.stop()
 
     def close(self) -> None:
         """See `Camera`. From another thread, it ends a `read` that waits."""
-        if self._closing.is_set():
-            return
-        self._closing.set()
-        self._waker.wake()
-        with self._lock:
-            self._armed = False
-            self._release()
+        if self._state.close():
+            self._waker.wake()
+            with self._lock:
+                self._held.close()
 
-    def _judged(self, stream: Stream, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
+    def _judged(self, taken: Taken, after_ns: int, passed: _PassedOver) -> Frame | None:
         """The frame if it may be given; None, and noted why, if not. The buffer goes back in any case."""
         is_new = self._tally.is_new(taken)
         exposure = self._exposure_of(taken)
@@ -212,15 +186,15 @@ class V4L2Camera:
         elif not taken.corrupt and exposure.earliest_ns < after_ns:
             passed.stale += 1
         else:
-            image = self._image(stream, taken, passed)
+            image = self._image(taken, passed)
             if image is not None:
-                stream.give_back(taken)
+                self._stream.give_back(taken)
                 return self._frame(image, exposure)
             self._tally.note_corrupt()
-        stream.give_back(taken)
+        self._stream.give_back(taken)
         return None
 
-    def _image(self, stream: Stream, taken: Taken, passed: _PassedOver) -> Pixels | None:
+    def _image(self, taken: Taken, passed: _PassedOver) -> Pixels | None:
         if taken.corrupt:
             passed.corrupt += 1
             passed.last_fault = "the driver says that its data are damaged"
@@ -228,7 +202,7 @@ class V4L2Camera:
         agreed = self._agreed
         try:
             return grey_image(
-                stream.data(taken),
+                self._stream.data(taken),
                 agreed.layout,
                 agreed.size,
                 stride_bytes=agreed.stride_bytes,
@@ -263,7 +237,7 @@ class V4L2Camera:
         delay_ns = max(round(self._options.stamp_delay_s * 1e9), self._tally.ahead_ns)
         return exposure_of(taken.stamp, Durations(exposure_ns, readout_ns, delay_ns))
 
-    def _settle(self, stream: Stream) -> None:
+    def _settle(self) -> None:
         """Pass over the first frames, which may still be exposed as before, and measure the frame period."""
         wanted = self._options.settle_frames
         slowest_ns = max(self._agreed.period_ns, round(self._applied.exposure_s * 1e9))
@@ -271,7 +245,7 @@ class V4L2Camera:
         passed = _PassedOver()
         seen = 0
         while seen < wanted + 1:
-            taken = stream.take(until_ns)
+            taken = self._stream.take(until_ns)
             if taken is None:
                 message = (
                     f"camera '{self._name}': its stream started, and {seen} of the first {wanted + 1} frames came in "
@@ -282,7 +256,7 @@ class V4L2Camera:
                 seen += 1
             else:
                 passed.repeated += 1
-            stream.give_back(taken)
+            self._stream.give_back(taken)
         self._period_ns = max(self._agreed.period_ns, self._tally.period_ns() or 0)
         self._require_unchanged()
 
@@ -356,23 +330,7 @@ class V4L2Camera:
             gain_range=self._scale.range,
         )
 
-    def _require_open(self) -> Stream:
-        if self._closing.is_set() or self._stream is None:
-            message = f"camera '{self._name}' is closed; open the rig again"
-            raise DeviceStateError(message)
-        return self._stream
 
-    def _require_armed(self) -> Stream:
-        stream = self._require_open()
-        if not self._armed:
-            message = f"camera '{self._name}' is not armed; call arm first"
-            raise DeviceStateError(message)
-        return stream
-
-    def _release(self) -> None:
-        if self._stream is not None:
-            self._stream.release()
-            self._stream = None
-        with suppress(OSError):
-            os.close(self._handle)
-        self._waker.close()
+def _close_quietly(handle: int) -> None:
+    with suppress(OSError):
+        os.close(handle)

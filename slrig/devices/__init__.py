@@ -1,6 +1,7 @@
 """What slrig asks of a camera, a projector and a rig: protocols and the values they exchange."""
 
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
+from slrig.devices.camera_state import CameraState
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
 from slrig.devices.positioner import Positioner, Positions
@@ -15,6 +16,7 @@ __all__ = [
     "Camera",
     "CameraInfo",
     "CameraSettings",
+    "CameraState",
     "Clock",
     "FoundDevice",
     "Head",

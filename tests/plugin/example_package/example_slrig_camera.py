@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, FoundDevice, Trigger
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, FoundDevice, Trigger
 from slrig.errors import (
     DeviceBusyError,
     DeviceGoneError,
-    DeviceStateError,
     FrameTimeoutError,
     UnsupportedByDeviceError,
 )
@@ -171,7 +170,7 @@ class ChartCamera:
         )
         self._sensor = sensor
         self._applied = AppliedSettings(sensor.exposure_s, sensor.gain)
-        self._armed = self._closed = False
+        self._state = CameraState(name)
         self._last, self._dropped = -1, 0
 
     @property
@@ -181,15 +180,7 @@ class ChartCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`. What is returned was read back; where it is not what was asked, within 1 %, it is refused."""
-        self._require_open()
-        if self._armed:
-            message = f"camera '{self._info.name}' is armed; disarm it before changing its settings"
-            raise DeviceStateError(message)
-        wanted = ((settings.exposure_s, EXPOSURE_RANGE_S, "exposure_s"), (settings.gain, GAIN_RANGE, "gain"))
-        for asked, (least, most), what in wanted:
-            if not least <= asked <= most:
-                message = f"camera '{self._info.name}': asked {what} {asked:g}, it takes {least:g} to {most:g}"
-                raise UnsupportedByDeviceError(message)
+        self._state.check_settings(settings, self._info)
         self._sensor.set(settings.exposure_s, settings.gain)
         taken = ((settings.exposure_s, self._sensor.exposure_s), (settings.gain, self._sensor.gain))
         for asked, got in taken:
@@ -203,26 +194,18 @@ class ChartCamera:
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. The sensor starts afresh: its buffers hold nothing from before."""
-        self._require_open()
-        if self._armed:
-            message = f"camera '{self._info.name}' is armed already; disarm it first"
-            raise DeviceStateError(message)
-        if count < 1 or trigger is not Trigger.FREE:
-            message = f"camera '{self._info.name}': asked {count} frames by {trigger} trigger; it runs freely only"
-            raise UnsupportedByDeviceError(message)
+        self._state.check_arming(count, trigger, self._info)
         self._last, self._dropped = -1, 0
         self._sensor.start()
-        self._armed = True
+        self._state.armed = trigger
 
     def trigger(self) -> None:
         """See `Camera`. There is nothing to trigger."""
-        self._require_open()
-        message = f"camera '{self._info.name}' runs by itself; read without a trigger"
-        raise DeviceStateError(message)
+        self._state.require_armed(Trigger.SOFTWARE)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
         """See `Camera`."""
-        self._require_armed()
+        self._state.require_armed()
         exposure_s = self._applied.exposure_s
         give_up_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         while (left_ns := give_up_ns - time.monotonic_ns()) > 0:
@@ -247,7 +230,7 @@ class ChartCamera:
                     gain=self._applied.gain,
                 )
         # Another thread may have closed the camera while this one waited.
-        self._require_armed()
+        self._state.require_armed()
         message = (
             f"camera '{self._info.name}': no frame that began after {after_ns} ns came within {timeout_s:g} s "
             f"(exposure {exposure_s:g} s, last frame number {self._last}); wait longer, or look at the camera"
@@ -257,25 +240,13 @@ class ChartCamera:
     def disarm(self) -> None:
         """See `Camera`."""
         self._sensor.stop()
-        self._armed = False
+        self._state.armed = None
 
     def close(self) -> None:
         """See `Camera`."""
         self.disarm()
-        if not self._closed:
-            self._closed = True
+        if self._state.close():
             _held.discard(self._info.serial)
-
-    def _require_open(self) -> None:
-        if self._closed:
-            message = f"camera '{self._info.name}' is closed; open it again"
-            raise DeviceStateError(message)
-
-    def _require_armed(self) -> None:
-        self._require_open()
-        if not self._armed:
-            message = f"camera '{self._info.name}' is not armed; call arm first"
-            raise DeviceStateError(message)
 
 
 _held: set[str] = set()

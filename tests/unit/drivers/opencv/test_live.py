@@ -51,9 +51,9 @@ def test_a_source_declares_what_its_table_says() -> None:
         assert info.triggers == {Trigger.FREE}
         assert str(info.format.size) == "80 x 60"
         assert camera.configure(CameraSettings(0.01005)).exposure_s == 0.01
-        with pytest.raises(UnsupportedByDeviceError, match=r"asked for an exposure of 0.02 s, the source gives 0.01 s"):
+        with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0.02, it takes 0.01 only"):
             camera.configure(CameraSettings(0.02))
-        with pytest.raises(UnsupportedByDeviceError, match="asked for gain of 2, the source gives 1 and OpenCV no"):
+        with pytest.raises(UnsupportedByDeviceError, match="asked for gain 2, it takes 1 only; OpenCV has no control"):
             camera.configure(CameraSettings(0.01, 2.0))
 
 
