@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +10,8 @@ from simulated_rig.light import LightTable, desktop_light, light_table, no_light
 from simulated_rig.options import Faults, ProjectorOptions
 from simulated_rig.staging import Staging
 from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
-from slrig.devices import COMPUTED, Clock, ProjectorInfo, Shown
-from slrig.errors import DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
+from slrig.devices import COMPUTED, Clock, ProjectorInfo, ProjectorState, Shown
+from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
 NAME = "projector"
@@ -33,11 +32,10 @@ class SimulatedProjector:
         swing = Flicker(options.flicker_hz, options.flicker_depth) if options.flicker_depth > 0 else None
         self.lamp = Lamp(self._dark, swing)
         self._rng = np.random.default_rng((seed, 0x70726F6A))
-        self._sequence: PatternSequence | None = None
+        self._state = ProjectorState("the rendered projector")
         self._tables: dict[int, LightTable] = {}
         self._shows = 0
         self._showing: int | None = None
-        self._closed = threading.Event()
         self._gone = False
 
     @property
@@ -67,10 +65,7 @@ class SimulatedProjector:
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. What was shown before goes dark."""
         self._require_usable()
-        size = self._options.size
-        if sequence.projector != size:
-            message = f"the projector is {size}, the sequence was made for {sequence.projector}; encode it for {size}"
-            raise UnsupportedByDeviceError(message)
+        self._state.require_size(sequence, self._options.size)
         if len(sequence) > self._options.max_patterns:
             message = (
                 f"the projector holds {self._options.max_patterns} patterns, the sequence has {len(sequence)}; "
@@ -85,19 +80,14 @@ class SimulatedProjector:
                 )
                 raise UnsupportedByDeviceError(message)
         self.blank()
-        self._sequence, self._tables = sequence, {}
+        self._state.loaded, self._tables = sequence, {}
         if self._staging is not None:
             self._staging.begun(len(sequence))
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
         self._require_usable()
-        if self._sequence is None:
-            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(self._sequence):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._sequence) - 1}"
-            raise UnsupportedByDeviceError(message)
+        sequence = self._state.require_pattern(index)
         if self._faults.unplug_projector_at_show is not None and self._shows >= self._faults.unplug_projector_at_show:
             self._gone, self._showing = True, None
             self.lamp.darken(at_ns=self._clock.now_ns())
@@ -106,23 +96,19 @@ class SimulatedProjector:
         if self._staging is not None:
             self._staging.shown()
         if index not in self._tables:
-            self._tables[index] = self._table(self._sequence.profiles[index])
+            self._tables[index] = self._table(sequence.profiles[index])
         error_s = self._options.visible_error_s
         t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
         off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s
         self.lamp.show(self._tables[index], at_ns=t_visible_ns + nanoseconds(off_s))
         self._showing = index
-        self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._closed)
+        self._clock.wait_until(t_visible_ns + nanoseconds(error_s), self._state.closed)
         return Shown(index, t_visible_ns, nanoseconds(error_s))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. This one does not play."""
         self._require_usable()
-        message = (
-            f"asked to play {exposure_s} s patterns every {period_s} s, the rendered projector has no trigger wire; "
-            "show each pattern and trigger the cameras by software"
-        )
-        raise UnsupportedByDeviceError(message)
+        self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -130,7 +116,7 @@ class SimulatedProjector:
 
     def blank(self) -> None:
         """See `Projector`. Raises DeviceGoneError after an unplug: nobody can say what it shows."""
-        if self._closed.is_set():
+        if self._state.closed.is_set():
             return
         if self._gone:
             self._require_usable()
@@ -141,8 +127,8 @@ class SimulatedProjector:
         """See `Projector`."""
         if not self._gone:
             self.blank()
-        self._showing, self._sequence, self._tables = None, None, {}
-        self._closed.set()
+        self._showing, self._state.loaded, self._tables = None, None, {}
+        self._state.closed.set()
 
     def _at_refresh(self, t_ns: int) -> int:
         refresh_hz = self._options.refresh_hz
@@ -161,9 +147,7 @@ class SimulatedProjector:
         return light_table(profile, self._options.size, self._response)
 
     def _require_usable(self) -> None:
-        if self._closed.is_set():
-            message = "the projector is closed; open the rig again"
-            raise DeviceStateError(message)
+        self._state.require_open()
         if self._gone:
             message = "the projector is gone (unplugged or powered off); plug it in and open the rig again"
             raise DeviceGoneError(message)

@@ -14,8 +14,8 @@ from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.planes import MIRRORS
 from drivers.dlpc350.tables import tables_of
 from drivers.dlpc350.timing import DARK_US, MOST_PATTERNS, Timing, check_loading, check_timing, lit
-from slrig.devices import ProjectorInfo, Shown
-from slrig.errors import DeviceGoneError, DeviceStateError, SlrigError, UnsupportedByDeviceError
+from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
 AWAKE_S = 10.0
@@ -56,8 +56,8 @@ class LightEngine:
             plays=True,
             latency_s=options.image_load_s + _COMMANDS_S,
         )
-        self._loaded: tuple[Place, ...] | None = None
-        self._closed = threading.Event()
+        self._state = ProjectorState("the light engine")
+        self._places: tuple[Place, ...] = ()
         self._lock = threading.RLock()
         try:
             self._prepare()
@@ -72,22 +72,18 @@ class LightEngine:
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. Refuses patterns that the flash lacks, and writes the pictures that hold them."""
-        self._require_open()
-        self._loaded = None
+        self._state.require_open()
+        self._state.loaded = None
         self.blank()
-        if sequence.projector != MIRRORS:
-            message = (
-                f"the light engine has {MIRRORS} mirrors, the sequence was made for {sequence.projector}; encode it "
-                f"for {MIRRORS}"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._state.require_size(sequence, MIRRORS)
         if len(sequence) > MOST_PATTERNS:
             message = (
                 f"asked for a sequence of {len(sequence)} patterns, the engine's table takes {MOST_PATTERNS}; scan one "
                 "axis only, or with a shorter line_shift_period_px"
             )
             raise UnsupportedByDeviceError(message)
-        self._loaded = self._flash.places(sequence)
+        self._places = self._flash.places(sequence)
+        self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
         """See `Projector`. Dark again after `hold_s`, whatever becomes of this program.
@@ -95,28 +91,24 @@ class LightEngine:
         When light begins is not told by the engine: it is after the command to start was sent, and before its sequencer
         says that it runs and a picture has had its time from the flash to the mirrors. The error is half of that span.
         """
-        places = self._require_loaded(f"show pattern {index}")
-        if not 0 <= index < len(places):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(places) - 1}"
-            raise UnsupportedByDeviceError(message)
+        self._state.require_pattern(index)
         hold_us = round(self._options.hold_s * 1e6)
         timing = Timing(hold_us - DARK_US, hold_us)
         check_timing(timing)
-        earliest_ns, running_ns = self._run((places[index],), timing)
+        earliest_ns, running_ns = self._run((self._places[index],), timing)
         latest_ns = running_ns + round(self._options.image_load_s * 1e9)
-        while (left_ns := latest_ns - time.monotonic_ns()) > 0:
-            if self._closed.wait(left_ns / 1e9):
-                self._require_open()
+        SystemClock().wait_until(latest_ns, self._state.closed)
+        self._state.require_open()
         return Shown(index, (earliest_ns + latest_ns) // 2, (latest_ns - earliest_ns + 1) // 2)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
-        places = self._require_loaded("play")
+        self._state.require_loaded("play")
         options = self._options
         timing = lit(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
-        counts = tables_of(places, options.colour, dark_between=timing.dark_between).counts
+        counts = tables_of(self._places, options.colour, dark_between=timing.dark_between).counts
         check_loading(counts, timing.period_us, options.image_load_s)
-        self._run(places, timing)
+        self._run(self._places, timing)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -125,7 +117,7 @@ class LightEngine:
     def blank(self) -> None:
         """See `Projector`. LEDs off, then the sequence stopped: each is tried, whatever becomes of the other."""
         with self._lock:
-            faults = [] if self._closed.is_set() else self._darken()
+            faults = [] if self._state.closed.is_set() else self._darken()
         # With the LEDs off it is dark, but an engine that does not do as it is told is to be known.
         if faults:
             raise faults[0]
@@ -133,8 +125,8 @@ class LightEngine:
     def close(self) -> None:
         """See `Projector`."""
         # Whoever waits for light need not wait any more.
-        already = self._closed.is_set()
-        self._closed.set()
+        already = self._state.closed.is_set()
+        self._state.closed.set()
         with self._lock:
             if not already:
                 self._leave()
@@ -144,7 +136,7 @@ class LightEngine:
         tables = tables_of(places, self._options.colour, dark_between=timing.dark_between)
         engine = self._engine
         with self._lock:
-            self._require_open()
+            self._state.require_open()
             try:
                 self.blank()
                 engine.set_timing(timing)
@@ -220,18 +212,6 @@ class LightEngine:
         if self._options.standby:
             with suppress(SlrigError):
                 self._engine.set_byte(Command.POWER, 1)
-        self._loaded = None
-        self._closed.set()
+        self._state.loaded = None
+        self._state.closed.set()
         self._engine.close()
-
-    def _require_open(self) -> None:
-        if self._closed.is_set():
-            message = "the light engine is closed; open the rig again"
-            raise DeviceStateError(message)
-
-    def _require_loaded(self, what: str) -> tuple[Place, ...]:
-        self._require_open()
-        if self._loaded is None:
-            message = f"asked to {what}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        return self._loaded

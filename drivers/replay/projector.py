@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
-from slrig.devices import COMPUTED, ProjectorInfo, Shown
-from slrig.errors import DeviceStateError, UnsupportedByDeviceError, setting
+from slrig.devices import COMPUTED, ProjectorInfo, ProjectorState, Shown
+from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, White
 
 
@@ -34,8 +34,7 @@ class ReplayProjector:
         self._cameras = cameras
         self._clock = clock
         self._stage = stage
-        self._loaded: tuple[Pattern, ...] | None = None
-        self._closed = False
+        self._state = ProjectorState("the recording's projector")
 
     @property
     def info(self) -> ProjectorInfo:
@@ -44,13 +43,8 @@ class ReplayProjector:
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. Refuses a pattern of which a camera has no frame."""
-        self._require_open()
-        if sequence.projector != self._info.size:
-            message = (
-                f"the recording was made with a projector of {self._info.size}, the sequence is for "
-                f"{sequence.projector}; encode it for {self._info.size}"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._state.require_open()
+        self._state.require_size(sequence, self._info.size)
         for pattern in sequence.patterns:
             lacking = [name for name, camera in self._cameras.items() if not camera.frames_of(pattern)]
             if lacking:
@@ -64,19 +58,13 @@ class ReplayProjector:
                 raise UnsupportedByDeviceError(message)
         self.blank()
         self._clock.rewind()
-        self._loaded = sequence.patterns
+        self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
-        self._require_open()
-        if self._loaded is None:
-            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(self._loaded):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._loaded) - 1}"
-            raise UnsupportedByDeviceError(message)
-        pattern = self._loaded[index]
-        showing = self._loaded[:index].count(pattern)
+        patterns = self._state.require_pattern(index).patterns
+        pattern = patterns[index]
+        showing = patterns[:index].count(pattern)
         self._stage.shown = (pattern, showing)
         times_s = [
             shots[min(showing, len(shots) - 1)].time_s
@@ -87,12 +75,7 @@ class ReplayProjector:
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. A recording does not play."""
-        self._require_open()
-        message = (
-            f"asked to play {exposure_s} s patterns every {period_s} s, a recording has no trigger wire; show each "
-            "pattern and trigger the cameras by software"
-        )
-        raise UnsupportedByDeviceError(message)
+        self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -107,13 +90,8 @@ class ReplayProjector:
         """See `Projector`."""
         self._clock.release()
         self.blank()
-        self._loaded = None
-        self._closed = True
-
-    def _require_open(self) -> None:
-        if self._closed:
-            message = "the projector is closed; open the rig again"
-            raise DeviceStateError(message)
+        self._state.loaded = None
+        self._state.closed.set()
 
 
 def _member(pattern: Pattern) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
@@ -12,8 +11,8 @@ from drivers.screen.options import UNMEASURED_S, ScreenOptions
 from drivers.screen.stage import Stage, opened
 from drivers.screen.timing import Presented, whole_light
 from drivers.screen.working import OwnThread
-from slrig.devices import ProjectorInfo, Shown
-from slrig.errors import DeviceError, DeviceStateError, UnsupportedByDeviceError
+from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.errors import DeviceError, DeviceStateError
 from slrig.model import PatternSequence
 
 Result = TypeVar("Result")
@@ -61,9 +60,8 @@ class ScreenProjector:
             latency_s=self._latency_s + self._latency_error_s + _USUAL_WAIT * self.refresh_s,
             refresh_s=self.refresh_s,
         )
-        self._sequence: PatternSequence | None = None
+        self._state = ProjectorState(f"the projector on output {options.output}")
         self._unchecked = False
-        self._closed = threading.Event()
         self._darkened = threading.Event()
 
     @property
@@ -73,39 +71,22 @@ class ScreenProjector:
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. Looks at the output again, which may have been changed since it was opened."""
-        self._require_open()
-        self._sequence = None
-        if sequence.projector != self._info.size:
-            message = (
-                f"output {self._info.name} shows {self._info.size} pixels, the sequence was made for "
-                f"{sequence.projector}: it would be scaled; encode it for {self._info.size}"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._state.require_open()
+        self._state.loaded = None
+        self._state.require_size(sequence, self._info.size)
         self.blank()
         self._or_dark(lambda: self._thread.do(lambda: self._stage.load(sequence), timeout_s=_LOADS_IN_S))
-        self._sequence = sequence
+        self._state.loaded = sequence
         self._unchecked = self._options.check_pixels
 
     def show(self, index: int) -> Shown:
         """See `Projector`. Dark, if it fails."""
-        self._require_open()
-        sequence = self._sequence
-        if sequence is None:
-            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(sequence):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(sequence) - 1}"
-            raise UnsupportedByDeviceError(message)
+        sequence = self._state.require_pattern(index)
         return self._or_dark(lambda: self._shown(sequence, index))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. A screen has no trigger wire."""
-        self._require_open()
-        message = (
-            f"asked to play {exposure_s} s patterns every {period_s} s, a screen output has no trigger wire; show each "
-            "pattern, and trigger the cameras by software"
-        )
-        raise UnsupportedByDeviceError(message)
+        self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -119,7 +100,7 @@ class ScreenProjector:
         DeviceError
             The window does not go black, and nobody is there to cover it.
         """
-        if self._closed.is_set():
+        if self._state.closed.is_set():
             return
         self._darkened.set()
         try:
@@ -130,15 +111,15 @@ class ScreenProjector:
         else:
             # The picture before is there until the dark one is scanned out.
             t_visible_ns, t_err_ns = self._light(presented)
-            self._wait_until(t_visible_ns + t_err_ns)
+            SystemClock().wait_until(t_visible_ns + t_err_ns, self._state.closed)
 
     def close(self) -> None:
         """See `Projector`. From any thread. The output stays black, `dark_after_s` beyond this process's end."""
-        if self._closed.is_set():
+        if self._state.closed.is_set():
             return
         self._darkened.set()
-        self._closed.set()
-        self._sequence = None
+        self._state.closed.set()
+        self._state.loaded = None
         # Whatever state it is in: what cannot be done any more is not needed.
         with suppress(DeviceError):
             self._thread.do(lambda: self._stage.show(None), timeout_s=_DARKENS_IN_S)
@@ -154,7 +135,7 @@ class ScreenProjector:
         if self._unchecked and not self._darkened.is_set():
             self._thread.do(lambda: self._stage.compare(sequence.image(index)), timeout_s=_SHOWS_IN_S)
             self._unchecked = False
-        self._wait_until(t_visible_ns + t_err_ns)
+        SystemClock().wait_until(t_visible_ns + t_err_ns, self._state.closed)
         if self._darkened.is_set():
             message = f"pattern {index} was darkened from outside before its light was there; show it again"
             raise DeviceStateError(message)
@@ -168,12 +149,6 @@ class ScreenProjector:
             latency_error_s=self._latency_error_s,
         )
 
-    def _wait_until(self, t_ns: int) -> None:
-        """Wait, unless the projector is closed meanwhile."""
-        while (left_ns := t_ns - time.monotonic_ns()) > 0:
-            if self._closed.wait(left_ns / 1e9):
-                return
-
     def _or_dark(self, attempt: Callable[[], Result]) -> Result:
         try:
             return attempt()
@@ -181,8 +156,3 @@ class ScreenProjector:
             with suppress(DeviceError):
                 self.blank()
             raise
-
-    def _require_open(self) -> None:
-        if self._closed.is_set():
-            message = f"the projector on output {self._options.output} is closed; open the rig again"
-            raise DeviceStateError(message)

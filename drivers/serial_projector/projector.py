@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +14,7 @@ from drivers.serial_projector.link import Link, RefusedError
 from drivers.serial_projector.options import SerialProjectorOptions
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
 from drivers.serial_projector.port import Port
-from slrig.devices import ProjectorInfo, Shown, SystemClock
+from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
 
@@ -65,9 +64,9 @@ class SerialProjector:
         self._size = Size(box.w, box.h)
         self._info = ProjectorInfo("projector", f"{box.model} {box.fw}", options.port, self._size, True, box.light_s)
         self._boot = box.boot
-        self._loaded: tuple[int, int] | None = None
+        self._state = ProjectorState(f"the trigger box on {options.port}")
+        self._wanted = (0, 0)
         self._lit: str | None = None
-        self._closed = threading.Event()
         self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000)
 
     @property
@@ -93,43 +92,37 @@ class SerialProjector:
         UnsupportedByDeviceError
             It holds others, or the sequence is for another size, or too long.
         """
-        self._require_open()
-        self._loaded = None
+        self._state.require_open()
+        self._state.loaded = None
         self.blank()
-        if sequence.projector != self._size:
-            message = (
-                f"the trigger box projects {self._size}, the sequence was made for {sequence.projector}; encode it for "
-                f"{self._size}"
-            )
-            raise UnsupportedByDeviceError(message)
+        self._state.require_size(sequence, self._size)
         count, most = len(sequence), self._client.box.max
         each = crc32_of_each(sequence)
         if count > most:
             found = f"the trigger box holds {most} patterns, the sequence has {count}"
             raise UnsupportedByDeviceError(self._to_be_flashed(sequence, found))
-        wanted = (count, crc32_of_all(each))
+        self._wanted = (count, crc32_of_all(each))
         try:
-            self._sent(lambda: self._client.load(*wanted))
+            self._sent(lambda: self._client.load(*self._wanted))
         except UnsupportedByDeviceError as error:
-            found = f"asked for {count} patterns with CRC-32 {wanted[1]:08X}, the trigger box holds others ({error})"
+            found = (
+                f"asked for {count} patterns with CRC-32 {self._wanted[1]:08X}, the trigger box holds others ({error})"
+            )
             raise UnsupportedByDeviceError(self._to_be_flashed(sequence, found)) from error
-        self._loaded = wanted
+        self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
         """See `Projector`. The instant is the box's own stamp; its error comes from the exchanges with its clock."""
-        loaded = self._require_loaded(f"show pattern {index}")
-        if not 0 <= index < loaded[0]:
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {loaded[0] - 1}"
-            raise UnsupportedByDeviceError(message)
+        self._state.require_pattern(index)
         with self._dark_if_it_fails():
             t_visible_ns, t_err_ns = self._sent(lambda: self._client.show(index))
             self._lit = f"pattern {index} was lit"
-            SystemClock().wait_until(t_visible_ns + t_err_ns, self._closed)
+            SystemClock().wait_until(t_visible_ns + t_err_ns, self._state.closed)
         return Shown(index, t_visible_ns, t_err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Returns when the box has begun; a play that ends by itself ends dark."""
-        count, _ = self._require_loaded("play")
+        count = len(self._state.require_loaded("play"))
         exposure_us, period_us = round(exposure_s * 1e6), round(period_s * 1e6)
         self._check_timing(exposure_us, period_us)
         with self._dark_if_it_fails():
@@ -148,19 +141,19 @@ class SerialProjector:
 
     def close(self) -> None:
         """See `Projector`."""
-        self._closed.set()
+        self._state.closed.set()
         self._client.close()
         self._keeping.stop()
-        self._loaded = self._lit = None
+        self._state.loaded = self._lit = None
 
     def _darken(self, command: Callable[[], object]) -> None:
-        if self._closed.is_set():
+        if self._state.closed.is_set():
             return
         try:
             self._sent(command)
         except BaseException as error:
             self._abandon()
-            if self._closed.is_set() and isinstance(error, DeviceStateError):
+            if self._state.closed.is_set() and isinstance(error, DeviceStateError):
                 # By another thread, meanwhile: dark.
                 return
             raise
@@ -181,7 +174,7 @@ class SerialProjector:
 
     def _abandon(self) -> None:
         """Leave the box to its watchdog until a sequence is loaded again."""
-        self._loaded = None
+        self._state.loaded = None
         self._client.abandon()
 
     def _sent(self, command: Callable[[], _Value]) -> _Value:
@@ -239,9 +232,8 @@ class SerialProjector:
             )
             raise DeviceGoneError(message)
         self._boot = box.boot
-        if self._loaded is not None:
-            count, crc32 = self._loaded
-            self._obeyed(lambda: self._client.load(count, crc32))
+        if self._state.loaded is not None:
+            self._obeyed(lambda: self._client.load(*self._wanted))
 
     def _check_timing(self, exposure_us: int, period_us: int) -> None:
         box = self._client.box
@@ -273,18 +265,6 @@ class SerialProjector:
             export(sequence, self._export_folder)
             where = f"its images and patterns.json are in {self._export_folder} now"
         return f"{found}. Flash the sequence: {where}; put the images into the light engine, patterns.json onto the box"
-
-    def _require_open(self) -> None:
-        if self._closed.is_set():
-            message = "the projector is closed; open the rig again"
-            raise DeviceStateError(message)
-
-    def _require_loaded(self, what: str) -> tuple[int, int]:
-        self._require_open()
-        if self._loaded is None:
-            message = f"asked to {what}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        return self._loaded
 
 
 class _RestartedError(DeviceError):

@@ -6,6 +6,7 @@ from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
 from slrig.devices.positioner import Positioner, Positions
 from slrig.devices.projector import Projector, ProjectorInfo, Shown
+from slrig.devices.projector_state import ProjectorState
 from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "Positions",
     "Projector",
     "ProjectorInfo",
+    "ProjectorState",
     "Rig",
     "Shown",
     "Synchronisation",

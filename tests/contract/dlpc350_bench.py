@@ -14,7 +14,6 @@ import sys
 import threading
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -31,19 +30,14 @@ from drivers.dlpc350.projector import LightEngine
 from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture
 from slrig.conformance import run
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Projector, Trigger
-from slrig.errors import (
-    DeviceBusyError,
-    DeviceGoneError,
-    DeviceStateError,
-    FrameTimeoutError,
-    UnsupportedByDeviceError,
-)
-from slrig.model import Calibration, Frame, PatternSequence, Size, Truth
+from slrig.devices import Camera, Projector
+from slrig.errors import DeviceBusyError, DeviceGoneError
+from slrig.model import Calibration, PatternSequence, Size, Truth
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.dlpc350_device import Cable, FakeEngine, UhidEngine
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench, rig_of
+from tests.contract.wired_camera import WiredCamera
 from tests.unit.capture.fake_rig import Scene
 
 PICTURES = "pictures"
@@ -51,8 +45,6 @@ LOAD_S = 0.03
 """What the fake engine takes for a picture."""
 _MOST_LOAD_S = 0.15
 """What its rig file says at the most. The fake is a thread, which a busy machine keeps waiting for a while."""
-_WIRE_NS = 20_000
-_ERR_NS = 1_000
 _EXPOSURES_S = (1e-4, 0.5)
 _GAINS = (1.0, 8.0)
 
@@ -76,124 +68,6 @@ def scene() -> Scene:
         noise_dn=0.5,
         white=0.5,
     )
-
-
-class WiredCamera:
-    """Implements `slrig.devices.Camera` on a stage: triggered by software, or by `pulse`."""
-
-    def __init__(self, name: str, stage: Stage) -> None:
-        self._stage = stage
-        self._settings = CameraSettings(1 / 60)
-        self._armed: Trigger | None = None
-        self._closed = False
-        self._exposures: deque[tuple[int, int, int]] = deque()
-        self._made = 0
-        self._left = 0
-        self._busy_until_ns = 0
-        self._dropped = 0
-        self._changed = threading.Condition()
-        self.info = CameraInfo(
-            name,
-            "camera on a stage",
-            "stage",
-            stage.format,
-            frozenset({Trigger.SOFTWARE, Trigger.HARDWARE}),
-            _EXPOSURES_S,
-            _GAINS,
-        )
-
-    def configure(self, settings: CameraSettings) -> AppliedSettings:
-        """See `Camera`."""
-        self._require(self._armed is None, "configure: the camera is armed; disarm it")
-        for what, asked, (least, most) in (
-            ("exposure", settings.exposure_s, _EXPOSURES_S),
-            ("gain", settings.gain, _GAINS),
-        ):
-            if not least <= asked <= most:
-                message = f"asked for {what} {asked:g}, the camera has {least:g} to {most:g}; choose one of these"
-                raise UnsupportedByDeviceError(message)
-        self._settings = settings
-        return AppliedSettings(settings.exposure_s, settings.gain)
-
-    def arm(self, count: int, trigger: Trigger) -> None:
-        """See `Camera`."""
-        self._require(self._armed is None, "arm: the camera is armed; disarm it")
-        if count < 1 or trigger not in self.info.triggers:
-            message = f"asked for {count} frames by {trigger}, the camera makes one or more by software or hardware"
-            raise UnsupportedByDeviceError(message)
-        with self._changed:
-            self._exposures.clear()
-            self._left, self._dropped, self._armed = count, 0, trigger
-
-    def trigger(self) -> None:
-        """See `Camera`."""
-        self._require(self._armed is Trigger.SOFTWARE, "trigger: the camera is not armed for it; arm it")
-        self._expose(time.monotonic_ns())
-
-    def pulse(self, t_ns: int) -> None:
-        """Take an edge on the wire."""
-        if self._armed is Trigger.HARDWARE:
-            self._expose(t_ns + _WIRE_NS)
-
-    def read(self, after_ns: int, timeout_s: float) -> Frame:
-        """See `Camera`."""
-        self._require(self._armed is not None, "read: the camera is not armed; arm it")
-        until = time.monotonic() + timeout_s
-        with self._changed:
-            while (left_s := until - time.monotonic()) > 0:
-                while self._exposures and self._exposures[0][1] < after_ns:
-                    self._exposures.popleft()
-                if self._exposures and (ready_s := (self._exposures[0][2] - time.monotonic_ns()) / 1e9) <= 0:
-                    return self._frame(*self._exposures.popleft())
-                self._changed.wait(min(left_s, ready_s) if self._exposures else left_s)
-        message = f"no frame in {timeout_s} s; check the trigger"
-        raise FrameTimeoutError(message)
-
-    def disarm(self) -> None:
-        """See `Camera`."""
-        with self._changed:
-            self._armed = None
-            # An exposure under way ends here: the next trigger must not be lost to it.
-            self._busy_until_ns = 0
-            self._exposures.clear()
-
-    def close(self) -> None:
-        """See `Camera`."""
-        self.disarm()
-        self._closed = True
-
-    def _expose(self, t_ns: int) -> None:
-        end_ns = t_ns + round(self._settings.exposure_s * 1e9)
-        with self._changed:
-            if self._left == 0 or t_ns < self._busy_until_ns:
-                self._dropped += 1
-                return
-            self._left -= 1
-            self._busy_until_ns = end_ns
-            self._exposures.append((self._made, t_ns, end_ns))
-            self._made += 1
-            self._changed.notify_all()
-
-    def _frame(self, number: int, start_ns: int, end_ns: int) -> Frame:
-        settings = self._settings
-        image = self._stage.exposed(start_ns, end_ns, gain=settings.gain)
-        return Frame(
-            self.info.name,
-            image,
-            start_ns,
-            end_ns,
-            _ERR_NS,
-            number,
-            self._dropped,
-            settings.exposure_s,
-            settings.gain,
-        )
-
-    def _require(self, condition: bool, message: str) -> None:
-        if self._closed:
-            message = "the camera is closed; open the rig again"
-        if self._closed or not condition:
-            raise DeviceStateError(message)
 
 
 class EngineHead:
@@ -241,7 +115,7 @@ class Table:
 
     def head(self, projector: Projector) -> EngineHead:
         """The projector and a new camera."""
-        self._camera = WiredCamera("left", self.stage)
+        self._camera = WiredCamera("left", self.stage, usual_s=1 / 60, exposures_s=_EXPOSURES_S, gains=_GAINS)
         return EngineHead(projector, self._camera)
 
     def connected(self, **more: object) -> EngineHead:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from drivers import screen
 from drivers.screen import guarding
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Projector, Trigger
-from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Projector, Trigger
+from slrig.errors import FrameTimeoutError
 from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size, Truth
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.screen_server import DummyServer, OutputPixels
@@ -55,7 +55,7 @@ class ScreenCamera:
         self._changed = threading.Condition()
         self._triggers: list[CameraSettings] = []
         self._frames: list[Frame] = []
-        self._armed, self._closed, self._count, self._turn = False, False, 0, 0
+        self._state, self._count, self._turn = CameraState(name), 0, 0
         self._never = threading.Event()
         self._thread = threading.Thread(target=self._expose_all, name=f"camera {name}", daemon=True)
         self._thread.start()
@@ -68,31 +68,21 @@ class ScreenCamera:
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """See `Camera`."""
         with self._changed:
-            self._require(armed=False)
-            for what, asked, (least, most) in (
-                ("exposure_s", settings.exposure_s, self._info.exposure_range_s),
-                ("gain", settings.gain, self._info.gain_range),
-            ):
-                if not least <= asked <= most:
-                    message = f"{what}: asked {asked}, the camera can do {least} to {most}; ask for one of these"
-                    raise UnsupportedByDeviceError(message)
+            self._state.check_settings(settings, self._info)
             self._settings = settings
             return AppliedSettings(settings.exposure_s, settings.gain)
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`."""
         with self._changed:
-            self._require(armed=False)
-            if count < 1 or trigger is not Trigger.SOFTWARE:
-                message = f"asked for {count} frames by {trigger} trigger; ask for one or more by software trigger"
-                raise UnsupportedByDeviceError(message)
-            self._armed = True
+            self._state.check_arming(count, trigger, self._info)
+            self._state.armed = trigger
             self._turn += 1
 
     def trigger(self) -> None:
         """See `Camera`."""
         with self._changed:
-            self._require(armed=True)
+            self._state.require_armed()
             self._triggers.append(self._settings)
             self._changed.notify_all()
 
@@ -100,7 +90,7 @@ class ScreenCamera:
         """See `Camera`."""
         until_ns = time.monotonic_ns() + round(timeout_s * 1e9)
         with self._changed:
-            self._require(armed=True)
+            self._state.require_armed()
             while True:
                 while self._frames:
                     frame = self._frames.pop(0)
@@ -110,12 +100,12 @@ class ScreenCamera:
                 if left_s <= 0 or not self._changed.wait(left_s):
                     message = f"no frame that begins after {after_ns} ns came in {timeout_s} s; trigger one"
                     raise FrameTimeoutError(message)
-                self._require(armed=True)
+                self._state.require_armed()
 
     def disarm(self) -> None:
         """See `Camera`."""
         with self._changed:
-            self._armed = False
+            self._state.armed = None
             self._triggers.clear()
             self._frames.clear()
             self._changed.notify_all()
@@ -124,27 +114,21 @@ class ScreenCamera:
         """See `Camera`."""
         self.disarm()
         with self._changed:
-            self._closed = True
+            self._state.close()
             self._changed.notify_all()
         self._thread.join(10)
         self._pixels.close()
 
-    def _require(self, *, armed: bool) -> None:
-        if self._closed or self._armed is not armed:
-            state = "closed" if self._closed else "armed" if self._armed else "not armed"
-            message = f"camera '{self._info.name}' is {state}; open, arm or disarm it first"
-            raise DeviceStateError(message)
-
     def _expose_all(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._triggers or self._closed)
-                if self._closed:
+                self._changed.wait_for(lambda: self._triggers or self._state.closed.is_set())
+                if self._state.closed.is_set():
                     return
                 settings, turn = self._triggers.pop(0), self._turn
             frame = self._exposed(settings)
             with self._changed:
-                if self._armed and turn == self._turn:
+                if self._state.armed and turn == self._turn:
                     self._frames.append(frame)
                     self._changed.notify_all()
 

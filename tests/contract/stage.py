@@ -12,9 +12,8 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.devices import ProjectorInfo, Shown
-from slrig.errors import DeviceStateError, UnsupportedByDeviceError
-from slrig.model import CameraFormat, PatternSequence, Pixels, Size
+from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
+from slrig.model import CameraFormat, PatternSequence, Pixels
 from tests.unit.capture.fake_rig import Scene
 
 REFERENCE_EXPOSURE_S = 0.01
@@ -96,8 +95,7 @@ class StagedProjector:
     def __init__(self, stage: Stage, *, err_ns: int = 100_000) -> None:
         self._stage = stage
         self._err_ns = err_ns
-        self._loaded: PatternSequence | None = None
-        self._closed = threading.Event()
+        self._state = ProjectorState("the staged projector")
 
     @property
     def info(self) -> ProjectorInfo:
@@ -107,34 +105,20 @@ class StagedProjector:
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`."""
-        self._require_open()
-        size: Size = self._stage.scene.projector
-        if sequence.projector != size:
-            message = f"the projector is {size}, the sequence was made for {sequence.projector}; encode it for {size}"
-            raise UnsupportedByDeviceError(message)
+        self._state.require_open()
+        self._state.require_size(sequence, self._stage.scene.projector)
         self.blank()
-        self._loaded = sequence
+        self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
-        self._require_open()
-        if self._loaded is None:
-            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(self._loaded):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._loaded) - 1}"
-            raise UnsupportedByDeviceError(message)
-        at_ns = self._stage.show(self._loaded.profiles[index])
-        while (left_ns := at_ns + self._err_ns - time.monotonic_ns()) > 0:
-            if self._closed.wait(left_ns / 1e9):
-                break
+        at_ns = self._stage.show(self._state.require_pattern(index).profiles[index])
+        SystemClock().wait_until(at_ns + self._err_ns, self._state.closed)
         return Shown(index, at_ns, self._err_ns)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`."""
-        self._require_open()
-        message = f"asked to play {exposure_s} s patterns every {period_s} s, the staged projector has no trigger wire"
-        raise UnsupportedByDeviceError(message)
+        self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -142,16 +126,11 @@ class StagedProjector:
 
     def blank(self) -> None:
         """See `Projector`."""
-        if not self._closed.is_set():
+        if not self._state.closed.is_set():
             self._stage.show(None)
 
     def close(self) -> None:
         """See `Projector`."""
         self.blank()
-        self._loaded = None
-        self._closed.set()
-
-    def _require_open(self) -> None:
-        if self._closed.is_set():
-            message = "the projector is closed; open the rig again"
-            raise DeviceStateError(message)
+        self._state.loaded = None
+        self._state.closed.set()

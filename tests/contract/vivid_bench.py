@@ -12,8 +12,7 @@ from functools import cache
 from pathlib import Path
 
 from drivers import opencv, v4l2
-from slrig.devices import Camera, Projector, ProjectorInfo, Shown
-from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.devices import Camera, Projector, ProjectorInfo, ProjectorState, Shown
 from slrig.model import Calibration, PatternSequence, Pixels, Size, Truth
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract.guest.vivid import Control, Node, Output, nodes
@@ -76,8 +75,7 @@ class LoopedProjector:
 
     def __init__(self, output: Output) -> None:
         self._output = output
-        self._loaded: PatternSequence | None = None
-        self._closed = False
+        self._state = ProjectorState("the video output")
         self._lock = threading.Lock()
         self.blank()
 
@@ -88,31 +86,21 @@ class LoopedProjector:
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`."""
-        self._require_open()
-        if sequence.projector != PROJECTOR:
-            message = f"the projector is {PROJECTOR}, the sequence was made for {sequence.projector}; encode it anew"
-            raise UnsupportedByDeviceError(message)
+        self._state.require_open()
+        self._state.require_size(sequence, PROJECTOR)
         self.blank()
-        self._loaded = sequence
+        self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
-        self._require_open()
-        if self._loaded is None:
-            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(self._loaded):
-            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(self._loaded) - 1}"
-            raise UnsupportedByDeviceError(message)
+        sequence = self._state.require_pattern(index)
         with self._lock:
-            at_ns = self._output.show(expected(self._loaded.profiles[index]).tobytes())
+            at_ns = self._output.show(expected(sequence.profiles[index]).tobytes())
         return Shown(index, at_ns, _CUT_NS)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`."""
-        self._require_open()
-        message = f"asked to play {exposure_s} s patterns every {period_s} s, a video signal has no trigger wire"
-        raise UnsupportedByDeviceError(message)
+        self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -120,20 +108,15 @@ class LoopedProjector:
 
     def blank(self) -> None:
         """See `Projector`."""
-        if not self._closed:
+        if not self._state.closed.is_set():
             with self._lock:
                 self._output.show(expected(None).tobytes())
 
     def close(self) -> None:
         """See `Projector`."""
         self.blank()
-        self._loaded = None
-        self._closed = True
-
-    def _require_open(self) -> None:
-        if self._closed:
-            message = "the projector is closed; open the rig again"
-            raise DeviceStateError(message)
+        self._state.loaded = None
+        self._state.closed.set()
 
 
 class LoopedHead:

@@ -23,7 +23,8 @@ from slrig.scan.holding import pattern_sequence
 from slrig.scan.plan import PatternPlan
 from tests.contract.screen_bench import let_go
 from tests.contract.screen_server import DummyServer, OutputPixels, require_xorg
-from tests.contract.serial_bench import TriggerBox, WiredCamera
+from tests.contract.serial_bench import TriggerBox
+from tests.contract.wired_camera import WiredCamera
 from tests.e2e.closed_loop.node import VideoNode, require_umockdev
 from tests.e2e.closed_loop.output import WatchedOutput
 from tests.e2e.closed_loop.scans import (

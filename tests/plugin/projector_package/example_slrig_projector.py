@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from slrig.devices import Projector, ProjectorInfo, Shown
-from slrig.errors import DeviceStateError, UnsupportedByDeviceError
+from slrig.devices import Projector, ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.model import PatternSequence, Pixels, Size
 
 LATENCY_S = 0.004
@@ -37,8 +35,7 @@ class LampProjector:
     def __init__(self, path: Path, size: Size) -> None:
         self._info = ProjectorInfo("projector", "test chart lamp", path.name, size, False, LATENCY_S)
         self._path = path
-        self._sequence: PatternSequence | None = None
-        self._closed = threading.Event()
+        self._state = ProjectorState()
         self._path.write_bytes(b"")
         self._light(np.zeros((1, 1), np.uint8), time.monotonic_ns())
 
@@ -49,34 +46,22 @@ class LampProjector:
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`."""
-        self._require_open()
-        if sequence.projector != self._info.size:
-            message = f"asked patterns for {sequence.projector}, the lamp is {self._info.size}; encode them for that"
-            raise UnsupportedByDeviceError(message)
+        self._state.require_open()
+        self._state.require_size(sequence, self._info.size)
         self.blank()
-        self._sequence = sequence
+        self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
         """See `Projector`."""
-        self._require_open()
-        if self._sequence is None:
-            message = f"asked to show pattern {index}, no sequence is loaded; call load first"
-            raise DeviceStateError(message)
-        if not 0 <= index < len(self._sequence):
-            message = f"asked to show pattern {index}, patterns 0 to {len(self._sequence) - 1} are loaded"
-            raise UnsupportedByDeviceError(message)
+        sequence = self._state.require_pattern(index)
         visible_ns = time.monotonic_ns() + round(LATENCY_S * 1e9)
-        self._light(self._sequence.profiles[index], visible_ns)
-        while (left_ns := visible_ns + _ERROR_NS - time.monotonic_ns()) > 0:
-            if self._closed.wait(left_ns / 1e9):
-                break
+        self._light(sequence.profiles[index], visible_ns)
+        SystemClock().wait_until(visible_ns + _ERROR_NS, self._state.closed)
         return Shown(index, visible_ns, _ERROR_NS)
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`."""
-        self._require_open()
-        message = f"asked to play {exposure_s:g} s patterns every {period_s:g} s, the lamp has no wire; step it"
-        raise UnsupportedByDeviceError(message)
+        self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
         """See `Projector`."""
@@ -84,23 +69,18 @@ class LampProjector:
 
     def blank(self) -> None:
         """See `Projector`."""
-        if not self._closed.is_set():
+        if not self._state.closed.is_set():
             self._light(np.zeros((1, 1), np.uint8), time.monotonic_ns())
 
     def close(self) -> None:
         """See `Projector`."""
         self.blank()
-        self._sequence = None
-        self._closed.set()
+        self._state.loaded = None
+        self._state.closed.set()
 
     def _light(self, rows: Pixels, t_ns: int) -> None:
         with self._path.open("ab") as file:
             file.write(json.dumps({"t_ns": t_ns, "rows": rows.tolist()}).encode() + b"\n")
-
-    def _require_open(self) -> None:
-        if self._closed.is_set():
-            message = "the projector is closed; open the rig again"
-            raise DeviceStateError(message)
 
 
 def open_projector(options: Mapping[str, object], folder: Path) -> Projector:

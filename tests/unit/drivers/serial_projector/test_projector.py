@@ -180,7 +180,7 @@ def test_a_sequence_of_another_size_is_refused(bench: Bench) -> None:
     projector = bench.open()
     projector.load(SEQUENCE)
     projector.show(0)
-    with pytest.raises(UnsupportedByDeviceError, match="projects 400 x 300, the sequence was made for 408 x 300"):
+    with pytest.raises(UnsupportedByDeviceError, match="shows 400 x 300, the sequence was made for 408 x 300"):
         projector.load(whole_sequence(Size(408, 300)))
     assert bench.scene.lit is None
 
