@@ -14,8 +14,8 @@ from simulated_rig.projector import SimulatedProjector
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script, Staging
-from simulated_rig.tables import checked
 from simulated_rig.world import Flicker, VirtualClock
+from slrig.bundle.faults import checked
 from slrig.devices import Camera, Clock, Head, SystemClock, progress_reporter
 from slrig.kernels import compilations_told
 from slrig.model import Calibration, Surface, Truth
@@ -140,6 +140,6 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
 
 def simulated_head(options: Mapping[str, object], folder: Path) -> SimulatedHead:
     """Return `open_head`'s instrument under its own type."""
-    table = checked(HeadOptions, options, source="the [head] table of the rendered rig")
+    table = checked(HeadOptions, options, "the [head] table of the rendered rig")
     path = folder / table.scene
     return SimulatedHead(table, Script(table, read_scene(path), path.parent))

@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.tables import Positive, Table, Triple
+from simulated_rig.tables import Positive, Triple
+from slrig.bundle.faults import Strict
 from slrig.model import Pinhole
 
 PROJECTOR = "projector"
@@ -18,7 +19,7 @@ PROJECTOR = "projector"
 Index = Annotated[int, Field(ge=0)]
 
 
-class Push(Table, use_attribute_docstrings=True):
+class Push(Strict, use_attribute_docstrings=True):
     """A device's change of pose, in its own frame: X' = turn (X + shift). The stated calibration does not follow."""
 
     device: Annotated[str, Field(min_length=1)]
@@ -68,7 +69,7 @@ class Drift(Push):
         return 1 - math.exp(-captures / (self.settle_captures or 1.0))
 
 
-class Moving(Table, use_attribute_docstrings=True):
+class Moving(Strict, use_attribute_docstrings=True):
     """What is moved does not stand still while a pose is captured: `[[head.faults.moving]]`."""
 
     pose: Index | None = None

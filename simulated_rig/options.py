@@ -13,7 +13,8 @@ from simulated_rig.light import Response
 from simulated_rig.optics import look_at
 from simulated_rig.poses import Pose, PoseSeries
 from simulated_rig.sensor import Sensor
-from simulated_rig.tables import Fraction, NotNegative, Pair, Positive, Table, Triple, at_least_one
+from simulated_rig.tables import Fraction, NotNegative, Pair, Positive, Triple, at_least_one
+from slrig.bundle.faults import Strict
 from slrig.errors import CalibrationError
 from slrig.model import Pinhole, Size
 
@@ -24,7 +25,7 @@ PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 Row = Triple
 
 
-class Device(Table, use_attribute_docstrings=True):
+class Device(Strict, use_attribute_docstrings=True):
     """Lens and pose of a camera or the projector.
 
     The pose is either position_mm and target_mm (a look-at, `down` pointing down in the image), or rotation and
@@ -234,7 +235,7 @@ class CameraOptions(Device):
         )
 
 
-class Faults(Table, use_attribute_docstrings=True):
+class Faults(Strict, use_attribute_docstrings=True):
     """What goes wrong, on demand: `[head.faults]`. Frames count from 0 for each camera, from its opening."""
 
     cameras: Names | None = None
@@ -301,7 +302,7 @@ class Faults(Table, use_attribute_docstrings=True):
     """Poses of which the object does not stand still."""
 
 
-class HeadOptions(Table, use_attribute_docstrings=True):
+class HeadOptions(Strict, use_attribute_docstrings=True):
     """The `[head]` table of a rendered rig without its `driver`."""
 
     scene: Annotated[str, Field(min_length=1)]

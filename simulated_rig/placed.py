@@ -8,13 +8,14 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from simulated_rig.tables import Fraction, NotNegative, Positive, Table, Triple
+from simulated_rig.tables import Fraction, NotNegative, Positive, Triple
+from slrig.bundle.faults import Strict
 from slrig.model import FloatArray
 
 TEXTURES = ("uniform", "checker", "noise")
 
 
-class Texture(Table):
+class Texture(Strict):
     """Albedo that varies: times 1 - contrast * t, t in 0..1 over the object's own coordinates.
 
     `checker` alternates squares of `scale_mm` over x and y; `noise` is smooth random shading with grains of that size.
@@ -25,14 +26,14 @@ class Texture(Table):
     scale_mm: Positive = 10.0
 
 
-class Specular(Table):
+class Specular(Strict):
     """A Phong lobe added to the Lambertian light: strength * cos(angle to the mirror direction) ^ exponent."""
 
     strength: NotNegative = 0.0
     exponent: Annotated[float, Field(ge=1)] = 20.0
 
 
-class Standing(Table):
+class Standing(Strict):
     """An object in a pose (rotation about its own x, then y, then z axis as fixed axes), with a gloss."""
 
     name: str = ""

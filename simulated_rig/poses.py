@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from simulated_rig.boards import Board
 from simulated_rig.optics import field_radius, image_positions
 from simulated_rig.placed import turned_by
-from simulated_rig.tables import NotNegative, Pair, Table, Triple
+from simulated_rig.tables import NotNegative, Pair, Triple
+from slrig.bundle.faults import Strict
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, Pinhole
 
@@ -29,7 +30,7 @@ _SIDES = (1, 5, 3, 7, 0, 4, 2, 6)
 """Eighths of a turn: corners are odd."""
 
 
-class Pose(Table, use_attribute_docstrings=True):
+class Pose(Strict, use_attribute_docstrings=True):
     """One pose: `[[head.pose]]`. Position and rotation are as of an object of a scene."""
 
     name: str = ""
@@ -45,7 +46,7 @@ class Pose(Table, use_attribute_docstrings=True):
     """How it is turned."""
 
 
-class PoseSeries(Table, use_attribute_docstrings=True):
+class PoseSeries(Strict, use_attribute_docstrings=True):
     """Poses of the scene's board, made up from a seed: `[head.poses]`."""
 
     count: Annotated[int, Field(ge=1, le=200)] = 20

@@ -20,9 +20,12 @@ from simulated_rig import shapes
 from simulated_rig.boards import Board, Print
 from simulated_rig.placed import Placed, turned_by
 from simulated_rig.shapes import Part
-from simulated_rig.tables import NotNegative, Pair, Positive, Table, at_least_one, checked, read_toml
+from simulated_rig.tables import NotNegative, Pair, Positive, at_least_one
+from slrig.bundle.faults import Strict, checked, read_toml
 from slrig.errors import ConfigError
 from slrig.model import FloatArray, IntArray
+
+_MOST_BYTES = 1 << 24
 
 
 class Plane(Placed):
@@ -86,7 +89,7 @@ class Stairs(Placed):
         return [shapes.staircase(self.steps, self.tread_mm, self.rise_mm, self.height_mm)]
 
 
-class Wave(Table):
+class Wave(Strict):
     """One sine of a relief: amplitude_mm * sin(2 pi s / wavelength_mm + phase), s along `direction_deg` from x."""
 
     amplitude_mm: float
@@ -95,7 +98,7 @@ class Wave(Table):
     phase_deg: float = 0.0
 
 
-class Bump(Table):
+class Bump(Strict):
     """One Gaussian hill (or hollow, with a negative height) of a relief."""
 
     centre_mm: Pair
@@ -191,7 +194,7 @@ Thing = Annotated[
 ]
 
 
-class Scene(Table):
+class Scene(Strict):
     """A scene file: a name and one or more objects."""
 
     name: str = ""
@@ -221,7 +224,7 @@ class SceneSurface:
 
 def read_scene(path: Path) -> Scene:
     """Return the scene of a TOML file. Raises ConfigError that lists all faults."""
-    return checked(Scene, read_toml(path), source=f"scene file {path}")
+    return checked(Scene, read_toml(path, _MOST_BYTES), f"the scene file {path}")
 
 
 def surface_of(scene: Scene, folder: Path) -> SceneSurface:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ipaddress
 import os
-import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_v
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
 from slrig.bundle.description import CameraName
-from slrig.bundle.faults import Strict, explain, keys_of, read_text
+from slrig.bundle.faults import Strict, checked, explain, read_toml
 from slrig.errors import ConfigError
 from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, bracket_fault
 
@@ -181,7 +180,7 @@ def read_rig(path: Path) -> RigConfig:
     ConfigError
         The file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one message.
     """
-    return rig_of(_read_toml(path), path)
+    return rig_of(read_toml(path, MOST_CONFIG_BYTES), path)
 
 
 def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
@@ -192,11 +191,7 @@ def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
     ConfigError
         Any key is unknown or wrong; all faults in one message.
     """
-    try:
-        table = RigTable.model_validate(data)
-    except ValidationError as cause:
-        message = f"{path} is not a valid rig file:\n{explain(cause, data, keys_of(RigTable))}"
-        raise ConfigError(message) from cause
+    table = checked(RigTable, data, f"the rig file {path}")
     folder = path.resolve().parent
     return RigConfig(
         name=table.name,
@@ -299,7 +294,7 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
     ConfigError
         The file is missing or not TOML, or a value is wrong; all faults in one message.
     """
-    data: dict[str, Any] = {} if path is None else _read_toml(path)
+    data: dict[str, Any] = {} if path is None else read_toml(path, MOST_CONFIG_BYTES)
     for key in ("data_dir", "rig"):
         if path is not None and isinstance(data.get(key), str):
             data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
@@ -321,12 +316,3 @@ def is_loopback(host: str) -> bool:
     with suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
     return False
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    text = read_text(path, MOST_CONFIG_BYTES, ConfigError)
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as cause:
-        message = f"{path}: expected TOML, found a fault: {cause}; correct that line"
-        raise ConfigError(message) from cause

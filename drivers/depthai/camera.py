@@ -18,8 +18,9 @@ from drivers.depthai.board import Board, Link, board_of
 from drivers.depthai.feed import KEPT_FRAMES, Feed
 from drivers.depthai.library import library
 from drivers.depthai.messages import Delivery, brightness
-from drivers.depthai.options import OakOptions, Stream, options_of
+from drivers.depthai.options import OakOptions, Stream
 from drivers.depthai.sensors import Sensor
+from slrig.bundle.faults import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import CalibrationError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame, Size
@@ -300,4 +301,4 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     LibraryMissingError, DeviceBusyError, DeviceGoneError, UnsupportedByDeviceError, DeviceError
         See `OakCamera`.
     """
-    return OakCamera(name, options_of(name, options))
+    return OakCamera(name, checked(OakOptions, options, f"the [[camera]] table '{name}'"))

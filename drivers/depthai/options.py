@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.errors import ConfigError
+from slrig.bundle.faults import Strict
 from slrig.model import Size
 
 USUAL_FPS = 20.0
@@ -64,12 +62,3 @@ class Stream:
     def period_ns(self) -> int:
         """From one frame to the next, ns."""
         return round(1e9 / self.fps)
-
-
-def options_of(name: str, options: Mapping[str, object]) -> OakOptions:
-    """Return a camera's options, checked. Raises ConfigError with every fault."""
-    try:
-        return OakOptions.model_validate(dict(options))
-    except ValidationError as cause:
-        message = f"the [[camera]] table '{name}' is wrong:\n{explain(cause, options, keys_of(OakOptions))}"
-        raise ConfigError(message) from cause

@@ -33,6 +33,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.linux import require_linux
+from slrig.bundle.faults import checked
 from slrig.devices import FoundDevice, Projector
 
 
@@ -65,10 +66,10 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     from drivers.dlpc350.finding import engines, resolved
     from drivers.dlpc350.flash import read_flash
     from drivers.dlpc350.link import open_link
-    from drivers.dlpc350.options import checked
+    from drivers.dlpc350.options import EngineOptions
     from drivers.dlpc350.projector import LightEngine
 
-    table = checked(options)
+    table = checked(EngineOptions, options, "the [projector] table of a light engine")
     flash = read_flash(folder / table.patterns)
     node = resolved(table.device, engines())
     return LightEngine(open_link(node.path), table, flash, serial=node.name)

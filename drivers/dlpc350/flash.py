@@ -23,11 +23,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from drivers.dlpc350.planes import PLANES, Plane, keys_of_plane, picture_of, plane_of, planes_in, words
 from drivers.dlpc350.timing import MOST_IMAGES
-from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.bundle.faults import Strict, checked, read_json, read_text
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
@@ -141,11 +141,7 @@ def read_flash(folder: Path) -> Flash:
     if not path.exists():
         return Flash(folder)
     data = read_json(read_text(path, _MOST_BYTES, ConfigError), path, ConfigError)
-    try:
-        listed = _List.model_validate(data)
-    except ValidationError as error:
-        message = f"{path}: the list of the flashed pictures is wrong:\n{explain(error, data, keys_of(_List))}"
-        raise ConfigError(message) from error
+    listed = checked(_List, data, f"{path}: the list of the flashed pictures")
     indices = [image.flash_index for image in listed.images]
     if len(set(indices)) != len(indices):
         message = f"{path}: expected each flash_index once, found {indices}; correct the list"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import IntEnum
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.errors import ConfigError
+from slrig.bundle.faults import Strict
 
 Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -89,14 +87,3 @@ class EngineOptions(Strict, use_attribute_docstrings=True):
     def current_byte(self) -> int:
         """The current in 255ths of the most."""
         return round(self.led_current * 255)
-
-
-def checked(options: Mapping[str, object]) -> EngineOptions:
-    """Return an engine's options. Raises ConfigError with all their faults."""
-    try:
-        return EngineOptions.model_validate(dict(options))
-    except ValidationError as error:
-        message = (
-            f"the [projector] table of a light engine is wrong:\n{explain(error, options, keys_of(EngineOptions))}"
-        )
-        raise ConfigError(message) from error

@@ -19,10 +19,11 @@ from pathlib import Path
 
 from drivers.genicam.connection import Connection
 from drivers.genicam.features import differ
-from drivers.genicam.options import GenicamOptions, options_of
+from drivers.genicam.options import GenicamOptions
 from drivers.genicam.pixels import FORMATS
 from drivers.genicam.session import Session
 from drivers.genicam.setup import line_of, prepare, set_trigger
+from slrig.bundle.faults import checked
 from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import CameraFormat, Frame
@@ -204,4 +205,5 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
         The camera does not take an option, or takes it otherwise.
     """
     del folder
-    return GenicamCamera(name, options_of(name, options))
+    table = f"the [[camera]] table of '{name}' (driver genicam)"
+    return GenicamCamera(name, checked(GenicamOptions, options, table))

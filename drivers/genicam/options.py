@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.errors import ConfigError
+from slrig.bundle.faults import Strict
 
 Stamp = Literal["exposure", "exposure_start", "exposure_end", "none"]
 
@@ -114,19 +113,3 @@ OWN_FEATURES = frozenset(
         "Width",
     }
 )
-
-
-def options_of(name: str, table: Mapping[str, object]) -> GenicamOptions:
-    """Check a camera's table.
-
-    Raises
-    ------
-    ConfigError
-        The table has faults, all of them in one message.
-    """
-    try:
-        return GenicamOptions.model_validate(dict(table))
-    except ValidationError as error:
-        known = explain(error, table, keys_of(GenicamOptions))
-        message = f"the [[camera]] table of '{name}' (driver genicam) is wrong:\n{known}"
-        raise ConfigError(message) from error

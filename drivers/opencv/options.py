@@ -13,9 +13,9 @@ from typing import Annotated
 from urllib.parse import urlsplit, urlunsplit
 
 import cv2
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
-from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.bundle.faults import Strict, checked
 from slrig.errors import ConfigError
 from slrig.model import Size
 
@@ -132,7 +132,7 @@ _NEEDED: Mapping[type[OpenCvOptions], str] = {
 }
 
 
-def checked(name: str, options: Mapping[str, object], folder: Path) -> Source:
+def source_of(name: str, options: Mapping[str, object], folder: Path) -> Source:
     """Return the source that a camera's options mean. Raises ConfigError with all their faults."""
     device = options.get("device")
     model: type[OpenCvOptions] = OpenCvOptions
@@ -148,12 +148,7 @@ def checked(name: str, options: Mapping[str, object], folder: Path) -> Source:
             model = _UnstampedOptions
     elif device is not None:
         model = _LiveOptions
-    try:
-        plain = model.model_validate(dict(options))
-    except ValidationError as error:
-        faults = explain(error, options, keys_of(OpenCvOptions))
-        message = f"the table of camera '{name}' is wrong:\n{faults}{_NEEDED[model]}"
-        raise ConfigError(message) from error
+    plain = checked(model, options, f"the table of camera '{name}'", hint=_NEEDED[model])
     backend = {**_backends(), "auto": usual}[plain.backend]
     return Source(
         kind, target if isinstance(target, int) else str(target), backend, _label(plain.device, target), plain

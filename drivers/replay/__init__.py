@@ -11,13 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import structlog
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from drivers.replay.camera import ReplayCamera, Stage
 from drivers.replay.clock import ReplayClock
 from drivers.replay.projector import ReplayProjector
 from slrig.bundle import Bundle, read_bundle
-from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.bundle.faults import Strict, checked
 from slrig.devices import Camera, Head, Projector
 from slrig.errors import BundleError, ConfigError
 from slrig.model import Calibration, Truth, without_missing_bits
@@ -100,11 +100,7 @@ def open_head(options: Mapping[str, object], folder: Path) -> Head:
     CalibrationError
         Its calibration is.
     """
-    try:
-        table = ReplayOptions.model_validate(dict(options))
-    except ValidationError as error:
-        message = f"the [head] table of a replayed rig is wrong:\n{explain(error, options, keys_of(ReplayOptions))}"
-        raise ConfigError(message) from error
+    table = checked(ReplayOptions, options, "the [head] table of a replayed rig")
     path = folder / table.bundle
     if not (path / "bundle.json").is_file():
         message = f'[head] bundle = "{table.bundle}": {path} is no scan bundle (it has no bundle.json); name its folder'

@@ -25,6 +25,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from slrig.bundle.faults import checked
 from slrig.devices import FoundDevice, Projector
 from slrig.errors import DeviceError, LibraryMissingError
 
@@ -56,11 +57,11 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         There is no graphical session, or it does not let this user in.
     """
-    from drivers.screen.options import checked
+    from drivers.screen.options import ScreenOptions
     from drivers.screen.projector import ScreenProjector
 
     del folder
-    return ScreenProjector(checked(options))
+    return ScreenProjector(checked(ScreenOptions, options, "the [projector] table of driver 'screen'"))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.errors import ConfigError
+from slrig.bundle.faults import Strict
 from slrig.model import Size
 
 Extent = Annotated[int, Field(ge=1, le=65_535)]
@@ -58,14 +56,3 @@ class ScreenOptions(Strict, use_attribute_docstrings=True):
     def native(self) -> Size | None:
         """The projector's own raster, if it is told."""
         return None if self.native_px is None else Size(*self.native_px)
-
-
-def checked(options: Mapping[str, object]) -> ScreenOptions:
-    """Return a screen's options. Raises ConfigError with all their faults."""
-    try:
-        return ScreenOptions.model_validate(dict(options))
-    except ValidationError as error:
-        message = (
-            f"the [projector] table of driver 'screen' is wrong:\n{explain(error, options, keys_of(ScreenOptions))}"
-        )
-        raise ConfigError(message) from error

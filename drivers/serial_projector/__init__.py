@@ -148,6 +148,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from slrig.bundle.faults import checked
 from slrig.devices import FoundDevice, Projector
 
 
@@ -176,11 +177,11 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         Nothing on the port speaks SLTP/1, or it may not be opened.
     """
-    from drivers.serial_projector.options import checked, export_path
+    from drivers.serial_projector.options import SerialProjectorOptions, export_path
     from drivers.serial_projector.port import SerialPort
     from drivers.serial_projector.projector import SerialProjector
 
-    table = checked(options)
+    table = checked(SerialProjectorOptions, options, "the [projector] table of a serial projector")
     return SerialProjector(SerialPort(table.port, baud=table.baud), table, export_folder=export_path(table, folder))
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.errors import ConfigError
+from slrig.bundle.faults import Strict
 
 
 class SerialProjectorOptions(Strict, use_attribute_docstrings=True):
@@ -45,16 +43,6 @@ class SerialProjectorOptions(Strict, use_attribute_docstrings=True):
     export_folder: Annotated[str, Field(min_length=1)] | None = None
     """Where to write the patterns of a sequence that the box does not hold, for flashing; from the rig file's
     folder."""
-
-
-def checked(options: Mapping[str, object]) -> SerialProjectorOptions:
-    """Return the options, checked. Raises ConfigError with all their faults."""
-    try:
-        return SerialProjectorOptions.model_validate(dict(options))
-    except ValidationError as error:
-        faults = explain(error, options, keys_of(SerialProjectorOptions))
-        message = f"the [projector] table of a serial projector is wrong:\n{faults}"
-        raise ConfigError(message) from error
 
 
 def export_path(options: SerialProjectorOptions, folder: Path) -> Path | None:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from drivers.linux import require_linux
+from slrig.bundle.faults import checked
 from slrig.devices import Camera, FoundDevice
 
 
@@ -41,10 +42,10 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
     """
     _require_system()
     from drivers.v4l2.camera import V4L2Camera
-    from drivers.v4l2.options import checked
+    from drivers.v4l2.options import V4L2Options
 
     del folder
-    return V4L2Camera(name, checked(name, options))
+    return V4L2Camera(name, checked(V4L2Options, options, f"the table of camera '{name}'"))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from drivers.v4l2.formats import LAYOUTS
-from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.errors import ConfigError
+from slrig.bundle.faults import Strict
 from slrig.model import Size
 
 Extent = Annotated[int, Field(ge=1, le=65_536)]
@@ -71,12 +69,3 @@ class V4L2Options(Strict, use_attribute_docstrings=True):
     def size(self) -> Size | None:
         """The frame's extent, if one is asked for."""
         return None if self.size_px is None else Size(*self.size_px)
-
-
-def checked(name: str, options: Mapping[str, object]) -> V4L2Options:
-    """Return a camera's options. Raises ConfigError with all their faults."""
-    try:
-        return V4L2Options.model_validate(dict(options))
-    except ValidationError as error:
-        message = f"the table of camera '{name}' is wrong:\n{explain(error, options, keys_of(V4L2Options))}"
-        raise ConfigError(message) from error

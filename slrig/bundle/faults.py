@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import difflib
 import json
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
-from slrig.errors import InvalidInputError
+from slrig.errors import ConfigError, InvalidInputError
 
 MOST_FAULTS = 20
 LONGEST_VALUE = 60
@@ -25,6 +26,9 @@ class Strict(BaseModel):
     """A description in which every key is known, every number finite, and nothing is converted in silence."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+Described = TypeVar("Described", bound=BaseModel)
 
 
 def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> str:
@@ -90,6 +94,31 @@ def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
     except ValueError as cause:
         message = f"{source}: {cause}"
         raise error(message) from cause
+
+
+def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
+    """Return the tables of a TOML file. Raises ConfigError: see `read_text`, or with the line where reading stopped."""
+    text = read_text(path, most_bytes, ConfigError)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as cause:
+        message = f"{path}: expected TOML, found a fault: {cause}; correct that line"
+        raise ConfigError(message) from cause
+
+
+def checked(model: type[Described], data: object, what: str, *, hint: str = "") -> Described:
+    """Return `data` as a `model`.
+
+    Raises
+    ------
+    ConfigError
+        Says `what` is wrong, lists every fault, and ends with `hint`.
+    """
+    try:
+        return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
+    except ValidationError as cause:
+        message = f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}"
+        raise ConfigError(message) from cause
 
 
 def explain(cause: ValidationError, data: object, known: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ from drivers import dlpc350
 from drivers.dlpc350.finding import engines
 from drivers.dlpc350.flash import Flash, read_flash, write_pictures
 from drivers.dlpc350.link import Link
-from drivers.dlpc350.options import checked
+from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.planes import MIRRORS
 from drivers.dlpc350.projector import LightEngine
 from slrig.capture.evidence import Evidence
@@ -122,7 +122,9 @@ class Table:
         """The driver at the other end of a new cable."""
         flash = read_flash(self.folder / PICTURES)
         link = Link(Cable(self.engine).host, "light engine")
-        return self.head(LightEngine(link, checked(self.options(**more)), flash, serial="LC4500-1"))
+        return self.head(
+            LightEngine(link, EngineOptions.model_validate(self.options(**more)), flash, serial="LC4500-1")
+        )
 
     def opened(self, **more: object) -> EngineHead:
         """The driver as a rig opens it, on whatever engine the kernel has."""

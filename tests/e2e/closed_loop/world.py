@@ -13,7 +13,7 @@ from simulated_rig.light import light_table
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import read_scene, surface_of
-from simulated_rig.tables import checked
+from slrig.bundle.faults import checked
 from slrig.config import read_rig
 from slrig.model import Calibration, CameraFormat, Pixels, Size
 
@@ -50,7 +50,7 @@ class World:
     def __init__(self, rig: Path, *, seed: int) -> None:
         head = read_rig(rig).head
         assert head is not None
-        options = checked(HeadOptions, head.options, source=str(rig))
+        options = checked(HeadOptions, head.options, str(rig))
         (camera,) = options.camera
         scene = rig.parent / options.scene
         lens = options.projector.pinhole()

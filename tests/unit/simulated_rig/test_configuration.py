@@ -55,8 +55,8 @@ def test_all_faults_of_the_options_come_in_one_message(tmp_path: Path) -> None:
         "sede",
     ):
         assert place in message
-    assert "6 faults" in message
-    assert "'red'" in message
+    assert len(message.splitlines()) == 7
+    assert "sede: unknown key; did you mean 'seed'?" in message
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_pose_may_be_given_as_a_calibration_has_it(tmp_path: Path) -> None:
         ("", "object"),
         ("object = []", "at least one"),
         ('[[object]]\nshape = "cube"\n', "shape"),
-        ('[[object]]\nshape = "sphere"\nradius_mm = -1.0\ncolour = 3\n', "2 faults"),
+        ('[[object]]\nshape = "sphere"\nradius_mm = -1.0\ncolour = 3\n', r"(?s)radius_mm.*colour: unknown key"),
         ('[[object]]\nshape = "mesh"\nfile = "absent.stl"\n', "absent.stl"),
         ('[[object]]\nshape = "mesh"\nfile = "broken.stl"\n', "broken.stl"),
         ('[[object]]\nshape = "mesh"\nfile = "strange.xyzzy"\n', "strange.xyzzy"),
@@ -115,7 +115,7 @@ def test_a_pose_may_be_given_as_a_calibration_has_it(tmp_path: Path) -> None:
         ('[[object]]\nshape = "relief"\nsize_mm = [5000.0, 5000.0]\nstep_mm = 0.1\n', "larger step_mm"),
         ('[[object]]\nshape = "turned"\nprofile_mm = [[9.0, 0.0], [9.0, 5.0], [9.0, 4.0]]\n', "rising heights"),
         ('[[object]]\nshape = "turned"\nprofile_mm = [[9.0, 0.0], [9.0, 5.0]]\n', "at least 3 points"),
-        ("[[object]\n", "not a TOML file"),
+        ("[[object]\n", "expected TOML, found a fault"),
     ],
 )
 def test_a_faulty_scene_is_refused_with_its_cause(tmp_path: Path, scene: str, words: str) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.dlpc350.flash import Flash, write_pictures
 from drivers.dlpc350.link import Link
-from drivers.dlpc350.options import checked
+from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.planes import MIRRORS
 from drivers.dlpc350.projector import LightEngine
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
@@ -43,7 +43,7 @@ class Bench:
 
     def open(self, **options: object) -> LightEngine:
         self.cable = Cable(self.engine)
-        table = checked({"patterns": "p", "image_load_s": 0.0, **options})
+        table = EngineOptions.model_validate({"patterns": "p", "image_load_s": 0.0, **options})
         return LightEngine(Link(self.cable.host, "light engine", answer_s=2.0), table, self.flash, serial="1")
 
     def _pulse(self, t_ns: int) -> None:
@@ -374,7 +374,7 @@ def test_an_engine_that_is_gone_while_it_is_opened_is_gone(bench: Bench) -> None
     bench.cable = Cable(bench.engine)
     bench.cable.unplug()
     with pytest.raises(DeviceGoneError):
-        LightEngine(Link(bench.cable.host, "light engine"), checked({"patterns": "p"}), bench.flash)
+        LightEngine(Link(bench.cable.host, "light engine"), EngineOptions(patterns="p"), bench.flash)
 
 
 def test_closing_from_another_thread_ends_a_wait_for_light(bench: Bench) -> None:

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from drivers.dlpc350.flash import Place
-from drivers.dlpc350.options import Colour, checked
+from drivers.dlpc350.options import Colour, EngineOptions
 from drivers.dlpc350.tables import tables_of
 from drivers.dlpc350.timing import MINIMUM_US, Timing, check_loading, check_timing, lit
+from slrig.bundle.faults import checked
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 
 
@@ -111,14 +112,14 @@ def test_a_table_of_two_pictures_is_sent_the_other_way_round() -> None:
 def test_all_faults_of_the_options_are_told_at_once() -> None:
     options: dict[str, Any] = {"patern": "p", "led": "ultraviolet", "hold_s": 1.0, "trigger_delay_us": 5.0}
     with pytest.raises(ConfigError) as refused:
-        checked(options)
+        checked(EngineOptions, options, "the table")
     text = str(refused.value)
     for words in ("patern: unknown key; did you mean 'patterns'?", "patterns: missing", "led: ", "hold_s: ", "5.0"):
         assert words in text
 
 
 def test_the_led_current_is_limited() -> None:
-    assert checked({"patterns": "p", "led_current": 0.4}).current_byte == 102
+    assert EngineOptions(patterns="p", led_current=0.4).current_byte == 102
     with pytest.raises(ConfigError, match=r"led_current is 0\.6, led_current_limit allows 0\.5"):
-        checked({"patterns": "p", "led_current": 0.6})
-    assert checked({"patterns": "p", "led_current": 0.6, "led_current_limit": 0.6}).colour is Colour.WHITE
+        checked(EngineOptions, {"patterns": "p", "led_current": 0.6}, "the table")
+    assert EngineOptions(patterns="p", led_current=0.6, led_current_limit=0.6).colour is Colour.WHITE

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from drivers.opencv.options import Kind, checked
+from drivers.opencv.options import Kind, source_of
 from slrig.errors import ConfigError
 
 LIVE = {"source_exposure_s": 0.01, "delay_s": 0.1, "frame_rate_hz": 30.0}
@@ -16,24 +16,24 @@ LIVE = {"source_exposure_s": 0.01, "delay_s": 0.1, "frame_rate_hz": 30.0}
 
 def test_a_camera_is_opened_through_the_kernels_interface_by_its_stamps(tmp_path: Path) -> None:
     for device in (0, "/dev/video0"):
-        source = checked("eye", {"device": device}, tmp_path)
+        source = source_of("eye", {"device": device}, tmp_path)
         assert (source.kind, source.backend, source.target) == (Kind.DEVICE, cv2.CAP_V4L2, device)
         assert source.label == "/dev/video0"
 
 
 def test_a_camera_whose_stamps_are_not_trusted_is_a_camera_still(tmp_path: Path) -> None:
-    source = checked("eye", {"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, tmp_path)
+    source = source_of("eye", {"device": 0, "delay_s": 0.1, "frame_rate_hz": 30}, tmp_path)
     assert (source.kind, source.backend) == (Kind.DEVICE, cv2.CAP_V4L2)
 
 
 def test_a_camera_of_another_back_end_is_a_live_source(tmp_path: Path) -> None:
-    source = checked("eye", {"device": 0, "backend": "ffmpeg", **LIVE}, tmp_path)
+    source = source_of("eye", {"device": 0, "backend": "ffmpeg", **LIVE}, tmp_path)
     assert (source.kind, source.backend) == (Kind.LIVE, cv2.CAP_FFMPEG)
 
 
 def test_an_address_is_a_live_source_and_its_password_is_not_told(tmp_path: Path) -> None:
     url = "rtsp://admin:secret@camera.local:554/stream?key=secret"
-    source = checked("eye", {"device": url, **LIVE}, tmp_path)
+    source = source_of("eye", {"device": url, **LIVE}, tmp_path)
     assert (source.kind, source.backend, source.target) == (Kind.LIVE, cv2.CAP_FFMPEG, url)
     assert source.label == "rtsp://camera.local:554/stream"
 
@@ -41,11 +41,11 @@ def test_an_address_is_a_live_source_and_its_password_is_not_told(tmp_path: Path
 def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
     (tmp_path / "film.avi").touch()
     os.mkfifo(tmp_path / "pipe.mjpeg")
-    film = checked("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
+    film = source_of("eye", {"device": "film.avi", "source_exposure_s": 0.01}, tmp_path)
     assert (film.kind, film.target) == (Kind.FILM, str(tmp_path / "film.avi"))
-    series = checked("eye", {"device": "f/%03d.png", "source_exposure_s": 0.01, "frame_rate_hz": 10}, tmp_path)
+    series = source_of("eye", {"device": "f/%03d.png", "source_exposure_s": 0.01, "frame_rate_hz": 10}, tmp_path)
     assert (series.kind, series.backend) == (Kind.FILM, cv2.CAP_IMAGES)
-    assert checked("eye", {"device": "pipe.mjpeg", **LIVE}, tmp_path).kind is Kind.LIVE
+    assert source_of("eye", {"device": "pipe.mjpeg", **LIVE}, tmp_path).kind is Kind.LIVE
 
 
 @pytest.mark.parametrize(
@@ -72,9 +72,9 @@ def test_files_are_films_and_pipes_are_live(tmp_path: Path) -> None:
 def test_options_are_checked(tmp_path: Path, options: dict[str, object], words: str) -> None:
     (tmp_path / "film.avi").touch()
     with pytest.raises(ConfigError, match=words):
-        checked("eye", options, tmp_path)
+        source_of("eye", options, tmp_path)
 
 
 def test_all_faults_come_in_one_message(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"(?s)size_px.*delay_s: .*colour: unknown key"):
-        checked("eye", {"device": "rtsp://eye", **LIVE, "size_px": [0, 2], "delay_s": -1, "colour": 1}, tmp_path)
+        source_of("eye", {"device": "rtsp://eye", **LIVE, "size_px": [0, 2], "delay_s": -1, "colour": 1}, tmp_path)

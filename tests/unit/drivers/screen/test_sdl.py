@@ -82,13 +82,13 @@ def test_a_display_of_another_name_or_size_is_refused() -> None:
 
 
 def test_two_displays_of_one_name_are_refused() -> None:
-    from drivers.screen.options import checked
+    from drivers.screen.options import ScreenOptions
 
     twins = [("PJ", Size(1280, 800), 60)] * 2
     with pytest.raises(UnsupportedByDeviceError, match="2 displays are of that name"):
-        sdl._chosen(twins, checked({"output": "PJ"}))
+        sdl._chosen(twins, ScreenOptions(output="PJ"))
     with pytest.raises(UnsupportedByDeviceError, match="does not tell its refresh rate"):
-        sdl._chosen([("PJ", Size(1280, 800), 0)], checked({"output": "PJ"}))
+        sdl._chosen([("PJ", Size(1280, 800), 0)], ScreenOptions(output="PJ"))
 
 
 def test_a_missing_library_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:

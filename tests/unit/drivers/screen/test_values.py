@@ -9,7 +9,7 @@ import pytest
 
 from drivers.screen import open_projector
 from drivers.screen.edid import parse
-from drivers.screen.options import checked
+from drivers.screen.options import ScreenOptions
 from drivers.screen.timing import copied, flipped, queued, whole_light
 from drivers.screen.working import OwnThread
 from slrig.errors import ConfigError, DeviceError, DeviceGoneError
@@ -59,7 +59,7 @@ def test_all_faults_of_a_table_come_in_one_message() -> None:
 
 
 def test_a_table_needs_no_more_than_its_output() -> None:
-    options = checked({"output": "HDMI-1"})
+    options = ScreenOptions(output="HDMI-1")
     assert (options.backend, options.native, options.latency_s) == ("auto", None, None)
 
 

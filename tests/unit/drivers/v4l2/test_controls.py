@@ -8,7 +8,8 @@ import pytest
 
 from drivers.v4l2 import controls as ctl
 from drivers.v4l2.controls import Control, GainScale
-from drivers.v4l2.options import V4L2Options, checked
+from drivers.v4l2.options import V4L2Options
+from slrig.bundle.faults import checked
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 
 NODE = Path("/dev/video7")
@@ -32,7 +33,7 @@ def webcam() -> dict[int, Control]:
 
 
 def options(**more: object) -> V4L2Options:
-    return checked("left", {"device": "/dev/video7", **more})
+    return V4L2Options.model_validate({"device": "/dev/video7", **more})
 
 
 def names(steps: tuple[tuple[Control, int], ...]) -> list[tuple[str, int]]:
@@ -109,8 +110,8 @@ def test_a_device_without_gain_has_gain_1() -> None:
 
 def test_all_faults_of_a_table_come_in_one_message() -> None:
     with pytest.raises(ConfigError) as caught:
-        checked("left", {"pixel_format": "H264", "size_px": [640], "fokus": 3, "frame_rate_hz": -1})
+        checked(V4L2Options, {"pixel_format": "H264", "size_px": [640], "fokus": 3, "frame_rate_hz": -1}, "the table")
     message = str(caught.value)
-    assert "camera 'left'" in message
+    assert message.startswith("the table is wrong:\n")
     for words in ("device: missing", "'H264'", "size_px", "did you mean 'focus'?", "frame_rate_hz"):
         assert words in message
