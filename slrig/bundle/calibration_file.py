@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Collection, Mapping
 from datetime import datetime
@@ -192,21 +191,3 @@ def _device(pinhole: Pinhole) -> dict[str, Any]:
         "rotation": pinhole.rotation.tolist(),
         "translation_mm": pinhole.translation_mm.tolist(),
     }
-
-
-def calibration_id(calibration: Calibration) -> str:
-    """Twelve hexadecimal digits that change with any number of the calibration."""
-    devices: dict[str, Pinhole | None] = {**calibration.cameras, "projector": calibration.projector}
-    text = json.dumps(
-        {
-            name: None
-            if device is None
-            else [
-                device.size.shape,
-                *(a.tolist() for a in (device.matrix, device.distortion, device.rotation, device.translation_mm)),
-            ]
-            for name, device in devices.items()
-        },
-        sort_keys=True,
-    )
-    return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -32,9 +32,10 @@ from slrig.sessions.acceptance.plan import (
 )
 from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
 from slrig.sessions.acceptance.report import document
-from slrig.sessions.acceptance.running import AcceptanceResult, Place, required_calibration, run_acceptance
+from slrig.sessions.acceptance.running import Place, required_calibration, run_acceptance
 from slrig.sessions.acceptance.scene import scripted_config
 from slrig.sessions.acceptance.store import HTML, JSON
+from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 

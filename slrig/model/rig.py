@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -154,3 +156,21 @@ class Calibration:
     def triangulates(self) -> bool:
         """Whether it has two rays that meet in a point; one camera alone has a direction, and no depth."""
         return self.projector is not None or len(self.cameras) > 1
+
+    @property
+    def digest(self) -> str:
+        """Twelve hexadecimal digits that change with any number of its devices, and not with what is known of them."""
+        devices: dict[str, Pinhole | None] = {**self.cameras, "projector": self.projector}
+        text = json.dumps(
+            {
+                name: None
+                if device is None
+                else [
+                    device.size.shape,
+                    *(a.tolist() for a in (device.matrix, device.distortion, device.rotation, device.translation_mm)),
+                ]
+                for name, device in devices.items()
+            },
+            sort_keys=True,
+        )
+        return hashlib.sha256(text.encode()).hexdigest()[:12]

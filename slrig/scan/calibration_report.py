@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.calibration_file import calibration_id
 from slrig.bundle.description import read_description
 from slrig.model import Calibration, FloatArray, Solved
 
@@ -30,7 +29,7 @@ def calibration_report(
     solved = calibration.solved
     if solved is None or share_mm is None:
         return {
-            "id": calibration_id(calibration),
+            "id": calibration.digest,
             "solved_at": None,
             "age_days": None,
             "expected_error_mm": None,

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from slrig.bundle import read_bundle, read_calibration
-from slrig.bundle.calibration_file import calibration_id, check_rays
+from slrig.bundle.calibration_file import check_rays
 from slrig.bundle.description import read_description
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import read_refused
@@ -218,5 +218,5 @@ def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
     return (
         Outline.of(live.stream.capture) == listed
         and path.exists()
-        and calibration_id(read_calibration(path)) == calibration_id(live.calibration)
+        and read_calibration(path).digest == live.calibration.digest
     )

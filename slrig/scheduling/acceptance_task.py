@@ -14,7 +14,7 @@ from slrig.scheduling.waiting import error_of, until
 from slrig.sessions.acceptance.asking import AcceptanceRequest
 from slrig.sessions.acceptance.desk import AcceptanceDesk
 from slrig.sessions.acceptance.records import AcceptanceState
-from slrig.sessions.acceptance.running import verdicts
+from slrig.sessions.acceptance.verdicts import verdicts
 
 
 class AcceptanceTask:

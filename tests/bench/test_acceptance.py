@@ -25,8 +25,9 @@ from slrig.discovery import open_rig
 from slrig.model import FloatArray
 from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Quantity, Step, exact_artefacts
 from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance.running import AcceptanceResult, run_acceptance
+from slrig.sessions.acceptance.running import run_acceptance
 from slrig.sessions.acceptance.scene import scripted_config
+from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 RIG = Path(os.environ.get("SLRIG_RIG") or Path(__file__).parents[2] / "config" / "rigs" / "demo.toml")
 SEEDS = int(os.environ.get("SLRIG_SEEDS") or 30)

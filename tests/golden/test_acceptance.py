@@ -16,8 +16,9 @@ from slrig.errors import NothingToReconstructError
 from slrig.model import Calibration
 from slrig.sessions.acceptance.plan import AcceptancePlan, Quantity, exact_artefacts
 from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance.running import AcceptanceResult, run_acceptance
+from slrig.sessions.acceptance.running import run_acceptance
 from slrig.sessions.acceptance.scene import scripted_config
+from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
 """Small: the demonstration's resolution over half its view."""

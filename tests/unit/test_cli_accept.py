@@ -21,8 +21,9 @@ from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, UnsupportedByDeviceError
 from slrig.sessions.acceptance.plan import AcceptancePlan
-from slrig.sessions.acceptance.running import AcceptanceResult, run_acceptance
+from slrig.sessions.acceptance.running import run_acceptance
 from slrig.sessions.acceptance.scene import scripted_config
+from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 RIGS = Path(__file__).parents[2] / "config" / "rigs"
 BALL_BAR = RIGS / "ball_bar.toml"

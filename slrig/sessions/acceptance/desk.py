@@ -30,15 +30,10 @@ from slrig.scan.records import Clock, ScanProgress, require_same_body, utc_now
 from slrig.scan.work import Holder
 from slrig.sessions.acceptance.plan import AcceptancePlan
 from slrig.sessions.acceptance.records import AcceptanceRecord, AcceptanceState, RequestKey
-from slrig.sessions.acceptance.running import (
-    AcceptanceResult,
-    ReconstructBundle,
-    by_positioner,
-    measured,
-    required_calibration,
-    verdicts,
-)
+from slrig.sessions.acceptance.report import write_reports
+from slrig.sessions.acceptance.running import ReconstructBundle, by_positioner, measured, required_calibration
 from slrig.sessions.acceptance.store import AcceptanceStore, interruption_fault
+from slrig.sessions.acceptance.verdicts import AcceptanceResult, verdicts
 from slrig.sessions.calibration.pose_shooting import RigLender
 from slrig.sessions.health.verification import solve_id
 
@@ -213,8 +208,6 @@ class AcceptanceDesk:
 
     def _measure(self, held: _Held, rig: Rig, cancelled: Callable[[], bool], *, scripted: bool) -> None:
         """On the rig's thread: measure one position, or all that are left."""
-        from slrig.sessions.acceptance.report import write_reports
-
         with self._lock:
             self._change(held, readings=held.record.from_first_take().readings)
         plan = held.record.plan

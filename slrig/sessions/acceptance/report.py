@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle.calibration_file import calibration_id
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import REJECTED_SHARE, Decision
 from slrig.calibration.segmentation import STEEPEST_DEG
@@ -17,8 +16,8 @@ from slrig.sessions.acceptance.charts import error_map, volume_view
 from slrig.sessions.acceptance.evaluation import BORDER_RINGS, Evidence, Reading
 from slrig.sessions.acceptance.plan import Artefact, Quantity
 from slrig.sessions.acceptance.points import kept_points, points_file
-from slrig.sessions.acceptance.running import FORMULA, AcceptanceResult, Verdict
 from slrig.sessions.acceptance.store import HTML, JSON
+from slrig.sessions.acceptance.verdicts import FORMULA, AcceptanceResult, Verdict
 from slrig.sessions.calibration.charts import legend
 from slrig.sessions.markup import Markup, joined, picture_uri, tag
 from slrig.sessions.report_style import report_page
@@ -51,7 +50,7 @@ def document(result: AcceptanceResult) -> dict[str, object]:
         "rendered": plan.rendered,
         "begun_at": result.begun.isoformat(timespec="seconds"),
         "ended_at": result.ended.isoformat(timespec="seconds"),
-        "calibration": calibration_id(result.calibration),
+        "calibration": result.calibration.digest,
         "decision": result.decision.value,
         "complete": result.complete,
         "rule": RULE,
@@ -123,7 +122,7 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
         tag("div", *(_tile(each, result) for each in result.verdicts), class_="tiles"),
         _rules(result),
         *(_artefact(artefact, result, evidence_of) for artefact in Artefact),
-        tag("footer", f"Written by slrig. {MANNER} Calibration {calibration_id(result.calibration)}."),
+        tag("footer", f"Written by slrig. {MANNER} Calibration {result.calibration.digest}."),
     ]
     return report_page(title, sections)
 

@@ -6,16 +6,12 @@ In the manner of VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import datetime
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
 from slrig.bundle.storage import refusals_of
-from slrig.calibration.artefacts import Decision, decision
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
@@ -33,11 +29,10 @@ from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import Progress, ReconstructionPlan, ScanPlan
 from slrig.scan.records import Clock, utc_now
 from slrig.sessions.acceptance.evaluation import Reading, reading
-from slrig.sessions.acceptance.plan import AcceptancePlan, Quantity, Step
+from slrig.sessions.acceptance.plan import AcceptancePlan, Step
 from slrig.sessions.acceptance.points import keep_points
-
-FORMULA = "U = 2 * sqrt((U_certificate / 2)^2 + s^2)"
-"""Expanded uncertainty, k = 2: the certificate's, and the standard deviation s of repeated captures of one position."""
+from slrig.sessions.acceptance.report import write_reports
+from slrig.sessions.acceptance.verdicts import AcceptanceResult, verdicts
 
 _BUNDLE, _MESH = "bundle", "mesh"
 
@@ -65,53 +60,6 @@ class ReconstructBundle(Protocol):
     ) -> Mapping[str, Any]:
         """Write the mesh into `output`."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """One quantity over all positions. error_mm, limit_mm : of the reading that comes nearest to its limit, or is
-    furthest beyond, which is that of `step`, `take`. certificate_mm : the artefact's expanded uncertainty, None where
-    it was not told; scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats :
-    captures that tell it. uncertainty_mm : U by `FORMULA`, what is not known left out.
-    """
-
-    quantity: Quantity
-    error_mm: float
-    limit_mm: float
-    step: str
-    take: int
-    certificate_mm: float | None
-    scatter_mm: float
-    repeats: int
-    uncertainty_mm: float
-    decision: Decision
-
-
-@dataclass(frozen=True, slots=True)
-class AcceptanceResult:
-    """A test that was done. readings : every capture in order. verdicts : by quantity."""
-
-    rig: str
-    begun: datetime
-    ended: datetime
-    plan: AcceptancePlan
-    calibration: Calibration
-    readings: tuple[Reading, ...]
-    verdicts: tuple[Verdict, ...]
-
-    @property
-    def decision(self) -> Decision:
-        """Fails if any quantity fails, passes if all pass."""
-        told = {verdict.decision for verdict in self.verdicts}
-        for worst in (Decision.FAILS, Decision.UNDECIDED):
-            if worst in told:
-                return worst
-        return Decision.PASSES
-
-    @property
-    def complete(self) -> bool:
-        """Whether every position was measured as often as planned."""
-        return len(self.readings) == len(self.plan.takes)
 
 
 def run_acceptance(
@@ -147,8 +95,6 @@ def run_acceptance(
     DeviceError, ScanEvidenceError, StorageError
         As a scan.
     """
-    from slrig.sessions.acceptance.report import write_reports
-
     calibration = required_calibration(rig)
     mover = by_positioner(rig, plan) if place is None else place
     _require_free(folder)
@@ -240,38 +186,6 @@ def required_calibration(rig: Rig) -> Calibration:
         message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
         raise CalibrationError(message)
     return rig.calibration
-
-
-def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[Verdict, ...]:
-    """What is decided of each quantity that was measured."""
-    told = {quantity for each in readings for quantity in each.errors_mm}
-    return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in told)
-
-
-def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> Verdict:
-    having = [each for each in readings if quantity in each.errors_mm]
-    worst = max(having, key=lambda each: abs(each.errors_mm[quantity]) - each.limits_mm[quantity])
-    scatter_mm, repeats = _scatter(quantity, having)
-    certificate = plan.artefacts.uncertainty_mm(quantity)
-    uncertainty = 2 * float(np.hypot((certificate or 0.0) / 2, 0.0 if np.isnan(scatter_mm) else scatter_mm))
-    error, limit = worst.errors_mm[quantity], worst.limits_mm[quantity]
-    return Verdict(
-        quantity, error, limit, worst.step, worst.take, certificate, scatter_mm, repeats, uncertainty,
-        decision(error, limit, uncertainty),
-    )  # fmt: skip
-
-
-def _scatter(quantity: Quantity, readings: Sequence[Reading]) -> tuple[float, int]:
-    """Standard deviation of repeated captures of one position, mm, and how many they were; NaN and 0 without any."""
-    by_step: dict[str, list[float]] = {}
-    for each in readings:
-        by_step.setdefault(each.step, []).append(each.errors_mm[quantity])
-    repeated = [np.array(errors) for errors in by_step.values() if len(errors) > 1]
-    if not repeated:
-        return float("nan"), 0
-    count = sum(len(errors) for errors in repeated)
-    squares = sum(float(((errors - errors.mean()) ** 2).sum()) for errors in repeated)
-    return float(np.sqrt(squares / (count - len(repeated)))), count
 
 
 def _part_of(progress: Progress, step: Step, take: int, index: int, count: int) -> Progress:

@@ -16,7 +16,6 @@ from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.bundle.calibration_file import calibration_id
 from slrig.calibration.board import Board
 from slrig.calibration.health.look import Look, health_of_scan
 from slrig.calibration.health.verdict import Health, HealthState
@@ -127,9 +126,7 @@ def verify_bundle(
 
 def solve_id(calibration: Calibration) -> str:
     """What a calibration's verifications are on record by: the id of its solve, else a digest of its numbers."""
-    if calibration.solved is not None:
-        return calibration.solved.id
-    return calibration_id(calibration)
+    return calibration.digest if calibration.solved is None else calibration.solved.id
 
 
 def require_healthy(health: Health, *, refuse_when_stale: bool) -> None:

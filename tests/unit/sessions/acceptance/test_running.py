@@ -28,7 +28,8 @@ from slrig.sessions.acceptance import running as acceptance
 from slrig.sessions.acceptance.evaluation import Reading, near_border, reading
 from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
 from slrig.sessions.acceptance.positions import acceptance_plan
-from slrig.sessions.acceptance.running import AcceptanceResult, Place, run_acceptance, verdicts
+from slrig.sessions.acceptance.running import Place, run_acceptance
+from slrig.sessions.acceptance.verdicts import AcceptanceResult, verdicts
 from tests.unit.sessions.acceptance.test_plan import GOOD, VOLUME, device
 
 CAMERA = device()

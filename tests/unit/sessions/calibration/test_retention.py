@@ -11,7 +11,7 @@ from uuid import UUID, uuid4
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.bundle.calibration_file import calibration_id, write_calibration
+from slrig.bundle.calibration_file import write_calibration
 from slrig.sessions.calibration.retention import Retention, named_by_scans
 from tests.unit.sessions.calibration.calibration_bench import CalibrationBench, tame_calibration
 
@@ -85,9 +85,9 @@ def test_one_that_states_no_error_is_known_by_its_numbers(bench: CalibrationBenc
         document.pop("solved")
         imported.append(bench.calibrations.take_in(json.dumps(document).encode(), ".json").id)
     bench.session()
-    a_scan(bench, report={"calibration": {"id": calibration_id(kept)}})
-    assert named_by_scans(bench.folder.scans) == {calibration_id(kept)}
-    tidy = Retention(bench.calibrations, bench.folder, keep=1, named=lambda: {calibration_id(gone)})
+    a_scan(bench, report={"calibration": {"id": kept.digest}})
+    assert named_by_scans(bench.folder.scans) == {kept.digest}
+    tidy = Retention(bench.calibrations, bench.folder, keep=1, named=lambda: {gone.digest})
     # Others than scans name them too.
     assert tidy() == ()
     assert Retention(bench.calibrations, bench.folder, keep=1)() == (imported[1],)
