@@ -19,7 +19,6 @@ ROOT = Path(__file__).parents[2]
 OF_THE_COMMAND_LINE = (
     "slrig/cli", "slrig/api", "slrig/sessions/examination", "slrig/scan/folder.py",
     "slrig/calibration/boards/printing.py",
-    "slrig/sessions/report_style.py",  # variables of a style sheet look like flags
     "drivers/screen/refusals.py",  # options of xrandr
 )  # fmt: skip
 # Programs that are not ours.

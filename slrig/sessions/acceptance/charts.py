@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
+from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from slrig.model import FloatArray, Pinhole
+from slrig.model import FloatArray, Pinhole, Pixels
 from slrig.sessions.acceptance.evaluation import Evidence
 from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Step
 from slrig.sessions.acceptance.scene import turn_deg
-from slrig.sessions.calibration.charts import WIDTH, drawing, ramp_colour
-from slrig.sessions.markup import Markup, tag
+from slrig.sessions.drawing import WIDTH, drawing, path, polygon, ramp_colour, shape
 
 _MAP_PX = (240, 180)
 _MARGIN_SHARE = 0.06
@@ -23,8 +23,8 @@ _NUMBER_LIFT = 3.5
 _MOST_CELL_PX = 12
 
 
-def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> bytes:
-    """A JPEG of an artefact as the camera sees it, coloured by how far its points lie off the fit.
+def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> Pixels:
+    """An artefact as the camera sees it, coloured by how far its points lie off the fit: (H, W, 3) uint8, BGR.
 
     Dark blue is most_mm inwards (below), yellow as much outwards; grey does not count.
     """
@@ -48,12 +48,8 @@ def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> bytes:
     filled = np.flatnonzero(count)
     shares = np.clip(0.5 + total[filled] / count[filled] / (2 * most_mm), 0, 1)
     picture.reshape(-1, 3)[filled] = _COLOURS[np.rint(shares * 255).astype(int)]
-    large = cv2.resize(picture, None, fx=cell, fy=cell, interpolation=cv2.INTER_NEAREST)[:height, :width]
-    written, data = cv2.imencode(".jpg", np.ascontiguousarray(large), [cv2.IMWRITE_JPEG_QUALITY, 88])
-    if not written:
-        message = f"a picture of {large.shape} could not be written as JPEG"
-        raise ValueError(message)
-    return data.tobytes()
+    large = cv2.resize(picture, None, fx=cell, fy=cell, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(large[:height, :width])
 
 
 def _colour(share: float) -> tuple[int, int, int]:
@@ -67,44 +63,42 @@ _COLOURS = np.array([_colour(value / 255) for value in range(256)], np.uint8)
 def volume_view(plan: AcceptancePlan, artefact: Artefact, *, aside: bool) -> Markup:
     """The working volume to scale with every position of one artefact, numbered; from the front, or from the side."""
     axes = [2, 1] if aside else [0, 1]
-    low, high = plan.volume_mm[0][axes], plan.volume_mm[1][axes]
+    low, high = plan.volume_mm[:, axes]
     # Both views in one scale, that in which the wider fills its half of the page.
     scale = (WIDTH - 2 * _MARGIN) / float((plan.volume_mm[1] - plan.volume_mm[0])[:2].max())
     size = scale * (high - low)
     corner = np.array([(WIDTH - size[0]) / 2, _MARGIN])
 
-    def placed(point_mm: FloatArray) -> FloatArray:
-        return np.asarray((point_mm[axes] - low) * scale + corner)
+    def placed(points_mm: FloatArray) -> FloatArray:
+        return np.asarray((points_mm[..., axes] - low) * scale + corner)
 
-    parts = [tag("rect", x=corner[0], y=corner[1], width=size[0], height=size[1], class_="volume")]
+    parts = [shape("rect", x=corner[0], y=corner[1], width=size[0], height=size[1], class_="volume")]
     steps = [step for step in plan.steps if step.artefact is artefact]
-    if artefact is Artefact.SPHERE:
-        radius = scale * plan.artefacts.diameter.value_mm / 2
-        parts += [_ball(placed(step.centre_mm), radius) for step in steps]
-    elif artefact is Artefact.BAR:
-        half = plan.artefacts.distance.value_mm / 2
-        for step in steps:
-            ends = [placed(step.centre_mm + side * half * step.axis) for side in (-1, 1)]
-            parts.append(tag("path", d=_path(ends), class_="arrow", stroke="currentColor", stroke_opacity=0.5))
-            parts += [_ball(end, scale * plan.artefacts.ball_mm / 2) for end in ends]
-    else:
-        parts += [tag("polygon", points=_listed([placed(each) for each in _outline(step, plan)]), class_="board")
-                  for step in steps]  # fmt: skip
+    for step in steps:
+        if artefact is Artefact.PLANE:
+            parts.append(polygon(placed(_outline_mm(step, plan)), "board"))
+            continue
+        ends, radius_mm = step.centre_mm[None], plan.artefacts.diameter.value_mm / 2
+        if artefact is Artefact.BAR:
+            ends, radius_mm = step.centre_mm + _ends_mm(plan)[:, None] * step.axis, plan.artefacts.ball_mm / 2
+            line = path(placed(ends))
+            parts.append(shape("path", d=line, class_="arrow", stroke="currentColor", stroke_opacity=0.5))
+        parts += [shape("circle", cx=x, cy=y, r=scale * radius_mm, class_="board") for x, y in placed(ends)]
     parts += _numbers(steps, placed, plan)
     view = "from the side, the rig to the left" if aside else "as the rig sees it"
     return drawing(WIDTH, float(size[1]) + 2 * _MARGIN, f"positions of the {artefact}, {view}", parts)
 
 
-def _ball(spot: FloatArray, radius: float) -> Markup:
-    return tag("circle", cx=spot[0], cy=spot[1], r=radius, class_="board")
+def _ends_mm(plan: AcceptancePlan) -> FloatArray:
+    """(2,) where the balls of the bar are along it, from its middle."""
+    return np.array([-1, 1]) * plan.artefacts.distance.value_mm / 2
 
 
-def _outline(step: Step, plan: AcceptancePlan) -> list[FloatArray]:
-    """The corners of a plane in a position, its length across."""
-    length, width = plan.artefacts.plane_mm
+def _outline_mm(step: Step, plan: AcceptancePlan) -> FloatArray:
+    """(4, 3) the corners of a plane in a position, its length across."""
+    corners = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]) * [*plan.artefacts.plane_mm, 0] / 2
     turn = Rotation.from_euler("xyz", turn_deg(step), degrees=True)
-    corners = np.array([(x * length / 2, y * width / 2, 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-    return list(step.centre_mm + turn.apply(corners))
+    return np.asarray(step.centre_mm + turn.apply(corners))
 
 
 def _numbers(steps: Sequence[Step], placed: Callable[[FloatArray], FloatArray], plan: AcceptancePlan) -> list[Markup]:
@@ -112,17 +106,10 @@ def _numbers(steps: Sequence[Step], placed: Callable[[FloatArray], FloatArray], 
     spots: dict[tuple[int, int], list[str]] = {}
     for step in steps:
         # At one end of a bar: the middles of all diagonals are one.
-        end = step.centre_mm + step.axis * (plan.artefacts.distance.value_mm / 2 * (step.artefact is Artefact.BAR))
-        x, y = placed(end)
+        along_mm = _ends_mm(plan)[1] if step.artefact is Artefact.BAR else 0.0
+        x, y = placed(step.centre_mm + step.axis * along_mm)
         spots.setdefault((round(x), round(y)), []).append(step.name.rpartition("-")[2])
     return [
-        tag("text", ", ".join(names), x=float(x), y=y + _NUMBER_LIFT, class_="label") for (x, y), names in spots.items()
+        shape("text", ", ".join(names), x=float(x), y=y + _NUMBER_LIFT, class_="label")
+        for (x, y), names in spots.items()
     ]
-
-
-def _path(points: Sequence[FloatArray]) -> str:
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-
-
-def _listed(points: Sequence[FloatArray]) -> str:
-    return " ".join(f"{x:.1f},{y:.1f}" for x, y in points)

@@ -31,6 +31,15 @@ class Figure:
     value: float
     sigma: float
 
+    def shown(self, number: float) -> str:
+        """A number with so many decimals that the deviation shows two digits, four if it is 0, and a true minus sign.
+
+        >>> Figure(-1810.4, 0.213).shown(-1810.4), Figure(-0.12, 0.00031).shown(0.00031), Figure(842.0, 15.0).shown(15)
+        ('−1810.40', '0.00031', '15')
+        """
+        digits = min(max(1 - math.floor(math.log10(self.sigma)), 0), 9) if self.sigma > 0 else 4
+        return f"{number:.{digits}f}".replace("-", "−")
+
 
 @dataclass(frozen=True, slots=True)
 class DeviceFigures:
@@ -46,6 +55,18 @@ class DeviceFigures:
     values: Mapping[str, Figure]
     centre_mm: tuple[Figure, Figure, Figure]
     residuals: DeviceResiduals
+
+    @property
+    def title(self) -> str:
+        """The device as a heading has it."""
+        return device_title(self.name)
+
+    @property
+    def solved(self) -> Mapping[str, Figure]:
+        """Its `values`, and where it is unless that was held."""
+        placed = any(axis.sigma > 0 for axis in self.centre_mm)
+        place = dict(zip(("x_mm", "y_mm", "z_mm"), self.centre_mm, strict=True))
+        return {**self.values, **place} if placed else self.values
 
     @property
     def is_projector(self) -> bool:
@@ -80,6 +101,15 @@ class PoseFigures:
     tilt_deg: float
     distance_mm: float
     left_out: str
+
+
+def device_title(name: str) -> str:
+    """A device as a heading has it.
+
+    >>> device_title("left"), device_title("projector")
+    ("Camera 'left'", 'Projector')
+    """
+    return "Projector" if name == PROJECTOR else f"Camera '{name}'"
 
 
 def device_figures(result: CalibrationResult) -> tuple[DeviceFigures, ...]:
@@ -152,12 +182,16 @@ def volume_diagonal_mm(result: CalibrationResult) -> float:
     return float(np.linalg.norm(most - least))
 
 
+def named_devices(calibration: Calibration) -> Mapping[str, Pinhole]:
+    """Every device by its name, cameras in order, then the projector."""
+    projector = {} if calibration.projector is None else {PROJECTOR: calibration.projector}
+    return {**calibration.cameras, **projector}
+
+
 def _placed(calibration: Calibration) -> list[tuple[str, Pinhole, slice]]:
     """Each device with its rows in the covariance."""
-    named = list(calibration.cameras.items())
-    if calibration.projector is not None:
-        named.append((PROJECTOR, calibration.projector))
     rows = len(PARAMETERS)
+    named = named_devices(calibration).items()
     return [(name, device, slice(rows * at, rows * (at + 1))) for at, (name, device) in enumerate(named)]
 
 

@@ -279,10 +279,12 @@ def test_a_run_measures_every_position_and_writes_what_it_found(
 def test_the_page_holds_everything_and_says_what_it_is_not(
     run: Callable[..., AcceptanceResult], tmp_path: Path
 ) -> None:
-    run(replace(SHORT, notes="after <moving> the bench"))
+    artefacts = replace(SHORT.artefacts, certificate="<script>alert(1)</script>")
+    run(replace(SHORT, notes="after <moving> the bench", artefacts=artefacts))
     page = (tmp_path / "out" / "report.html").read_text()
     assert "No conformity" in page
     assert "after &lt;moving&gt; the bench" in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert page.count("data:image/jpeg;base64,") == 4
     assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
     assert "<script" not in page

@@ -80,7 +80,7 @@ def test_what_is_not_known_is_null_in_json_and_no_number_on_screen_and_page() ->
     page = Page(report_html(result(), poses()[0], board=CHESSBOARD, title="one camera"))
     assert page.number("point_mm") == pytest.approx(result().expected.point_mm, rel=5e-3)
     assert not {"noise_mm", "total_mm", "length_mm_per_m"} & set(page.figures)
-    words = " ".join(page.words)
+    words = " ".join(" ".join(page.words).split())
     assert "Expected error across the line of sight" in words
     assert "by how much a point of known distance may lie wrong across the line of sight there" in words
     for told in (stream.getvalue(), words):

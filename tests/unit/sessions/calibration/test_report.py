@@ -13,9 +13,9 @@ import pytest
 
 from slrig.calibration.judging.verdict import Grade
 from slrig.calibration.solution import PROJECTOR
+from slrig.sessions.calibration.charts import error_slices
 from slrig.sessions.calibration.figures import baselines, device_figures, pose_figures
 from slrig.sessions.calibration.report import report_html
-from slrig.sessions.calibration.scene import error_slices
 from slrig.sessions.calibration.solving import CalibrationResult
 from tests.unit.sessions.calibration.solved import (
     BOARD,
@@ -138,6 +138,27 @@ def test_page_asks_nobody_for_anything() -> None:
     assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", report())
 
 
+def test_whatever_a_person_or_a_device_named_is_text() -> None:
+    label = '"><script>alert(1)</script>'
+    whole, solution = result(), result().solution
+    cameras = {label: whole.calibration.cameras["left"]}
+    residuals = {label: solution.residuals["left"], PROJECTOR: solution.residuals[PROJECTOR]}
+    named = replace(
+        whole,
+        solution=replace(solution, residuals=residuals, outliers={BUMPED: label}),
+        calibration=replace(whole.calibration, cameras=cameras),
+        verdict=replace(whole.verdict, summary=label, reasons=(label,)),
+        scale=(label,),
+    )
+    white = {BUMPED: {label: np.full((1024, 1280), 90, dtype=np.uint8)}}
+    found = report_html(
+        named, [], white, board=BOARD, title=label, remarks={POSES[3]: [label]}, refused={label: label}, machine=label
+    )
+    assert "<script" not in found
+    assert "script" not in Page(found).tags
+    assert Page(found).words.count(label) > 5
+
+
 def test_verdict_comes_first_and_in_words() -> None:
     verdict = result().verdict
     assert page().figures["grade"] == verdict.grade.words.capitalize()
@@ -241,15 +262,15 @@ def test_every_pose_is_listed_with_its_figures_and_reasons() -> None:
 
 def test_slices_show_the_error_of_the_places_in_them() -> None:
     slices = error_slices(result().expected)
-    assert [each.z_mm for each in slices] == sorted({each.z_mm for each in slices})
+    assert [z_mm for z_mm, _ in slices] == sorted({z_mm for z_mm, _ in slices})
     assert len(slices) == 3
     grid, errors = result().expected.grid_mm, result().expected.grid_point_mm
-    for each in slices:
+    for z_mm, picture in slices:
         told = {
             (float(x), float(y)): float(error)
-            for x, y, error in re.findall(r"<title>x (-?\d+), y (-?\d+), z -?\d+ mm: ([\d.]+) mm</title>", each.picture)
+            for x, y, error in re.findall(r"<title>x (-?\d+), y (-?\d+), z -?\d+ mm: ([\d.]+) mm</title>", picture)
         }
-        here = np.abs(grid[:, 2] - each.z_mm) < 1e-6
+        here = np.abs(grid[:, 2] - z_mm) < 1e-6
         assert len(told) == here.sum() == 63
         for place, error in zip(grid[here], errors[here], strict=True):
             assert told[round(place[0]), round(place[1])] == pytest.approx(error, rel=5e-3)
