@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Request
 
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.scan.folder import DataFolder
-from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.walking import reconstruction
 from slrig.scan.worker import Worker
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.notices import NoticedHealth, Notices
@@ -23,7 +19,6 @@ from slrig.scheduling.scheduler import Scheduler
 from slrig.scheduling.store import ScheduleStore
 from slrig.scheduling.tasks import Tasks
 from slrig.sessions.acceptance.desk import AcceptanceDesk
-from slrig.sessions.acceptance.running import ReconstructBundle
 from slrig.sessions.calibration.calibrating import Calibrations
 from slrig.sessions.calibration.retention import Retention
 from slrig.sessions.calibration.tools import CalibrationTools
@@ -120,7 +115,12 @@ def assembled_service(
         folder, lender, health, tools=verification_tools or usual_verification_tools(worker), spare_bytes=spare_bytes
     )
     runner.watch_health(verifications)
-    acceptance = AcceptanceDesk(folder, lender, reconstruct=_elsewhere(worker))
+    acceptance = AcceptanceDesk(
+        folder,
+        lender,
+        evaluate=worker.task("slrig.sessions.acceptance.running:evaluated", "evaluation of the position"),
+        report=worker.task("slrig.sessions.acceptance.report:write_reports", "report of the acceptance test"),
+    )
     retention = Retention(
         calibrations,
         folder,
@@ -146,20 +146,6 @@ def assembled_service(
         retention=retention,
         refuse_when_stale=refuse_when_stale,
     )
-
-
-def _elsewhere(worker: Worker) -> ReconstructBundle:
-    """Reconstruction in the process that scans have theirs in. Both call it on the thread that owns the rig."""
-
-    def reconstruct(
-        bundle: Path, output: Path, /, *, plan: ReconstructionPlan, progress: Progress, cancelled: Callable[[], bool]
-    ) -> Mapping[str, Any]:
-        report: Mapping[str, Any] = worker.run(
-            reconstruction(worker.module, bundle, output, plan), progress=progress, cancelled=cancelled
-        )
-        return report
-
-    return reconstruct
 
 
 def _of_request(request: Request) -> Service:

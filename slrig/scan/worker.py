@@ -244,10 +244,10 @@ class Worker:
             self._note(told)
 
     def task(self, function: str, what: str) -> Callable[..., Any]:
-        """A function of the mathematics, "module:function", done by the worker; `progress` is told how far it is."""
+        """A function of the mathematics, "module:function", done by the worker; see `run` for the two callables."""
 
-        def call(*given: Any, progress: Told = _silent, **options: Any) -> Any:
-            return self.run(Call(function, given, options, what=what), progress=progress)
+        def call(*given: Any, progress: Told = _silent, cancelled: Callable[[], bool] = _never, **options: Any) -> Any:
+            return self.run(Call(function, given, options, what=what), progress=progress, cancelled=cancelled)
 
         return call
 

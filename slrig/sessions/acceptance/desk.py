@@ -30,8 +30,7 @@ from slrig.scan.records import Clock, ScanProgress, require_same_body, utc_now
 from slrig.scan.work import Holder
 from slrig.sessions.acceptance.plan import AcceptancePlan
 from slrig.sessions.acceptance.records import AcceptanceRecord, AcceptanceState, RequestKey
-from slrig.sessions.acceptance.report import write_reports
-from slrig.sessions.acceptance.running import ReconstructBundle, by_positioner, measured, required_calibration
+from slrig.sessions.acceptance.running import Evaluate, by_positioner, measured, required_calibration
 from slrig.sessions.acceptance.store import AcceptanceStore, interruption_fault
 from slrig.sessions.acceptance.verdicts import AcceptanceResult, verdicts
 from slrig.sessions.calibration.pose_shooting import RigLender
@@ -62,13 +61,15 @@ class AcceptanceDesk:
         folder: DataFolder,
         lender: RigLender,
         *,
+        evaluate: Evaluate,
+        report: Callable[[AcceptanceResult, Path], None],
         clock: Clock = utc_now,
-        reconstruct: ReconstructBundle | None = None,
     ) -> None:
+        """`evaluate` : as `slrig.sessions.acceptance.running.evaluated`. report : writes the reports of a test."""
         self._store = AcceptanceStore(folder)
         self._lender = lender
         self._clock = clock
-        self._reconstruct = reconstruct
+        self._evaluate, self._report = evaluate, report
         self._lock = threading.RLock()
         self._tests = {record.id: _Held(record) for record in self._store.load()}
 
@@ -232,9 +233,7 @@ class AcceptanceDesk:
                 raise ScanCancelledError(message)
             if place is not None and take == 0:
                 place(rig, step)
-            found = measured(
-                rig, plan, step, take, folder, progress=told, cancelled=cancelled, reconstruct=self._reconstruct
-            )
+            found = measured(rig, plan, step, take, folder, progress=told, cancelled=cancelled, evaluate=self._evaluate)
             self._change(held, readings=(*held.record.readings, found))
             following = held.record.next_take
             # A repeat goes with its first: nothing is moved between them.
@@ -246,7 +245,7 @@ class AcceptanceDesk:
                 rig.name, record.created_at, self._clock(), plan, calibration, record.readings,
                 verdicts(record.readings, plan),
             )  # fmt: skip
-            write_reports(result, folder)
+            self._report(result, folder)
             self._change(held, state=AcceptanceState.FINISHED, decision=result.decision, progress=None)
 
     def _change(self, held: _Held, **changes: Any) -> None:

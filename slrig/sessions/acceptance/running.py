@@ -31,7 +31,6 @@ from slrig.scan.records import Clock, utc_now
 from slrig.sessions.acceptance.evaluation import Reading, reading
 from slrig.sessions.acceptance.plan import AcceptancePlan, Step
 from slrig.sessions.acceptance.points import keep_points
-from slrig.sessions.acceptance.report import write_reports
 from slrig.sessions.acceptance.verdicts import AcceptanceResult, verdicts
 
 _BUNDLE, _MESH = "bundle", "mesh"
@@ -46,7 +45,7 @@ class Place(Protocol):
 
 
 class ReconstructBundle(Protocol):
-    """`slrig.scan.pipeline.reconstruct_bundle`, or a way to have it done elsewhere."""
+    """`slrig.scan.pipeline.reconstruct_bundle`."""
 
     def __call__(
         self,
@@ -62,6 +61,26 @@ class ReconstructBundle(Protocol):
         ...
 
 
+class Evaluate(Protocol):
+    """`evaluated`, or a way to have it done elsewhere."""
+
+    def __call__(
+        self,
+        work: Path,
+        folder: Path,
+        plan: AcceptancePlan,
+        step: Step,
+        take: int,
+        calibration: Calibration,
+        /,
+        *,
+        progress: Progress,
+        cancelled: Callable[[], bool],
+    ) -> Reading:
+        """Return what one position gave, and keep its points in `folder`."""
+        ...
+
+
 def run_acceptance(
     rig: Rig,
     plan: AcceptancePlan,
@@ -71,7 +90,7 @@ def run_acceptance(
     cancelled: Callable[[], bool],
     place: Place | None = None,
     again: Callable[[Step, SlrigError], bool] | None = None,
-    reconstruct: ReconstructBundle | None = None,
+    evaluate: Evaluate | None = None,
     clock: Clock = utc_now,
 ) -> AcceptanceResult:
     """Measure every position of a plan, evaluate, and write report.html, report.json and the points into `folder`.
@@ -95,6 +114,9 @@ def run_acceptance(
     DeviceError, ScanEvidenceError, StorageError
         As a scan.
     """
+    # Late: the service measures position by position, and has the worker write the reports.
+    from slrig.sessions.acceptance.report import write_reports
+
     calibration = required_calibration(rig)
     mover = by_positioner(rig, plan) if place is None else place
     _require_free(folder)
@@ -112,9 +134,7 @@ def run_acceptance(
                 told("place", 0.0, step.words)
                 mover(rig, step)
             try:
-                found = measured(
-                    rig, plan, step, take, folder, progress=told, cancelled=cancelled, reconstruct=reconstruct
-                )
+                found = measured(rig, plan, step, take, folder, progress=told, cancelled=cancelled, evaluate=evaluate)
                 break
             except (NothingToReconstructError, ScanEvidenceError) as error:
                 if again is None or not again(step, error):
@@ -136,7 +156,7 @@ def measured(
     *,
     progress: Progress,
     cancelled: Callable[[], bool],
-    reconstruct: ReconstructBundle | None = None,
+    evaluate: Evaluate | None = None,
 ) -> Reading:
     """Capture and evaluate one position, and keep its points. Raises as `run_acceptance`."""
     calibration = required_calibration(rig)
@@ -150,15 +170,33 @@ def measured(
         # is judged, is to hold nothing of the calibration's own error, which is what form is to show.
         blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
         capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)
-        make = _usual_reconstruction() if reconstruct is None else reconstruct
-        make(work / _BUNDLE, work / _MESH, plan=scan.reconstruction, progress=progress, cancelled=cancelled)
-        with refusals_of(work):
-            mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
-        found, evidence = reading(mesh, step, take, plan, calibration)
-        keep_points(evidence, folder, step.name, take)
-        return found
+        judge = evaluated if evaluate is None else evaluate
+        return judge(work, folder, plan, step, take, calibration, progress=progress, cancelled=cancelled)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def evaluated(
+    work: Path,
+    folder: Path,
+    plan: AcceptancePlan,
+    step: Step,
+    take: int,
+    calibration: Calibration,
+    /,
+    *,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    reconstruct: ReconstructBundle | None = None,
+) -> Reading:
+    """Reconstruct the bundle in `work`, measure the artefact in its mesh, and keep its points in `folder`."""
+    make = _usual_reconstruction() if reconstruct is None else reconstruct
+    make(work / _BUNDLE, work / _MESH, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
+    with refusals_of(work):
+        mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
+    found, evidence = reading(mesh, step, take, plan, calibration)
+    keep_points(evidence, folder, step.name, take)
+    return found
 
 
 def by_positioner(rig: Rig, plan: AcceptancePlan) -> Place:

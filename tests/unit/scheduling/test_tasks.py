@@ -36,6 +36,8 @@ from slrig.scheduling.tasks import Tasks, holder_of
 from slrig.scheduling.waiting import error_of
 from slrig.sessions.acceptance.asking import AcceptanceRequest
 from slrig.sessions.acceptance.desk import AcceptanceDesk
+from slrig.sessions.acceptance.report import write_reports
+from slrig.sessions.acceptance.running import evaluated
 from slrig.sessions.calibration.calibrating import CalibratedRig, Calibrations
 from slrig.sessions.health.store import HealthStore
 from slrig.sessions.health.verification import VerificationDesk, VerificationTools
@@ -60,7 +62,7 @@ class TaskBench(CalibrationBench):
         tools = self.tame.tools()
         verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_look())
         self.verifications = VerificationDesk(self.folder, self.lender, self.health, tools=verifying)
-        self.acceptance = AcceptanceDesk(self.folder, self.lender)
+        self.acceptance = AcceptanceDesk(self.folder, self.lender, evaluate=evaluated, report=write_reports)
         self.tidied: list[int] = []
         self.tasks = Tasks(
             self.lender, self.calibrations, self.verifications, self.acceptance,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,6 +37,8 @@ from slrig.sessions.acceptance import running as acceptance
 from slrig.sessions.acceptance.desk import AcceptanceDesk
 from slrig.sessions.acceptance.plan import AcceptancePlan
 from slrig.sessions.acceptance.records import AcceptanceState, RequestKey, record_from_json, record_json
+from slrig.sessions.acceptance.report import write_reports
+from slrig.sessions.acceptance.running import evaluated
 from slrig.sessions.acceptance.store import interruption_fault
 from tests.unit.sessions.acceptance.test_running import RIG, SHORT, TamePositioner, scan_of
 
@@ -104,7 +107,9 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, lender: TameLender) -
         (output / "mesh.ply").write_bytes(encode_mesh_ply(scan_of(step)))
         return {}
 
-    return lambda: AcceptanceDesk(folder, lender, reconstruct=reconstruct)
+    return lambda: AcceptanceDesk(
+        folder, lender, evaluate=partial(evaluated, reconstruct=reconstruct), report=write_reports
+    )
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from slrig.sessions.acceptance import running as acceptance
 from slrig.sessions.acceptance.evaluation import Reading, near_border, reading
 from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
 from slrig.sessions.acceptance.positions import acceptance_plan
-from slrig.sessions.acceptance.running import Place, run_acceptance
+from slrig.sessions.acceptance.running import Place, evaluated, run_acceptance
 from slrig.sessions.acceptance.verdicts import AcceptanceResult, verdicts
 from tests.unit.sessions.acceptance.test_plan import GOOD, VOLUME, device
 
@@ -236,7 +237,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Accept
 
         return run_acceptance(
             rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, place=place, again=again,
-            reconstruct=reconstruct,
+            evaluate=partial(evaluated, reconstruct=reconstruct),
         )  # fmt: skip
 
     return go
