@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from drivers.opencv import kernel
 from drivers.opencv.options import Source
-from drivers.opencv.timing import Arrivals, Exposed, Grabbed, Sleep, by_stamp, is_of_this_clock
+from drivers.opencv.timing import Arrivals, Grabbed, Sleep, by_stamp, is_of_this_clock
+from drivers.v4l2.timing import Exposure
 from slrig.errors import DeviceError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 
 OPEN_LIMIT_S = 10.0
@@ -29,7 +30,7 @@ class Taken:
     """One frame as OpenCV gave it. exposed : None where nothing tells when. number, lost : of the source, so far."""
 
     data: NDArray[Any]
-    exposed: Exposed | None
+    exposed: Exposure | None
     number: int
     lost: int = 0
 
@@ -218,7 +219,7 @@ class FilmFeed:
         while (left_ns := start_ns + self._exposure_ns - time.monotonic_ns()) > 0:
             if stop.wait(left_ns / 1e9):
                 return None
-        return Taken(data, Exposed(start_ns, start_ns + self._exposure_ns), film.number)
+        return Taken(data, Exposure(start_ns, start_ns + self._exposure_ns), film.number)
 
     def pause(self) -> None:
         """See `Feed`."""

@@ -7,25 +7,9 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.v4l2.timing import Exposure
+
 _OTHER_CLOCK_NS = 10_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Exposed:
-    """All rows were exposed between `earliest_ns` and `latest_ns`, CLOCK_MONOTONIC."""
-
-    earliest_ns: int
-    latest_ns: int
-
-    def centred(self, exposure_ns: int) -> tuple[int, int, int]:
-        """Start, end and error of an exposure of this length in the middle: both ends are right within the error.
-
-        >>> Exposed(100, 160).centred(20)
-        (120, 140, 20)
-        """
-        error_ns = (max(self.latest_ns - self.earliest_ns - exposure_ns, 0) + 1) // 2
-        start_ns = self.earliest_ns + error_ns
-        return start_ns, start_ns + exposure_ns, error_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +21,10 @@ class Grabbed:
     slept_ns: int
 
 
-def by_stamp(stamp_ns: int, grabbed: Grabbed, *, exposure_ns: int, period_ns: int) -> Exposed:
+def by_stamp(stamp_ns: int, grabbed: Grabbed, *, exposure_ns: int, period_ns: int) -> Exposure:
     """Return when a frame with the kernel's stamp was exposed, whatever instant of the frame the stamp names."""
     latest_ns = min(stamp_ns + period_ns + exposure_ns, grabbed.returned_ns)
-    return Exposed(stamp_ns - period_ns - exposure_ns, latest_ns)
+    return Exposure(stamp_ns - period_ns - exposure_ns, latest_ns)
 
 
 def is_of_this_clock(stamp_ns: int, grabbed: Grabbed) -> bool:
@@ -69,7 +53,7 @@ class Arrivals:
         self.queued = 0
         """Frames since the queue was last seen empty."""
 
-    def exposed(self, grabbed: Grabbed) -> Exposed | None:
+    def exposed(self, grabbed: Grabbed) -> Exposure | None:
         """Return when a frame was exposed; None while nothing tells for how long it had been waiting."""
         if grabbed.slept_ns >= self._wait_ns:
             self._empty_ns = grabbed.asked_ns
@@ -77,7 +61,7 @@ class Arrivals:
         self.queued += 1
         if self._empty_ns is None:
             return None
-        return Exposed(self._empty_ns - self._delay_ns - self.exposure_ns, grabbed.returned_ns)
+        return Exposure(self._empty_ns - self._delay_ns - self.exposure_ns, grabbed.returned_ns)
 
 
 class Sleep:

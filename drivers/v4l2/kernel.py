@@ -297,7 +297,10 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
     number = error.errno or 0
     cause = f"{node}: {doing}: {os.strerror(number)}"
     if number in GONE:
-        return DeviceGoneError(f"{cause}; the camera is gone or its stream has died: plug it in again, and reopen it")
+        return DeviceGoneError(
+            f"{cause}; the camera is gone or its stream has died: plug it in again, and reopen it (slrig devices lists "
+            "those that are there)"
+        )
     if number == errno.EBUSY:
         holders = holders_of(node)
         by = f" by {', '.join(holders)}" if holders else ""
@@ -313,7 +316,7 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
             'pixel_format = "MJPG"'
         )
     if number in REFUSED:
-        return UnsupportedByDeviceError(f"{cause}; the device cannot do that")
+        return UnsupportedByDeviceError(f"{cause}; the device cannot do that (slrig devices lists the cameras)")
     return DeviceError(f"{cause}; look for the kernel's own words with: dmesg | tail")
 
 

@@ -123,7 +123,7 @@ def test_a_device_that_another_program_holds_is_busy(plugged: Plug) -> None:
     device = plugged()
     device.fault("busy")
     begun_s = time.monotonic()
-    with pytest.raises(DeviceBusyError, match="/dev/video0 is used by another program"):
+    with pytest.raises(DeviceBusyError, match=r"/dev/video0: .*it is held"):
         device.open_camera(**GREY)
     # OpenCV would have waited for ten seconds.
     assert time.monotonic() - begun_s < 5

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 
-from drivers.opencv.timing import Arrivals, Exposed, Grabbed, Sleep, by_stamp, is_of_this_clock
+from drivers.opencv.timing import Arrivals, Grabbed, Sleep, by_stamp, is_of_this_clock
+from drivers.v4l2.timing import Exposure
 
 MS = 1_000_000
 PERIOD_NS, EXPOSURE_NS, DELAY_NS = 20 * MS, 10 * MS, 30 * MS
@@ -39,7 +40,7 @@ def test_a_stamp_of_another_clock_gives_itself_away() -> None:
 
 
 def test_the_centre_is_claimed_and_both_ends_are_within_the_error() -> None:
-    start_ns, end_ns, error_ns = Exposed(100, 161).centred(20)
+    start_ns, end_ns, error_ns = Exposure(100, 161).centred(20)
     assert end_ns - start_ns == 20
     assert start_ns - error_ns <= 100 <= start_ns + error_ns
     assert end_ns + error_ns >= 161
@@ -47,7 +48,7 @@ def test_the_centre_is_claimed_and_both_ends_are_within_the_error() -> None:
 
 def test_a_frame_that_was_waited_for_arrived_after_the_wait_began() -> None:
     exposed = arrivals().exposed(waited(100, 118))
-    assert exposed == Exposed((100 - 30 - 10) * MS, 118 * MS)
+    assert exposed == Exposure((100 - 30 - 10) * MS, 118 * MS)
 
 
 def test_frames_that_came_without_a_wait_are_as_old_as_the_last_wait() -> None:
