@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from slrig.model import FloatArray
 
@@ -52,16 +53,20 @@ def path(*lines: FloatArray) -> str:
     return "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) for points in lines)
 
 
+def ramp(shares: FloatArray) -> NDArray[np.uint8]:
+    """(..., 3) uint8, red, green, blue: the colours of values between 0 (dark blue) and 1 (yellow)."""
+    places = np.linspace(0, 1, len(_STOPS))
+    parts = [np.interp(shares, places, stops) for stops in _STOPS.T]
+    return np.asarray(np.rint(np.stack(parts, axis=-1)), dtype=np.uint8)
+
+
 def ramp_colour(share: float) -> str:
-    """The colour of a value between 0 (dark blue) and 1 (yellow), as CSS.
+    """The colour of a value between 0 and 1, as CSS.
 
     >>> ramp_colour(0.0), ramp_colour(1.0)
     ('#172c52', '#fae258')
     """
-    place = min(max(share, 0.0), 1.0) * (len(_STOPS) - 1)
-    below = min(int(place), len(_STOPS) - 2)
-    mixed = _STOPS[below] + (place - below) * (_STOPS[below + 1] - _STOPS[below])
-    return "#" + "".join(f"{round(part):02x}" for part in mixed)
+    return f"#{ramp(np.array(share)).tobytes().hex()}"
 
 
 def ink_on(share: float) -> str:

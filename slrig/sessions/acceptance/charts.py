@@ -13,7 +13,7 @@ from slrig.model import FloatArray, Pinhole, Pixels
 from slrig.sessions.acceptance.evaluation import Evidence
 from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Step
 from slrig.sessions.acceptance.scene import turn_deg
-from slrig.sessions.drawing import WIDTH, drawing, path, polygon, ramp_colour, shape
+from slrig.sessions.drawing import WIDTH, drawing, path, polygon, ramp, shape
 
 _MAP_PX = (240, 180)
 _MARGIN_SHARE = 0.06
@@ -47,17 +47,9 @@ def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> Pixels:
     total = np.bincount(keys, weights=evidence.distances_mm[on][used], minlength=grid[0] * grid[1])
     filled = np.flatnonzero(count)
     shares = np.clip(0.5 + total[filled] / count[filled] / (2 * most_mm), 0, 1)
-    picture.reshape(-1, 3)[filled] = _COLOURS[np.rint(shares * 255).astype(int)]
+    picture.reshape(-1, 3)[filled] = ramp(shares)[:, ::-1]
     large = cv2.resize(picture, None, fx=cell, fy=cell, interpolation=cv2.INTER_NEAREST)
     return np.asarray(large[:height, :width])
-
-
-def _colour(share: float) -> tuple[int, int, int]:
-    text = ramp_colour(share)
-    return int(text[5:7], 16), int(text[3:5], 16), int(text[1:3], 16)
-
-
-_COLOURS = np.array([_colour(value / 255) for value in range(256)], np.uint8)
 
 
 def volume_view(plan: AcceptancePlan, artefact: Artefact, *, aside: bool) -> Markup:

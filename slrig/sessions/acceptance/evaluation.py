@@ -46,6 +46,11 @@ class Reading:
     used: int
     rejected_share: float
 
+    @property
+    def beyond(self) -> bool:
+        """Whether an error is beyond its limit."""
+        return any(abs(error) > self.limits_mm[quantity] for quantity, error in self.errors_mm.items())
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:

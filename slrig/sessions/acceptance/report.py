@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from slrig.bundle.storage import write_file
-from slrig.calibration.artefacts import REJECTED_SHARE, Decision
+from slrig.calibration.artefacts import REJECTED_SHARE
 from slrig.calibration.segmentation import STEEPEST_DEG
 from slrig.scan.artefacts import write_report
 from slrig.sessions.acceptance.charts import error_map, volume_view
@@ -24,8 +25,6 @@ FORMAT = "slrig-acceptance"
 MANNER = "In the manner of VDI/VDE 2634 part 2 and ISO 10360-13. No conformity with either is claimed."
 RULE = "passes if |error| <= MPE - U, fails if |error| > MPE + U, undecided between"
 _QUALITY = 88
-_LOOKS = {Decision.PASSES: "good", Decision.UNDECIDED: "usable", Decision.FAILS: "do_not_use"}
-_TITLES = {Artefact.SPHERE: "Sphere", Artefact.BAR: "Ball bar", Artefact.PLANE: "Plane"}
 
 
 def write_reports(result: AcceptanceResult, folder: Path) -> None:
@@ -114,6 +113,8 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
     """The page. `evidence_of` is asked for the points of one reading at a time: all at once are large."""
     plan = result.plan
     camera = next(iter(result.calibration.cameras.values()))
+    artefact_of = {step.name: step.artefact for step in plan.steps}
+    readings = {kind: [each for each in result.readings if artefact_of[each.step] is kind] for kind in Artefact}
 
     def picture(reading: Reading, most_mm: float) -> str:
         return jpeg_uri(error_map(evidence_of(reading), camera, most_mm=most_mm), _QUALITY)
@@ -125,51 +126,18 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
         manner=MANNER,
         rule=RULE,
         formula=FORMULA,
-        look=_LOOKS[result.decision],
         sides_mm=tuple(plan.volume_mm[1] - plan.volume_mm[0]),
         steepest_deg=STEEPEST_DEG,
         border_rings=BORDER_RINGS,
         rejected_share=REJECTED_SHARE,
-        parts=[_part(artefact, result) for artefact in Artefact if _readings(artefact, result)],
+        words={step.name: step.words for step in plan.steps},
+        # Of each artefact that was measured: its readings, and the error of the brightest colour of its pictures.
+        measured={
+            kind: (own, 3 * float(np.median([reading.sigma_mm for reading in own])))
+            for kind, own in readings.items()
+            if own
+        },
+        volume_view=partial(volume_view, plan),
         picture=picture,
-        beyond=_beyond,
         legend=legend,
-        um=_um,
     )
-
-
-def _readings(artefact: Artefact, result: AcceptanceResult) -> list[Reading]:
-    steps = {step.name for step in result.plan.steps if step.artefact is artefact}
-    return [each for each in result.readings if each.step in steps]
-
-
-def _part(artefact: Artefact, result: AcceptanceResult) -> dict[str, object]:
-    """What the page tells of one artefact."""
-    plan, readings = result.plan, _readings(artefact, result)
-    return {
-        "title": _TITLES[artefact],
-        "size": _certified(artefact, result),
-        "front": volume_view(plan, artefact, aside=False),
-        "aside": volume_view(plan, artefact, aside=True),
-        "steps": {step.name: step for step in plan.steps},
-        "readings": readings,
-        # The brightest colour of its pictures.
-        "most_mm": 3 * float(np.median([reading.sigma_mm for reading in readings])),
-    }
-
-
-def _beyond(reading: Reading) -> bool:
-    return any(abs(error) > reading.limits_mm[quantity] for quantity, error in reading.errors_mm.items())
-
-
-def _certified(artefact: Artefact, result: AcceptanceResult) -> str:
-    artefacts = result.plan.artefacts
-    if artefact is Artefact.PLANE:
-        return f"{artefacts.plane_mm[0]:g} × {artefacts.plane_mm[1]:g} mm"
-    value = artefacts.diameter if artefact is Artefact.SPHERE else artefacts.distance
-    told = "" if value.uncertainty_mm is None else f" ± {_um(value.uncertainty_mm)} µm (k = 2)"
-    return f"{value.value_mm:g} mm{told}"
-
-
-def _um(value_mm: float) -> str:
-    return f"{1000 * value_mm:.1f}"

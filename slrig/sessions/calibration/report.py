@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from markupsafe import Markup
@@ -65,10 +66,6 @@ def report_html(
     devices = device_figures(result)
     shown = pose_figures(result, board, [pose.observation.name for pose in poses])
     least_mm, most_mm = error_range_mm(expected)
-    views = ((False, "From above: the camera's right is down."), (True, "From the side."))
-
-    def coverage(device: DeviceFigures) -> Markup:
-        return _coverage(device, result, poses, board)
 
     return filled(
         "calibration.html",
@@ -91,18 +88,15 @@ def report_html(
         sides_mm=tuple(expected.volume_mm[1] - expected.volume_mm[0]),
         diagonal_mm=volume_diagonal_mm(result),
         slices=error_slices(expected),
-        views=[
-            (rig_view(result.calibration, stood, board, expected.volume_mm, aside=aside), words)
-            for aside, words in views
-        ],
         pictures=list(_pictures(shown, poses, pictures or {}, board)),
         parameters=PARAMETERS,
         board_words=board_words,
-        coverage=coverage,
+        coverage=partial(_coverage, result, poses, board),
         device_title=device_title,
         legend=legend,
         longest_arrow_px=longest_arrow_px,
         residual_map=residual_map,
+        rig_view=partial(rig_view, result.calibration, stood, board, expected.volume_mm),
         rounded=rounded,
     )
 
@@ -122,7 +116,7 @@ def _pictures(
             yield jpeg_uri(drawn[..., ::-1], _QUALITY), words
 
 
-def _coverage(figures: DeviceFigures, result: CalibrationResult, poses: Sequence[ReadPose], board: Board) -> Markup:
+def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board, figures: DeviceFigures) -> Markup:
     stood, left_out = result.solution.poses, result.solution.outliers
     used = [pose.observation for pose in poses if pose.observation.name not in left_out]
     if figures.is_projector:
