@@ -150,12 +150,12 @@ def _residuals(records: Records, at: Thresholds, top: float) -> list[Markup]:
     panel.limit(at.watch_mean_px, "watch (mean)", _COLOURS[HealthState.WATCH])
     panel.limit(at.stale_mean_px, "stale (mean)", _COLOURS[HealthState.STALE])
     for number, name in enumerate(dict.fromkeys(name for look in looks for name in look)):
-        colour, x = _LINES[number % len(_LINES)], _LEFT + 230 + 130 * number
+        colour, x = _LINES[number % len(_LINES)], _LEFT + 256 + 130 * number
         panel.line([abs(look[name].mean_px) if name in look else None for look in looks], colour)
         panel.line([look[name].rms_px if name in look else None for look in looks], colour, wide=0.7)
         panel.parts.append(shape("path", d=f"M{x:.1f} {top - 16:.1f}h14", stroke=colour, stroke_width=2))
         panel.parts.append(shape("text", " - ".join(name), x=x + 18, y=top - 12))
-    note = shape("text", "thick: mean, thin: rms", x=_END + 6, y=top + _PANEL + 4, class_="faint")
+    note = shape("text", "thick: mean, thin: rms", x=_END, y=top + _PANEL + 36, class_="faint end")
     return [*panel.parts, note]
 
 
