@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import numpy as np
-
-from slrig.kernels import kernel, kernel_part
-from slrig.model import FloatArray
+from slrig.kernels import kernel_part
 
 _HALF_PI, _QUARTER_PI = math.pi / 2, math.pi / 4
 _TAN_EIGHTH_PI = math.sqrt(2.0) - 1.0
@@ -18,13 +14,6 @@ _P = (-8.750608600031904122785e-1, -1.615753718733365076637e1, -7.50085579231470
       -1.228866684490136173410e2, -6.485021904942025371773e1)  # fmt: skip
 _Q = (2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2,
       4.853903996359136964868e2, 1.945506571482613964425e2)  # fmt: skip
-
-
-def angles_rad(sines: FloatArray, cosines: FloatArray) -> FloatArray:
-    """(n,) float64: `angle_rad` of each pair."""
-    found = np.zeros(len(sines))
-    _angles(np.ascontiguousarray(sines, np.float64), np.ascontiguousarray(cosines, np.float64), found)
-    return found
 
 
 @kernel_part(inline="always")
@@ -42,9 +31,3 @@ def angle_rad(sine: float, cosine: float) -> float:
     angle = _HALF_PI - angle if sine > across else angle
     angle = math.pi - angle if cosine < 0.0 else angle
     return angle if high > 0.0 else 0.0
-
-
-@kernel(in_every_scan=False)
-def _angles(sines: Any, cosines: Any, found: Any) -> None:
-    for at in range(len(found)):
-        found[at] = angle_rad(sines[at], cosines[at])

@@ -105,28 +105,6 @@ def mesh_figures(vertices_mm: NDArray[np.floating[Any]], faces: IntArray) -> dic
     }
 
 
-def smallest_angles_deg(corners_mm: FloatArray) -> FloatArray:
-    """(F,) float64: the smallest angle of each triangle, (F, 3, 3); 0 for a triangle that is a point."""
-    twice_area = 2 * _areas_mm2(corners_mm)
-    smallest = np.full(len(corners_mm), np.pi)
-    for corner in range(3):
-        u = corners_mm[:, (corner + 1) % 3] - corners_mm[:, corner]
-        v = corners_mm[:, (corner + 2) % 3] - corners_mm[:, corner]
-        smallest = np.minimum(smallest, np.arctan2(twice_area, np.einsum("ij,ij->i", u, v)))
-    return np.asarray(np.degrees(smallest))
-
-
-def harmonic_indices(corners_mm: FloatArray) -> FloatArray:
-    """(F,) float64: hrm = 4 (cot α + cot β + cot η) of each triangle, (F, 3, 3); infinite where it has no area.
-
-    By the law of cosines this is (a² + b² + c²) / area, a, b, c the sides.
-    """
-    sides = corners_mm - np.roll(corners_mm, 1, axis=1)
-    squares = np.einsum("ijk,ijk->i", sides, sides)
-    area_mm2 = _areas_mm2(corners_mm)
-    return np.asarray(np.divide(squares, area_mm2, out=np.full(len(squares), np.inf), where=area_mm2 > 0))
-
-
 def score(
     mesh: Mesh,
     surface: Surface,

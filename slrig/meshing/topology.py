@@ -15,16 +15,6 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import IntArray
 
 
-class EdgeTable(NamedTuple):
-    """Every undirected edge of a mesh, once.
-
-    edges : (E, 2) int32, lower vertex first, in rising order; triangle_counts : (E,) int32, triangles that use it.
-    """
-
-    edges: IntArray
-    triangle_counts: IntArray
-
-
 @dataclass(frozen=True, slots=True)
 class TopologyCounts:
     """What is right and wrong with how a mesh hangs together.
@@ -59,42 +49,6 @@ class CompactIndex(NamedTuple):
     faces: IntArray
 
 
-def edge_table(faces: IntArray) -> EdgeTable:
-    """Every undirected edge of `faces`, with the number of triangles that use it."""
-    keys, counts = _runs(_edge_keys(faces))
-    edges = np.stack((keys >> 32, keys & 0xFFFFFFFF), axis=1).astype(np.int32)
-    return EdgeTable(edges, counts)
-
-
-def boundary_edges(faces: IntArray) -> IntArray:
-    """(B, 2) int32: edges that only one triangle uses, in the direction in which it runs along them.
-
-    The surface lies to the left of each, seen from the side where triangles are counter-clockwise.
-    """
-    table = edge_table(faces)
-    alone = table.edges[table.triangle_counts == 1].astype(np.int64)
-    undirected = _edge_keys(faces)
-    directed = _directed_edges(faces)
-    return directed[_is_among(undirected, (alone[:, 0] << 32) | alone[:, 1])]
-
-
-def boundary_vertex_count(faces: IntArray) -> int:
-    """Number of vertices that lie on an edge which only one triangle uses."""
-    table = edge_table(faces)
-    return _marked_count(table.edges[table.triangle_counts == 1])
-
-
-def nonmanifold_edge_count(faces: IntArray) -> int:
-    """Number of undirected edges that more than two triangles use."""
-    return int((_runs(_edge_keys(faces))[1] > 2).sum())
-
-
-def misoriented_edge_count(faces: IntArray) -> int:
-    """Number of directed edges that more than one triangle runs along: its neighbours face opposite sides."""
-    edges = _directed_edges(faces).astype(np.int64)
-    return int((_runs((edges[:, 0] << 32) | edges[:, 1])[1] > 1).sum())
-
-
 def duplicate_face_count(faces: IntArray) -> int:
     """Number of faces whose three vertices, in any order, an earlier face has already."""
     if not len(faces):
@@ -108,16 +62,6 @@ def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
     """(F,) bool: a vertex comes twice in the face."""
     a, b, c = faces.T
     return np.asarray((a == b) | (b == c) | (c == a))
-
-
-def component_labels(faces: IntArray) -> IntArray:
-    """(F,) int32: which connected piece each face belongs to, numbered from 0 in order of first appearance.
-
-    Faces that share a vertex belong together.
-    """
-    faces = np.ascontiguousarray(faces)
-    everyone = np.ones(len(faces), dtype=np.bool_)
-    return np.asarray(_component_labels(faces, _joined(faces, everyone, _vertex_bound(faces))))
 
 
 def component_sizes(faces: IntArray, among: NDArray[np.bool_]) -> IntArray:
@@ -158,41 +102,8 @@ def compact(faces: IntArray, *, vertex_count: int) -> CompactIndex:
     return CompactIndex(kept, renumbered[faces])
 
 
-def _directed_edges(faces: IntArray) -> IntArray:
-    """(3F, 2) int32: edges 0-1 of all faces, then 1-2, then 2-0."""
-    return np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-
-
-def _edge_keys(faces: IntArray) -> NDArray[np.int64]:
-    """(3F,) int64: each edge as one number, lower vertex in the upper 32 bits, in the order of `_directed_edges`."""
-    rolled = faces[:, [1, 2, 0]]
-    low = np.minimum(faces, rolled).T.ravel().astype(np.int64)
-    return (low << 32) | np.maximum(faces, rolled).T.ravel()
-
-
-def _runs(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], IntArray]:
-    """Distinct keys in rising order, (K,), and how often each comes, (K,) int32."""
-    ordered = np.sort(keys)
-    starts = np.flatnonzero(np.concatenate(([True], ordered[1:] != ordered[:-1]))) if len(keys) else np.zeros(0, int)
-    return ordered[starts], np.diff(np.append(starts, len(ordered))).astype(np.int32)
-
-
-def _is_among(keys: NDArray[np.int64], rising: NDArray[np.int64]) -> NDArray[np.bool_]:
-    if not len(rising):
-        return np.zeros(len(keys), dtype=np.bool_)
-    at = np.minimum(np.searchsorted(rising, keys), len(rising) - 1)
-    return np.asarray(rising[at] == keys)
-
-
 def _vertex_bound(faces: IntArray) -> int:
     return int(faces.max()) + 1 if faces.size else 0
-
-
-def _marked_count(indices: IntArray) -> int:
-    """Number of different vertices among `indices`."""
-    marked = np.zeros(_vertex_bound(indices), dtype=np.bool_)
-    marked[indices.ravel()] = True
-    return int(marked.sum())
 
 
 @kernel
@@ -339,20 +250,6 @@ def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
     for vertex in range(vertex_bound):
         parents[vertex] = parents[parents[vertex]]
     return parents
-
-
-@kernel(in_every_scan=False)
-def _component_labels(faces: IntArray, roots: IntArray) -> IntArray:
-    numbers = np.full(len(roots), -1, dtype=np.int32)
-    labels = np.zeros(len(faces), dtype=np.int32)
-    count = 0
-    for face in range(len(faces)):
-        root = roots[faces[face, 0]]
-        if numbers[root] < 0:
-            numbers[root] = count
-            count += 1
-        labels[face] = numbers[root]
-    return labels
 
 
 @kernel

@@ -15,11 +15,11 @@ import pytest
 from slrig.meshing.initial import initial_mesh
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import Optimised, optimised
-from slrig.meshing.quality import smallest_angles_deg
 from slrig.meshing.runs import whole_curves
 from slrig.meshing.strips import strip_neighbours, strips
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.plain import smallest_angles_deg
 from tests.unit.meshing.test_optimisation import face_curves, joined, mean_index, uneven
 
 _RUNS = 11

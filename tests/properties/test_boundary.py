@@ -14,8 +14,9 @@ from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary import longest_boundary_edge_mm, shrunk, smoothed
 from slrig.meshing.runs import neighbouring_curves, whole_curves
 from slrig.meshing.strips import strips
-from slrig.meshing.topology import boundary_edges, boundary_vertex_count, topology_counts
+from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.plain import boundary_edges
 
 # The first call of a kernel compiles it.
 unhurried = settings(deadline=None)
@@ -63,7 +64,7 @@ def edge_pieces(faces: IntArray, point_count: int) -> int:
 
 def touching_corners(faces: IntArray) -> int:
     """Corners of the boundary beyond the first at each vertex: where boundaries touch in a point."""
-    return len(boundary_edges(faces)) - boundary_vertex_count(faces)
+    return len(boundary_edges(faces)) - topology_counts(faces).boundary_vertices
 
 
 def hold_together(faces: IntArray, adjacency: IntArray, point_count: int) -> None:

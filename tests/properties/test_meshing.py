@@ -16,8 +16,9 @@ from slrig.meshing.initial import initial_mesh
 from slrig.meshing.optimisation import NO_FLIPS, optimised
 from slrig.meshing.runs import neighbouring_curves, whole_curves
 from slrig.meshing.strips import strips, to_drop
-from slrig.meshing.topology import boundary_edges, topology_counts
+from slrig.meshing.topology import topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
+from tests.unit.meshing.plain import boundary_edges
 
 # The first call of a kernel compiles it.
 unhurried = settings(deadline=None)

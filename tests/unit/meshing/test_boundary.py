@@ -11,9 +11,10 @@ import pytest
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
 from slrig.meshing.boundary_rules import following, may_add
-from slrig.meshing.topology import boundary_edges, boundary_vertex_count
+from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.boundary_oracle import as_set, smoothed_by_hand
+from tests.unit.meshing.plain import boundary_edges
 
 ANYTHING_MM = 1e6
 
@@ -62,7 +63,7 @@ def test_a_notch_is_filled_with_one_triangle_of_the_same_winding() -> None:
     assert as_set(result.faces[result.added]) == {(2, 4, 3)}
     assert result.removed_triangles == 0
     np.testing.assert_array_equal(result.faces[:-1], faces)
-    assert boundary_vertex_count(result.faces) == boundary_vertex_count(faces) - 1
+    assert topology_counts(result.faces).boundary_vertices == topology_counts(faces).boundary_vertices - 1
 
 
 def test_a_spike_goes_with_its_triangles() -> None:
@@ -335,7 +336,7 @@ def test_lambda_is_the_median_of_the_edges_at_a_vertex() -> None:
 def test_the_boundary_points_are_counted() -> None:
     _, faces = grid(5, 7)
     for left in (faces, np.delete(faces, [10, 30], axis=0), faces[:0]):
-        assert boundary_point_count(left, neighbours(left, vertex_count=35)) == boundary_vertex_count(left)
+        assert boundary_point_count(left, neighbours(left, vertex_count=35)) == topology_counts(left).boundary_vertices
 
 
 def test_nothing_to_do_on_no_faces() -> None:

@@ -13,11 +13,11 @@ from scipy.spatial import Delaunay
 
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.optimisation import INDEX, NO_FLIPS, TURN_LIMIT, Optimised, optimised
-from slrig.meshing.quality import harmonic_indices, smallest_angles_deg
 from slrig.meshing.runs import whole_curves
 from slrig.meshing.strips import strips
-from slrig.meshing.topology import boundary_edges, topology_counts
+from slrig.meshing.topology import topology_counts
 from slrig.model import FlipRule, FloatArray, IntArray
+from tests.unit.meshing.plain import boundary_edges, harmonic_indices, smallest_angles_deg
 from tests.unit.meshing.test_flips import delaunay, verdict
 
 

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from slrig.meshing.quality import harmonic_indices, mesh_figures, smallest_angles_deg
+from slrig.meshing.quality import mesh_figures
 from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.plain import harmonic_indices, smallest_angles_deg
 
 
 def lattice(rows: int, columns: int) -> tuple[FloatArray, IntArray]:

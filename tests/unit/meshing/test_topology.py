@@ -10,19 +10,14 @@ import pytest
 
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.topology import (
-    boundary_edges,
-    boundary_vertex_count,
     compact,
-    component_labels,
     component_sizes,
     degenerate_faces,
     duplicate_face_count,
-    edge_table,
-    misoriented_edge_count,
-    nonmanifold_edge_count,
     topology_counts,
 )
 from slrig.model import FloatArray, IntArray
+from tests.unit.meshing.plain import boundary_edges
 
 TETRAHEDRON = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], dtype=np.int32)
 
@@ -49,42 +44,34 @@ def test_a_closed_tetrahedron_has_no_border_and_characteristic_two() -> None:
 def test_a_grid_has_the_border_of_a_rectangle() -> None:
     faces = grid(5, 7)
     counts = topology_counts(faces)
-    assert counts.boundary_vertices == counts.boundary_edges == 2 * (4 + 6) == boundary_vertex_count(faces)
+    assert counts.boundary_vertices == counts.boundary_edges == 2 * (4 + 6)
     assert counts.euler_characteristic == 1
     assert counts.misoriented_edges == counts.nonmanifold_edges == 0
 
 
-def test_an_edge_table_counts_triangles() -> None:
-    table = edge_table(faces_of((0, 1, 2), (2, 1, 3)))
-    assert table.edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
-    assert table.triangle_counts.tolist() == [1, 1, 2, 1, 1]
-
-
 def test_random_faces_agree_with_counting_one_by_one() -> None:
-    faces = np.random.default_rng(3).integers(0, 12, (150, 3)).astype(np.int32)
-    faces = faces[~degenerate_faces(faces)]
-    directed = [(int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3)]
-    undirected = Counter((min(e), max(e)) for e in directed)
-    table = edge_table(faces)
-    assert dict(zip(map(tuple, table.edges.tolist()), table.triangle_counts.tolist(), strict=True)) == undirected
-    assert nonmanifold_edge_count(faces) == sum(count > 2 for count in undirected.values()) > 0
-    assert misoriented_edge_count(faces) == sum(count > 1 for count in Counter(directed).values()) > 0
-    assert duplicate_face_count(faces) == len(faces) - len({tuple(sorted(f)) for f in faces.tolist()}) > 0
-
-
-def test_all_counts_at_once_are_the_counts_one_by_one() -> None:
     random = np.random.default_rng(9)
     for most in (4, 12, 300):
         faces = random.integers(0, most, (150, 3)).astype(np.int32)
-        counts, table = topology_counts(faces), edge_table(faces)
-        assert counts.edges == len(table.edges)
-        assert counts.boundary_edges == (table.triangle_counts == 1).sum()
-        assert counts.boundary_vertices == boundary_vertex_count(faces)
-        assert counts.nonmanifold_edges == nonmanifold_edge_count(faces)
-        assert counts.misoriented_edges == misoriented_edge_count(faces)
-        assert counts.duplicate_faces == duplicate_face_count(faces)
+        counts = topology_counts(faces)
+        directed = Counter((int(f[i]), int(f[(i + 1) % 3])) for f in faces for i in range(3))
+        undirected = Counter((min(e), max(e)) for e in directed.elements())
+        alone = [edge for edge, uses in undirected.items() if uses == 1]
+        assert counts.edges == len(undirected)
+        assert counts.boundary_edges == len(alone) == len(boundary_edges(faces))
+        assert counts.boundary_vertices == len({end for edge in alone for end in edge})
+        assert counts.nonmanifold_edges == sum(uses > 2 for uses in undirected.values())
+        assert counts.misoriented_edges == sum(uses > 1 for uses in directed.values())
+        assert counts.duplicate_faces == len(faces) - len({tuple(sorted(f)) for f in faces.tolist()})
         assert counts.degenerate_faces == degenerate_faces(faces).sum()
         assert counts.vertices == len(np.unique(faces))
+
+
+def test_each_random_count_has_something_to_count() -> None:
+    counts = topology_counts(np.random.default_rng(3).integers(0, 12, (150, 3)).astype(np.int32))
+    assert counts.nonmanifold_edges > 0
+    assert counts.misoriented_edges > 0
+    assert counts.duplicate_faces > 0
 
 
 def test_boundary_edges_keep_the_direction_of_their_triangle() -> None:
@@ -95,12 +82,12 @@ def test_boundary_edges_keep_the_direction_of_their_triangle() -> None:
 def test_a_triangle_turned_over_is_misoriented_on_each_shared_edge() -> None:
     turned = TETRAHEDRON.copy()
     turned[0] = turned[0, ::-1]
-    assert misoriented_edge_count(turned) == 3
-    assert nonmanifold_edge_count(turned) == 0
+    assert topology_counts(turned).misoriented_edges == 3
+    assert topology_counts(turned).nonmanifold_edges == 0
 
 
 def test_a_third_triangle_on_an_edge_is_nonmanifold() -> None:
-    assert nonmanifold_edge_count(faces_of((0, 1, 2), (1, 0, 3), (0, 1, 4))) == 1
+    assert topology_counts(faces_of((0, 1, 2), (1, 0, 3), (0, 1, 4))).nonmanifold_edges == 1
 
 
 def test_a_duplicate_is_found_whatever_the_order_of_its_corners() -> None:
@@ -111,37 +98,35 @@ def test_faces_that_use_a_vertex_twice_are_degenerate() -> None:
     assert degenerate_faces(faces_of((0, 0, 1), (0, 1, 2), (3, 4, 3), (5, 6, 6))).tolist() == [True, False, True, True]
 
 
-def test_components_are_numbered_by_first_appearance_and_joined_by_a_vertex() -> None:
+def test_components_are_joined_by_a_vertex() -> None:
     faces = faces_of((8, 9, 7), (0, 1, 2), (9, 10, 11), (3, 4, 5), (5, 1, 6))
-    assert component_labels(faces).tolist() == [0, 1, 0, 1, 1]
+    assert component_sizes(faces, np.ones(5, dtype=np.bool_)).tolist() == [2, 3, 2, 3, 3]
     assert topology_counts(faces).components == 2
 
 
-def test_sizes_of_components_agree_with_counting_labels() -> None:
+def flooded(faces: IntArray) -> IntArray:
+    """(F,): the connected piece of each face, numbered from 0, by spreading the lowest number over shared vertices."""
+    labels = np.arange(len(faces))
+    while True:
+        lowest = np.full(int(faces.max()) + 1, len(faces))
+        np.minimum.at(lowest, faces.ravel(), np.repeat(labels, 3))
+        spread = np.minimum(labels, lowest[faces].min(axis=1))
+        if (spread == labels).all():
+            return np.asarray(np.unique(labels, return_inverse=True)[1])
+        labels = spread
+
+
+def test_sizes_of_components_agree_with_flooding() -> None:
     random = np.random.default_rng(6)
-    faces = grid(30, 40)
-    among = np.asarray(random.random(len(faces)) < 0.45)
-    labels = component_labels(faces[among])
+    faces = random.permutation(grid(30, 40))
+    among = np.asarray(random.random(len(faces)) < 0.2)
+    labels = flooded(faces[among])
+    assert topology_counts(faces[among]).components == labels.max() + 1 > 20
     wanted = np.zeros(len(faces), dtype=np.int64)
     wanted[among] = np.bincount(labels)[labels]
     assert component_sizes(faces, among).tolist() == wanted.tolist()
     assert len(np.unique(wanted)) > 3
     assert component_sizes(faces[:0], among[:0]).shape == (0,)
-
-
-def test_labels_agree_with_flooding() -> None:
-    random = np.random.default_rng(7)
-    faces = random.permutation(grid(30, 40))[:500]
-    labels = np.arange(len(faces))
-    while True:
-        lowest = np.full(1200, len(faces))
-        np.minimum.at(lowest, faces.ravel(), np.repeat(labels, 3))
-        spread = np.minimum(labels, lowest[faces].min(axis=1))
-        if (spread == labels).all():
-            break
-        labels = spread
-    assert component_labels(faces).tolist() == np.unique(labels, return_inverse=True)[1].tolist()
-    assert labels.max() > 20
 
 
 def test_compact_agrees_with_plain_numpy() -> None:

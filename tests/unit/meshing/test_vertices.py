@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.meshing.angles import angles_rad
+from slrig.meshing.angles import angle_rad
 from slrig.meshing.boundary_rules import boundary_half_edges
 from slrig.meshing.flips import BLOCK, GAMMA, prefer_flips, prefers_flip
 from slrig.meshing.normals import vertex_normals
@@ -26,7 +26,8 @@ def test_angles_are_those_of_the_library() -> None:
     random = np.random.default_rng(0)
     sines, cosines = np.abs(random.normal(size=20_000)), random.normal(size=20_000) * 10.0 ** random.integers(-8, 8)
     sines[:6], cosines[:6] = (0, 0, 0, 1, 1, 1), (0, 1, -1, 0, 1, -1)
-    np.testing.assert_allclose(angles_rad(sines, cosines), np.arctan2(sines, cosines), rtol=1e-15, atol=0)
+    found = [angle_rad(*pair) for pair in zip(sines.tolist(), cosines.tolist(), strict=True)]
+    np.testing.assert_allclose(found, np.arctan2(sines, cosines), rtol=1e-15, atol=0)
 
 
 def test_normals_are_means_weighted_by_angle() -> None:

@@ -1,0 +1,36 @@
+"""Meshes measured in plain numpy, for tests to compare with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slrig.model import FloatArray, IntArray
+
+
+def boundary_edges(faces: IntArray) -> IntArray:
+    """(B, 2): edges that only one triangle uses, in the direction in which it runs along them."""
+    directed = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    _, which, uses = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(directed[uses[which] == 1])
+
+
+def smallest_angles_deg(corners_mm: FloatArray) -> FloatArray:
+    """(F,) float64: the smallest angle of each triangle, (F, 3, 3); 0 for a triangle that is a point."""
+    smallest = np.full(len(corners_mm), np.pi)
+    for corner in range(3):
+        u = corners_mm[:, (corner + 1) % 3] - corners_mm[:, corner]
+        v = corners_mm[:, (corner + 2) % 3] - corners_mm[:, corner]
+        across = np.linalg.norm(np.cross(u, v), axis=1)
+        smallest = np.minimum(smallest, np.arctan2(across, np.einsum("ij,ij->i", u, v)))
+    return np.asarray(np.degrees(smallest))
+
+
+def harmonic_indices(corners_mm: FloatArray) -> FloatArray:
+    """(F,) float64: hrm = 4 (cot α + cot β + cot η) of each triangle, (F, 3, 3); infinite where it has no area.
+
+    By the law of cosines this is (a² + b² + c²) / area, a, b, c the sides.
+    """
+    sides = corners_mm - np.roll(corners_mm, 1, axis=1)
+    squares = np.einsum("ijk,ijk->i", sides, sides)
+    area_mm2 = np.linalg.norm(np.cross(sides[:, 1], sides[:, 2]), axis=1) / 2
+    return np.asarray(np.divide(squares, area_mm2, out=np.full(len(squares), np.inf), where=area_mm2 > 0))
