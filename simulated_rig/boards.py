@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from simulated_rig.placed import Standing, turned_by
+from simulated_rig.placed import Standing
 from simulated_rig.shapes import Part, bent_sheet, rectangle_between
-from simulated_rig.tables import NotNegative, Positive, Triple
+from simulated_rig.tables import NotNegative, Positive
 from slrig.model import FloatArray
 
 Albedo = Annotated[float, Field(gt=0, le=1)]
@@ -208,11 +208,6 @@ class Board(Standing):
             top, left = row * size + 1, column * size + 1
             dark[top : top + modules, left : left + modules] = drawn == 0
         return across, down, dark
-
-
-def corners_in_world_mm(board: Board, position_mm: Triple, rotation_deg: Triple) -> FloatArray:
-    """(n, 3) float64: the print's corners in the world, of a board in a pose."""
-    return np.asarray(board.corners_mm @ turned_by(rotation_deg).T + position_mm, np.float64)
 
 
 def along_of(x_mm: FloatArray, curvature_per_mm: float) -> FloatArray:

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from simulated_rig.boards import Board
 from simulated_rig.optics import field_radius, image_positions
-from simulated_rig.placed import turned_by
 from simulated_rig.tables import NotNegative, Pair, Triple
 from slrig.bundle.faults import Strict
 from slrig.errors import ConfigError
@@ -181,9 +180,3 @@ def _in_image(points: FloatArray, device: Pinhole, radius: float, edge_px: float
     pixels = image_positions(points, device)
     limit = np.array([device.size.width_px, device.size.height_px]) - 1 - edge_px
     return bool(((pixels >= edge_px) & (pixels <= limit)).all())
-
-
-def middle_pose(board: Board, pose: Pose) -> tuple[FloatArray, FloatArray]:
-    """Return (rotation, translation_mm) of the designed board's frame, whose origin is corner 0: X_world = R X + t."""
-    rotation = turned_by(pose.rotation_deg)
-    return rotation, np.array(pose.position_mm) - rotation @ np.array([*board.middle_mm, 0.0])

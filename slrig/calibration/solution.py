@@ -8,7 +8,6 @@ variance that it has where it is solved for: leaving it out says nothing of it (
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -138,13 +137,3 @@ class Solution:
     residuals: Mapping[str, DeviceResiduals]
     board_shape_mm: FloatArray | None = None
     bow: Bow | None = None
-
-    @property
-    def stereo_rms_px(self) -> float:
-        """All devices together, px: root of the mean over devices of the mean squared distance of their points.
-
-        What a stereo calibration quotes as its rms, each point counted once in each device. The projector has its light
-        one coordinate at a time; a point's distance there is √2 of that.
-        """
-        squares = [left.rms_px**2 * (2.0 if name == PROJECTOR else 1.0) for name, left in self.residuals.items()]
-        return math.sqrt(sum(squares) / len(squares)) if squares else math.nan

@@ -26,23 +26,6 @@ _SAME_LINE_ALIGNED = np.cos(_SAME_LINE_ANGLE)
 _HALF_OCTANT = np.tan(np.pi / 8)
 
 
-def chain(
-    points_px: FloatArray,
-    normals: FloatArray,
-    strength: FloatArray,
-    strong: NDArray[np.bool_],
-    shape: tuple[int, int],
-) -> tuple[IntArray, IntArray]:
-    """Link points into chains.
-
-    points_px : (n, 2) float64 (x, y); normals : (n, 2) float64; strength : (n,) float64;
-    strong : (n,) bool, points at which a chain may start; shape : (rows, columns) of the image.
-    Returns order, the indices of the points chain by chain, and offsets (chains + 1,). A chain has two points or more.
-    """
-    order, offsets, _ = chain_frames(points_px, normals, strength, strong, np.array([0, len(points_px)]), shape)
-    return order, offsets
-
-
 def chain_frames(
     points_px: FloatArray,
     normals: FloatArray,
@@ -53,8 +36,10 @@ def chain_frames(
 ) -> tuple[IntArray, IntArray, IntArray]:
     """Link the points of several frames, each by itself: frame k holds the points borders[k]:borders[k + 1].
 
-    The other arguments are as for `chain`. Returns order and offsets as `chain` does, frame by frame, and the frame of
-    each chain (chains,).
+    points_px : (n, 2) float64 (x, y); normals : (n, 2) float64; strength : (n,) float64;
+    strong : (n,) bool, points at which a chain may start; shape : (rows, columns) of the image.
+    Returns, frame by frame, order, the indices of the points chain by chain, offsets (chains + 1,), and the frame of
+    each chain (chains,). A chain has two points or more.
     """
     # Positive numbers sort as their bits do; complemented, from the largest to the smallest.
     keys = ~strength.astype(np.float32).view(np.uint32)

@@ -19,7 +19,7 @@ from slrig.model import FloatArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.surface_fit import POINTS, fit_kernel, stencils
+from slrig.reconstruction.surface_fit import stencils
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,28 +137,8 @@ def _add_variance(line: Any, cosine: float, sine: float, read: float, slope: flo
         cc[x] += (read + slope * max(line[x], 0.0)) * (cosine * cosine)
 
 
-def fitted_points(
-    seen: PositionMap, usable: NDArray[np.bool_], starts_px: FloatArray, targets_px: FloatArray, /
-) -> FittedPoints:
-    """Points of the image at which a local surface of the position map has the wanted positions.
-
-    usable : (H, W) bool, pixels whose light is of one surface; starts_px : (n, 2) float64 (x, y); targets_px : (n,)
-    float64, the column of each point's line.
-    A quadratic surface is fitted to the 5 x 5 pixels round the start with Gaussian weights, a plane where pixels are
-    missing; pixels that others in between separate from the start are left out. From the start the point moves along
-    the gradient by Newton's method.
-
-    Returns points (n, 2), normals (n, 2) along the gradient, sigma_px (n,), the standard deviation along the normal
-    from noise or from the scatter of the pixels about the surface, whichever is larger, and found (n,) bool.
-    """
-    fitted = no_points(len(starts_px))
-    starts, targets = np.ascontiguousarray(starts_px), np.asarray(targets_px, dtype=np.float64)
-    in_bands(fit_kernel, len(starts), *windows(seen, usable), starts, targets, *fitted, rows_at_least=POINTS)
-    return fitted
-
-
 FittedPoints = tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]
-"""Points (n, 2), normals (n, 2), deviations (n,) and success (n,) of `fitted_points`."""
+"""What `fit_kernel` fills in: points (n, 2), normals (n, 2) along the gradient, sigma_px (n,), found (n,) bool."""
 
 
 def windows(seen: PositionMap, usable: NDArray[np.bool_]) -> tuple[Any, ...]:

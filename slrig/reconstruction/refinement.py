@@ -34,21 +34,6 @@ _MOST_FOR_MEDIAN = 20_000
 _CROSSING_PX = 0.62  # more than half a pixel: two neighbours' noisy slopes must not both miss a line between them
 
 
-def line_crossings(
-    seen: PositionMap, usable: NDArray[np.bool_], code: CodeMap, position_of: FloatArray, /
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Where lines cross pixels, by the position map alone: a start for every stripe that the light can hold.
-
-    position_of : (frames, cells) float64, as for `identify`, of all shifts. A line crosses a pixel when it passes
-    within 0.62 px of its centre, along either axis.
-    Returns frame (n,) int32, starts_px (n, 2) and targets_px (n,), frame by frame, row by row.
-    """
-    started, landed = _nothing_taken(len(position_of), usable.shape)
-    return _crossings(
-        seen, usable, code, position_of, started, landed, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-    )  # fmt: skip
-
-
 def _crossings(
     seen: PositionMap,
     usable: NDArray[np.bool_],
@@ -60,7 +45,12 @@ def _crossings(
     normals: FloatArray,
     targets: FloatArray,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """The crossings, less those from which a fit would surely land at a pixel that has its point."""
+    """Where lines cross pixels, less those crossings from which a fit would surely land at a pixel that has its point.
+
+    position_of : (frames, cells) float64, as for `identify`, of all shifts. A line crosses a pixel when it passes
+    within 0.62 px of its centre, along either axis.
+    Returns frame (n,) int32, starts_px (n, 2) and targets_px (n,), frame by frame, row by row.
+    """
     by_cell = np.ascontiguousarray(position_of.T)
     frames, rows = len(position_of), len(usable)
     shown = position_of[np.isfinite(position_of)]

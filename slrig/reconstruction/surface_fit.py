@@ -1,4 +1,4 @@
-"""Least squares for a small surface of a position map: the kernel under `phase.fitted_points`."""
+"""Least squares for a small surface of a position map: points where it has a wanted value."""
 
 from __future__ import annotations
 
@@ -52,8 +52,12 @@ def fit_kernel(
     first: int, last: int, position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
     whole_freedom: float, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
 ) -> None:  # fmt: skip
-    """Fill in points, normals, deviation and found, zeros so far, as `phase.fitted_points` returns them.
+    """Fill in points, normals, deviation and found, zeros so far: where a local surface has the wanted positions.
 
+    A quadratic surface is fitted to the 5 x 5 pixels round the start with Gaussian weights, a plane where pixels are
+    missing; pixels that others in between separate from the start are left out. From the start the point moves along
+    the gradient by Newton's method. deviation : along the normal, from noise or from the scatter of the pixels about
+    the surface, whichever is larger. usable : (H, W) bool, pixels whose light is of one surface.
     whole : (H, W) uint8, pixels whose 5 x 5 neighbours are all usable; stencils, basis, plane, whole_freedom : as
     `stencils` returns them. Sums over pixels are of differences from the middle one, small enough for single precision.
     """

@@ -16,7 +16,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from simulated_rig.bound import ExposedView, stripe_bound
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import SceneSurface, read_scene, surface_of
@@ -25,6 +24,7 @@ from slrig.model import Calibration, CameraFormat, Capture, LineShift, PatternSe
 from slrig.scan.holding import pattern_sequence
 from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
+from tests.light_bound import ExposedView, stripe_bound
 
 CONFIG = Path(__file__).parents[2] / "config"
 ALBEDO = 0.85

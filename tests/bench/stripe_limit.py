@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from simulated_rig import transport
-from simulated_rig.bound import ExposedView, pixel_bound, stripe_bound
 from simulated_rig.options import CameraOptions, ProjectorOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, surface_of
@@ -27,6 +26,7 @@ from slrig.patterns.positions import cell_positions, index_of_word, line_positio
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import axis_frames
+from tests.light_bound import ExposedView, pixel_bound, stripe_bound
 
 PLANE: Mapping[str, object] = {"shape": "plane", "size_mm": [240.0, 240.0], "rotation_deg": [8.0, -12.0, 0.0]}
 SPHERE: Mapping[str, object] = {"shape": "sphere", "radius_mm": 60.0, "position_mm": [0.0, 0.0, 40.0]}

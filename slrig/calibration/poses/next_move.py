@@ -104,12 +104,6 @@ def next_move(
     return Advice(words, False, camera, options[chosen].outline_px, options[chosen], worst, expected)
 
 
-def cell_sigma_px(device: DeviceGuess, *, information: FloatArray | None = None) -> FloatArray:
-    """(6, 6) float64: by how far the device's projection may be off in each cell, px per coordinate."""
-    held = device.information if information is None else information
-    return np.asarray(_cells(held[None], _reach(device))[0].reshape(CELLS, CELLS), dtype=np.float64)
-
-
 @dataclass(frozen=True, slots=True)
 class _Informed:
     """By device: (c, 8, 8) information with each of c candidates added, the way to its frame from the camera's, and

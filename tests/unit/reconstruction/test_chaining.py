@@ -16,7 +16,7 @@ from slrig.reconstruction.chaining import (
     _SAME_LINE_ANGLE,
     _SAME_LINE_PX,
     _SHARPEST_TURN,
-    chain,
+    chain_frames,
 )
 
 SHAPE = (60, 80)
@@ -36,7 +36,8 @@ class Found(NamedTuple):
     def chained(self, *, strong: NDArray[np.bool_] | None = None) -> list[list[int]]:
         """The chains as lists of indices."""
         may_start = np.ones(len(self.points_px), dtype=np.bool_) if strong is None else strong
-        order, offsets = chain(self.points_px, self.normals, self.strength, may_start, SHAPE)
+        borders = np.array([0, len(self.points_px)])
+        order, offsets, _ = chain_frames(self.points_px, self.normals, self.strength, may_start, borders, SHAPE)
         return [order[a:b].tolist() for a, b in pairwise(offsets)]
 
 

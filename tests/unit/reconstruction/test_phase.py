@@ -17,8 +17,9 @@ from slrig.model import Axis, FloatArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import PositionMap, fitted_points, has_phase, position_map
+from slrig.reconstruction.phase import PositionMap, has_phase, position_map
 from tests.unit.reconstruction.builders import bars, cells_of, code_frames, grid, nearest_lines
+from tests.unit.reconstruction.refining import fitted_points
 
 SHAPE = (60, 80)
 QUIET = NoiseModel(1e-4, 0.0)

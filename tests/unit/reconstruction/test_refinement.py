@@ -16,10 +16,11 @@ from slrig.patterns.sequence import scan_patterns
 from slrig.reconstruction.camera import CameraCurves, CodeTables, Limits, camera_curves
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import axis_frames
-from slrig.reconstruction.phase import PositionMap, fitted_points
-from slrig.reconstruction.refinement import Refinement, line_crossings, refined
+from slrig.reconstruction.phase import PositionMap
+from slrig.reconstruction.refinement import Refinement, refined
 from slrig.reconstruction.stripes import LinePoints, chained
 from tests.unit.reconstruction.builders import cells_of, grid, nearest_lines, seen_by_camera
+from tests.unit.reconstruction.refining import fitted_points, line_crossings
 
 SHAPE = (60, 80)
 PROJECTOR = Size(160, 128)

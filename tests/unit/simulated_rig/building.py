@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from simulated_rig.boards import Board
 from simulated_rig.device import SimulatedHead, simulated_head
-from slrig.model import Axis, Black, LineShift, Pattern, PatternSequence, Pixels, Size, White
+from simulated_rig.placed import turned_by
+from simulated_rig.tables import Triple
+from slrig.model import Axis, Black, FloatArray, LineShift, Pattern, PatternSequence, Pixels, Size, White
 
 FACING_PLATE = """
 [[object]]
@@ -65,3 +68,8 @@ def white_black_lines(size: Size, *, lines: int = 8) -> PatternSequence:
         patterns.append(LineShift(Axis.COLUMN, shift, 8))
         profiles.append(line_profile(size, shift))
     return PatternSequence(size, tuple(patterns), tuple(profiles))
+
+
+def corners_in_world_mm(board: Board, position_mm: Triple, rotation_deg: Triple) -> FloatArray:
+    """(n, 3) float64: the print's corners in the world, of a board in a pose."""
+    return np.asarray(board.corners_mm @ turned_by(rotation_deg).T + position_mm, np.float64)

@@ -10,10 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from simulated_rig.boards import Board, Print, across_of, along_of, corners_in_world_mm
+from simulated_rig.boards import Board, Print, across_of, along_of
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.model import FloatArray
+from tests.unit.simulated_rig.building import corners_in_world_mm
 
 SIZES: dict[str, dict[str, Any]] = {
     "chessboard": {"columns": 5, "rows": 4, "square_mm": 9.0},

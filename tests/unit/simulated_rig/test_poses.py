@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.boards import Board, corners_in_world_mm
+from simulated_rig.boards import Board
 from simulated_rig.device import SimulatedHead
 from simulated_rig.optics import image_positions
 from simulated_rig.options import HeadOptions
 from simulated_rig.placed import turned_by
-from simulated_rig.poses import PoseSeries, made_up, middle_pose
+from simulated_rig.poses import PoseSeries, made_up
 from slrig.calibration.board import Board as Designed
 from slrig.calibration.board import BoardKind
 from slrig.config import read_rig
@@ -22,7 +22,7 @@ from slrig.discovery import open_rig
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, Pixels
 from tests.rendered_boards import board_head, board_options, board_scene
-from tests.unit.simulated_rig.building import FACING_PLATE, small_head, white_black_lines
+from tests.unit.simulated_rig.building import FACING_PLATE, corners_in_world_mm, small_head, white_black_lines
 
 CHESSBOARD = Board.model_validate(
     {"shape": "board", "kind": "chessboard", "columns": 8, "rows": 5, "square_mm": 20.0, "margin_mm": 8.0}
@@ -172,7 +172,9 @@ def test_the_truth_follows_the_pose(tmp_path: Path) -> None:
 
 def test_the_designed_frame_of_a_pose_has_its_origin_at_corner_0() -> None:
     pose = made_up(PoseSeries(count=1, edge_px=3.0), CHESSBOARD, DEVICES)[0]
-    rotation, translation = middle_pose(CHESSBOARD, pose)
+    rotation = turned_by(pose.rotation_deg)
+    # Of the designed board, whose origin is corner 0: X_world = R X + t.
+    translation = np.array(pose.position_mm) - rotation @ np.array([*CHESSBOARD.middle_mm, 0.0])
     designed = Designed(BoardKind.CHESSBOARD, 8, 5, 20.0).points_mm
     placed = corners_in_world_mm(CHESSBOARD, pose.position_mm, pose.rotation_deg)
     np.testing.assert_allclose(designed @ rotation.T + translation, placed, atol=1e-9)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simulated_rig.boards import Board, corners_in_world_mm
+from simulated_rig.boards import Board
 from simulated_rig.casting import caster
 from simulated_rig.options import CameraOptions
 from simulated_rig.placed import turned_by
@@ -19,6 +19,7 @@ from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, SceneSurface, surface_of
 from simulated_rig.transport import Hits, trace
 from slrig.model import FloatArray, Pinhole, Size
+from tests.unit.simulated_rig.building import corners_in_world_mm
 from tests.unit.simulated_rig.test_boards import dark_at
 
 POSITION = (6.0, -4.0, 12.0)

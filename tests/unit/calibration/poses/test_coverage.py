@@ -11,7 +11,7 @@ from slrig.calibration.observations import PoseObservation
 from slrig.calibration.poses.candidates import board_rotation
 from slrig.calibration.poses.checks import judge_pose
 from slrig.calibration.poses.coverage import GOALS, attitude, cells_of, coverage, full_turn_deg
-from slrig.calibration.poses.next_move import Advice, cell_sigma_px, next_move
+from slrig.calibration.poses.next_move import Advice, _cells, _reach, next_move
 from slrig.calibration.poses.rough import rig_guess
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
 from slrig.model import FloatArray, Pinhole, Size
@@ -253,7 +253,7 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
     poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(stood)]
     poses = [pose for pose in poses if pose.views]
     guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
-    stated = np.sqrt(2) * cell_sigma_px(guess).max()
+    stated = np.sqrt(2) * _cells(guess.information[None], _reach(guess)).max()
     found = np.sqrt(
         (_errors_px(shooting, [each for each in stood if shooting.shot("x", each).views], range(200, 220)) ** 2).mean()
     )

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from simulated_rig.bound import ExposedView
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, surface_of
 from slrig.calibration.board import Board, BoardKind
 from slrig.model import CameraFormat, CameraTruth, Capture, FloatArray, Pattern, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.light_bound import ExposedView
 
 BOARD = Board(BoardKind.CHESSBOARD, 8, 5, 18.0)
 ROTATION_DEG = (16.0, -12.0, 6.0)

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simulated_rig.bound import ExposedView, StripeBound, pixel_bound, stripe_bound
 from simulated_rig.light import Response
 from simulated_rig.options import CameraOptions, ProjectorOptions
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, surface_of
 from simulated_rig.sensor import Sensor
 from slrig.model import FloatArray, Pixels
+from tests.light_bound import ExposedView, StripeBound, pixel_bound, stripe_bound
 from tests.unit.simulated_rig.building import line_profile
 
 PERIOD = 24
