@@ -36,7 +36,7 @@ class ScheduleRequest(Strict):
         default=3600.0, description="how long after its time a run may still start, a busy rig included"
     )
     retry_s: Annotated[float, Field(ge=LEAST_RETRY_S, le=MOST_GRACE_S)] = Field(
-        default=60.0, description="how often a run that found the rig busy tries again"
+        default=60.0, description="how often a run that found the rig busy, or a device that failed, tries again"
     )
     catch_up: bool = Field(
         default=True,

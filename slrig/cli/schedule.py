@@ -31,7 +31,7 @@ def add(
     ] = None,
     grace_s: Annotated[float | None, typer.Option(help="How late a run may start, seconds. Default 3600.")] = None,
     retry_s: Annotated[
-        float | None, typer.Option(help="How often a busy rig is tried again, seconds. Default 60.")
+        float | None, typer.Option(help="How often a rig that is busy, or fails, is tried again, s. Default 60.")
     ] = None,
     catch_up: Annotated[
         bool, typer.Option("--catch-up/--no-catch-up", help="After a long pause, run once for what was missed.")

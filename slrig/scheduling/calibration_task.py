@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 from uuid import UUID
 
 from slrig.calibration.judging.verdict import Grade
-from slrig.errors import UnsupportedByDeviceError
+from slrig.errors import CalibrationNotFoundError, CalibrationStateError, DeviceError, UnsupportedByDeviceError
+from slrig.scan.faults import WorkerLostError
 from slrig.scan.work import Holder
 from slrig.scheduling.naming import NamedLender
 from slrig.scheduling.positions import require_positions
@@ -21,7 +23,7 @@ from slrig.sessions.calibration.records import PoseState, SessionRecord, Session
 class CalibrationTask:
     """Implements `slrig.scheduling.tasks.Task`. Scans may come between two poses; a pose waits in line behind them.
 
-    tidy : called after each, so that they do not pile up.
+    tidy : called after each, however it ended, so that they do not pile up.
     """
 
     def __init__(self, lender: NamedLender, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
@@ -39,18 +41,24 @@ class CalibrationTask:
         first, *others = self._positions(asked)
         session = self._calibrations.open(asked.board.board(), label=holder.words).id
         try:
-            # The first may not wait: a busy rig is told before anything was done.
-            self._shoot(session, holder, asked, first, wait=False)
-        except BaseException:
-            self._calibrations.delete(session)
+            try:
+                # The first may not wait: a busy rig is told before anything was done.
+                self._shoot(session, holder, asked, first, wait=False)
+            except BaseException:
+                self._calibrations.delete(session)
+                raise
+            for position in others:
+                self._await_rig(session, cancelled)
+                self._shoot(session, holder, asked, position, wait=True)
+            self._await_poses(session, cancelled)
+            return self._told(self._solved(session, cancelled), asked)
+        except (DeviceError, WorkerLostError):
+            # It is tried again from the first pose on. A pose that is being read yet leaves it to `tidy`.
+            with suppress(CalibrationStateError, CalibrationNotFoundError):
+                self._calibrations.delete(session)
             raise
-        for position in others:
-            self._await_rig(session, cancelled)
-            self._shoot(session, holder, asked, position, wait=True)
-        self._await_poses(session, cancelled)
-        told = self._told(self._solved(session, cancelled), asked)
-        self._tidy()
-        return told
+        finally:
+            self._tidy()
 
     def _positions(self, asked: CalibrationOptions) -> list[int | str]:
         facts = self._lender.status().facts

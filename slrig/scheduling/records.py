@@ -34,9 +34,9 @@ class Order:
     """What a person asks for: when, what, and how late it may be.
 
     grace_s : how long after its time a run may still start, a busy rig's included. retry_s : a run that finds the rig
-    busy tries again so often. catch_up : after a pause longer than the grace (the service was off, the schedule was
-    paused) the newest of the runs that were missed is made up for, once; otherwise it is recorded as missed.
-    options : of the task, checked by whoever does it.
+    busy, or a device that fails, tries again so often. catch_up : after a pause longer than the grace (the service was
+    off, the schedule was paused) the newest of the runs that were missed is made up for, once; otherwise it is recorded
+    as missed. options : of the task, checked by whoever does it.
 
     Raises
     ------

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 
 import structlog
 
-from slrig.errors import RigBusyError, ScheduleNotFoundError, SlrigError
+from slrig.errors import DeviceError, RigBusyError, ScheduleNotFoundError, SlrigError, UnsupportedByDeviceError
+from slrig.scan.faults import WorkerLostError
 from slrig.scan.records import Clock, utc_now
 from slrig.scheduling.records import Run, RunState, Schedule
 from slrig.scheduling.store import ScheduleStore
@@ -31,9 +32,9 @@ class Work(Protocol):
         Raises
         ------
         RigBusyError
-            Somebody holds the rig: before anything was done. The run tries again within its grace.
+            Somebody holds the rig: before anything was done.
         SlrigError
-            It could not be done.
+            It could not be done. What may pass, see `passes`, has the run try again within its grace.
         """
         ...
 
@@ -44,6 +45,17 @@ class Notice(Protocol):
     def __call__(self, schedule: Schedule, run: Run, /) -> None:
         """Take note. Must not raise."""
         ...
+
+
+def passes(error: SlrigError) -> bool:
+    """Whether a run that met this may go well a little later: the rig was held, a device failed, the worker was lost.
+
+    >>> passes(DeviceError("no answer")), passes(UnsupportedByDeviceError("no such trigger"))
+    (True, False)
+    """
+    return isinstance(error, RigBusyError | DeviceError | WorkerLostError) and not isinstance(
+        error, UnsupportedByDeviceError
+    )
 
 
 def in_a_thread(work: Callable[[], None]) -> None:
@@ -139,15 +151,14 @@ class Scheduler:
             result = self._work(schedule, run, cancelled=self._stop.is_set)
             state = RunState.SUCCEEDED
             reason = f"at try {run.attempts + 1}" if run.attempts else run.reason
-        except RigBusyError as error:
-            now = self._clock()
-            again = now + timedelta(seconds=schedule.order.retry_s)
-            if again <= run.deadline:
-                self._store.postpone(run, f"rig busy: {error}", again)
-                return
-            state, reason = RunState.SKIPPED, f"rig busy: {error}"
         except SlrigError as error:
-            reason = str(error)
+            busy = isinstance(error, RigBusyError)
+            reason = f"rig busy: {error}" if busy else str(error)
+            again = self._clock() + timedelta(seconds=schedule.order.retry_s)
+            if passes(error) and again <= run.deadline and not self._stop.is_set():
+                self._store.postpone(run, reason, again)
+                return
+            state = RunState.SKIPPED if busy else RunState.FAILED
         except Exception as error:  # noqa: BLE001 - the schedule outlives whatever happens in one run
             _log.exception("a scheduled run failed", schedule=str(schedule.id), due=run.due.isoformat())
             reason = f"an error of its own: {error!r}"

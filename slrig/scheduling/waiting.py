@@ -34,6 +34,6 @@ def error_of(fault: ScanFault) -> SlrigError:
     >>> error_of(ScanFault("PoseRefusedError", "no camera sees the board"))
     PoseRefusedError('no camera sees the board')
     """
-    kind = error_classes().get(fault.kind, DeviceError)
-    # A busy rig would have a scheduled run begin anew, and it is begun; and these two take more than a message.
+    kind = error_classes().get(fault.kind, SlrigError)
+    # These two take more than a message.
     return DeviceError(fault.message) if kind in {RigBusyError, LibraryMissingError} else kind(fault.message)

@@ -9,7 +9,15 @@ from typing import Any
 
 import pytest
 
-from slrig.errors import DeviceError, ScheduleError, ScheduleNotFoundError
+from slrig.errors import (
+    DeviceError,
+    PoseRefusedError,
+    ScheduleError,
+    ScheduleNotFoundError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.scan.faults import WorkerLostError
 from slrig.scheduling.cron import Cron
 from slrig.scheduling.records import Order, RunState, TaskKind
 from tests.unit.scheduling.desk import START, Desk
@@ -160,9 +168,9 @@ def assert_none_else(desk: Desk) -> None:
 
 def test_a_failure_is_recorded_with_its_cause_and_the_schedule_goes_on(desk: Desk) -> None:
     daily = desk.daily()
-    desk.fails = DeviceError("camera 'left' is gone; plug it in")
+    desk.fails = PoseRefusedError("no camera sees the board; uncover it")
     desk.look(hours=1)
-    assert desk.run(daily).reason == "camera 'left' is gone; plug it in"
+    assert desk.run(daily).reason == "no camera sees the board; uncover it"
     desk.fails = RuntimeError("a defect")
     desk.look(days=1)
     assert "a defect" in str(desk.run(daily).reason)
@@ -170,6 +178,36 @@ def test_a_failure_is_recorded_with_its_cause_and_the_schedule_goes_on(desk: Des
     desk.look(days=1)
     states = [state for _, state, _ in desk.rows(daily)]
     assert states == [RunState.FAILED, RunState.FAILED, RunState.SUCCEEDED]
+
+
+@pytest.mark.parametrize("error", [DeviceError("camera 'left' is gone; plug it in"), WorkerLostError("out of memory")])
+def test_what_may_pass_is_tried_again_within_the_grace(desk: Desk, error: SlrigError) -> None:
+    daily = desk.daily()
+    desk.fails = error
+    desk.look(hours=1)
+    assert desk.rows(daily) == [("23 06:00", RunState.WAITING, 1)]
+    assert desk.run(daily).reason == str(error)
+    desk.fails = None
+    desk.look(minutes=10)
+    assert desk.rows(daily) == [("23 06:00", RunState.SUCCEEDED, 1)]
+    assert desk.run(daily).reason == "at try 2"
+
+
+def test_a_device_that_stays_away_for_the_whole_grace_fails_the_run(desk: Desk) -> None:
+    daily = desk.daily()
+    desk.fails = DeviceError("camera 'left' is gone; plug it in")
+    for _ in range(14):
+        desk.look(minutes=10)
+    assert desk.rows(daily) == [("23 06:00", RunState.FAILED, 1)]
+    assert desk.run(daily).reason == "camera 'left' is gone; plug it in"
+    assert desk.told == [(START + timedelta(hours=1), RunState.FAILED)]
+
+
+def test_what_will_not_pass_is_not_tried_again(desk: Desk) -> None:
+    daily = desk.daily()
+    desk.fails = UnsupportedByDeviceError("this rig has no positioner")
+    desk.look(hours=1)
+    assert desk.rows(daily) == [("23 06:00", RunState.FAILED, 1)]
 
 
 def test_a_pause_is_made_up_for_once(desk: Desk) -> None:

@@ -20,6 +20,7 @@ from slrig.errors import (
     ScanCancelledError,
     ScanStateError,
     ScheduleError,
+    SlrigError,
     SolveRefusedError,
     UnsupportedByDeviceError,
 )
@@ -221,6 +222,9 @@ def test_device_that_fails_ends_the_run(bench: TaskBench) -> None:
     bench.error = DeviceError("the camera does not answer")
     with pytest.raises(DeviceError, match="the camera does not answer"):
         bench.do(TaskKind.CALIBRATION, board=BOARD)
+    # It is tried again from the first pose on, and nothing is left of it.
+    assert bench.calibrations.latest() == []
+    assert bench.tidied == [0]
 
 
 def test_rig_without_a_positioner_is_told_in_words(tmp_path: Path) -> None:
@@ -367,5 +371,5 @@ def test_acceptance_is_measured_by_script_and_tells_its_decision(
 
 def test_fault_of_a_busy_rig_is_not_told_as_one() -> None:
     assert type(error_of(ScanFault("RigBusyError", "held"))) is DeviceError
-    assert type(error_of(ScanFault("UnexpectedError", "odd"))) is DeviceError
+    assert type(error_of(ScanFault("UnexpectedError", "odd"))) is SlrigError
     assert type(error_of(ScanFault("PoseRefusedError", "dark"))) is PoseRefusedError

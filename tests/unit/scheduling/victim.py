@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from slrig.errors import DeviceError, RigBusyError
+from slrig.errors import PoseRefusedError, RigBusyError
 from slrig.scheduling.records import Run, Schedule
 from slrig.scheduling.scheduler import Scheduler
 from slrig.scheduling.store import ScheduleStore
@@ -42,8 +42,8 @@ def keep(folder: Path, seed: int, ready: Connection) -> None:
         while time.monotonic() < until:
             os.sched_yield()
         if chance.random() < 0.1:
-            broken = "a device failed"
-            raise DeviceError(broken)
+            unseen = "no camera sees the board"
+            raise PoseRefusedError(unseen)
         os.write(diary, f"end {run.number}\n".encode())
         return {}
 
