@@ -11,11 +11,11 @@ from fastapi import APIRouter, Body, Header, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
-from slrig.api.calibration import fingerprint
 from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
-from slrig.api.schemas import Strict
+from slrig.api.schemas import fingerprint
 from slrig.api.service import Serving
+from slrig.bundle.faults import Strict
 from slrig.calibration.artefacts import Decision
 from slrig.sessions.acceptance.asking import AcceptanceRequest
 from slrig.sessions.acceptance.evaluation import Reading

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Body, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from slrig.api.calibration_schemas import (
@@ -28,7 +26,7 @@ from slrig.api.calibration_schemas import (
     pose_body,
 )
 from slrig.api.openapi import problems
-from slrig.api.schemas import pattern_plan
+from slrig.api.schemas import fingerprint, pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
 from slrig.calibration.board import USUAL_BOARD
@@ -187,11 +185,6 @@ def shoot_script(
     poses = service.calibrations.poses
     pose = poses.script(calibration_id, request.positions, asked, wait=request.if_busy == "queue")
     return _accepted(service, response, calibration_id, pose)
-
-
-def fingerprint(request: BaseModel) -> str:
-    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
-    return hashlib.sha256(f"{type(request).__name__} {request.model_dump_json()}".encode()).hexdigest()
 
 
 def _accepted(service: Service, response: Response, calibration_id: UUID, pose: PoseRecord) -> PoseBody:

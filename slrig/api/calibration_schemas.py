@@ -10,7 +10,8 @@ from uuid import UUID
 from pydantic import BaseModel, Field
 
 from slrig.api.problems import fault_problem
-from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, Strict
+from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody
+from slrig.bundle.faults import Strict
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import Comparison, Difference
 from slrig.scan.plan import PatternPlan

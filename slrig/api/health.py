@@ -12,8 +12,9 @@ from pydantic import BaseModel, Field
 from slrig.api.calibration_schemas import BoardRequest, IfBusy, board_of
 from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
-from slrig.api.schemas import MOST_EXPOSURE_S, Strict
+from slrig.api.schemas import MOST_EXPOSURE_S
 from slrig.api.service import Service, Serving
+from slrig.bundle.faults import Strict
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import HealthState
 from slrig.errors import CalibrationError

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from typing import Annotated
 from uuid import UUID
@@ -11,7 +10,7 @@ from fastapi import APIRouter, Body, Header, Query, Response
 
 from slrig.api.artefacts import ready_files
 from slrig.api.openapi import problems
-from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, scan_body, scan_plan
+from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, fingerprint, scan_body, scan_plan
 from slrig.api.service import Service, Serving
 from slrig.scan.records import ScanProgress, ScanRecord, ScanState
 from slrig.sessions.health.verification import require_healthy
@@ -62,11 +61,6 @@ def _started(service: Service, request: ScanRequest, key: str | None) -> ScanRec
 def _require_healthy(service: Service) -> None:
     health, _, _ = service.verifications.health()
     require_healthy(health, refuse_when_stale=service.refuse_when_stale)
-
-
-def fingerprint(request: ScanRequest) -> str:
-    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
-    return hashlib.sha256(request.model_dump_json().encode()).hexdigest()
 
 
 def _first_answer(record: ScanRecord) -> ScanRecord:

@@ -8,7 +8,7 @@ from uuid import UUID
 
 from pydantic import BaseModel, Field
 
-from slrig.api.schemas import Strict
+from slrig.bundle.faults import Strict
 from slrig.scheduling.cron import Cron
 from slrig.scheduling.records import LEAST_RETRY_S, MOST_GRACE_S, Order, Run, RunState, Schedule, TaskKind
 

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, WithJsonSchema, field_validator
+from pydantic import BaseModel, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from slrig.api.problems import fault_problem
+from slrig.bundle.faults import Strict
 from slrig.config import BracketSeconds, ScanDefaults
 from slrig.model import Axis, FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 
 MOST_EXPOSURE_S = 60.0
-
-
-class Strict(BaseModel):
-    """A request: no unknown field, no value of another kind."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class PatternRequest(Strict):
@@ -104,6 +100,11 @@ class ScanRequest(Strict):
             message = "expected exposure_s or exposures_s, found both; keep exposures_s for a bracket"
             raise ValueError(message)
         return exposures_s
+
+
+def fingerprint(request: BaseModel) -> str:
+    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
+    return hashlib.sha256(f"{type(request).__name__} {request.model_dump_json()}".encode()).hexdigest()
 
 
 def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:

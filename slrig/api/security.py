@@ -10,12 +10,10 @@ from pathlib import Path
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from slrig import KEY_VARIABLE
 from slrig.api.problems import answer, problem
 from slrig.bundle.storage import write_file
 from slrig.errors import ConfigError
-
-KEY_VARIABLE = "SLRIG_API_KEY"
-"""Where a client keeps its key, and where a service may be given one instead of making its own."""
 
 OPEN_PATHS = frozenset({"/livez", "/readyz"})
 """What answers without a key: probes, which tell nothing about scans."""

@@ -15,9 +15,10 @@ import structlog
 import uvicorn
 from starlette.concurrency import run_in_threadpool
 
+from slrig import KEY_VARIABLE
 from slrig.api.app import create_app
 from slrig.api.logs import set_up_logs
-from slrig.api.security import KEY_VARIABLE, claim_key
+from slrig.api.security import claim_key
 from slrig.api.service import Service, assembled_service
 from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback

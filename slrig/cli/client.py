@@ -16,10 +16,10 @@ from urllib.parse import urlsplit
 
 import httpx2
 
+from slrig import KEY_VARIABLE
 from slrig.bundle.storage import refusals_of, staging_name
 from slrig.errors import ConfigError, ServiceError
 
-KEY_VARIABLE = "SLRIG_API_KEY"
 PATIENCE_S = 30.0
 """How long a connection that broke is tried again before the service counts as gone."""
 

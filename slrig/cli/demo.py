@@ -17,8 +17,9 @@ from typing import Any
 import typer
 
 import slrig
+from slrig import KEY_VARIABLE
 from slrig.bundle.storage import refusals_of
-from slrig.cli.client import KEY_VARIABLE, ServiceClient
+from slrig.cli.client import ServiceClient
 from slrig.cli.display import progress_shown
 from slrig.cli.scan import scan_with, tell_result
 from slrig.errors import ConfigError, ServiceError

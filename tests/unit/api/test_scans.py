@@ -12,8 +12,7 @@ import pytest
 import trimesh
 from fastapi.testclient import TestClient
 
-from slrig.api.scans import fingerprint
-from slrig.api.schemas import ScanRequest
+from slrig.api.schemas import ScanRequest, fingerprint
 from slrig.scan.worker import Worker
 from tests.unit.api.conftest import ServedBench, ended
 
