@@ -12,13 +12,11 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
 from slrig.api.openapi import problems
-from slrig.api.problems import fault_problem
-from slrig.api.schemas import fingerprint
+from slrig.api.schemas import AnyFault, filled, fingerprint
 from slrig.api.service import Serving
 from slrig.bundle.faults import Strict
 from slrig.calibration.artefacts import Decision
 from slrig.sessions.acceptance.asking import AcceptanceRequest
-from slrig.sessions.acceptance.evaluation import Reading
 from slrig.sessions.acceptance.records import AcceptanceRecord, AcceptanceState, RequestKey
 from slrig.sessions.acceptance.store import HTML, JSON
 
@@ -90,7 +88,7 @@ class AcceptanceBody(AcceptanceSummary):
     positions: list[StepBody]
     readings: list[ReadingBody]
     progress: dict[str, Any] | None
-    error: dict[str, Any] | None = Field(description="why the last position was not measured; it may be measured again")
+    error: AnyFault = Field(description="why the last position was not measured; it may be measured again")
 
 
 @router.post("", status_code=201, responses=problems(409, 422, 503, 507))
@@ -163,42 +161,27 @@ def _key(given: str | None, request: BaseModel) -> RequestKey | None:
 
 def _summary(record: AcceptanceRecord) -> AcceptanceSummary:
     names = (HTML, JSON) if record.state is AcceptanceState.FINISHED else ()
-    return AcceptanceSummary(
-        id=record.id,
-        created_at=record.created_at,
-        rig=record.rig,
-        calibration=record.calibration,
-        state=record.state,
+    return filled(
+        AcceptanceSummary,
+        record,
         captures=len(record.plan.takes),
         captures_done=len(record.readings),
-        decision=record.decision,
         files={name: f"/acceptance/{record.id}/{name}" for name in names},
     )
 
 
 def _body(record: AcceptanceRecord) -> AcceptanceBody:
-    steps = [
-        StepBody(name=step.name, artefact=step.artefact, centre_mm=tuple(step.centre_mm.tolist()), words=step.words)
-        for step in record.plan.steps
-    ]
+    steps = [filled(StepBody, step, centre_mm=tuple(step.centre_mm.tolist())) for step in record.plan.steps]
     following = record.next_take
-    return AcceptanceBody(
-        **_summary(record).model_dump(),
+    return filled(
+        AcceptanceBody,
+        _summary(record),
         next=None if following is None else next(each for each in steps if each.name == following[0].name),
         positions=steps,
-        readings=[_reading(each) for each in record.readings],
+        readings=[
+            filled(ReadingBody, each, position=each.step, capture=each.take + 1, points_used=each.used)
+            for each in record.readings
+        ],
         progress=None if record.progress is None else record.progress.as_json(),
-        error=None if record.fault is None else fault_problem(record.fault),
-    )
-
-
-def _reading(reading: Reading) -> ReadingBody:
-    return ReadingBody(
-        position=reading.step,
-        capture=reading.take + 1,
-        errors_mm={quantity.value: error for quantity, error in reading.errors_mm.items()},
-        limits_mm={quantity.value: limit for quantity, limit in reading.limits_mm.items()},
-        noise_mm=reading.noise_mm,
-        points_used=reading.used,
-        rejected_share=reading.rejected_share,
+        error=record.fault,
     )

@@ -7,18 +7,19 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, BeforeValidator, Field
 
-from slrig.api.problems import fault_problem
-from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody
+from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
 from slrig.bundle.faults import Strict
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind, BoardShape
-from slrig.calibration.judging.comparison import Comparison, Difference
+from slrig.calibration.judging.comparison import Comparison
 from slrig.scan.plan import PatternPlan
 from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
 
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 CornerCount = Annotated[int, Field(ge=3, le=60)]
+Known = Annotated[float | None, BeforeValidator(plain)]
+"""A figure, null where it is not known, which is NaN."""
 IfBusy = Literal["reject", "queue"]
 
 
@@ -191,8 +192,8 @@ class DifferenceBody(BaseModel):
     """Second minus first, and its standard deviation; null where either says nothing of its own error."""
 
     value: float
-    sigma: float | None
-    sigmas: float | None = Field(description="the size of the difference in its standard deviation")
+    sigma: Known
+    sigmas: Known = Field(description="the size of the difference in its standard deviation")
     words: str
 
 
@@ -212,8 +213,8 @@ class ComparisonBody(BaseModel):
     second: UUID
     devices: dict[str, DeviceDifferenceBody]
     missing: list[str] = Field(description="devices that only one of them has")
-    moved_rms_mm: float | None = Field(description="by how much points in the volume move; null without a volume")
-    moved_most_mm: float | None
+    moved_rms_mm: Known = Field(description="by how much points in the volume move; null without a volume")
+    moved_most_mm: Known
     words: list[str]
 
 
@@ -228,107 +229,52 @@ def pose_body(session_id: UUID, pose: PoseRecord, cameras: Mapping[str, object])
     here = f"/calibration/{session_id}/pose/{pose.number}"
     shown = pose.state in {PoseState.ACCEPTED, PoseState.REFUSED}
     pictures = {name: f"{here}/picture.png?camera={name}" for name in cameras} if shown else {}
-    return PoseBody(
-        number=pose.number,
-        name=pose.name,
-        state=pose.state,
-        created_at=pose.created_at,
-        position=pose.position,
-        position_name=pose.position_name,
-        exposure_s=pose.exposure_s,
-        answer=None if pose.answer is None else dict(pose.answer),
-        error=None if pose.fault is None else fault_problem(pose.fault),
-        seconds=pose.seconds,
-        links=PoseLinks(
-            self=here, events=f"/calibration/{session_id}/events", cancel=f"{here}/cancel", pictures=pictures
-        ),
-    )
+    links = PoseLinks(self=here, events=f"/calibration/{session_id}/events", cancel=f"{here}/cancel", pictures=pictures)
+    return filled(PoseBody, pose, error=pose.fault, links=links)
 
 
 def calibration_summary(record: SessionRecord, *, active: UUID | None, files: Mapping[str, str]) -> CalibrationSummary:
     """A calibration as a list shows it; `files` maps the names of those that are ready to their paths."""
-    return CalibrationSummary(**_summary(record, active, files))
+    return filled(CalibrationSummary, record, **_summary(record, active, files))
 
 
 def calibration_body(
     record: SessionRecord, *, active: UUID | None, files: Mapping[str, str], last_event: int
 ) -> CalibrationBody:
     """A calibration as an answer."""
-    return CalibrationBody(
+    board = record.board
+    return filled(
+        CalibrationBody,
+        record,
         **_summary(record, active, files),
-        board=None if record.board is None else _board(record.board),
-        patterns=record.patterns,
+        board=None if board is None else filled(BoardBody, board, corners=(board.columns, board.rows)),
         shot=[pose_body(record.id, pose, record.cameras) for pose in record.poses],
-        script=list(record.script),
-        coverage=None if record.coverage is None else dict(record.coverage),
-        next_move=None if record.next_move is None else dict(record.next_move),
-        progress=None if record.progress is None else ProgressBody(**record.progress.as_json()),
-        error=None if record.fault is None else fault_problem(record.fault),
-        result=None if record.result is None else dict(record.result),
+        error=record.fault,
         last_event=last_event,
     )
 
 
 def comparison_body(first: UUID, second: UUID, found: Comparison) -> ComparisonBody:
     """A comparison as an answer."""
-    return ComparisonBody(
-        first=first,
-        second=second,
-        devices={
-            name: DeviceDifferenceBody(
-                focal_percent=_difference(each.focal_percent),
-                principal_px=_difference(each.principal_px),
-                rotation_deg=None if each.rotation_deg is None else _difference(each.rotation_deg),
-                baseline_mm=None if each.baseline_mm is None else _difference(each.baseline_mm),
-            )
-            for name, each in found.devices.items()
-        },
-        missing=list(found.missing),
-        moved_rms_mm=plain(found.moved_rms_mm),
-        moved_most_mm=plain(found.moved_most_mm),
-        words=list(found.words),
-    )
+    return filled(ComparisonBody, found, first=first, second=second)
 
 
 def _summary(record: SessionRecord, active: UUID | None, files: Mapping[str, str]) -> dict[str, Any]:
     here = f"/calibration/{record.id}"
     devices = [*record.cameras, *(["projector"] if record.projector is not None else [])]
-    verdict = (record.result or {}).get("verdict") or {}
+    shown = devices if record.board is not None else ()
     return {
-        "id": record.id,
-        "state": record.state,
-        "label": record.label,
-        "rig": record.rig,
-        "created_at": record.created_at,
-        "solved_at": record.solved_at,
         "imported": record.board is None,
         "active": active == record.id,
         "poses": len(record.accepted),
-        "verdict": verdict.get("summary"),
+        "verdict": ((record.result or {}).get("verdict") or {}).get("summary"),
         "links": CalibrationLinks(
             self=here,
             events=f"{here}/events",
             pose=f"{here}/pose",
             solve=f"{here}/solve",
             activate=f"{here}/activate",
-            coverage={
-                name: f"{here}/coverage.png?device={name}" for name in (devices if record.board is not None else ())
-            },
+            coverage={name: f"{here}/coverage.png?device={name}" for name in shown},
             files=dict(files),
         ),
     }
-
-
-def _board(board: Board) -> BoardBody:
-    return BoardBody(
-        kind=board.kind,
-        corners=(board.columns, board.rows),
-        square_mm=board.square_mm,
-        marker_mm=board.marker_mm,
-        dictionary=board.dictionary,
-        title=board.title,
-    )
-
-
-def _difference(found: Difference) -> DifferenceBody:
-    return DifferenceBody(value=found.value, sigma=plain(found.sigma), sigmas=plain(found.sigmas), words=found.words)

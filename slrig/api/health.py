@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Body, Query, Response
@@ -11,8 +11,7 @@ from pydantic import BaseModel, Field
 
 from slrig.api.calibration_schemas import BoardRequest, IfBusy, board_of
 from slrig.api.openapi import problems
-from slrig.api.problems import fault_problem
-from slrig.api.schemas import MOST_EXPOSURE_S
+from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
 from slrig.bundle.faults import Strict
 from slrig.calibration.board import Board
@@ -109,7 +108,7 @@ class VerificationBody(BaseModel):
     state: JobState
     created_at: datetime
     found: VerificationFigures | None
-    error: dict[str, Any] | None
+    error: AnyFault
     links: dict[str, str]
 
 
@@ -119,10 +118,9 @@ def look_at_health(service: Serving) -> HealthBody:
     health, latest, calibration = service.verifications.health()
     solved = None if calibration is None else calibration.solved
     age_s = None if solved is None else (utc_now() - datetime.fromisoformat(solved.solved_at)).total_seconds()
-    return HealthBody(
-        state=health.state,
-        reasons=list(health.reasons),
-        remedy=health.remedy,
+    return filled(
+        HealthBody,
+        health,
         calibration=None if calibration is None else solve_id(calibration),
         calibration_age_s=age_s,
         refuses_scans_when_stale=service.refuse_when_stale,
@@ -203,11 +201,6 @@ def _figures(record: VerificationRecord) -> VerificationFigures:
 
 def _body(job: VerificationJob) -> VerificationBody:
     here = f"/rig/verification/{job.id}"
-    return VerificationBody(
-        id=job.id,
-        state=job.state,
-        created_at=job.created_at,
-        found=None if job.record is None else _figures(job.record),
-        error=None if job.fault is None else fault_problem(job.fault),
-        links={"self": here, "cancel": f"{here}/cancel", "health": "/rig/health"},
-    )
+    found = None if job.record is None else _figures(job.record)
+    links = {"self": here, "cancel": f"{here}/cancel", "health": "/rig/health"}
+    return filled(VerificationBody, job, found=found, error=job.fault, links=links)

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from datetime import datetime
 from uuid import UUID
 
 from fastapi import APIRouter
 
-from slrig.api.schemas import (
-    CalibrationInUse,
-    CameraBody,
-    DeviceBody,
-    DeviceList,
-    DriverBody,
-    MissingLibraryBody,
-    OtherSystemBody,
-    ProjectorBody,
-    RigBody,
-)
+from slrig.api.schemas import CalibrationInUse, CameraBody, DeviceList, ProjectorBody, RigBody, filled
 from slrig.api.service import Serving
-from slrig.devices import CameraInfo, ProjectorInfo
+from slrig.devices import CameraInfo
 from slrig.discovery import found_devices, installed_drivers
 from slrig.model import Size
 from slrig.scan.records import utc_now
@@ -34,19 +23,19 @@ def look_at_rig(service: Serving) -> RigBody:
     """Return the rig: its devices, who holds it, and how many scans wait. Touches no device."""
     status = service.runner.status()
     facts = status.facts
-    return RigBody(
+    return filled(
+        RigBody,
+        status,
         name=status.rig,
         open=facts is not None and status.fault is None,
         error=status.fault,
         calibrated=None if facts is None else (status.active is not None or facts.calibration is not None),
         calibration=_in_use(status),
-        positions=[] if facts is None else list(facts.positions),
+        positions=[] if facts is None else facts.positions,
         cameras=[] if facts is None else [_camera(name, camera) for name, camera in facts.cameras.items()],
-        projector=None if facts is None else _projector(facts.projector),
-        holder=status.holder,
-        since=status.since,
-        waiting=status.waiting,
-        queue_length=status.queue_length,
+        projector=None
+        if facts is None
+        else filled(ProjectorBody, facts.projector, size_px=_extent(facts.projector.size)),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
     )
 
@@ -55,22 +44,7 @@ def look_at_rig(service: Serving) -> RigBody:
 def list_devices() -> DeviceList:
     """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing."""
     found = found_devices()
-    return DeviceList(
-        drivers=[
-            DriverBody(
-                kind=driver.kind,
-                name=driver.name,
-                package=driver.package,
-                version=driver.version,
-                fault=driver.fault,
-            )
-            for driver in installed_drivers()
-        ],
-        devices=[DeviceBody(**asdict(device)) for device in found.devices],
-        missing=[MissingLibraryBody(**asdict(library)) for library in found.missing],
-        elsewhere=[OtherSystemBody(**asdict(driver)) for driver in found.elsewhere],
-        faults=[str(fault) for fault in found.faults],
-    )
+    return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
 
 
 def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
@@ -92,26 +66,10 @@ def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
 
 
 def _camera(name: str, camera: CameraInfo) -> CameraBody:
-    return CameraBody(
-        name=name,
-        model=camera.model,
-        serial=camera.serial,
-        size_px=_extent(camera.format.size),
-        bit_depth=camera.format.bit_depth,
-        triggers=sorted(camera.triggers),
-        exposure_range_s=camera.exposure_range_s,
-        gain_range=camera.gain_range,
-    )
-
-
-def _projector(projector: ProjectorInfo) -> ProjectorBody:
-    return ProjectorBody(
-        name=projector.name,
-        model=projector.model,
-        serial=projector.serial,
-        size_px=_extent(projector.size),
-        plays=projector.plays,
-        latency_s=projector.latency_s,
+    form = camera.format
+    triggers = sorted(camera.triggers)
+    return filled(
+        CameraBody, camera, name=name, size_px=_extent(form.size), bit_depth=form.bit_depth, triggers=triggers
     )
 
 

@@ -8,6 +8,7 @@ from uuid import UUID
 
 from pydantic import BaseModel, Field
 
+from slrig.api.schemas import filled
 from slrig.bundle.faults import Strict
 from slrig.scheduling.cron import Cron
 from slrig.scheduling.records import LEAST_RETRY_S, MOST_GRACE_S, Order, Run, RunState, Schedule, TaskKind
@@ -46,16 +47,8 @@ class ScheduleRequest(Strict):
 
     def order(self) -> Order:
         """What is asked for. Raises ScheduleError."""
-        return Order(
-            Cron(self.cron, self.time_zone),
-            self.task,
-            self.options,
-            self.label,
-            self.grace_s,
-            self.retry_s,
-            self.catch_up,
-            self.enabled,
-        )
+        asked = {name: value for name, value in self if name not in {"cron", "time_zone"}}
+        return Order(Cron(self.cron, self.time_zone), **asked)
 
 
 class ScheduleLinks(BaseModel):
@@ -119,17 +112,12 @@ class RunPage(BaseModel):
 def schedule_body(schedule: Schedule, now: datetime) -> ScheduleBody:
     """A record as an answer."""
     order, here = schedule.order, f"/schedule/{schedule.id}"
-    return ScheduleBody(
+    return filled(
+        ScheduleBody,
+        order,
         id=schedule.id,
         cron=order.cron.text,
         time_zone=order.cron.time_zone,
-        task=order.task,
-        options=dict(order.options),
-        label=order.label,
-        grace_s=order.grace_s,
-        retry_s=order.retry_s,
-        catch_up=order.catch_up,
-        enabled=order.enabled,
         created_at=schedule.created_at,
         upcoming=[order.cron.local(due) for due in order.cron.upcoming(now, UPCOMING)],
         links=ScheduleLinks(self=here, runs=f"{here}/runs", pause=f"{here}/pause", resume=f"{here}/resume"),
@@ -138,15 +126,4 @@ def schedule_body(schedule: Schedule, now: datetime) -> ScheduleBody:
 
 def run_body(run: Run, cron: Cron) -> RunBody:
     """A record as an answer; cron : of its schedule."""
-    return RunBody(
-        number=run.number,
-        due=cron.local(run.due),
-        state=run.state,
-        reason=run.reason,
-        count=run.count,
-        attempts=run.attempts,
-        next_attempt=run.next_attempt,
-        started_at=run.started_at,
-        finished_at=run.finished_at,
-        result=None if run.result is None else dict(run.result),
-    )
+    return filled(RunBody, run, due=cron.local(run.due))

@@ -6,19 +6,21 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 from uuid import UUID
 
-from pydantic import BaseModel, Field, ValidationInfo, WithJsonSchema, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from slrig.api.problems import fault_problem
 from slrig.bundle.faults import Strict
 from slrig.config import BracketSeconds, ScanDefaults
 from slrig.model import Axis, FlipRule
+from slrig.scan.faults import ScanFault
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 
 MOST_EXPOSURE_S = 60.0
+Body = TypeVar("Body", bound=BaseModel)
 
 
 class PatternRequest(Strict):
@@ -102,6 +104,12 @@ class ScanRequest(Strict):
         return exposures_s
 
 
+def filled(body: type[Body], source: object, /, **others: Any) -> Body:
+    """An answer with the attributes of `source` by their names, at every depth, save what `others` says."""
+    own = {name: getattr(source, name) for name in body.model_fields if name not in others}
+    return body.model_validate({**own, **others}, from_attributes=True)
+
+
 def fingerprint(request: BaseModel) -> str:
     """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
     return hashlib.sha256(f"{type(request).__name__} {request.model_dump_json()}".encode()).hexdigest()
@@ -147,7 +155,7 @@ class ProgressBody(BaseModel):
     """How far a scan is: 0 to 1 of the whole."""
 
     stage: str
-    fraction: float
+    fraction: Annotated[float, AfterValidator(lambda fraction: round(fraction, 4))]
     detail: str
 
 
@@ -160,8 +168,15 @@ class ScanLinks(BaseModel):
     files: dict[str, str]
 
 
+def _shown_fault(fault: object) -> object:
+    """A problem stands for itself: what was sent can be read again."""
+    return fault_problem(fault) if isinstance(fault, ScanFault) else fault
+
+
+AnyFault = Annotated[dict[str, Any] | None, BeforeValidator(_shown_fault)]
+"""A recorded fault, shown as the problem that it is."""
 FaultBody = Annotated[
-    dict[str, Any] | None,
+    AnyFault,
     # Already a document, without the members that do not apply; described as what it is.
     WithJsonSchema({"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]}),
     Field(description="why the scan did not succeed"),
@@ -195,20 +210,8 @@ class ScanPage(BaseModel):
 def scan_body(record: ScanRecord, files: Mapping[str, str]) -> ScanBody:
     """A record as an answer; `files` maps the names of those that are ready to their paths."""
     here = f"/scan/{record.id}"
-    return ScanBody(
-        id=record.id,
-        state=record.state,
-        label=record.label,
-        rig=record.rig,
-        created_at=record.created_at,
-        started_at=record.started_at,
-        finished_at=record.finished_at,
-        plan=record.plan,
-        progress=ProgressBody(**record.progress.as_json()),
-        error=None if record.fault is None else fault_problem(record.fault),
-        summary=None if record.summary is None else dict(record.summary),
-        links=ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=dict(files)),
-    )
+    links = ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=dict(files))
+    return filled(ScanBody, record, error=record.fault, links=links)
 
 
 class CameraBody(BaseModel):
