@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url
+from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url, client_of
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -146,7 +146,7 @@ def run(
     from slrig.cli.calibrate_walk import opened, walk
 
     chosen = None if resume is not None else chosen_board(kind, corners, square_mm, marker_mm, dictionary)
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         session = (
             opened(client, chosen, label=label, projector=not cameras_alone)
             if chosen is not None
@@ -168,7 +168,7 @@ def list_stored(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson 
     """List the calibrations that a service keeps, from new to old."""
     from slrig.cli.calibrate_stored import list_calibrations
 
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         list_calibrations(client, as_json=as_json)
 
 
@@ -177,7 +177,7 @@ def show(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = N
     """Show how good a calibration is, or what its poses still lack."""
     from slrig.cli.calibrate_stored import show_calibration
 
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         show_calibration(client, calibration, as_json=as_json)
 
 
@@ -195,26 +195,28 @@ def compare(
     """
     from slrig.cli.calibrate_stored import compare_calibrations
 
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         compare_calibrations(client, first, second, as_json=as_json)
 
 
 @app.command()
 def activate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Have scans use a calibration from now on."""
-    from slrig.cli.calibrate_stored import activate_calibration
+    from slrig.cli.calibrate_stored import whole_id
 
-    with _client(url, key_file) as client:
-        activate_calibration(client, calibration)
+    with client_of(url, key_file) as client:
+        found = client.post(f"/calibration/{whole_id(client, calibration)}/activate", None)
+    typer.echo(f"Scans use calibration {found['id'][:8]} from now on.")
 
 
 @app.command()
 def deactivate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Have scans use the rig's own calibration again."""
-    from slrig.cli.calibrate_stored import deactivate_calibration
+    from slrig.cli.calibrate_stored import whole_id
 
-    with _client(url, key_file) as client:
-        deactivate_calibration(client, calibration)
+    with client_of(url, key_file) as client:
+        client.post(f"/calibration/{whole_id(client, calibration)}/deactivate", None)
+    typer.echo("Scans use the rig's own calibration again.")
 
 
 @app.command()
@@ -230,7 +232,7 @@ def export(
     """Write a calibration that a service keeps into a file."""
     from slrig.cli.calibrate_stored import export_calibration
 
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         export_calibration(client, calibration, file)
 
 
@@ -244,14 +246,8 @@ def take_in(
     """Give a service a calibration that was found elsewhere."""
     from slrig.cli.calibrate_stored import import_calibration
 
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         import_calibration(client, file, label=label)
-
-
-def _client(url: str, key_file: Path | None) -> Any:
-    from slrig.cli.client import ServiceClient, read_key
-
-    return ServiceClient(url, read_key(key_file))
 
 
 def chosen_board(

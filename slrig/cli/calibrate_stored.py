@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode
 
 import typer
 from rich.console import Console
@@ -118,18 +119,6 @@ def compare_calibrations(client: ServiceClient, first: str, second: str, *, as_j
     console.print(table)
 
 
-def activate_calibration(client: ServiceClient, beginning: str) -> None:
-    """Have scans use a calibration from now on."""
-    found = client.post(f"/calibration/{whole_id(client, beginning)}/activate", None)
-    typer.echo(f"Scans use calibration {found['id'][:8]} from now on.")
-
-
-def deactivate_calibration(client: ServiceClient, beginning: str) -> None:
-    """Have scans use the rig's own calibration again."""
-    client.post(f"/calibration/{whole_id(client, beginning)}/deactivate", None)
-    typer.echo("Scans use the rig's own calibration again.")
-
-
 def export_calibration(client: ServiceClient, beginning: str, file: Path) -> None:
     """Write a calibration, or its report, into a file of the kind that its ending names.
 
@@ -171,16 +160,10 @@ def import_calibration(client: ServiceClient, file: Path, *, label: str | None) 
         path = Path(folder) / "calibration.json"
         write_calibration(path, calibration)
         document: dict[str, Any] = json.loads(path.read_bytes())
-    query = "" if label is None else f"?{_query(label=label)}"
+    query = "" if label is None else f"?{urlencode({'label': label})}"
     found = client.post(f"/calibration/import{query}", document)
     typer.echo(f"{'imported':<10}{found['id']}")
     typer.echo(f"To have scans use it: slrig calibrate activate {found['id'][:8]}")
-
-
-def _query(**given: str) -> str:
-    from urllib.parse import urlencode
-
-    return urlencode(given)
 
 
 def _difference(found: Mapping[str, Any] | None) -> str:

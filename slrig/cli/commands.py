@@ -15,7 +15,7 @@ import typer
 import typer.core
 
 from slrig.cli import acceptance_command, calibrate, schedule, verify_command
-from slrig.cli.options import USUAL_URL, AsJson, KeyFile, RigFile, Url
+from slrig.cli.options import USUAL_URL, AsJson, KeyFile, RigFile, Url, client_of
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -182,7 +182,6 @@ def scan(
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.client import ServiceClient, read_key
     from slrig.cli.scan import FILES, scan_with, tell_result
 
     patterns = _given(
@@ -206,7 +205,7 @@ def scan(
             axis=axis,
         ),
     }
-    with ServiceClient(url, read_key(key_file)) as client:
+    with client_of(url, key_file) as client:
         files = tuple(file or FILES)
         result = scan_with(client, request, output, files=files)
     tell_result(result, output, files=files)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,3 +15,10 @@ KeyFile = Annotated[
 ]
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def client_of(url: str, key_file: Path | None) -> Any:
+    """A client of the service that the options name. Raises ConfigError."""
+    from slrig.cli.client import ServiceClient, read_key
+
+    return ServiceClient(url, read_key(key_file))

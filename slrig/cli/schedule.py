@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url
+from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url, client_of
 
 app = typer.Typer(no_args_is_help=True, help="Work for the rig at set times.")
 
@@ -58,14 +57,14 @@ def add(
             if value is not None
         },
     }
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         _tell_schedule(client.post("/schedule", request), as_json=as_json)
 
 
 @app.command(name="list")
 def list_schedules(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
     """List schedules with the time that each is due next."""
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         found = client.get("/schedule")
     if as_json:
         _print_json(found)
@@ -95,7 +94,7 @@ def runs(
     as_json: AsJson = False,
 ) -> None:
     """List what became of a schedule's due times, from new to old."""
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         chosen = _chosen(client, schedule)
         found = client.get(f"{chosen['links']['runs']}?limit={limit}")
     if as_json:
@@ -118,7 +117,7 @@ def runs(
 @app.command()
 def pause(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Let nothing become due until the schedule is resumed."""
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         client.post(f"{_path(client, schedule)}/pause", None)
     typer.echo("paused")
 
@@ -126,14 +125,14 @@ def pause(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) 
 @app.command()
 def resume(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Go on after a pause."""
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         _tell_schedule(client.post(f"{_path(client, schedule)}/resume", None), as_json=False)
 
 
 @app.command()
 def cancel(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Have the run under way end early. The schedule stays as it is."""
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         client.post(f"{_path(client, schedule)}/cancel", None)
     typer.echo("the run was asked to end")
 
@@ -141,15 +140,9 @@ def cancel(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None)
 @app.command()
 def remove(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
     """Forget a schedule and its runs."""
-    with _client(url, key_file) as client:
+    with client_of(url, key_file) as client:
         client.delete_at(_path(client, schedule))
     typer.echo("removed")
-
-
-def _client(url: str, key_file: Path | None) -> Any:
-    from slrig.cli.client import ServiceClient, read_key
-
-    return ServiceClient(url, read_key(key_file))
 
 
 def _options(given: list[str]) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def test_ctrl_c_cancels_the_pose_under_way_and_keeps_the_session(monkeypatch: py
         raise KeyboardInterrupt
 
     monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", interrupted)
-    monkeypatch.setattr(calibrate, "_client", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
     result = CliRunner().invoke(app, ["calibrate", "run", *BOARD_OPTIONS], input="\n")
     assert result.exit_code == INTERRUPTED
     assert desk.asked[-1][:2] == ("POST", f"/calibration/{ID}/pose/1/cancel")
@@ -126,7 +126,7 @@ def test_ctrl_c_cancels_the_pose_under_way_and_keeps_the_session(monkeypatch: py
 
 def test_session_is_taken_up_by_the_beginning_of_its_id(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
-    monkeypatch.setattr(calibrate, "_client", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
     result = CliRunner().invoke(app, ["calibrate", "run", "--id", ID[:6]], input="q\n")
     assert result.exit_code == 0, result.output
     assert desk.asked == []
@@ -136,7 +136,7 @@ def test_session_is_taken_up_by_the_beginning_of_its_id(monkeypatch: pytest.Monk
 
 def test_walk_without_a_board_takes_the_usual_one_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
-    monkeypatch.setattr(calibrate, "_client", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
     result = run("run")
     assert result.exit_code == 0, result.output
     board = desk.asked[0][2]["board"]
@@ -147,7 +147,7 @@ def test_walk_without_a_board_takes_the_usual_one_and_says_so(monkeypatch: pytes
 def test_script_shoots_every_position_then_solves(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
     monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", lambda _s: None)
-    monkeypatch.setattr(calibrate, "_client", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
     result = run("run", *BOARD_OPTIONS, "--scripted", "--position", "pose 1", "--activate", "--exposure-s", "0.02",
                  "--board-shape", "bowed")  # fmt: skip
     assert result.exit_code == 0, result.output

@@ -71,7 +71,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
 
     monkeypatch.setattr(
         calibrate,
-        "_client",
+        "client_of",
         lambda _url, _key: ServiceClient("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
     )
     return asked

@@ -47,7 +47,7 @@ def reached(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     def client(_url: str, _key_file: Path | None) -> ServiceClient:
         return ServiceClient("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
 
-    monkeypatch.setattr(schedule, "_client", client)
+    monkeypatch.setattr(schedule, "client_of", client)
     yield
     for each in kept(service):
         service.delete(each["links"]["self"])
