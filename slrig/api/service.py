@@ -23,8 +23,7 @@ from slrig.sessions.calibration.calibrating import Calibrations
 from slrig.sessions.calibration.retention import Retention
 from slrig.sessions.calibration.tools import CalibrationTools
 from slrig.sessions.calibration.tools import calibration_tools as usual_calibration_tools
-from slrig.sessions.health.verification import VerificationDesk, VerificationTools
-from slrig.sessions.health.verification import verification_tools as usual_verification_tools
+from slrig.sessions.health.verification import VerificationDesk, verification_tools
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
@@ -87,7 +86,6 @@ def assembled_service(
     *,
     rig_name: str,
     calibration_tools: CalibrationTools | None = None,
-    verification_tools: VerificationTools | None = None,
     refuse_when_stale: bool = False,
 ) -> Service:
     """A service of what scans, and of the rest made to go with it. Nothing is started but what sends notices.
@@ -111,9 +109,7 @@ def assembled_service(
     schedules = ScheduleStore(folder.database)
     notices = Notices(settings.webhook_url, rig=rig_name)
     health = NoticedHealth(folder.database, notices)
-    verifications = VerificationDesk(
-        folder, lender, health, tools=verification_tools or usual_verification_tools(worker), spare_bytes=spare_bytes
-    )
+    verifications = VerificationDesk(folder, lender, health, tools=verification_tools(worker), spare_bytes=spare_bytes)
     runner.watch_health(verifications)
     acceptance = AcceptanceDesk(
         folder,

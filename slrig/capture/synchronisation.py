@@ -28,6 +28,7 @@ _FRAMES_AFTER = 3
 _GONE = 0.9
 _FLASHES_PER_TRIAL = 8
 _TRIES = 3
+_TIMEOUT_S = 2.0  # of one frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +80,6 @@ def measure_latency(
     search_s: float = USUAL_SEARCH_S,
     exposure_s: float | None = None,
     trigger: Trigger | None = None,
-    timeout_s: float = 2.0,
-    seed: int = 0,
     cancelled: Callable[[], bool] = lambda: False,
     told: Callable[[str, float, str], None] = lambda _stage, _fraction, _detail: None,
 ) -> LatencyMeasurement:
@@ -98,8 +97,6 @@ def measure_latency(
         Exposure for the test; that of the rig's settings if absent. Longer exposures see more flashes as they happen.
     trigger
         How exposures are started; absent, freely running cameras are preferred: they watch while the projector works.
-    seed
-        Of the random moments.
 
     Raises
     ------
@@ -123,8 +120,8 @@ def measure_latency(
                 camera.configure(settings if exposure_s is None else replace(settings, exposure_s=exposure_s))
             elif exposure_s is not None:
                 camera.configure(CameraSettings(exposure_s))
-            test = _FlashTest(rig, name, camera, _trigger(name, camera, trigger), search_s, timeout_s, cancelled)
-            rng = np.random.default_rng((seed, index))
+            test = _FlashTest(rig, name, camera, _trigger(name, camera, trigger), search_s, cancelled)
+            rng = np.random.default_rng((0, index))
             try:
                 measured[name] = test.run(trials, rng, told)
             finally:
@@ -165,7 +162,6 @@ class _FlashTest:
     camera: Camera
     trigger: Trigger
     search_s: float
-    timeout_s: float
     cancelled: Callable[[], bool]
     least_error_ns: int = 2**62
     period_ns: int = 0
@@ -256,4 +252,4 @@ class _FlashTest:
         return self._read(after_ns)
 
     def _read(self, after_ns: int) -> Frame:
-        return self.camera.read(after_ns, self.timeout_s)
+        return self.camera.read(after_ns, _TIMEOUT_S)

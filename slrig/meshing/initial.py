@@ -16,6 +16,8 @@ from slrig.meshing.topology import component_sizes
 from slrig.model import FloatArray, IntArray
 
 _BLOCK = 4096
+_SMALLEST_COMPONENT = 100
+"""Pieces of fewer connected triangles are dust: a few stripe points that agreed by chance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +56,12 @@ def initial_mesh(
     widest_step_px: float,
     depth_edge_ratio: float,
     keep_holes: bool,
-    smallest_component: int = 100,
     runs: IntArray | None = None,
 ) -> InitialMesh:
     """Mesh between neighbouring curves and drop what is no surface.
 
     points_mm : (n, 3) float64; offsets : (c + 1,) int32; position_px : (c,) float64; bridge_after : (n,) bool;
     sampling_mm : (n,) float64; eye_mm : (3,) float64, the camera that decides which side is the front.
-    smallest_component : pieces of fewer connected triangles are dust: a few stripe points that agreed by chance.
     runs : (s, 4) int32, the parts to be joined, as `slrig.meshing.runs.parts_of_curves` gives them; without them whole
     neighbouring curves are.
     """
@@ -73,7 +73,7 @@ def initial_mesh(
         points_mm, everything, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
     )
     connected = ~drop.any
-    kept = component_sizes(everything, connected) >= max(smallest_component, 1)
+    kept = component_sizes(everything, connected) >= _SMALLEST_COMPONENT
     areas_mm2 = np.zeros(-(-len(everything) // _BLOCK))
     in_bands(_facing_areas, len(areas_mm2), np.ascontiguousarray(points_mm), everything, kept, eye_mm, areas_mm2)
     count = int(np.count_nonzero(kept))

@@ -14,6 +14,7 @@ from slrig.meshing.search_tree import SearchTree
 from slrig.meshing.topology import degenerate_faces, topology_counts
 from slrig.model import FloatArray, IntArray, Mesh, Surface
 
+_MESH_SAMPLES = 200_000
 _VISIBLE_SAMPLES = 60_000
 _FACES_AT_ONCE = 200_000
 _GROSS_MM = 1.0
@@ -110,9 +111,6 @@ def score(
     surface: Surface,
     visible_points_mm: NDArray[np.floating[Any]],
     eye_mm: FloatArray,
-    *,
-    sample_count: int = 200_000,
-    seed: int = 0,
 ) -> TruthScore:
     """The error of `mesh` against the true `surface`, all in one world frame.
 
@@ -122,18 +120,16 @@ def score(
     ----------
     visible_points_mm : (n, 3), points of the true surface that the camera sees and the projector lights.
     eye_mm : (3,), the camera's centre of projection.
-    sample_count : points on the mesh.
-    seed : of the points on the mesh and of the rays that count layers.
     """
     vertices, faces = _welded(np.asarray(mesh.vertices_mm, dtype=np.float64), mesh.faces)
     collapsed = degenerate_faces(faces)
     faces = np.ascontiguousarray(faces[~collapsed])
     area_mm2, facing = _areas_and_facing(vertices, faces, eye_mm)
     counts = topology_counts(faces)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
 
     truth = SearchTree.over(surface.vertices_mm, surface.faces)
-    error_mm = truth.distances_mm(_points_on(vertices, faces, area_mm2, sample_count, random))
+    error_mm = truth.distances_mm(_points_on(vertices, faces, area_mm2, _MESH_SAMPLES, random))
     found = SearchTree.over(vertices, faces)
     near = error_mm < _GROSS_MM
     p50, p95, p99 = np.percentile(error_mm, (50, 95, 99)) if len(error_mm) else (np.nan, np.nan, np.nan)
@@ -225,11 +221,6 @@ def _error_over_sigma(mesh: Mesh, truth: SearchTree) -> float:
     if not stated.any():
         return float(np.nan)
     return float(np.percentile(error_mm[stated] / mesh.sigma_mm[stated], _ONE_SIGMA_PERCENT))
-
-
-def _areas_mm2(corners_mm: FloatArray) -> FloatArray:
-    normals = np.cross(corners_mm[:, 1] - corners_mm[:, 0], corners_mm[:, 2] - corners_mm[:, 0])
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", normals, normals)) / 2)
 
 
 def _share(true_where: NDArray[np.bool_]) -> float:

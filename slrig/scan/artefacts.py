@@ -66,11 +66,6 @@ def write_converted(folder: Path, name: str) -> None:
     write_file(folder / name, ON_REQUEST[name](decode_mesh_ply(data)))
 
 
-def write_points(curves: PointCurves, path: Path, *, sigma_calibration_mm: FloatArray | None = None) -> None:
-    """Write the points of `curves` as PLY; sigma_calibration_mm as for `encode_points_ply`. Raises StorageError."""
-    write_file(path, encode_points_ply(curves, sigma_calibration_mm=sigma_calibration_mm))
-
-
 def write_report(report: Mapping[str, object], path: Path) -> None:
     """Write a report as JSON, keys in the order given. Numbers that are not finite become null.
 

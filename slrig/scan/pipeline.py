@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle import read_truth
 from slrig.bundle.health import read_health
+from slrig.bundle.storage import write_file
 from slrig.errors import ScanCancelledError
 from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
@@ -24,7 +25,7 @@ from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, 
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
-from slrig.scan.artefacts import write_mesh, write_points, write_report
+from slrig.scan.artefacts import encode_points_ply, write_mesh, write_report
 from slrig.scan.calibration_report import calibration_report
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.feed import FedFrames
@@ -114,7 +115,8 @@ def reconstruct_bundle(
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
-        write_points(meshed.curves, staging / "points.ply", sigma_calibration_mm=meshed.share_mm)
+        points = encode_points_ply(meshed.curves, sigma_calibration_mm=meshed.share_mm)
+        write_file(staging / "points.ply", points)
         write_mesh(mesh, staging, sigma_calibration_mm=meshed.mesh_share_mm)
         entered("pictures", 0.85, "")
         _write_pictures(mesh, cameras, staging)

@@ -44,7 +44,6 @@ class Notices:
         *,
         rig: str,
         clock: Clock = utc_now,
-        timeout_s: float = TIMEOUT_S,
         most: int = MOST_WAITING,
     ) -> None:
         self._url = url
@@ -52,7 +51,6 @@ class Notices:
         self._host = None if url is None else urlsplit(url).hostname
         self._rig = rig
         self._clock = clock
-        self._timeout_s = timeout_s
         self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue(most)
         self._sender: threading.Thread | None = None
         if url is not None:
@@ -131,7 +129,7 @@ class Notices:
         # Loaded by those who use it.
         import httpx2
 
-        with httpx2.Client(timeout=self._timeout_s, follow_redirects=False) as client:
+        with httpx2.Client(timeout=TIMEOUT_S, follow_redirects=False) as client:
             while (notice := self._waiting.get()) is not None:
                 try:
                     status = client.post(url, json=notice).status_code

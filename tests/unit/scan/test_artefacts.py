@@ -25,7 +25,6 @@ from slrig.scan.artefacts import (
     encode_points_ply,
     write_converted,
     write_mesh,
-    write_points,
     write_report,
 )
 from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
@@ -152,7 +151,7 @@ def test_formats_that_are_made_on_request_are_offered() -> None:
 
 def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:
     curves = example_curves()
-    write_points(curves, tmp_path / "points.ply")
+    (tmp_path / "points.ply").write_bytes(encode_points_ply(curves))
     found = load(tmp_path / "points.ply")
     data = found.metadata["_ply_raw"]["vertex"]["data"]
     assert found.vertices == pytest.approx(curves.points_mm, rel=1e-6)
