@@ -153,27 +153,19 @@ def fetch_bundle(request: Request, service: Serving, scan_id: UUID, known: Known
     return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)
 
 
-class _Outlet:
+class _Outlet(bytearray):
     """A file that only grows: what was written is taken out as it comes."""
 
-    def __init__(self) -> None:
-        self._waiting = bytearray()
-        self._offset = 0
-
     def write(self, data: bytes) -> int:
-        self._waiting += data
-        self._offset += len(data)
+        self.extend(data)
         return len(data)
-
-    def tell(self) -> int:
-        return self._offset
 
     def flush(self) -> None:
         """Nothing is held back."""
 
     def take(self) -> bytes:
-        taken = bytes(self._waiting)
-        self._waiting.clear()
+        taken = bytes(self)
+        self.clear()
         return taken
 
 
@@ -183,7 +175,7 @@ def zipped(folder: Path) -> Iterator[bytes]:
     The same files give the same bytes: names are sorted, and all times are the zip format's first.
     """
     outlet = _Outlet()
-    with zipfile.ZipFile(outlet, "w") as archive:  # type: ignore[call-overload] # write, tell and flush are enough
+    with zipfile.ZipFile(outlet, "w") as archive:  # type: ignore[call-overload] # write and flush are enough
         for path in sorted(folder.rglob("*")):
             if not path.is_file():
                 continue
