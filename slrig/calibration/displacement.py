@@ -12,8 +12,6 @@ camera alone has no third measurement: there r · X = m with the viewing ray r, 
 Where several cameras see the light of one projector pixel, a scan takes the mean of their points, weighted by inverse
 variance; with equal noise in all of them the weight is the square of how far a camera sees the point move, in pixels,
 when it moves along the projector's ray.
-
-Lenses are Brown's (1966), in OpenCV's order.
 """
 
 from __future__ import annotations
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 
 from slrig.calibration.solution import PARAMETERS
 from slrig.model import Axis, FloatArray, Pinhole, told_depth, triangulated_axis
+from slrig.model.lens import by_terms, distorted
 
 _EACH = len(PARAMETERS)
 
@@ -158,42 +157,26 @@ def _projected(device: Pinhole, points_mm: FloatArray) -> _Projected:
     before = z > 0
     z = np.where(before, z, np.nan)
     x, y = x / z, y / z
-    k1, k2, p1, p2, k3 = device.distortion
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
-    bent = np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
-        axis=1,
-    )
-    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    by_x = np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, cross], axis=1)
-    by_y = np.stack([cross, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=1)
+    xd, yd, xx, xy, yy = distorted(device.distortion, x, y)
     matrix = device.matrix[:2, :2]
-    pixel = bent @ matrix.T + device.matrix[:2, 2]
-    by_normalised = matrix @ np.stack([by_x, by_y], axis=2)
+    pixel = np.stack([xd, yd], axis=1) @ matrix.T + device.matrix[:2, 2]
+    by_normalised = matrix @ np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     perspective = np.zeros((len(x), 2, 3))
     perspective[:, 0, 0] = perspective[:, 1, 1] = 1 / z
     perspective[:, 0, 2], perspective[:, 1, 2] = -x / z, -y / z
     by_device = by_normalised @ perspective
     by = np.zeros((len(x), 2, _EACH))
-    by[:, 0, 0], by[:, 1, 1] = bent[:, 0], bent[:, 1]
+    by[:, 0, 0], by[:, 1, 1] = xd, yd
     by[:, 0, 2] = by[:, 1, 3] = 1
-    lens = [
-        np.stack([x * r2, y * r2], axis=1),
-        np.stack([x * r2**2, y * r2**2], axis=1),
-        np.stack([2 * x * y, r2 + 2 * y * y], axis=1),
-        np.stack([r2 + 2 * x * x, 2 * x * y], axis=1),
-        np.stack([x * r2**3, y * r2**3], axis=1),
-    ]
-    by[:, :, 4:9] = matrix @ np.stack(lens, axis=2)
+    for row in range(2):
+        by[:, row, 4:9] = np.stack(by_terms(matrix[row, 0], matrix[row, 1], x, y), axis=1)
     # R' X = R X + turn x (R X).
     by[:, :, 9:12] = np.cross(turned[:, None, :], by_device)
     by[:, :, 12:15] = by_device
     inside = before & (pixel > -0.5).all(axis=1)
     inside &= (pixel[:, 0] < device.size.width_px - 0.5) & (pixel[:, 1] < device.size.height_px - 0.5)
     # Beyond the radius at which its distortion turns back a lens sees nothing, whatever the polynomial says there.
-    inside &= by_x[:, 0] * by_y[:, 1] - cross * cross > 0
+    inside &= xx * yy - xy * xy > 0
     return _Projected(pixel, by_device @ device.rotation, by, inside)
 
 

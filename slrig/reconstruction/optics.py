@@ -1,7 +1,7 @@
-"""Pinhole optics with Brown distortion, for kernels: pixels to rays and points to pixels (Brown 1966; OpenCV's order).
+"""Pinholes with a lens (`slrig.model.lens`), for kernels: pixels to rays and points to pixels.
 
 A device is passed to kernels as one flat array (22,) float64:
-fx, skew, cx, fy, cy, k1, k2, p1, p2, k3, then the rotation row by row and the translation.
+fx, skew, cx, fy, cy, the lens's k1, k2, p1, p2, k3, then the rotation row by row and the translation.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, Pinhole
+from slrig.model.lens_kernels import distorted, undistorted
 
 _POINTS = 1024  # that are worth calling a kernel for
-_UNDISTORT_STEPS = 30
-_CONVERGED = 1e-7  # of a step of Newton's method, which leaves about the square of it
+_SETTLED = 1e-7  # of normalised coordinates
 
 
 def packed(device: Pinhole) -> FloatArray:
@@ -50,32 +50,9 @@ def to_depths(device: Pinhole, points_mm: FloatArray) -> FloatArray:
     return np.asarray(points_mm @ device.rotation[2] + device.translation_mm[2])
 
 
-@kernel_part(inline="always")
-def distort(d: Any, x: float, y: float) -> Any:
-    """Distorted normalised coordinates and their Jacobian: xd, yd, ∂xd/∂x, ∂xd/∂y, ∂yd/∂x, ∂yd/∂y."""
-    k1, k2, p1, p2, k3 = d[5], d[6], d[7], d[8], d[9]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # ∂radial/∂r²
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    return (
-        xd,
-        yd,
-        radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
-        cross,
-        cross,
-        radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
-    )
-
-
 @kernel_part
 def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
-    """Undistorted normalised coordinates of a pixel, by Newton's method on the distortion.
-
-    NaN for a pixel that the lens cannot light: beyond the radius where its distortion turns back there is no direction.
-    """
+    """Undistorted normalised coordinates of a pixel, NaN for one that the lens cannot light."""
     yd = (v - d[4]) / d[3]
     return normalised_near(d, u, v, (u - d[2] - d[1] * yd) / d[0], yd)
 
@@ -84,19 +61,7 @@ def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
 def normalised_near(d: Any, u: float, v: float, x: float, y: float) -> Any:
     """As `normalised_from_pixel`, from a start: coordinates that are known to be near."""
     yd = (v - d[4]) / d[3]
-    xd = (u - d[2] - d[1] * yd) / d[0]
-    for _ in range(_UNDISTORT_STEPS):
-        gx, gy, a, b, c, e = distort(d, x, y)
-        det = a * e - b * c
-        if not det > 0:
-            break
-        scale = 1 / det
-        dx, dy = (e * (xd - gx) - b * (yd - gy)) * scale, (a * (yd - gy) - c * (xd - gx)) * scale
-        x += dx
-        y += dy
-        if dx * dx + dy * dy < _CONVERGED * _CONVERGED:
-            return x, y
-    return np.nan, np.nan
+    return undistorted(d[5:10], (u - d[2] - d[1] * yd) / d[0], yd, x, y, _SETTLED)
 
 
 @kernel_part
@@ -128,6 +93,6 @@ def _project_kernel(first: int, last: int, d: Any, points: Any, out: Any) -> Non
     for i in range(first, last):
         px, py, pz = to_device(d, points[i, 0], points[i, 1], points[i, 2])
         if pz > 0:
-            xd, yd, _, _, _, _ = distort(d, px / pz, py / pz)
+            xd, yd, _, _, _ = distorted(d[5:10], px / pz, py / pz)
             out[i, 0] = d[0] * xd + d[1] * yd + d[2]
             out[i, 1] = d[3] * yd + d[4]

@@ -13,7 +13,8 @@ import numpy as np
 
 from slrig.kernels import kernel_part
 from slrig.model import DEVICE_PARAMETERS
-from slrig.reconstruction.optics import distort, to_device
+from slrig.model.lens_kernels import by_terms, distorted
+from slrig.reconstruction.optics import to_device
 
 
 @kernel_part
@@ -21,9 +22,9 @@ def gradient(d: Any, a: float, b: float, x: float, y: float, z: float, out: Any)
     """Fill out (3,) with ∂(a u + b v)/∂X, X in the world."""
     xc, yc, zc = to_device(d, x, y, z)
     xn, yn = xc / zc, yc / zc
-    _, _, xx, xy, yx, yy = distort(d, xn, yn)
+    _, _, xx, xy, yy = distorted(d[5:10], xn, yn)
     by_x, by_y = a * d[0], a * d[1] + b * d[3]
-    gx, gy = (by_x * xx + by_y * yx) / zc, (by_x * xy + by_y * yy) / zc
+    gx, gy = (by_x * xx + by_y * xy) / zc, (by_x * xy + by_y * yy) / zc
     gz = -(gx * xn + gy * yn)
     for k in range(3):
         out[k] = d[10 + k] * gx + d[13 + k] * gy + d[16 + k] * gz
@@ -34,20 +35,19 @@ def add_parameters(d: Any, a: float, b: float, x: float, y: float, z: float, out
     """Add the derivatives of a u + b v by the device's 15 parameters to out (15,)."""
     xc, yc, zc = to_device(d, x, y, z)
     xn, yn = xc / zc, yc / zc
-    xd, yd, xx, xy, yx, yy = distort(d, xn, yn)
+    xd, yd, xx, xy, yy = distorted(d[5:10], xn, yn)
     by_x, by_y = a * d[0], a * d[1] + b * d[3]
-    r2 = xn * xn + yn * yn
     out[0] += a * xd
     out[1] += b * yd
     out[2] += a
     out[3] += b
-    radial = (by_x * xn + by_y * yn) * r2
-    out[4] += radial
-    out[5] += radial * r2
-    out[6] += by_x * 2 * xn * yn + by_y * (r2 + 2 * yn * yn)
-    out[7] += by_x * (r2 + 2 * xn * xn) + by_y * 2 * xn * yn
-    out[8] += radial * r2 * r2
-    gx, gy = (by_x * xx + by_y * yx) / zc, (by_x * xy + by_y * yy) / zc
+    k1, k2, p1, p2, k3 = by_terms(by_x, by_y, xn, yn)
+    out[4] += k1
+    out[5] += k2
+    out[6] += p1
+    out[7] += p2
+    out[8] += k3
+    gx, gy = (by_x * xx + by_y * xy) / zc, (by_x * xy + by_y * yy) / zc
     gz = -(gx * xn + gy * yn)
     # R' X = R X + turn x (R X).
     wx, wy, wz = xc - d[19], yc - d[20], zc - d[21]
@@ -65,10 +65,10 @@ def pixel_squares(d: Any, size: Any, x: float, y: float, z: float, direction: An
     xc, yc, zc = to_device(d, x, y, z)
     if zc <= 0:
         return 0.0
-    xd, yd, xx, xy, yx, yy = distort(d, xc / zc, yc / zc)
+    xd, yd, xx, xy, yy = distorted(d[5:10], xc / zc, yc / zc)
     u, v = d[0] * xd + d[1] * yd + d[2], d[3] * yd + d[4]
     # Beyond the radius at which its distortion turns back a lens sees nothing.
-    if not (-0.5 < u < size[0] - 0.5 and -0.5 < v < size[1] - 0.5 and xx * yy - xy * yx > 0):
+    if not (-0.5 < u < size[0] - 0.5 and -0.5 < v < size[1] - 0.5 and xx * yy - xy * xy > 0):
         return 0.0
     total = 0.0
     for k in range(2):

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import Axis, Pinhole, Refusal, Source
+from slrig.model.lens_kernels import distorted
 from slrig.reconstruction.epipolar import runs_down
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.optics import (
-    distort,
     normalised_from_pixel,
     normalised_near,
     packed,
@@ -104,11 +104,11 @@ def _position(p: Any, x: float, y: float, z: float, row: bool) -> Any:
     """Projector position of a world point along the coded axis, and along the other one; z_p tells behind."""
     xp, yp, zp = to_device(p, x, y, z)
     xn, yn = xp / zp, yp / zp
-    xd, yd, a, b, c, e = distort(p, xn, yn)
+    xd, yd, a, b, c = distorted(p[5:10], xn, yn)
     u, v = p[0] * xd + p[1] * yd + p[2], p[3] * yd + p[4]
     if row:
-        return v, u, zp, xn, yn, p[3] * c, p[3] * e
-    return u, v, zp, xn, yn, p[0] * a + p[1] * c, p[0] * b + p[1] * e
+        return v, u, zp, xn, yn, p[3] * b, p[3] * c
+    return u, v, zp, xn, yn, p[0] * a + p[1] * b, p[0] * b + p[1] * c
 
 
 @kernel_part
@@ -174,10 +174,10 @@ def _sheet_kernel(
             along[i] = v
             # On the same sheet, for a stripe found a little aside: position(o + s d) stays, so along with the ray's
             # direction its depth changes by ds = -s ∇position · dd / ∇position · d.
-            _, _, a, b, c, e = distort(camera, x, y)
-            fx, fy = 1 / (camera[0] * (a * e - b * c)), 1 / (camera[3] * (a * e - b * c))
+            _, _, a, b, c = distorted(camera[5:10], x, y)
+            fx, fy = 1 / (camera[0] * (a * c - b * b)), 1 / (camera[3] * (a * c - b * b))
             skew = camera[1] / camera[0]
-            dxu, dxv, dyu, dyv = e * fx, -(b + e * skew) * fy, -c * fx, (a + c * skew) * fy
+            dxu, dxv, dyu, dyv = c * fx, -(b + c * skew) * fy, -b * fx, (a + b * skew) * fy
             dx, dy = dxu * normals[i, 0] + dxv * normals[i, 1], dyu * normals[i, 0] + dyv * normals[i, 1]
             along_d = across_d = 0.0
             for k in range(3):

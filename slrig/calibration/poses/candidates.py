@@ -14,6 +14,7 @@ from slrig.calibration.poses.light_view import within
 from slrig.calibration.poses.rough import DeviceGuess
 from slrig.calibration.solution import BoardPose
 from slrig.model import FloatArray
+from slrig.model.lens import distorted
 
 TILT_DEG = 30.0
 """Where a tilt tells most per corner that is lost to blur: the middle of what is wanted."""
@@ -77,17 +78,13 @@ def board_rotation(tilt_deg: tuple[float, float], turn_deg: float) -> FloatArray
 
 
 def projected(guess: DeviceGuess, space_mm: FloatArray) -> FloatArray:
-    """Return (..., 2) float64: where points (..., 3) of a device's frame fall, Brown's model; NaN behind the device.
+    """Return (..., 2) float64: where points (..., 3) of a device's frame fall; NaN behind the device.
 
     All candidates at once, which OpenCV's own function takes one call each for.
     """
     depth = np.where(space_mm[..., 2] > 0, space_mm[..., 2], np.nan)
     x, y = space_mm[..., 0] / depth, space_mm[..., 1] / depth
-    k1, k2, p1, p2 = guess.distortion[:4]
-    square = x * x + y * y
-    radial = 1 + square * (k1 + square * k2)
-    across = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-    down = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+    across, down, _, _, _ = distorted(guess.distortion, x, y)
     matrix = guess.matrix
     return np.stack([matrix[0, 0] * across + matrix[0, 2], matrix[1, 1] * down + matrix[1, 2]], axis=-1)
 

@@ -25,12 +25,13 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from slrig.calibration.solution import Bow, DeviceResiduals
 from slrig.calibration.solving.adjustment import Prior, adjusted, kept_of, normal_equations, weights_of
 from slrig.calibration.solving.deviations import deviations_of
-from slrig.calibration.solving.parameters import LENS_TERMS, difference
+from slrig.calibration.solving.parameters import difference
 from slrig.calibration.solving.problem import Fit, Problem, Terms, free_of
 from slrig.calibration.solving.projection import BEND, DEVICE
 from slrig.calibration.solving.shape import bow_of
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray
+from slrig.model.lens import LENS_TERMS
 
 LEAST_KNOWN = 0.05
 """The greatest deviation of a focal length, over it, with which a calibration still is one."""

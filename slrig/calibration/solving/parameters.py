@@ -17,7 +17,6 @@ from slrig.calibration.solution import PARAMETERS, BoardPose
 from slrig.calibration.solving.projection import BEND, DEVICE, POSE
 from slrig.model import FloatArray, Pinhole, Size
 
-LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 _FIRST_LENS = PARAMETERS.index("k1")
 _FIRST_TURN = PARAMETERS.index("turn_x")
 

@@ -1,7 +1,7 @@
 """Where corners and light fall for given devices and poses, with analytic Jacobians, for kernels.
 
 A device is a row of 21: fx, fy, cx, cy, k1, k2, p1, p2, k3, its rotation row by row, its translation (mm): world to
-device. A pose is a row of 12: rotation and translation, board to world. Lenses are Brown's (1966), in OpenCV's order.
+device. A pose is a row of 12: rotation and translation, board to world. Lenses are those of `slrig.model.lens`.
 
 The board's surface is (x, y, z(x, y)), z a polynomial of the second and third degree (`bend`, mm) in coordinates that
 are centred and divided by half the board's extent (`frame`: centre x, centre y, that half). It is 0 for a flat board.
@@ -22,12 +22,13 @@ import numpy as np
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray
+from slrig.model.lens_kernels import by_terms, distorted, undistorted
 
 DEVICE, POSE, BEND = 15, 6, 7
 CORNER_TERMS = DEVICE + POSE + 2 + BEND
 LIGHT_TERMS = 2 * DEVICE + POSE + BEND
 _STEPS = 30
-_SETTLED = 1e-12
+_SETTLED = 1e-12  # of normalised coordinates
 _SHARED = 20_000
 
 
@@ -88,40 +89,6 @@ def weighed_blocks(
 
 
 @kernel_part(inline="always")
-def distorted(d: Any, x: float, y: float) -> Any:
-    """Distorted coordinates and their derivatives: xd, yd, ∂xd/∂x, ∂xd/∂y = ∂yd/∂x, ∂yd/∂y."""
-    k1, k2, p1, p2, k3 = d[4], d[5], d[6], d[7], d[8]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
-        2 * x * y * slope + 2 * p1 * x + 2 * p2 * y,
-        radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
-    )
-
-
-@kernel_part
-def undistorted(d: Any, u: float, v: float) -> Any:
-    """Normalised coordinates of a pixel by Newton's method; NaN where the lens sends no light."""
-    xd, yd = (u - d[2]) / d[0], (v - d[3]) / d[1]
-    x, y = xd, yd
-    for _ in range(_STEPS):
-        gx, gy, a, b, c = distorted(d, x, y)
-        det = a * c - b * b
-        if not det > 0:
-            break
-        dx, dy = (c * (xd - gx) - b * (yd - gy)) / det, (a * (yd - gy) - b * (xd - gx)) / det
-        x += dx
-        y += dy
-        if dx * dx + dy * dy < _SETTLED * _SETTLED:
-            return x, y
-    return np.nan, np.nan
-
-
-@kernel_part(inline="always")
 def _height(bend: Any, frame: Any, x: float, y: float, basis: Any) -> Any:
     """The surface's height, and its slopes, at board coordinates; fills the bend's basis (7,)."""
     s = 1 / frame[2]
@@ -163,19 +130,15 @@ def _device_row(d: Any, row: bool, x: float, y: float, z: float, w: Any, out: An
     (x, y, z) : the point in the device; w : the point turned into the device, before its translation.
     """
     xn, yn = x / z, y / z
-    xd, yd, a, b, c = distorted(d, xn, yn)
-    r2 = xn * xn + yn * yn
+    xd, yd, a, b, c = distorted(d[4:9], xn, yn)
     if row:
-        f, by_x, by_y = d[1], d[1] * b, d[1] * c
+        by_x, by_y = d[1] * b, d[1] * c
         out[0], out[1], out[2], out[3] = 0.0, yd, 0.0, 1.0
-        out[6], out[7] = f * (r2 + 2 * yn * yn), f * 2 * xn * yn
-        radial = f * yn
+        out[4], out[5], out[6], out[7], out[8] = by_terms(0.0, d[1], xn, yn)
     else:
-        f, by_x, by_y = d[0], d[0] * a, d[0] * b
+        by_x, by_y = d[0] * a, d[0] * b
         out[0], out[1], out[2], out[3] = xd, 0.0, 1.0, 0.0
-        out[6], out[7] = f * 2 * xn * yn, f * (r2 + 2 * xn * xn)
-        radial = f * xn
-    out[4], out[5], out[8] = radial * r2, radial * r2 * r2, radial * r2 * r2 * r2
+        out[4], out[5], out[6], out[7], out[8] = by_terms(d[0], 0.0, xn, yn)
     gx, gy = by_x / z, by_y / z
     gz = -(gx * xn + gy * yn)
     out[9], out[10], out[11] = w[1] * gz - w[2] * gy, w[2] * gx - w[0] * gz, w[0] * gy - w[1] * gx
@@ -198,7 +161,7 @@ def _corner_kernel(
         x, y, z = w[0] + d[18], w[1] + d[19], w[2] + d[20]
         if not z > 0:
             continue
-        xd, yd, _, _, _ = distorted(d, x / z, y / z)
+        xd, yd, _, _, _ = distorted(d[4:9], x / z, y / z)
         residual[i, 0] = d[0] * xd + d[2] - measured[i, 0]
         residual[i, 1] = d[1] * yd + d[3] - measured[i, 1]
         if not jacobian:
@@ -239,7 +202,8 @@ def _light_kernel(
     basis = np.zeros(BEND)
     for i in range(first, last):
         c, p, row = devices[where[i, 0]], poses[where[i, 1]], where[i, 2] == 1
-        xn, yn = undistorted(c, pixels[i, 0], pixels[i, 1])
+        cxd, cyd = (pixels[i, 0] - c[2]) / c[0], (pixels[i, 1] - c[3]) / c[1]
+        xn, yn = undistorted(c[4:9], cxd, cyd, cxd, cyd, _SETTLED)
         d = _turned_back(c, 9, xn, yn, 1.0)
         o = _turned_back(c, 9, -c[18], -c[19], -c[20])
         in_board = _turned_back(p, 0, o[0] - p[9], o[1] - p[10], o[2] - p[11])
@@ -251,7 +215,7 @@ def _light_kernel(
         x, y, z = w[0] + projector[18], w[1] + projector[19], w[2] + projector[20]
         if not z > 0:
             continue
-        xd, yd, _, _, _ = distorted(projector, x / z, y / z)
+        xd, yd, _, _, _ = distorted(projector[4:9], x / z, y / z)
         got = projector[1] * yd + projector[3] if row else projector[0] * xd + projector[2]
         residual[i] = got - positions[i]
         if not jacobian:
@@ -263,7 +227,7 @@ def _light_kernel(
         share = (gw[0] * d[0] + gw[1] * d[1] + gw[2] * d[2]) / (n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
         # What a shift of the ray does, in the camera: h = R_c (g - share n).
         h = _turned(c, 9, gw[0] - share * n[0], gw[1] - share * n[1], gw[2] - share * n[2])
-        _ray_row(c, pixels[i, 0], pixels[i, 1], xn, yn, s, h, out)
+        _ray_row(c, cxd, cyd, xn, yn, s, h, out)
         qx, qy, qz = px - p[9], py - p[10], pz - p[11]
         out[30], out[31] = share * (qy * n[2] - qz * n[1]), share * (qz * n[0] - qx * n[2])
         out[32] = share * (qx * n[1] - qy * n[0])
@@ -273,19 +237,15 @@ def _light_kernel(
 
 
 @kernel_part
-def _ray_row(c: Any, u: float, v: float, xn: float, yn: float, s: float, h: Any, out: Any) -> None:
+def _ray_row(c: Any, xd: float, yd: float, xn: float, yn: float, s: float, h: Any, out: Any) -> None:
     """Derivatives by the 15 parameters of the camera that a ray comes from; h : gradient in the camera."""
-    _, _, a, b, e = distorted(c, xn, yn)
+    _, _, a, b, e = distorted(c[4:9], xn, yn)
     det = a * e - b * b
     # d(x, y) = J⁻¹ (d(xd, yd) - ∂distorted/∂k dk), and the gradient by (x, y) is s h.
     gx, gy = s * (e * h[0] - b * h[1]) / det, s * (a * h[1] - b * h[0]) / det
-    r2 = xn * xn + yn * yn
-    radial = gx * xn + gy * yn
-    out[0], out[1] = -gx * (u - c[2]) / (c[0] * c[0]), -gy * (v - c[3]) / (c[1] * c[1])
+    out[0], out[1] = -gx * xd / c[0], -gy * yd / c[1]
     out[2], out[3] = -gx / c[0], -gy / c[1]
-    out[4], out[5], out[8] = -radial * r2, -radial * r2 * r2, -radial * r2 * r2 * r2
-    out[6] = -(gx * 2 * xn * yn + gy * (r2 + 2 * yn * yn))
-    out[7] = -(gx * (r2 + 2 * xn * xn) + gy * 2 * xn * yn)
+    out[4], out[5], out[6], out[7], out[8] = by_terms(-gx, -gy, xn, yn)
     qx, qy, qz = s * xn - c[18], s * yn - c[19], s - c[20]
     out[9], out[10], out[11] = h[1] * qz - h[2] * qy, h[2] * qx - h[0] * qz, h[0] * qy - h[1] * qx
     out[12], out[13], out[14] = -h[0], -h[1], -h[2]

@@ -14,10 +14,8 @@ from slrig.calibration.board import Board
 from slrig.calibration.poses.coverage import attitude
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, BoardPose, DeviceResiduals
 from slrig.model import Calibration, FloatArray, Pinhole, Size
+from slrig.model.lens import LENS_TERMS
 from slrig.sessions.calibration.solving import CalibrationResult
-
-LENS = ("k1", "k2", "p1", "p2", "k3")
-"""The terms of Brown's distortion, in the order of `Pinhole.distortion`."""
 
 _INNER = PARAMETERS[:9]
 _TURN = slice(9, 12)
@@ -117,14 +115,14 @@ def device_figures(result: CalibrationResult) -> tuple[DeviceFigures, ...]:
     found = []
     for name, device, place in _placed(result.calibration):
         covariance = result.solution.covariance[place, place]
-        terms = tuple(term for term in LENS if term in result.solution.distortion.get(name, ()))
+        terms = tuple(term for term in LENS_TERMS if term in result.solution.distortion.get(name, ()))
         numbers = [device.matrix[0, 0], device.matrix[1, 1], device.matrix[0, 2], device.matrix[1, 2]]
         numbers += device.distortion.tolist()
         sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         values = {
             each: Figure(float(number), float(sigma))
             for each, number, sigma in zip(_INNER, numbers, sigmas, strict=False)
-            if each not in LENS or each in terms
+            if each not in LENS_TERMS or each in terms
         }
         found.append(
             DeviceFigures(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slrig.model import FloatArray, Pinhole, Size
-from slrig.reconstruction.optics import distort, packed, project, rays, to_depths
+from slrig.reconstruction.optics import project, rays, to_depths
 from tests.unit.reconstruction.builders import CAMERA, OTHER_CAMERA, PROJECTOR, opencv_pixels, opencv_rays
 
 DEVICES = pytest.mark.parametrize("device", [CAMERA, OTHER_CAMERA, PROJECTOR], ids=["camera", "other", "projector"])
@@ -63,23 +63,6 @@ def test_skew_shears_columns_by_rows_and_is_undone() -> None:
     expected[:, 0] += 12.5 * (straight[:, 1] - matrix[1, 2]) / matrix[1, 1]
     np.testing.assert_allclose(project(skewed, points), expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(rays(skewed, expected), opencv_rays(CAMERA, straight), rtol=0, atol=1e-12)
-
-
-def test_the_jacobian_of_distortion_is_its_slope() -> None:
-    strong = replace(CAMERA, distortion=np.array([-0.31, 0.17, 3e-3, -2e-3, 0.05]))
-    p = packed(strong)
-    h = 1e-6
-    for x, y in np.random.default_rng(7).uniform(-0.4, 0.4, (60, 2)):
-        _, _, *jacobian = distort(p, x, y)
-        across = np.subtract(distort(p, x + h, y)[:2], distort(p, x - h, y)[:2]) / (2 * h)
-        along = np.subtract(distort(p, x, y + h)[:2], distort(p, x, y - h)[:2]) / (2 * h)
-        # ∂xd/∂x, ∂xd/∂y, ∂yd/∂x, ∂yd/∂y
-        np.testing.assert_allclose(jacobian, [across[0], along[0], across[1], along[1]], rtol=0, atol=1e-9)
-
-
-def test_distortion_without_coefficients_is_the_identity() -> None:
-    plain = packed(replace(CAMERA, distortion=np.zeros(5)))
-    assert distort(plain, 0.31, -0.22) == (0.31, -0.22, 1.0, 0.0, 0.0, 1.0)
 
 
 def test_depth_is_the_third_device_coordinate() -> None:
