@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slrig.capture.checks import BAND_SAMPLES, BANDS, Chosen, Reference, Samples, rows_of, variation, worst_judged
 from slrig.capture.pair_checks import rougher
+from slrig.model.gray_code import Integers, gray_index, to_gray
 
 _CROSSINGS = 12
 _SPAN_PERIODS = 3
@@ -27,7 +27,7 @@ _AS_MUCH_TO_BLAME = 0.1
 class Code:
     """Gray code read at the sampled pixels. index : (n,) int64, cell index; sure : every bit is beyond doubt."""
 
-    index: NDArray[np.int64]
+    index: Integers
     sure: Chosen
     bits: int
 
@@ -36,9 +36,7 @@ def read_code(differences: Sequence[Samples], ref: Reference) -> Code:
     """Decode: one vector bit − inverse (or 2·bit − white − black) per bit, most significant first."""
     stack = np.stack(differences)
     sure = ref.lit & (np.abs(stack) > 0.2 * ref.contrast).all(axis=0)
-    parity = np.bitwise_xor.accumulate(stack > 0, axis=0)
-    weights = 2 ** np.arange(len(stack) - 1, -1, -1, dtype=np.int64)
-    return Code(np.asarray(weights @ parity.astype(np.int64)), sure, len(stack))
+    return Code(gray_index(stack > 0), sure, len(stack))
 
 
 def swapped_bit(code: Code) -> int | None:
@@ -56,7 +54,7 @@ def swapped_bit(code: Code) -> int | None:
         return None
     here, beside = here[sure], beside[sure]
     step = max(1.0, float(np.percentile(np.abs(here - beside), 75)))
-    words = (here ^ here >> 1) ^ (beside ^ beside >> 1)
+    words = to_gray(here) ^ to_gray(beside)
     for coarse in range(code.bits - 1):
         # Pairs whose most significant difference is this bit.
         crossing = words >> (code.bits - 1 - coarse) == 1

@@ -1,8 +1,7 @@
-"""The reflected binary (Gray) code of projector cells: patterns, and the way back from bits to positions.
+"""Patterns of Gray code, and the positions of its cells and of the edges between them.
 
-Position c (a projector column or row) lies in cell i = ⌊(c + offset)/cell⌋; the cell's code word is g = i ^ (i >> 1)
-(F. Gray, US patent 2 632 058, 1953). Neighbouring cells differ in exactly one bit, so a pixel that sees the edge
-between two cells can be wrong by one cell at most. Bit 0 is the most significant.
+Position c (a projector column or row) lies in cell i = ⌊(c + offset)/cell⌋, whose code word is that of
+`slrig.model.gray_code`. Bit 0 is the most significant.
 
 Six columns, three bits, most significant first:
 
@@ -16,40 +15,12 @@ Six columns, three bits, most significant first:
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slrig.errors import PatternError
 from slrig.model import Axis, FloatArray, Gray, Size
-
-Integers = NDArray[np.integer[Any]]
-
-
-def to_gray(index: ArrayLike) -> Integers:
-    """Code word g = i ^ (i >> 1) of each cell index; integers of any shape.
-
-    >>> [format(word, "03b") for word in to_gray([0, 1, 2, 3, 4, 5])]
-    ['000', '001', '011', '010', '110', '111']
-    """
-    cells = np.asarray(index)
-    return np.asarray(cells ^ (cells >> 1))
-
-
-def from_gray(word: ArrayLike) -> Integers:
-    """Cell index of each code word, the inverse of `to_gray`: bit s of i is the parity of g's bits from s upwards.
-
-    >>> from_gray([0, 1, 3, 2, 6, 7])
-    array([0, 1, 2, 3, 4, 5])
-    """
-    cells = np.array(word)
-    # Prefix exclusive-or by doubling: after shifts of 1, 2, 4 … every bit has met all bits above it.
-    shift = 1
-    while shift < 8 * cells.itemsize:
-        cells ^= cells >> shift
-        shift *= 2
-    return cells
+from slrig.model.gray_code import to_gray
 
 
 def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:
@@ -113,18 +84,6 @@ def along_axis(lit: NDArray[np.bool_], axis: Axis) -> NDArray[np.uint8]:
     """Spread a (n,) bool profile to (1, n) for columns or (n, 1) for rows, uint8, 255 where lit."""
     profile = np.where(lit, np.uint8(255), np.uint8(0))
     return profile[np.newaxis, :] if axis is Axis.COLUMN else profile[:, np.newaxis]
-
-
-def gray_index(lit: NDArray[np.bool_]) -> Integers:
-    """Cell index from the bits seen, the inverse of playing a code: lit (bits, …) bool, most significant bit first.
-
-    >>> gray_index(np.array([[False, True], [True, True], [False, True]]))
-    array([3, 5])
-    """
-    # Bit s of the index is the parity of the code word's bits from s upwards.
-    parity = np.bitwise_xor.accumulate(lit, axis=0)
-    weights = 2 ** np.arange(len(lit) - 1, -1, -1, dtype=np.int64)
-    return np.asarray(np.tensordot(weights, parity.astype(np.int64), axes=1))
 
 
 def cell_centre_px(index: ArrayLike, *, cell_px: int, offset_px: int) -> FloatArray:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Gray, IntArray, LineShift, Size
-from slrig.patterns.gray import cell_centre_px, edge_indices, edge_position_px, from_gray, require_addressable
+from slrig.model.gray_code import from_gray
+from slrig.patterns.gray import cell_centre_px, edge_indices, edge_position_px, require_addressable
 from slrig.patterns.line_shift import is_whole, line_number, line_position_px
 
 LEAST_FROM_BORDER_PX = 3.0

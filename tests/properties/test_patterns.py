@@ -9,15 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slrig.model import Axis, Gray, LineShift, Size
+from slrig.model.gray_code import from_gray, gray_index, to_gray
 from slrig.patterns.gray import (
     cell_centre_px,
     edge_indices,
     edge_position_px,
-    from_gray,
     gray_bits,
-    gray_index,
     gray_profile,
-    to_gray,
 )
 from slrig.patterns.line_shift import is_whole, line_count, line_number, line_position_px, line_profile
 

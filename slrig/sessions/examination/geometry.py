@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from slrig.capture.evidence import Evidence
 from slrig.capture.orientation import Orientation, apart_deg, expected_orientation, orientation
 from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
-from slrig.patterns.gray import cell_centre_px, gray_index
+from slrig.model.gray_code import gray_index
+from slrig.patterns.gray import cell_centre_px
 from slrig.sessions.examination.findings import Finding, camera_named, fault, note, ok
 from slrig.sessions.examination.light import Seen
 from slrig.sessions.examination.viewing import Viewer

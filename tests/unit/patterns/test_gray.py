@@ -7,15 +7,14 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, Gray, Size
+from slrig.model.gray_code import from_gray, to_gray
 from slrig.patterns.gray import (
     cell_centre_px,
     edge_indices,
     edge_position_px,
-    from_gray,
     gray_bits,
     gray_profile,
     require_addressable,
-    to_gray,
 )
 
 
