@@ -12,7 +12,7 @@ import numpy as np
 from slrig.kernels import in_bands, kernel
 from slrig.model import IntArray
 
-_CROWDED, _REPEATED = 1, 2
+_CROWDED, _REPEATED = 1, 2  # what is wrong with a face
 
 
 class Incidence(NamedTuple):

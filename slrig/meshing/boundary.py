@@ -31,9 +31,9 @@ from slrig.meshing.boundary_rules import (
 )
 from slrig.model import FloatArray, IntArray
 
-PSI = math.pi / 2
-LONGEST_MM = 5.0
-_SPACINGS = 4.0
+PSI = math.pi / 2  # the paper's ψ
+LONGEST_MM = 5.0  # the paper's λ
+_SPACINGS = 4.0  # λ alone took 9 100 of 28 900 good triangles of every eighth stripe of a face
 _MOST_TRIANGLES_OF_A_SPIKE = 6
 
 

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 from slrig.kernels import kernel_part
 from slrig.model import FlipRule
 
-GAMMA = math.pi / 6
+GAMMA = math.pi / 6  # the paper's γ
 _COS_GAMMA, _SIN_GAMMA = math.cos(GAMMA), math.sin(GAMMA)
-_TIE = 1e-12
+_TIE = 1e-12  # far above rounding: of two sums of angles that are equal, neither is the wider
 BLOCK = 488  # not a power of two: rows of a page each would share their places in the cache
 
 

@@ -15,7 +15,7 @@ from slrig.meshing.strips import strip_neighbours, strips, to_drop
 from slrig.meshing.topology import component_sizes
 from slrig.model import FloatArray, IntArray
 
-_BLOCK = 4096
+_BLOCK = 4096  # faces to a sum; the sums are added up in order, the same for any number of threads
 _SMALLEST_COMPONENT = 100
 """Pieces of fewer connected triangles are dust: a few stripe points that agreed by chance."""
 

@@ -36,9 +36,9 @@ from slrig.meshing.flips import BLOCK, GAMMA, constraint, prefer_flips, prefers_
 from slrig.model import FlipRule, FloatArray, IntArray
 
 NO_FLIPS, INDEX, TURN_LIMIT = "no flips", "index", "turn limit"
-_FLAT_INDEX = 1e5
-_UNITS_PER_INDEX = 2.0**20
-_FACES_AT_ONCE = 16384
+_FLAT_INDEX = 1e5  # that of a triangle some 30 000 times as long as high
+_UNITS_PER_INDEX = 2.0**20  # 64 bits then hold the sum over 88 million triangles of the greatest index
+_FACES_AT_ONCE = 16384  # that are worth calling a kernel for
 
 
 @dataclass(frozen=True, slots=True)

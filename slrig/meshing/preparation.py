@@ -16,7 +16,7 @@ from slrig.meshing.quality import mesh_figures
 from slrig.meshing.surface import MeshingLimits, finished_mesh
 from slrig.model import FlipRule
 
-_CURVES, _POINTS = 16, 40
+_CURVES, _POINTS = 16, 40  # a few hundred points: it is compiling that takes the time
 _LIMITS = MeshingLimits(
     widest_step_px=1.0, depth_edge_ratio=6.0, keep_holes=False, flip_rule=FlipRule.CONSTRAINED, smooth_boundary=True
 )

@@ -15,17 +15,18 @@ from slrig.meshing.topology import degenerate_faces, topology_counts
 from slrig.model import FloatArray, IntArray, Mesh, Surface
 
 _MESH_SAMPLES = 200_000
-_VISIBLE_SAMPLES = 60_000
-_FACES_AT_ONCE = 200_000
+_VISIBLE_SAMPLES = 60_000  # a share of so many is known to 0.2 %; rays are what takes the time
+_FACES_AT_ONCE = 200_000  # some tens of megabytes
+# What the figures of `TruthScore` are named for: reports are compared by them.
 _GROSS_MM = 1.0
 _FALSE_MM = 0.5
 _WELD_MM = 1e-3
-_BLOCK = 4096
-_CLASSES = 4096
-_FLAT_MM2 = 1e-9
-_ASIDE_MM = 0.05
 _SLIVER_DEG = 10.0
-_ONE_SIGMA_PERCENT = 68.27
+_ONE_SIGMA_PERCENT = 68.27  # of a normal distribution within one standard deviation
+_BLOCK = 4096  # faces to a row of sums, which are added up in order
+_CLASSES = 4096  # of values; only one of them is sorted
+_FLAT_MM2 = 1e-9
+_ASIDE_MM = 0.05  # off vertices and edges
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +134,7 @@ def score(
     found = SearchTree.over(vertices, faces)
     near = error_mm < _GROSS_MM
     p50, p95, p99 = np.percentile(error_mm, (50, 95, 99)) if len(error_mm) else (np.nan, np.nan, np.nan)
-    # Every so many of the visible points: a share of 60 000 is known to 0.2 %, and rays are what takes the time.
+    # Every so many of the visible points.
     visible = np.asarray(visible_points_mm[:: max(1, len(visible_points_mm) // _VISIBLE_SAMPLES)], dtype=np.float64)
     first_mm, gap_mm, layers = _seen_through(found, truth, visible, eye_mm, random)
     return TruthScore(

@@ -17,7 +17,7 @@ from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
 _TRIANGLES_PER_LEAF = 4
-_STACK = 64
+_STACK = 64  # a walk holds one node for each level of the tree, and one more: no tree in memory has as many
 # A ray along an edge or through a vertex must not slip between two triangles: barycentric tolerance.
 _EDGE_TOLERANCE = 1e-9
 

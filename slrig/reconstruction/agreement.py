@@ -11,6 +11,8 @@ from slrig.reconstruction.merging import MergedCurves
 from slrig.reconstruction.redundancy import DEVIATIONS_PER_MEDIAN
 
 FEWEST_POINTS = 100
+"""That both have: with fewer they hardly see the same surface."""
+
 MOST_OVER_SIGMA = 3.0
 """Beyond this the deviations that were stated do not explain what was found."""
 

@@ -30,9 +30,9 @@ from slrig.reconstruction.sensitivity import across, add_row, pixel_squares, sha
 
 _EACH = DEVICE_PARAMETERS
 _NODES = 10  # along each side of the volume
-_FEWEST_NODES = 8
+_FEWEST_NODES = 8  # 24 displacements, to take a rigid motion of six numbers out of
 _DROPPED = 0.002  # of the variance, at any place in the volume
-_REACH = 2
+_REACH = 2  # points either way, for the direction of a curve
 _CAMERA_CAMERA, _ALL = int(Source.CAMERA_CAMERA), int(Source.ALL)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from slrig.kernels import in_bands, kernel
 from slrig.reconstruction.phase import PositionMap
 
-_FLAT_PX = 1.0
+_FLAT_PX = 1.0  # projector px of second difference over six pixels: more is two surfaces with a step between
 _SIXTH_GAIN = 2 * (45**2 + 9**2 + 1) / 60**2  # variance of the sixth-order difference of unit noise
 
 

@@ -16,14 +16,15 @@ from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
 _SHARPEST_TURN = np.pi / 3
-_SAME_LINE_ANGLE = np.pi / 6
-_SAME_LINE_PX = 0.8
+_SAME_LINE_ANGLE = np.pi / 6  # as linking after Steger has it
+_SAME_LINE_PX = 0.8  # a line may answer again up to 0.6 px away (`steger._TAYLOR_BOX`)
 _LONGEST_STEP_PX = 2.2
+# The neighbours of a pixel, by the octant that they lie in: 0 along x, 2 along y.
 _STEP_X = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 _STEP_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 _SHARPEST_ALIGNED = np.cos(_SHARPEST_TURN)
 _SAME_LINE_ALIGNED = np.cos(_SAME_LINE_ANGLE)
-_HALF_OCTANT = np.tan(np.pi / 8)
+_HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
 
 
 def chain_frames(

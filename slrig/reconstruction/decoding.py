@@ -23,7 +23,7 @@ _NOT_LIT = int(Refusal.NOT_LIT)
 _SATURATED = int(Refusal.SATURATED)
 _AMBIGUOUS_BIT = int(Refusal.AMBIGUOUS_BIT)
 _BEYOND_PROJECTOR = int(Refusal.BEYOND_PROJECTOR)
-_MOST_UNCERTAIN_BITS = 4
+_MOST_UNCERTAIN_BITS = 4  # each doubles the words that a pixel may show, all of which are looked up
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,8 @@ from slrig.reconstruction.frames import (
 from slrig.reconstruction.noise import NoiseModel, fitted_noise, noise_samples
 
 _NEARLY_FULL = 0.97  # of full scale: from here on sensors bend
-_CLEAR_SIGMA = 20.0
-_LEAST_FOR_LIGHT = 500
+_CLEAR_SIGMA = 20.0  # the ratio of two exposures is then known to a twentieth at each pixel,
+_LEAST_FOR_LIGHT = 500  # and the median of so many to a three-hundredth
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ _SHADOW_EDGE = int(Refusal.SHADOW_EDGE)
 _DEPTH_EDGE = int(Refusal.DEPTH_EDGE)
 _SHORT_STRIPE = int(Refusal.SHORT_STRIPE)
 _SATURATED = int(Refusal.SATURATED)
-_LONGEST_GAP_POINTS = 3
+_LONGEST_GAP_POINTS = 3  # that show another position, or none, on a stripe that goes on behind them
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.identification import CodedStripes
 from slrig.reconstruction.stripes import gathered
 
-_END_POINTS = 10
+_END_POINTS = 10  # the paper's r, for which it gives no number
 
 
 @dataclass(frozen=True, slots=True)

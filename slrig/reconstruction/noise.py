@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from slrig.reconstruction.frames import AxisFrames
 
-_QUANTISATION_VARIANCE = 1.0 / 12.0
-_MOST_SAMPLES = 200_000
-_LEAST_RANGE = 10.0
+_QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
+_MOST_SAMPLES = 200_000  # some 8000 for each of the bins
+_LEAST_RANGE = 10.0  # of levels, in standard deviations of the noise, for a slope
 _BINS = 24
 _LEAST_PER_BIN = 50
 _BOX = np.ones((3, 3), dtype=np.uint8)

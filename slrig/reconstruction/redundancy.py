@@ -22,11 +22,11 @@ from slrig.reconstruction.merging import by_row
 from slrig.reconstruction.optics import project
 from slrig.reconstruction.triangulation import SheetCurves
 
-CELLS = 6
-FEWEST_PAIRS = 20
-_STEPS = 32
-_TANGENT_REACH = 2
-_OUTLYING = 12.0
+CELLS = 6  # along each side of the map, as in those of a calibration's residuals
+FEWEST_PAIRS = 20  # the mean of a cell is then known to a quarter of their scatter
+_STEPS = 32  # segments that the foot of a perpendicular is looked for on
+_TANGENT_REACH = 2  # points either way, for the direction of a stripe
+_OUTLYING = 12.0  # robust standard deviations, as for points to be merged: two different things, not one
 DEVIATIONS_PER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 

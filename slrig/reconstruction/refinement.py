@@ -22,15 +22,14 @@ from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.phase import FittedPoints, PositionMap, no_points, windows
 from slrig.reconstruction.stripes import LinePoints
-from slrig.reconstruction.surface_fit import POINTS, fit_kernel
+from slrig.reconstruction.surface_fit import LEAST_GRADIENT, POINTS, fit_kernel
 
-_LEAST_GRADIENT = 0.05
-_SURE_PX = 0.15
-_FAINT = 1e-6
-_POINTS_TIED = 5
-_CLEAR_PX = 0.12
+_SURE_PX = 0.15  # a chain may begin at a point that the filter missed, if it is known as well as this
+_FAINT = 1e-6  # far below a filter's response: what it found comes first
+_POINTS_TIED = 5  # by a filter along the stripe: 2√π of its scale, 4.3 points at 1.2 px
+_CLEAR_PX = 0.12  # so near to the border of a pixel, a fit of its own might end beyond it
 _LINES_KEPT = 2  # of the lines that begin at one pixel, which are neighbours, these many are remembered
-_MOST_FOR_MEDIAN = 20_000
+_MOST_FOR_MEDIAN = 20_000  # tied, their median is known to a fiftieth of their scatter
 _CROSSING_PX = 0.62  # more than half a pixel: two neighbours' noisy slopes must not both miss a line between them
 
 
@@ -92,7 +91,7 @@ def _crossing_kernel(
             gx = _slope(position[y, x - 1], here, position[y, x + 1], usable[y, x - 1], usable[y, x + 1])
             gy = _slope(position[y - 1, x], here, position[y + 1, x], usable[y - 1, x], usable[y + 1, x])
             squared = gx * gx + gy * gy
-            if not squared > _LEAST_GRADIENT * _LEAST_GRADIENT:
+            if not squared > LEAST_GRADIENT * LEAST_GRADIENT:
                 continue
             reach = _CROSSING_PX * (abs(gx) + abs(gy)) + 1e-6
             low_cell, high_cell = lowest[y, x], highest[y, x]

@@ -27,6 +27,7 @@ _LEAST_RIGHT = 0.7
 _LEAST_PASSAGE_PX = 2.0
 """Of both halves of a cell: each pixel then sees one edge of the code at most."""
 _MOST_BITS = 3
+"""Where more would have to go the code itself is not seen."""
 _LEAST_FOUND = 0.5
 """Of the lines' points. Resolved blocks of rendered plates have 0.9 to 1.0, those where lines blur into one another
 0.02 to 0.15, and where the one passes into the other 0.6."""

@@ -18,7 +18,7 @@ EDGE = 1
 
 _SUPPORT = 3.6  # kernel radius in sigmas
 _TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; the chain drops double responses
-_NEWTON_BOX = 1.1
+_NEWTON_BOX = 1.1  # half a pixel beyond the first step's
 _ROWS, _POINTS = 32, 1024  # that are worth calling a kernel for
 
 

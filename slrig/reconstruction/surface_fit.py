@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from slrig.kernels import kernel, kernel_part
 
-_REACH = 2
+_REACH = 2  # pixels either way: 5 x 5
 _QUADRATIC_SCALE_PX = 1.1
 _LINEAR_SCALE_PX = 0.9
-_LEAST_FOR_LINEAR = 5
+_LEAST_FOR_LINEAR = 5  # pixels: two more than a plane has numbers, to tell its scatter by
 _LONGEST_MOVE_PX = 1.0
-_LEAST_GRADIENT = 0.05
-_LEAST_FREEDOM = 0.5
-_PIXELS = 25
+LEAST_GRADIENT = 0.05  # projector px per camera px; the deviation of a point is that of the position over it
+_LEAST_FREEDOM = 0.5  # with less the residuals tell nothing of the scatter, and the noise stands
+_PIXELS = (2 * _REACH + 1) ** 2
 _LANES = 32  # 25 pixels, or points side by side: whole vectors
 POINTS = 1024  # that are worth calling the kernel for
 
@@ -209,7 +209,7 @@ def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: f
         gx = f1 + 2.0 * f3 * x + f4 * y
         gy = f2 + f4 * x + 2.0 * f5 * y
         squared = gx * gx + gy * gy
-        if squared < _LEAST_GRADIENT * _LEAST_GRADIENT:
+        if squared < LEAST_GRADIENT * LEAST_GRADIENT:
             break
         miss = (f0 + f1 * x + f2 * y + f3 * x * x + f4 * x * y + f5 * y * y - target) / squared
         x -= miss * gx
@@ -227,7 +227,7 @@ def _put(
     """Take point i as found, at (x, y) from the pixel (ix, iy), unless it moved too far or the surface is too flat."""
     gradient = np.sqrt(gx * gx + gy * gy)
     mx, my = x + ix - starts[i, 0], y + iy - starts[i, 1]
-    if not gradient >= _LEAST_GRADIENT or not mx * mx + my * my <= _LONGEST_MOVE_PX * _LONGEST_MOVE_PX:
+    if not gradient >= LEAST_GRADIENT or not mx * mx + my * my <= _LONGEST_MOVE_PX * _LONGEST_MOVE_PX:
         return
     excess = max(1.0, misfit / freedom) if freedom > _LEAST_FREEDOM else 1.0
     variance = noise * excess
