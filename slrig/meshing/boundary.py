@@ -34,7 +34,7 @@ from slrig.model import FloatArray, IntArray
 PSI = math.pi / 2  # the paper's ψ
 LONGEST_MM = 5.0  # the paper's λ
 _SPACINGS = 4.0  # λ alone took 9 100 of 28 900 good triangles of every eighth stripe of a face
-_MOST_TRIANGLES_OF_A_SPIKE = 6
+_MOST_TRIANGLES_OF_A_SPIKE = 6  # chosen; 3 leaves 8 of 239 246 triangles more of a rendered vase, 12 the same
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from slrig.reconstruction.stripes import (
 )
 
 _FINEST_SCALE_PX = 1.0  # at 0.7 px, stripes of 0.7 px are found to 0.027 px rms, at 1.0 px to 0.008
-_COARSEST_SCALE_PX = 2.5
+_COARSEST_SCALE_PX = 2.5  # chosen; half and double give the same figures of a rendered vase, refined by phase
 _LEAST_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
 
 

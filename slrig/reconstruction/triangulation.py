@@ -26,7 +26,7 @@ from slrig.reconstruction.sheet_curves import SheetCurves, ordered_along_sheet, 
 _NEWTON_STEPS = 25  # two to four, of sheets of strong lenses as well; more is a start that does not settle
 _CONVERGED_PX = 1e-5  # before the last step of Newton's method, which leaves about the square of it
 _PROBE_PX = 1e-3  # far above rounding, and a point moves straight over so little
-_BORDER_PX = 2.0
+_BORDER_PX = 2.0  # beyond the projector's image; chosen, 0 and 4 give the same figures of a rendered vase
 _NEAR_PX = 3.0  # so near to the last point, its ray is moved on for a start of Newton's method
 _NONE, _BEHIND_DEVICE = int(Refusal.NONE), int(Refusal.BEHIND_DEVICE)
 
