@@ -11,14 +11,14 @@ from fastapi import APIRouter, Body, Header, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
+from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.records import AcceptanceRecord, AcceptanceState, RequestKey
+from slrig.accept.store import HTML, JSON
 from slrig.api.openapi import problems
 from slrig.api.schemas import AnyFault, filled, fingerprint
 from slrig.api.service import Serving
 from slrig.bundle.faults import Strict
 from slrig.calibration.artefacts import Decision
-from slrig.sessions.acceptance.asking import AcceptanceRequest
-from slrig.sessions.acceptance.records import AcceptanceRecord, AcceptanceState, RequestKey
-from slrig.sessions.acceptance.store import HTML, JSON
 
 router = APIRouter(prefix="/acceptance", tags=["acceptance"])
 

@@ -17,8 +17,8 @@ from slrig.api.openapi import problems
 from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
+from slrig.jobs.data_folder import DataFolder
 from slrig.scan.artefacts import MESH, ON_REQUEST, write_converted
-from slrig.scan.folder import DataFolder
 from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, rejected_picture
 from slrig.scan.records import ScanRecord, ScanState
 

@@ -29,11 +29,11 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import fingerprint, pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
+from slrig.calibrate.calibrating import EXPORTS
+from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.records import PoseRecord, PoseState, SessionRecord
+from slrig.calibrate.store import REPORT
 from slrig.calibration.board import USUAL_BOARD
-from slrig.sessions.calibration.calibrating import EXPORTS
-from slrig.sessions.calibration.pose_shooting import PoseRequest
-from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord
-from slrig.sessions.calibration.store import REPORT
 
 IMPORT_PATH = "/calibration/import"
 MOST_IMPORT_BYTES = MOST_CALIBRATION_BYTES
@@ -139,7 +139,7 @@ async def import_calibration(
         )
         raise HTTPException(415, message)
     text = await request.body()
-    record = await run_in_threadpool(service.calibrations.take_in, text, ending, label=label)
+    record = await run_in_threadpool(service.calibrations.submit, text, ending, label=label)
     response.headers["Location"] = f"/calibration/{record.id}"
     return await run_in_threadpool(answered, service, record)
 

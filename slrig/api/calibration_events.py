@@ -12,9 +12,9 @@ from fastapi.concurrency import run_in_threadpool
 from slrig.api.openapi import problems
 from slrig.api.service import Serving
 from slrig.api.streams import Followed, LastEventId, event_stream, stream_answers
+from slrig.calibrate.register import CalibrationRegister
 from slrig.errors import CalibrationNotFoundError
 from slrig.scan.records import ScanEvent
-from slrig.sessions.calibration.register import CalibrationRegister
 
 router = APIRouter(prefix="/calibration/{calibration_id}", tags=["calibration"])
 

@@ -12,10 +12,10 @@ from fastapi.responses import FileResponse
 from slrig.api.openapi import problems
 from slrig.api.service import Serving
 from slrig.bundle.description import CAMERA_NAME
+from slrig.calibrate.calibrating import EXPORTS
+from slrig.calibrate.pose_answering import picture_name
+from slrig.calibrate.store import REPORT
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
-from slrig.sessions.calibration.calibrating import EXPORTS
-from slrig.sessions.calibration.pose_answering import picture_name
-from slrig.sessions.calibration.store import REPORT
 
 MEDIA_TYPES = {
     "calibration.json": "application/json",

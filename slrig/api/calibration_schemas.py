@@ -11,10 +11,10 @@ from pydantic import BaseModel, BeforeValidator, Field
 
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
 from slrig.bundle.faults import Strict
+from slrig.calibrate.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import Comparison
 from slrig.scan.plan import PatternPlan
-from slrig.sessions.calibration.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
 
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 CornerCount = Annotated[int, Field(ge=3, le=60)]

@@ -15,7 +15,7 @@ from slrig.api.problems import fault_problem
 from slrig.api.service import Serving
 from slrig.api.streams import Followed, LastEventId, event_stream, stream_answers
 from slrig.errors import ScanNotFoundError
-from slrig.scan.faults import ScanFault
+from slrig.failure import JobFailure
 from slrig.scan.records import ScanEvent
 from slrig.scan.store import ScanStore
 
@@ -63,5 +63,5 @@ def _data(event: ScanEvent) -> dict[str, Any]:
     data = dict(event.data)
     fault = data.get("error")
     if fault is not None:
-        data["error"] = fault_problem(ScanFault(fault["kind"], fault["message"]))
+        data["error"] = fault_problem(JobFailure(fault["kind"], fault["message"]))
     return data

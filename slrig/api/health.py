@@ -17,10 +17,10 @@ from slrig.bundle.faults import Strict
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import HealthState
 from slrig.errors import CalibrationError
-from slrig.scan.records import utc_now
-from slrig.sessions.health.plot import health_svg
-from slrig.sessions.health.store import VerificationRecord
-from slrig.sessions.health.verification import JobState, VerificationJob, solve_id
+from slrig.jobs.records import utc_now
+from slrig.verify.plot import health_svg
+from slrig.verify.store import VerificationRecord
+from slrig.verify.verification import JobState, VerificationJob
 
 router = APIRouter(prefix="/rig", tags=["health"])
 
@@ -121,7 +121,7 @@ def look_at_health(service: Serving) -> HealthBody:
     return filled(
         HealthBody,
         health,
-        calibration=None if calibration is None else solve_id(calibration),
+        calibration=None if calibration is None else calibration.solve_id,
         calibration_age_s=age_s,
         refuses_scans_when_stale=service.refuse_when_stale,
         latest=None if latest is None else _figures(latest),

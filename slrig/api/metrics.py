@@ -14,8 +14,9 @@ from prometheus_client.registry import Collector
 
 from slrig.api.service import Service, Serving
 from slrig.calibration.health.verdict import HealthState
-from slrig.scan.records import ScanState, utc_now
-from slrig.scheduling.records import RunState, TaskKind
+from slrig.jobs.records import utc_now
+from slrig.scan.records import ScanState
+from slrig.schedule.records import RunState, TaskKind
 
 router = APIRouter(tags=["system"])
 

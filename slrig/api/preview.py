@@ -16,7 +16,7 @@ from slrig.api.openapi import problems
 from slrig.api.service import Serving
 from slrig.api.streams import OpenStreams
 from slrig.errors import SlrigError
-from slrig.scan.preview import Light, Watch
+from slrig.rig.preview import Light, Watch
 
 BOUNDARY = "picture"
 WIDEST_PX = 1280

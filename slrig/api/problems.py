@@ -16,9 +16,9 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig import errors
+from slrig import failure as faults
 from slrig.errors import RigBusyError, SlrigError
-from slrig.scan import faults
-from slrig.scan.faults import ScanFault, error_classes
+from slrig.failure import JobFailure, error_classes
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -130,7 +130,7 @@ def problem(status: int, kind: str, detail: str, **members: Any) -> dict[str, An
     return {key: value for key, value in document.items() if value is not None}
 
 
-def fault_problem(fault: ScanFault) -> dict[str, Any]:
+def fault_problem(fault: JobFailure) -> dict[str, Any]:
     """The problem that stands for a scan's recorded fault."""
     known = error_classes().get(fault.kind)
     return problem(500 if known is None else STATUS[known], fault.kind, fault.message)

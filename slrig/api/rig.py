@@ -11,9 +11,9 @@ from slrig.api.schemas import CalibrationInUse, CameraBody, DeviceList, Projecto
 from slrig.api.service import Serving
 from slrig.devices import CameraInfo
 from slrig.discovery import found_devices, installed_drivers
+from slrig.jobs.records import utc_now
 from slrig.model import Size
-from slrig.scan.records import utc_now
-from slrig.scan.work import RunnerStatus
+from slrig.scan.runner import RunnerStatus
 
 router = APIRouter(tags=["rig"])
 

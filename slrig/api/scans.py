@@ -13,7 +13,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, fingerprint, scan_body, scan_plan
 from slrig.api.service import Service, Serving
 from slrig.scan.records import ScanProgress, ScanRecord, ScanState
-from slrig.sessions.health.verification import require_healthy
+from slrig.verify.verification import require_healthy
 
 USUAL_PAGE = 50
 

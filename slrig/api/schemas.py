@@ -14,8 +14,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 from slrig.api.problems import fault_problem
 from slrig.bundle.faults import Strict
 from slrig.config import BracketSeconds, ScanDefaults
+from slrig.failure import JobFailure
 from slrig.model import Axis, FlipRule
-from slrig.scan.faults import ScanFault
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 
@@ -170,7 +170,7 @@ class ScanLinks(BaseModel):
 
 def _shown_fault(fault: object) -> object:
     """A problem stands for itself: what was sent can be read again."""
-    return fault_problem(fault) if isinstance(fault, ScanFault) else fault
+    return fault_problem(fault) if isinstance(fault, JobFailure) else fault
 
 
 AnyFault = Annotated[dict[str, Any] | None, BeforeValidator(_shown_fault)]

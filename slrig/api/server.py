@@ -24,13 +24,13 @@ from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ServiceError
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
+from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.folder import DataFolder
-from slrig.scan.holding import HeldRig
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
 from slrig.scan.sweep import sweep
-from slrig.scan.worker import LOADING, READY, Worker, prepare_kernel_cache
 
 ADDRESS_FILE = "service.json"
 """Where in the data folder a running service tells its URL and process id."""
@@ -74,7 +74,7 @@ def open_service(
     runner = Runner(
         store,
         folder,
-        HeldRig(rig.name, lambda: open_rig(rig)),
+        RigSession(rig.name, lambda: open_rig(rig)),
         worker,
         capture=capture_bundle,
         queue_length=settings.queue_length,

@@ -8,22 +8,22 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from slrig.accept.desk import AcceptanceDesk
+from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.retention import Retention
+from slrig.calibrate.tools import CalibrationTools
+from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
-from slrig.scan.folder import DataFolder
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.worker import Worker
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import Worker
-from slrig.scheduling.naming import NamedLender
-from slrig.scheduling.notices import NoticedHealth, Notices
-from slrig.scheduling.scheduler import Scheduler
-from slrig.scheduling.store import ScheduleStore
-from slrig.scheduling.tasks import Tasks
-from slrig.sessions.acceptance.desk import AcceptanceDesk
-from slrig.sessions.calibration.calibrating import Calibrations
-from slrig.sessions.calibration.retention import Retention
-from slrig.sessions.calibration.tools import CalibrationTools
-from slrig.sessions.calibration.tools import calibration_tools as usual_calibration_tools
-from slrig.sessions.health.verification import VerificationDesk, verification_tools
+from slrig.schedule.holder import NamedHolder
+from slrig.schedule.notices import NoticedHealth, Notices
+from slrig.schedule.scheduler import Scheduler
+from slrig.schedule.store import ScheduleStore
+from slrig.schedule.tasks import Tasks
+from slrig.verify.verification import VerificationDesk, verification_tools
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
@@ -98,10 +98,10 @@ def assembled_service(
         The disk refused. What was given is still the caller's to close.
     """
     spare_bytes = settings.min_free_bytes
-    lender = NamedLender(runner)
+    queue = NamedHolder(runner)
     calibrations = Calibrations(
         folder,
-        lender,
+        queue,
         rig_name=rig_name,
         tools=calibration_tools or usual_calibration_tools(worker),
         spare_bytes=spare_bytes,
@@ -109,13 +109,13 @@ def assembled_service(
     schedules = ScheduleStore(folder.database)
     notices = Notices(settings.webhook_url, rig=rig_name)
     health = NoticedHealth(folder.database, notices)
-    verifications = VerificationDesk(folder, lender, health, tools=verification_tools(worker), spare_bytes=spare_bytes)
+    verifications = VerificationDesk(folder, queue, health, tools=verification_tools(worker), spare_bytes=spare_bytes)
     runner.watch_health(verifications)
     acceptance = AcceptanceDesk(
         folder,
-        lender,
-        evaluate=worker.task("slrig.sessions.acceptance.running:evaluated", "evaluation of the position"),
-        report=worker.task("slrig.sessions.acceptance.report:write_reports", "report of the acceptance test"),
+        queue,
+        evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
+        report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
     )
     retention = Retention(
         calibrations,
@@ -123,7 +123,7 @@ def assembled_service(
         keep=settings.keep_calibrations,
         named=lambda: {test.calibration for test in acceptance.latest()},
     )
-    tasks = Tasks(lender, calibrations, verifications, acceptance, tidy=retention)
+    tasks = Tasks(queue, calibrations, verifications, acceptance, tidy=retention)
     # The folder's lock keeps every other process out.
     scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)
     return Service(

@@ -12,7 +12,7 @@ from slrig.api.problems import answer, explanations, problem
 from slrig.api.schemas import Explanation, Probe
 from slrig.api.service import Service, Serving
 from slrig.errors import StorageError
-from slrig.scan.work import RunnerStatus
+from slrig.scan.runner import RunnerStatus
 
 router = APIRouter(tags=["system"])
 

@@ -13,14 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slrig.api.logs import set_up_logs_for_a_person
-from slrig.calibration.artefacts import Decision
-from slrig.cli.display import progress_shown
-from slrig.config import RigConfig, read_rig
-from slrig.devices import Rig
-from slrig.discovery import open_rig
-from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
-from slrig.sessions.acceptance.plan import (
+from slrig.accept.plan import (
     USUAL_REPEATS,
     AcceptancePlan,
     Artefacts,
@@ -30,12 +23,19 @@ from slrig.sessions.acceptance.plan import (
     exact_artefacts,
     usual_limits,
 )
-from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance.report import document
-from slrig.sessions.acceptance.running import Place, required_calibration, run_acceptance
-from slrig.sessions.acceptance.scene import scripted_config
-from slrig.sessions.acceptance.store import HTML, JSON
-from slrig.sessions.acceptance.verdicts import AcceptanceResult
+from slrig.accept.positions import acceptance_plan, rig_volume_mm
+from slrig.accept.report import document
+from slrig.accept.running import Place, required_calibration, run_acceptance
+from slrig.accept.scene import scripted_config
+from slrig.accept.store import HTML, JSON
+from slrig.accept.verdicts import AcceptanceResult
+from slrig.api.logs import set_up_logs_for_a_person
+from slrig.calibration.artefacts import Decision
+from slrig.cli.display import progress_shown
+from slrig.config import RigConfig, read_rig
+from slrig.devices import Rig
+from slrig.discovery import open_rig
+from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 

@@ -237,7 +237,7 @@ def export(
 
 
 @app.command(name="import")
-def take_in(
+def submit(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Calibration: slrig's .json, or OpenCV's .yml or .xml.")],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
     url: Url = USUAL_URL,

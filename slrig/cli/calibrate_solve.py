@@ -18,19 +18,19 @@ from rich.console import Console
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration, write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_file
+from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.poses.checks import check_same_devices
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
 from slrig.cli.display import ProgressDisplay, progress_shown
 from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
+from slrig.jobs.worker import prepare_kernel_cache
 from slrig.model import Calibration, Size
-from slrig.scan.worker import prepare_kernel_cache
-from slrig.sessions.calibration.pose_frames import bundle_device_sizes
 
 if TYPE_CHECKING:
-    from slrig.sessions.calibration.solving import CalibrationResult, ReadPose
-    from slrig.sessions.calibration.tools import Setting
+    from slrig.calibrate.solving import CalibrationResult, ReadPose
+    from slrig.calibrate.tools import Setting
 
 DESCRIPTION = "bundle.json"
 ENDINGS = (".json", ".yml", ".yaml", ".xml")
@@ -86,9 +86,9 @@ def solve_folder(
     with progress_shown() as display:
         display("loading", 0.0, "")
         # numba and its kernels: a second or two, and many the first time.
-        from slrig.sessions.calibration.pose_judging import summary
-        from slrig.sessions.calibration.solving import solve_poses
-        from slrig.sessions.calibration.tools import Setting
+        from slrig.calibrate.pose_judging import summary
+        from slrig.calibrate.solving import solve_poses
+        from slrig.calibrate.tools import Setting
 
         sizes, unreadable = _one_rig(bundles)
         setting = Setting(
@@ -201,8 +201,8 @@ def _one_rig(bundles: Mapping[str, Path]) -> tuple[Mapping[str, Size], dict[str,
 
 
 def _read(bundles: Mapping[str, Path], setting: Setting, display: ProgressDisplay) -> Readings:
-    from slrig.sessions.calibration.pose_judging import judgement
-    from slrig.sessions.calibration.pose_reading import read_pose
+    from slrig.calibrate.pose_judging import judgement
+    from slrig.calibrate.pose_reading import read_pose
 
     found = Readings()
     for at, (name, path) in enumerate(bundles.items()):
@@ -266,8 +266,8 @@ def _write_calibration(output: Path, calibration: Calibration) -> None:
 def _report(
     result: CalibrationResult, found: Readings, folder: Path, bundles: Mapping[str, Path], setting: Setting
 ) -> str:
-    from slrig.sessions.calibration.pose_pictures import white_frame
-    from slrig.sessions.calibration.report import report_html
+    from slrig.calibrate.pose_pictures import white_frame
+    from slrig.calibrate.report import report_html
 
     pictures = {
         pose.observation.name: {

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slrig.sessions.calibration.words import rounded
+from slrig.calibrate.words import rounded
 
 _COLOURS = {"good": "green", "usable": "yellow"}
 _NAMES = {

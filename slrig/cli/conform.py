@@ -17,7 +17,7 @@ from slrig.config import RigConfig, read_rig
 from slrig.conformance import Outcome, Report, run
 from slrig.discovery import open_rig
 from slrig.model import PatternSequence
-from slrig.scan.holding import pattern_sequence
+from slrig.scan.plan_check import pattern_sequence
 
 _COLOURS = {
     Outcome.PASSED: "green",

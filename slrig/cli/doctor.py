@@ -17,10 +17,10 @@ from slrig.cli.display import progress_shown
 from slrig.config import RigConfig, read_rig
 from slrig.devices import FoundDevice, Rig
 from slrig.discovery import found_devices, installed_drivers, open_rig
-from slrig.scan.holding import pattern_sequence
-from slrig.sessions.examination.doctor import Diagnosis, examine
-from slrig.sessions.examination.findings import Severity
-from slrig.sessions.examination.rig_file import refuse_existing, write_rig_file
+from slrig.doctor.doctor import Diagnosis, examine
+from slrig.doctor.findings import Severity
+from slrig.doctor.rig_file import refuse_existing, write_rig_file
+from slrig.scan.plan_check import pattern_sequence
 
 _COLOURS = {Severity.OK: "green", Severity.NOTE: "yellow", Severity.FAULT: "bold red"}
 

@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 import typer
 
 from slrig.bundle.storage import write_file
-from slrig.cli.rig_draft import Draft, Part, device_key, fault_of, rig_text, split_assignment, split_device, typed
+from slrig.cli.rig_draft import Draft, Part, device_key, failure_of, rig_text, split_assignment, split_device, typed
 from slrig.devices import FoundDevice
 from slrig.discovery import Findings, found_devices
+from slrig.doctor.rig_file import refuse_existing
 from slrig.errors import ConfigError, DeviceGoneError
 from slrig.option_models import kinds_of
-from slrig.sessions.examination.rig_file import refuse_existing
 
 Answer = TypeVar("Answer")
 
@@ -149,7 +149,7 @@ def _complete(part: Part, *, ask: bool) -> None:
 
         def answer(text: str, key: str = needed.name, kinds: frozenset[str] = needed.kinds) -> object:
             value = typed(text, kinds)
-            if fault := fault_of(part.driver, {**part.options, key: value}, key):
+            if fault := failure_of(part.driver, {**part.options, key: value}, key):
                 raise ConfigError(fault)
             return value
 

@@ -52,7 +52,7 @@ def reconstruct_with_progress(
         read_calibration(calibration)
     with progress_shown() as display:
         prepare_here(display)
-        from slrig.scan.pipeline import reconstruct_bundle
+        from slrig.scan.reconstruct import reconstruct_bundle
 
         report = reconstruct_bundle(
             bundle,

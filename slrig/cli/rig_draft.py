@@ -14,9 +14,9 @@ from pydantic import ValidationError
 from slrig.bundle.faults import explain, keys_of
 from slrig.cli.driver_options import explained, option
 from slrig.config import rig_of
+from slrig.doctor.rig_file import toml_value
 from slrig.errors import ConfigError
 from slrig.option_models import kinds_of, option_model
-from slrig.sessions.examination.rig_file import toml_value
 
 _WIDTH = 80
 _KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", list: "array", dict: "object"}
@@ -148,7 +148,7 @@ def typed(text: str, kinds: frozenset[str]) -> object:
     return data["value"] if kind is not None and fits and len(data) == 1 else text
 
 
-def fault_of(driver: str, options: Mapping[str, object], key: str = "") -> str:
+def failure_of(driver: str, options: Mapping[str, object], key: str = "") -> str:
     """What the driver's model says against options, of one of them or of all; "" where it takes them."""
     model = option_model(driver)
     if model is None:
@@ -176,7 +176,7 @@ def rig_text(draft: Draft, path: Path) -> str:
     faults = [
         f"driver '{table.driver}' does not take these options of {name}:\n{fault}"
         for name, table in zip(names, tables, strict=True)
-        if (fault := fault_of(table.driver, table.options))
+        if (fault := failure_of(table.driver, table.options))
     ]
     if faults:
         message = "\n".join([*faults, "nothing was written; every option: slrig devices --options DRIVER"])

@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration
+from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
 from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import Health, HealthState, judged
@@ -23,8 +24,7 @@ from slrig.errors import CalibrationError
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import Progress, ScanPlan
-from slrig.sessions.calibration.records import USUAL_PATTERNS
-from slrig.sessions.health.verification import verify_bundle
+from slrig.verify.verification import verify_bundle
 
 _COLOURS = {HealthState.GOOD: "green", HealthState.WATCH: "yellow", HealthState.STALE: "bold red"}
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import typer
 
 from slrig.cli.display import progress_shown
-from slrig.scan.worker import prepare_kernel_cache
-from slrig.scan.worker_wait import PREPARING
+from slrig.jobs.worker import prepare_kernel_cache
+from slrig.jobs.worker_wait import PREPARING
 
 Display = Callable[[str, float, str], None]
 
@@ -32,7 +32,7 @@ def prepare_here(display: Display) -> int:
     display("loading", 0.0, "")
     # numba itself: a second.
     from slrig.kernels import Prepared, prepared
-    from slrig.scan.pipeline import warm_kernels
+    from slrig.scan.reconstruct import warm_kernels
 
     def told(now: Prepared) -> None:
         display(PREPARING, 0.0, f"first time only: {now.done} of {now.total}")

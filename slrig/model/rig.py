@@ -158,6 +158,11 @@ class Calibration:
         return self.projector is not None or len(self.cameras) > 1
 
     @property
+    def solve_id(self) -> str:
+        """What is on record about this calibration goes by: the id of its solve, else a digest of its numbers."""
+        return self.digest if self.solved is None else self.solved.id
+
+    @property
     def digest(self) -> str:
         """Twelve hexadecimal digits that change with any number of its devices, and not with what is known of them."""
         devices: dict[str, Pinhole | None] = {**self.cameras, "projector": self.projector}

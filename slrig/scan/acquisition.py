@@ -18,11 +18,11 @@ from slrig.capture.exposure import whole_refreshes_s
 from slrig.capture.session import SETTINGS_TOLERANCE
 from slrig.devices import Rig
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
-from slrig.scan.exposing import Exposing
-from slrig.scan.feed import FrameSink
-from slrig.scan.holding import pattern_sequence
-from slrig.scan.outline import Outline
+from slrig.jobs.frame_feed import FrameSink
+from slrig.model.header import CaptureHeader
+from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.plan_check import pattern_sequence
 from slrig.scan.recording import Recorder
 
 _log = structlog.get_logger(__name__)
@@ -76,7 +76,7 @@ def capture_bundle(
         if frames is not None:
             once = tuple((index, name) for index in range(len(sequence)) for name in formats)
             listed = once * max(len(exposures_s), 1)
-            frames.begin(Outline(sequence.projector, sequence.patterns, formats, listed), rig.calibration)
+            frames.begin(CaptureHeader(sequence.projector, sequence.patterns, formats, listed), rig.calibration)
         try:
             for shot in exposing.shots():
                 if frames is not None:

@@ -27,8 +27,8 @@ from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import position_map
 from slrig.reconstruction.resolution import unresolved_bits
 from slrig.scan.artefacts import write_report
-from slrig.scan.output import REPORT, REPORT_FORMAT, staged_folder
 from slrig.scan.pictures import rejection_picture, write_png
+from slrig.scan.staging import REPORT, REPORT_FORMAT, staged_folder
 
 _FEW, _MANY = 0.05, 0.25
 

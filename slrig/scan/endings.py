@@ -11,7 +11,7 @@ from uuid import UUID
 import structlog
 
 from slrig.errors import StorageError
-from slrig.scan.faults import ScanFault
+from slrig.failure import JobFailure
 from slrig.scan.records import ScanState
 from slrig.scan.store import ScanStore
 
@@ -27,7 +27,7 @@ class Ending:
 
     id: UUID
     state: ScanState
-    fault: ScanFault | None
+    fault: JobFailure | None
     summary: Mapping[str, Any] | None = None
 
 

@@ -21,10 +21,10 @@ from slrig.bundle.refused import read_refused
 from slrig.capture.exposure import check_exposures
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
 from slrig.model import LEAST_SHARE, Axis, Calibration, Refusal, without_missing_bits
+from slrig.model.header import CaptureHeader
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
-from slrig.scan.outline import Outline
 from slrig.scan.report import capture_notes, capture_report
 from slrig.scan.resolved import unresolved_notes
 from slrig.scan.stream import LiveScan, ScanStream, Seen, cell_px, step_px
@@ -190,7 +190,7 @@ def _walked(
         names += capture.cameras
         devices = _require_calibration(folder, names, recorded.calibration)
         try:
-            stream = ScanStream(Outline.of(capture), devices, entered=stage_entered, axis=axis)
+            stream = ScanStream(CaptureHeader.of(capture), devices, entered=stage_entered, axis=axis)
             for name in names:
                 for shot in capture.shots:
                     if shot.camera == name:
@@ -210,13 +210,13 @@ def _walked(
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
     """Whether the frames taken live are those that the bundle lists, for the calibration that it is measured by."""
     description = read_description(folder)
-    listed = Outline(
+    listed = CaptureHeader(
         description.projector_size(), description.pattern_list(), description.camera_formats(),
         tuple((frame.pattern, frame.camera) for frame in description.frames),
     )  # fmt: skip
     path = folder / CALIBRATION if calibration_file is None else calibration_file
     return (
-        Outline.of(live.stream.capture) == listed
+        CaptureHeader.of(live.stream.capture) == listed
         and path.exists()
         and read_calibration(path).digest == live.calibration.digest
     )

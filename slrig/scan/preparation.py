@@ -39,8 +39,8 @@ _log = structlog.get_logger(__name__)
 def prepare_kernels(reconstruct: Callable[..., Any], told: Callable[[Prepared], None]) -> None:
     """Load every kernel that a usual scan needs; the first time they are compiled.
 
-    reconstruct : `slrig.scan.pipeline.reconstruct_bundle`. `told` hears how far that is, once for every kernel or part
-    of one that has to be compiled, on the thread that compiles it.
+    reconstruct : `slrig.scan.reconstruct.reconstruct_bundle`. `told` hears how far that is, once for every kernel or
+    part of one that has to be compiled, on the thread that compiles it.
     """
     with _MeshingCompiler() as beside:
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -14,21 +14,12 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle.storage import write_file
-from slrig.errors import IdempotencyError
-from slrig.scan.faults import ScanFault
+from slrig.failure import JobFailure
 from slrig.scan.plan import ScanPlan
-
-Clock = Callable[[], datetime]
-"""Gives the present moment with a time zone."""
 
 _RECORD = "record.json"
 
 _plan_adapter = TypeAdapter(ScanPlan)
-
-
-def utc_now() -> datetime:
-    """The present moment, UTC. For records only: durations are measured with a monotonic clock."""
-    return datetime.now(UTC)
 
 
 class ScanState(StrEnum):
@@ -82,7 +73,7 @@ class ScanRecord:
     started_at: datetime | None
     finished_at: datetime | None
     progress: ScanProgress
-    fault: ScanFault | None
+    fault: JobFailure | None
     summary: Mapping[str, Any] | None
 
 
@@ -158,13 +149,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def require_same_body(first: str, again: str, *, made: str) -> None:
-    """Raise IdempotencyError unless both requests with one key have one fingerprint. made : what a request makes."""
-    if first != again:
-        message = (
-            "This Idempotency-Key was sent before with another request body. "
-            f"Use a new key for a new {made}, or repeat the first body unchanged."
-        )
-        raise IdempotencyError(message)

@@ -18,7 +18,7 @@ from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.fusion import ExposureUse
 from slrig.reconstruction.merging import MergedCurves
 from slrig.reconstruction.redundancy import PairRedundancy, Redundancy
-from slrig.scan.output import REPORT_FORMAT
+from slrig.scan.staging import REPORT_FORMAT
 
 _MOST_OFF = 0.1
 

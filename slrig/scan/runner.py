@@ -1,33 +1,61 @@
-"""The one that scans: a rig that is lent to one piece of work at a time, and the record of those that are scans."""
+"""Scans: taken, put in the queue of the rig, and their records kept."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import datetime
 from uuid import UUID, uuid4
 
 import structlog
 
 from slrig.devices import Rig
 from slrig.errors import InvalidInputError, ScanStateError
+from slrig.failure import ScanInterruptedError, failure_of
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.job import Holder, RigWork
+from slrig.jobs.queue import JobQueue
+from slrig.jobs.records import utc_now
+from slrig.jobs.worker import Worker
+from slrig.rig.preview import Light, Watch
+from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
 from slrig.scan.endings import Endings
-from slrig.scan.faults import ScanInterruptedError, fault_of
-from slrig.scan.folder import DataFolder
-from slrig.scan.holding import ActiveCalibration, HeldRig, check_plan
-from slrig.scan.lending import Lender
+from slrig.scan.job import CaptureBundle, ScanJob, ScanTools, WatchesHealth
 from slrig.scan.plan import ScanPlan
-from slrig.scan.preview import Light, Watch
-from slrig.scan.records import ScanRecord, ScanState, utc_now
+from slrig.scan.plan_check import check_plan
+from slrig.scan.records import ScanRecord, ScanState
 from slrig.scan.store import ScanStore
-from slrig.scan.walking import ScanTools, ScanWalk
-from slrig.scan.work import CaptureBundle, Holder, Loan, RunnerStatus, WatchesHealth
-from slrig.scan.worker import Worker
 
 _log = structlog.get_logger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
+class RunnerStatus:
+    """What the runner is at: the rig as far as it is known, who holds it and since when, and how many wait.
+
+    `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` is
+    `Holder.name`. `opening` is what the rig's driver told last, while it is opened. `reconstruction` is
+    `Worker.condition`, `preparing` whether that is on its way to ready.
+    """
+
+    rig: str
+    facts: RigFacts | None
+    active: ActiveCalibration | None
+    misfit: str | None
+    fault: str | None
+    holder: str | None
+    since: datetime | None
+    waiting: int
+    queue_length: int
+    opening: str
+    reconstruction: str
+    preparing: bool
+    ending: bool
+
+
 class Runner:
-    """Takes scans, works them off in order, and leaves every one of them in a final state; lends the rig to other work.
+    """Takes scans, works them off in order, and leaves each in a final state; lets other work have the rig.
 
     Every public method may be called from any thread.
     """
@@ -36,7 +64,7 @@ class Runner:
         self,
         store: ScanStore,
         folder: DataFolder,
-        rig: HeldRig,
+        rig: RigSession,
         worker: Worker,
         *,
         capture: CaptureBundle,
@@ -51,7 +79,7 @@ class Runner:
         self._spare_bytes = spare_bytes
         self._closing = threading.Lock()
         self._closed = False
-        self._lender = Lender(rig, queue_length=queue_length, give_up=give_up)
+        self._queue = JobQueue(rig, queue_length=queue_length, give_up=give_up)
         self._endings = Endings(store)
         self._health: WatchesHealth | None = None
         self._tools = ScanTools(
@@ -61,18 +89,18 @@ class Runner:
             capture,
             self._endings,
             spare_bytes,
-            ending=lambda: self._lender.ending,
+            ending=lambda: self._queue.ending,
             health=lambda: self._health,
         )
 
     def start(self) -> None:
         """Start the owner thread, which opens the rig, and the worker, which loads its kernels."""
-        self._lender.start()
+        self._queue.start()
         self._worker.start()
 
     def take_up(self, scans: Iterable[UUID]) -> None:
         """Put scans in line that a kill of the service left unfinished, see `slrig.scan.sweep`; before `start`."""
-        self._lender.take_up([ScanWalk(self._store.get(scan), self._tools) for scan in scans])
+        self._queue.take_up([ScanJob(self._store.get(scan), self._tools) for scan in scans])
 
     def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> ScanRecord:
         """Record a scan and have it done; `wait` lets it queue behind others.
@@ -92,8 +120,8 @@ class Runner:
         DeviceError
             A driver hangs.
         """
-        self._lender.refuse_while_stuck()
-        rig = self._lender.rig
+        self._queue.refuse_while_stuck()
+        rig = self._queue.rig
         # Before the rig was first open nothing is known about it; the scan then fails with the same errors.
         frame_bytes = 0 if rig.facts is None else check_plan(plan, rig.facts, rig.calibration)
         rig.refuse_misfit()
@@ -101,17 +129,17 @@ class Runner:
         self._folder.require_space(2 * frame_bytes + self._spare_bytes)
         record: ScanRecord | None = None
 
-        def make() -> ScanWalk:
+        def make() -> ScanJob:
             nonlocal record
             record = self._store.create(plan, rig=rig.name, label=label, key=key)
-            return ScanWalk(record, self._tools)
+            return ScanJob(record, self._tools)
 
-        self._lender.take_in(make, wait=wait)
+        self._queue.submit(make, wait=wait)
         if record is None:
             raise TypeError(record)
         return record
 
-    def borrow(
+    def submit_work(
         self,
         work: Callable[[Rig, Callable[[], bool]], None],
         *,
@@ -120,7 +148,7 @@ class Runner:
         ended: Callable[[Exception | None], None],
         begun: Callable[[UUID], None] = lambda _: None,
     ) -> UUID:
-        """Have `work` done with the rig, in line with the scans, and return the number of the loan. See `Loan`.
+        """Have `work` done with the rig, in line with the scans, and return its id. See `RigWork`.
 
         `begun` is told that number once a place in the line is certain, before the work can begin.
 
@@ -129,18 +157,18 @@ class Runner:
         RigBusyError, QueueFullError, DeviceError
             As `submit` does.
         """
-        self._lender.refuse_while_stuck()
+        self._queue.refuse_while_stuck()
 
-        def make() -> Loan:
-            loan = Loan(uuid4(), holder, utc_now(), work, ended, lambda: self._lender.ending)
-            begun(loan.id)
-            return loan
+        def make() -> RigWork:
+            job = RigWork(uuid4(), holder, utc_now(), work, ended, lambda: self._queue.ending)
+            begun(job.id)
+            return job
 
-        return self._lender.take_in(make, wait=wait).id
+        return self._queue.submit(make, wait=wait).id
 
-    def recall(self, loan: UUID) -> None:
+    def cancel_work(self, work_id: UUID) -> None:
         """Ask work that has the rig, or waits for it, to end early. Returns at once; one that is over stays so."""
-        self._lender.cancel(loan)
+        self._queue.cancel(work_id)
 
     def watch_health(self, health: WatchesHealth) -> None:
         """Have scans that begin from now on carry the health of their calibration, and tell what they find of it."""
@@ -154,7 +182,7 @@ class Runner:
         CalibrationError
             It is for other devices than those of the open rig.
         """
-        rig = self._lender.rig
+        rig = self._queue.rig
         fault = None if active is None else rig.misfit(active)
         # Before the rig is open nobody knows; a scan is then refused with the same words.
         if fault is not None:
@@ -162,19 +190,19 @@ class Runner:
         rig.active = active
 
     def watch(self, camera: str, light: Light) -> Watch:
-        """Look through a camera: see `Lender.watch`."""
-        return self._lender.watch(camera, light)
+        """Look through a camera: see `JobQueue.watch`."""
+        return self._queue.watch(camera, light)
 
     def cancel(self, scan_id: UUID) -> ScanRecord:
         """Ask a scan to stop. Returns at once; a scan that has finished stays as it is. Raises ScanNotFoundError."""
         record = self._store.get(scan_id)
-        if self._lender.cancel(scan_id):
+        if self._queue.cancel(scan_id):
             return record
         self._endings.settle()
         if scan_id not in self._endings:
             # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
             message = "Nothing works on this scan any more. Scan again."
-            self._store.finish(scan_id, ScanState.INTERRUPTED, fault=fault_of(ScanInterruptedError(message)))
+            self._store.finish(scan_id, ScanState.INTERRUPTED, fault=failure_of(ScanInterruptedError(message)))
         return self._store.get(scan_id)
 
     def delete(self, scan_id: UUID) -> None:
@@ -202,7 +230,7 @@ class Runner:
 
     def status(self) -> RunnerStatus:
         """Return what the runner is at. Touches no device."""
-        rig, lent = self._lender.rig, self._lender.status()
+        rig, held = self._queue.rig, self._queue.status()
         active = rig.active
         misfit = None if active is None else rig.misfit(active)
         return RunnerStatus(
@@ -211,14 +239,14 @@ class Runner:
             active=active,
             misfit=None if misfit is None else str(misfit),
             fault=None if rig.fault is None else rig.fault.message,
-            holder=None if lent.holder is None else lent.holder.name,
-            since=lent.since,
-            waiting=lent.waiting,
-            queue_length=self._lender.queue_length,
+            holder=None if held.holder is None else held.holder.name,
+            since=held.since,
+            waiting=held.waiting,
+            queue_length=self._queue.queue_length,
             opening=rig.calls.doing,
             reconstruction=self._worker.condition,
             preparing=self._worker.loading,
-            ending=lent.ending,
+            ending=held.ending,
         )
 
     def close(self, *, timeout_s: float = 3.0) -> None:
@@ -230,8 +258,8 @@ class Runner:
         with self._closing:
             if not self._closed:
                 self._closed = True
-                self._lender.end()
+                self._queue.end()
                 # The owner thread may be waiting for a reconstruction.
                 self._worker.close()
-                self._lender.join(timeout_s)
+                self._queue.join(timeout_s)
                 self._endings.close()

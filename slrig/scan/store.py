@@ -17,22 +17,12 @@ from sqlalchemy import delete, select, text
 from sqlalchemy.orm import Session
 
 from slrig.errors import ScanNotFoundError, StorageError
-from slrig.scan.database import Database
-from slrig.scan.faults import KeyInFlightError, ScanFault
+from slrig.failure import JobFailure, KeyInFlightError
+from slrig.jobs.database import Database
+from slrig.jobs.records import Clock, require_same_body, utc_now
 from slrig.scan.migrations import upgrade
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import (
-    Clock,
-    KeptRecord,
-    ScanEvent,
-    ScanProgress,
-    ScanRecord,
-    ScanState,
-    plan_from_json,
-    plan_json,
-    require_same_body,
-    utc_now,
-)
+from slrig.scan.records import KeptRecord, ScanEvent, ScanProgress, ScanRecord, ScanState, plan_from_json, plan_json
 from slrig.scan.tables import EventRow, KeyRow, ScanRow
 
 _log = structlog.get_logger(__name__)
@@ -157,7 +147,7 @@ class ScanStore:
         scan_id: UUID,
         state: ScanState,
         *,
-        fault: ScanFault | None = None,
+        fault: JobFailure | None = None,
         summary: Mapping[str, Any] | None = None,
     ) -> bool:
         """Record a final state. The first one stands: returns False, and changes nothing, for a finished scan."""
@@ -169,7 +159,7 @@ class ScanStore:
         self._wake(scan_id)
         return True
 
-    def lose_files(self, scan_id: UUID, fault: ScanFault) -> None:
+    def lose_files(self, scan_id: UUID, fault: JobFailure) -> None:
         """Record that a finished scan's files are gone."""
         with self._database.changing() as session:
             self._close_row(session, _find(session, scan_id), ScanState.FAILED, fault, None)
@@ -247,7 +237,7 @@ class ScanStore:
         session: Session,
         row: ScanRow,
         state: ScanState,
-        fault: ScanFault | None,
+        fault: JobFailure | None,
         summary: Mapping[str, Any] | None,
     ) -> None:
         row.state = state
@@ -329,7 +319,7 @@ def _record(row: ScanRow) -> ScanRecord:
         started_at=_moment(row.started_at),
         finished_at=_moment(row.finished_at),
         progress=ScanProgress(row.stage, row.fraction, row.detail),
-        fault=None if row.fault_kind is None else ScanFault(row.fault_kind, row.fault_message or ""),
+        fault=None if row.fault_kind is None else JobFailure(row.fault_kind, row.fault_message or ""),
         summary=row.summary,
     )
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
 from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Pattern, Pinhole, Pixels, Refusal, Shot, Size
+from slrig.model.header import CaptureHeader
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import (
@@ -29,7 +30,6 @@ from slrig.reconstruction.frames import (
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_frames
 from slrig.scan.light_axis import chosen_axis
-from slrig.scan.outline import Outline
 from slrig.scan.report import Stopwatch
 
 Entered = Callable[[str, str], None]
@@ -68,7 +68,7 @@ class ScanStream:
     """
 
     def __init__(
-        self, outline: Outline, calibration: Calibration, *, entered: Entered, axis: Axis | None = None
+        self, outline: CaptureHeader, calibration: Calibration, *, entered: Entered, axis: Axis | None = None
     ) -> None:
         self.outline = outline
         devices = [calibration.cameras[name] for name in outline.cameras]
@@ -122,7 +122,7 @@ class _Eye:
     before all of them are in, so they wait for `finish`.
     """
 
-    def __init__(self, name: str, outline: Outline, axis: Axis, entered: Entered) -> None:
+    def __init__(self, name: str, outline: CaptureHeader, axis: Axis, entered: Entered) -> None:
         self._name = name
         self._axis = axis
         self._patterns = outline.patterns
@@ -179,7 +179,7 @@ class _Eye:
 class LiveScan:
     """A stream that is fed while the scan is captured, with the seconds it took so far."""
 
-    def __init__(self, outline: Outline, calibration: Calibration) -> None:
+    def __init__(self, outline: CaptureHeader, calibration: Calibration) -> None:
         self.calibration = calibration
         self.evidence: EvidenceSummary | None = None
         self.watch = Stopwatch()

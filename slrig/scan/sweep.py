@@ -9,8 +9,8 @@ from pathlib import Path
 from uuid import UUID
 
 from slrig.errors import StorageError
-from slrig.scan.faults import fault_of, interruption
-from slrig.scan.folder import DataFolder, missing_files
+from slrig.failure import failure_of, interruption
+from slrig.jobs.data_folder import DataFolder, missing_files
 from slrig.scan.records import ScanState, read_record, report_summary
 from slrig.scan.store import ScanStore
 
@@ -56,7 +56,7 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
             continue
         if whole:
             folder.keep_bundle(record.id)
-        store.finish(record.id, ScanState.INTERRUPTED, fault=fault_of(interruption()))
+        store.finish(record.id, ScanState.INTERRUPTED, fault=failure_of(interruption()))
         interrupted.append(record.id)
     for scan_id, state in store.states().items():
         if state is ScanState.SUCCEEDED and (missing := missing_files(folder.scan(scan_id))):
@@ -64,7 +64,7 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
                 store.delete(scan_id)
                 continue
             message = f"{' and '.join(missing)} of this scan is gone from {folder.scan(scan_id)}. Scan again."
-            store.lose_files(scan_id, fault_of(StorageError(message)))
+            store.lose_files(scan_id, failure_of(StorageError(message)))
             lost.append(scan_id)
     for leftover in folder.incoming.iterdir():
         if leftover.name not in map(str, resumed):

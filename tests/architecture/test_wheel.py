@@ -30,5 +30,5 @@ def test_every_module_and_template_is_in_the_wheel(tmp_path: Path) -> None:
     held = set(ZipFile(wheel).namelist())
     needed = [path for package in PACKAGES for path in (ROOT / package).rglob("*.*")]
     names = [path.relative_to(ROOT).as_posix() for path in needed if path.suffix in {".py", ".html", ".css"}]
-    assert "slrig/sessions/templates/report.html" in names
+    assert "slrig/reports/templates/report.html" in names
     assert [name for name in names if name not in held] == []

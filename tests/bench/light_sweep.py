@@ -21,9 +21,9 @@ from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import SceneSurface, read_scene, surface_of
 from slrig.bundle import write_bundle, write_truth
 from slrig.model import Calibration, CameraFormat, Capture, LineShift, PatternSequence, Shot, Surface, Truth
-from slrig.scan.holding import pattern_sequence
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
+from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.light_bound import ExposedView, stripe_bound
 
 CONFIG = Path(__file__).parents[2] / "config"

@@ -19,15 +19,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slrig.accept.plan import AcceptancePlan, Artefact, Quantity, Step, exact_artefacts
+from slrig.accept.positions import acceptance_plan, rig_volume_mm
+from slrig.accept.running import run_acceptance
+from slrig.accept.scene import scripted_config
+from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import REJECTED_SHARE, Decision, fitted_sphere
 from slrig.config import HeadTable, read_rig
 from slrig.discovery import open_rig
 from slrig.model import FloatArray
-from slrig.sessions.acceptance.plan import AcceptancePlan, Artefact, Quantity, Step, exact_artefacts
-from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance.running import run_acceptance
-from slrig.sessions.acceptance.scene import scripted_config
-from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 RIG = Path(os.environ.get("SLRIG_RIG") or Path(__file__).parents[2] / "config" / "rigs" / "demo.toml")
 SEEDS = int(os.environ.get("SLRIG_SEEDS") or 30)

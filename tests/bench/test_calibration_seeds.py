@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from simulated_rig.options import HeadOptions
+from slrig.calibrate.pose_reading import read_pose
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import Solution
@@ -31,7 +32,6 @@ from slrig.errors import PoseRefusedError, ScanEvidenceError
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.sessions.calibration.pose_reading import read_pose
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene
 from tests.unit.calibration.solving.against_truth import in_deviations, in_first_camera
 

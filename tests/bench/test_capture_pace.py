@@ -16,8 +16,8 @@ from slrig.bundle import read_bundle
 from slrig.capture.evidence import EvidenceSummary
 from slrig.devices import CameraSettings, Projector, ProjectorInfo, Rig, Shown
 from slrig.model import Calibration, PatternSequence, Shot
+from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.outline import Outline
 from slrig.scan.plan import ScanPlan
 from tests.contract.benches import simulated
 
@@ -73,7 +73,7 @@ class Sink:
     def __init__(self) -> None:
         self.frames = 0
 
-    def begin(self, _outline: Outline, _calibration: Calibration | None) -> None:
+    def begin(self, _outline: CaptureHeader, _calibration: Calibration | None) -> None:
         self.frames = 0
 
     def take(self, _shot: Shot) -> None:

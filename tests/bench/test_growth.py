@@ -23,8 +23,8 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Capture, LineShift, Pattern
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.peers.ours import FILE_STAGES
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "demo.toml"

@@ -21,8 +21,8 @@ from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.edges import EdgeLimits
 from slrig.reconstruction.refinement import refined
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.plots import FIGURES, Curve, Panel, require_matplotlib, write_figure
 
 RIGS = Path(__file__).parents[2] / "config" / "rigs"

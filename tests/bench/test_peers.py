@@ -23,8 +23,8 @@ from slrig.bundle import read_bundle, read_truth
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.peers.catalogue import METHODS, OURS
 from tests.bench.peers.figures import figures_of
 from tests.bench.peers.measuring import Phase

@@ -25,11 +25,11 @@ from slrig.capture.evidence import check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, LineShift, Mesh
+from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.measured import Walked
-from slrig.scan.outline import Outline
-from slrig.scan.pipeline import _meshed
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import _meshed
 from slrig.scan.report import Stopwatch
 from slrig.scan.stream import ScanStream, cell_px, step_px
 from slrig.scan.triangulated import triangulated
@@ -88,7 +88,7 @@ class Run:
         last_line = max(i for i, s in enumerate(capture.shots) if isinstance(capture.patterns[s.pattern], LineShift))
         began = time.perf_counter()
         cpu = time.process_time()
-        stream = ScanStream(Outline.of(capture), calibration, entered=lambda stage, _camera: watch.enter(stage))
+        stream = ScanStream(CaptureHeader.of(capture), calibration, entered=lambda stage, _camera: watch.enter(stage))
         came: list[float] = []
         for shot in capture.shots:
             came.append(time.perf_counter())

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
+from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.scene import SCENE, scripted_config
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.sessions.acceptance.asking import AcceptanceRequest
-from slrig.sessions.acceptance.scene import SCENE, scripted_config
 from tests.e2e.conftest import Start, write_rig
 from tests.e2e.schedules import at_once, awaited, newest
 from tests.e2e.test_calibration_walk import Caller

@@ -19,8 +19,8 @@ from slrig.bundle.calibration_file import write_calibration
 from slrig.devices import CameraSettings, Rig
 from slrig.meshing.quality import TruthScore
 from slrig.model import Mesh, Truth
-from slrig.scan.holding import pattern_sequence
 from slrig.scan.plan import PatternPlan
+from slrig.scan.plan_check import pattern_sequence
 from tests.contract.screen_bench import let_go
 from tests.contract.screen_server import DummyServer, OutputPixels, require_xorg
 from tests.contract.serial_bench import TriggerBox

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import ScanPlan
-from slrig.sessions.calibration.records import USUAL_PATTERNS
 from tests.e2e.conftest import ServiceProcess, Start
 from tests.e2e.test_calibration_walk import BOARD, Caller, scanned, write_rig
 

@@ -13,8 +13,8 @@ from slrig.bundle import read_capture
 from slrig.devices import CameraSettings, Rig
 from slrig.model import Capture
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.e2e.conftest import Start, write_rig
 
 SECOND_CAMERA = """

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slrig.accept.plan import AcceptancePlan, Quantity, exact_artefacts
+from slrig.accept.positions import acceptance_plan, rig_volume_mm
+from slrig.accept.running import run_acceptance
+from slrig.accept.scene import scripted_config
+from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import Decision, fitted_sphere
 from slrig.config import HeadTable, RigConfig, read_rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError
 from slrig.model import Calibration
-from slrig.sessions.acceptance.plan import AcceptancePlan, Quantity, exact_artefacts
-from slrig.sessions.acceptance.positions import acceptance_plan, rig_volume_mm
-from slrig.sessions.acceptance.running import run_acceptance
-from slrig.sessions.acceptance.scene import scripted_config
-from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
 """Small: the demonstration's resolution over half its view."""

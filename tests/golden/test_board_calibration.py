@@ -14,14 +14,14 @@ import pytest
 from typer.testing import CliRunner
 
 from slrig.bundle.calibration_file import write_calibration
+from slrig.calibrate.pose_frames import bundle_device_sizes
+from slrig.calibrate.pose_reading import read_pose
+from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import COLUMN, ROW, Correspondences
 from slrig.calibration.solution import PARAMETERS, PROJECTOR
 from slrig.cli.commands import app
 from slrig.model import FloatArray
-from slrig.sessions.calibration.pose_frames import bundle_device_sizes
-from slrig.sessions.calibration.pose_reading import read_pose
-from slrig.sessions.calibration.solving import CalibrationResult, ReadPose, solve_poses
 
 pytestmark = pytest.mark.slow
 BOARD = Board(BoardKind.CHESSBOARD, 7, 9, 75.0)

@@ -18,10 +18,10 @@ from slrig.capture.evidence import EvidenceSummary
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, Shot
+from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.outline import Outline
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.stream import LiveScan
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -54,7 +54,7 @@ class Watching:
     def __init__(self) -> None:
         self.live: LiveScan | None = None
 
-    def begin(self, outline: Outline, calibration: Calibration | None) -> None:
+    def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
         assert calibration is not None
         self.live = LiveScan(outline, calibration)
 

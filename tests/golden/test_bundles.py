@@ -10,8 +10,8 @@ import pytest
 
 from slrig.bundle import read_bundle, write_bundle
 from slrig.model import Capture, LineShift
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 
 pytestmark = pytest.mark.shared
 

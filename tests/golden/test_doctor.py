@@ -16,11 +16,11 @@ from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.devices import FoundDevice, Rig
 from slrig.discovery import open_rig
+from slrig.doctor.doctor import Diagnosis, examine
+from slrig.doctor.findings import Severity
 from slrig.errors import ScanEvidenceError
 from slrig.model import PatternSequence
 from slrig.patterns.sequence import encode, scan_patterns
-from slrig.sessions.examination.doctor import Diagnosis, examine
-from slrig.sessions.examination.findings import Severity
 
 BOARD = """
 name = "board"

@@ -28,6 +28,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from slrig.bundle import write_calibration
+from slrig.calibrate.pose_reading import read_pose
 from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.displacement import modes_of, moved_points, rigid_free
 from slrig.calibration.judging.expected_error import expected_error
@@ -38,9 +39,8 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, FloatArray, Pinhole, Solved
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.sessions.calibration.pose_reading import read_pose
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.unit.calibration.perturbed import aligned, met_with_light, pixels
 from tests.unit.calibration.solving.against_truth import in_first_camera
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from slrig.calibrate.pose_reading import read_pose
+from slrig.calibrate.solving import solve_poses
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.health.verdict import HealthState, judged
 from slrig.calibration.solution import PROJECTOR
 from slrig.model import Calibration, Size
-from slrig.sessions.calibration.pose_reading import read_pose
-from slrig.sessions.calibration.solving import solve_poses
-from slrig.sessions.health.verification import verify_bundle
+from slrig.verify.verification import verify_bundle
 from tests.rendered_boards import board_options, rendered_poses
 
 pytestmark = pytest.mark.slow

@@ -17,8 +17,8 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import FloatArray
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.records import report_summary
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "two_cameras.toml"

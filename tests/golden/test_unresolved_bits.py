@@ -21,8 +21,8 @@ from slrig.meshing.rasteriser import rasterised
 from slrig.model import Axis, FloatArray, Pinhole
 from slrig.reconstruction.frames import axis_frames
 from slrig.reconstruction.optics import project
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.golden.test_light_axis import Device, rig_file, scanned
 
 CAMERA: Device = {

@@ -8,9 +8,9 @@ from typing import Any
 import httpx2
 
 from slrig.api.calibration_schemas import CalibrationBody, CalibrationList, PoseBody
+from slrig.calibrate.pose_judging import summary
 from slrig.cli.client import ServiceClient
-from slrig.sessions.calibration.pose_judging import summary
-from tests.unit.sessions.calibration.solved import BOARD, solved_result
+from tests.unit.calibrate.solved import BOARD, solved_result
 
 ID = "3f6c1f6e-9f0e-4c57-8a39-5f8a4f0c2b11"
 NOW = "2026-11-22T09:30:00+00:00"

@@ -12,6 +12,10 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
+from slrig.accept.plan import AcceptancePlan
+from slrig.accept.running import run_acceptance
+from slrig.accept.scene import scripted_config
+from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
 from slrig.cli.accept import Asked, moving, placed_by_hand
@@ -20,10 +24,6 @@ from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, UnsupportedByDeviceError
-from slrig.sessions.acceptance.plan import AcceptancePlan
-from slrig.sessions.acceptance.running import run_acceptance
-from slrig.sessions.acceptance.scene import scripted_config
-from slrig.sessions.acceptance.verdicts import AcceptanceResult
 
 RIGS = Path(__file__).parents[2] / "config" / "rigs"
 BALL_BAR = RIGS / "ball_bar.toml"

@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 from slrig.bundle import read_calibration, read_opencv_calibration
+from slrig.calibrate.pose_judging import summary
 from slrig.calibration.board import USUAL_BOARD, BoardShape
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import PoseRefusedError, SolveRefusedError
-from slrig.sessions.calibration.pose_judging import summary
+from tests.unit.calibrate.solved import BOARD, BUMP, BUMPED, POSES, read_poses, solved_result
 from tests.unit.calibrate_command import refused, run
-from tests.unit.sessions.calibration.solved import BOARD, BUMP, BUMPED, POSES, read_poses, solved_result
 
 GIVEN = POSES[:6]
 BOARD_OPTIONS = ["--board", "chessboard", "--corners", "11x8", "--square-mm", "12"]
@@ -72,8 +72,8 @@ def solving(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         options["progress"]("adjustment", 0.5, "")
         return solved_result()
 
-    monkeypatch.setattr("slrig.sessions.calibration.pose_reading.read_pose", read_pose)
-    monkeypatch.setattr("slrig.sessions.calibration.solving.solve_poses", solve_poses)
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", read_pose)
+    monkeypatch.setattr("slrig.calibrate.solving.solve_poses", solve_poses)
     return asked
 
 
@@ -143,7 +143,7 @@ def test_report_is_written_with_what_each_camera_saw(
     import numpy as np
 
     monkeypatch.setattr(
-        "slrig.sessions.calibration.pose_pictures.white_frame",
+        "slrig.calibrate.pose_pictures.white_frame",
         lambda _folder, _camera: np.full((1024, 1280), 80, dtype=np.uint8),
     )
     report = tmp_path / "report.html"
@@ -191,7 +191,7 @@ def test_pose_that_cannot_be_used_is_named_with_its_cause(
             raise PoseRefusedError(message)
         return known[name]
 
-    monkeypatch.setattr("slrig.sessions.calibration.pose_reading.read_pose", read_pose)
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", read_pose)
     result = run("solve", poses, *BOARD_OPTIONS, "--output", tmp_path / "rig.json")
     assert result.exit_code == 0, result.output
     assert "pose_02" not in solving["poses"]
@@ -203,7 +203,7 @@ def test_two_poses_the_same_are_judged_as_live_ones_are(
     poses: Path, solving: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     known = {**read_poses(), "pose_05": read_poses()["pose_04"]}
-    monkeypatch.setattr("slrig.sessions.calibration.pose_reading.read_pose", lambda _folder, _board, name: known[name])
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", lambda _folder, _board, name: known[name])
     result = run("solve", poses, *BOARD_OPTIONS, "--output", tmp_path / "rig.json")
     assert result.exit_code == 0, result.output
     assert len(solving["poses"]) == len(GIVEN) - 1
@@ -217,7 +217,7 @@ def test_wrong_board_is_told_once_for_all_poses(
         message = f"pose '{name}': another board: expected 9 x 9 corners, found 11 x 8"
         raise PoseRefusedError(message)
 
-    monkeypatch.setattr("slrig.sessions.calibration.pose_reading.read_pose", read_pose)
+    monkeypatch.setattr("slrig.calibrate.pose_reading.read_pose", read_pose)
     options = ["--board", "chessboard", "--corners", "9x9", "--square-mm", "12", "--output", tmp_path / "rig.json"]
     words = refused(run("solve", poses, *options))
     assert "none of its poses (6) shows a chessboard 9x9, 12 mm that can be used" in words
@@ -243,7 +243,7 @@ def test_refused_solve_names_the_poses_that_were_not_used(
         message = "all boards are parallel: tilt them"
         raise SolveRefusedError(message)
 
-    monkeypatch.setattr("slrig.sessions.calibration.solving.solve_poses", refuse)
+    monkeypatch.setattr("slrig.calibrate.solving.solve_poses", refuse)
     (poses / "pose_04" / "bundle.json").write_text("{")
     words = refused(run("solve", poses, *BOARD_OPTIONS, "--output", tmp_path / "rig.json"))
     assert words.startswith("all boards are parallel: tilt them\n1 pose was not used:\n  pose_04: ")

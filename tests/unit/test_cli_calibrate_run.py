@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from slrig.cli import calibrate
 from slrig.cli.calibrate_walk import Walk, opened
 from slrig.cli.commands import INTERRUPTED, app
+from tests.unit.calibrate.solved import BOARD
 from tests.unit.calibrate_command import refused, run
 from tests.unit.calibration_desk import ID, Desk, client_of
-from tests.unit.sessions.calibration.solved import BOARD
 
 BOARD_OPTIONS = ["--board", "chessboard", "--corners", "11x8", "--square-mm", "12"]
 

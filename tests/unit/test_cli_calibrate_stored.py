@@ -14,9 +14,9 @@ from slrig.api.calibration_schemas import ComparisonBody
 from slrig.bundle import write_calibration, write_opencv_calibration
 from slrig.cli import calibrate
 from slrig.cli.client import ServiceClient
+from tests.unit.calibrate.solved import solved_result
 from tests.unit.calibrate_command import refused, run
 from tests.unit.calibration_desk import ID, Desk
-from tests.unit.sessions.calibration.solved import solved_result
 
 OTHER = "77777777-9f0e-4c57-8a39-5f8a4f0c2b11"
 BOARD_OPTIONS = ["--board", "chessboard", "--corners", "11x8", "--square-mm", "12"]

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from slrig.cli import init
 from slrig.cli.commands import app
-from slrig.cli.rig_draft import fault_of, typed
+from slrig.cli.rig_draft import failure_of, typed
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Camera, FoundDevice, Projector
 from slrig.discovery import Findings, MissingLibrary, open_rig
@@ -54,7 +54,7 @@ class Bench:
         rig = read_rig(self.path)
         assert rig.projector is not None
         for table in (rig.projector, *rig.cameras):
-            assert fault_of(table.driver, table.options) == ""
+            assert failure_of(table.driver, table.options) == ""
         return rig
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.serial_projector.device import main as box
-from slrig.cli.rig_draft import fault_of
+from slrig.cli.rig_draft import failure_of
 from slrig.config import RigConfig, read_rig
 from slrig.option_models import described_drivers
 
@@ -29,7 +29,7 @@ def taken_by_its_drivers(path: Path) -> RigConfig:
     assert tables
     for table in tables:
         assert table.driver in described_drivers("slrig")
-        assert fault_of(table.driver, table.options) == ""
+        assert failure_of(table.driver, table.options) == ""
     return rig
 
 

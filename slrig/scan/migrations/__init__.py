@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy import Connection
 
-from slrig.scan.database import run_migrations
+from slrig.jobs.database import run_migrations
 
 
 def upgrade(connection: Connection) -> None:

@@ -10,8 +10,8 @@ import trimesh
 
 from slrig.bundle.truth import SURFACE, VISIBLE
 from slrig.model import Surface
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.peers.measuring import Meter, Phase
 
 FILE_STAGES = frozenset({"read bundle", "write mesh", "pictures", "compare with truth", "write report", "done"})

@@ -20,8 +20,8 @@ from slrig.meshing.quality import TruthScore, score
 from slrig.meshing.search_tree import SearchTree
 from slrig.model import FloatArray, Mesh, Truth
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
 from tests.e2e.conftest import Start, write_rig
 
 EXPOSURE_S = 0.0167

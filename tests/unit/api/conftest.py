@@ -14,13 +14,13 @@ from slrig.api.app import create_app
 from slrig.api.security import digest
 from slrig.api.service import assembled_service
 from slrig.config import ScanDefaults, ServiceSettings
-from slrig.scan.folder import DataFolder
-from slrig.scan.holding import HeldRig
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.worker import Worker
+from slrig.rig.session import RigSession
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import Worker
+from tests.unit.calibrate.calibration_bench import TameCalibrating
 from tests.unit.scan.fakes import WAIT_S, TameBench
-from tests.unit.sessions.calibration.calibration_bench import TameCalibrating
 
 KEY = "the key of the tests"
 
@@ -37,7 +37,7 @@ class ServedBench(TameBench):
         folder = DataFolder(root, free=lambda _: self.free_bytes)
         store = ScanStore(folder.database)
         self.worker = Worker("tests.unit.scan.fake_pipeline")
-        rig = HeldRig("bench", self.open_rig)
+        rig = RigSession("bench", self.open_rig)
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
         self.tame = TameCalibrating(self)

@@ -9,15 +9,15 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
+from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
-from slrig.sessions.acceptance.asking import AcceptanceRequest
-from slrig.sessions.acceptance.desk import AcceptanceDesk
-from tests.unit.sessions.acceptance.test_desk import PLAN, TameLender, desk, desks, lender
-from tests.unit.sessions.acceptance.test_running import RIG
+from tests.unit.accept.test_desk import PLAN, TameLender, desk, desks, queue
+from tests.unit.accept.test_running import RIG
 
-__all__ = ["desk", "desks", "lender"]
+__all__ = ["desk", "desks", "queue"]
 
 EXACT = {
     "sphere": {"value_mm": 30, "uncertainty_mm": 0.001},
@@ -84,10 +84,10 @@ def test_what_cannot_be_tested_is_refused(client: TestClient, body: dict[str, ob
 
 
 def test_a_held_rig_answers_409_and_an_unknown_test_404(
-    client: TestClient, desk: AcceptanceDesk, lender: TameLender
+    client: TestClient, desk: AcceptanceDesk, queue: TameLender
 ) -> None:
     test = desk.open(lambda _: PLAN)
-    lender.busy = True
+    queue.busy = True
     answer = client.post(f"/acceptance/{test.id}/position")
     assert (answer.status_code, answer.json()["holder"]) == (409, "1")
     assert client.get("/acceptance/00000000-0000-0000-0000-000000000000").status_code == 404
@@ -104,7 +104,7 @@ def test_exact_artefacts_are_refused_on_metal(client: TestClient) -> None:
 
 
 def test_a_repeated_request_opens_and_measures_nothing_anew(
-    client: TestClient, desk: AcceptanceDesk, lender: TameLender, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, desk: AcceptanceDesk, queue: TameLender, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     key = {"Idempotency-Key": "once"}
@@ -115,7 +115,7 @@ def test_a_repeated_request_opens_and_measures_nothing_anew(
     again = client.post("/acceptance", headers=key)
     assert (again.status_code, again.headers["location"], again.json()) == (201, path, first.json())
     assert client.post(f"{path}/position", headers=key).json() == client.get(path).json()
-    assert (len(lender.holders), len(desk.latest())) == (1, 1)
+    assert (len(queue.holders), len(desk.latest())) == (1, 1)
     for where in ("/acceptance", f"{path}/position"):
         other = {"repeats": 2} if where == "/acceptance" else {"scripted": True}
         answer = client.post(where, headers=key, json=other)

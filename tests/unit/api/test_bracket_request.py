@@ -19,8 +19,9 @@ from slrig.config import ScanDefaults, read_rig
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 from slrig.model import CameraFormat, Size
-from slrig.scan.holding import RigFacts, check_plan
+from slrig.rig.session import RigFacts
 from slrig.scan.plan import ScanPlan
+from slrig.scan.plan_check import check_plan
 from slrig.scan.records import plan_from_json, plan_json
 
 RIG = """

@@ -15,11 +15,11 @@ from fastapi.testclient import TestClient
 from slrig.bundle.calibration_file import write_calibration
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, Size
-from slrig.scan.holding import pattern_sequence
+from slrig.scan.plan_check import pattern_sequence
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.api.test_scans import events_of
+from tests.unit.calibrate.calibration_bench import PNG, tame_calibration
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.sessions.calibration.calibration_bench import PNG, tame_calibration
 
 BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
 

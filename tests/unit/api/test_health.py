@@ -14,24 +14,24 @@ from fastapi.testclient import TestClient
 from slrig.api import health
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
-from slrig.scan.folder import DataFolder
-from slrig.sessions.health.store import HealthStore
-from slrig.sessions.health.verification import VerificationDesk
-from tests.unit.sessions.health.test_verification import TAME, Lender
+from slrig.jobs.data_folder import DataFolder
+from slrig.verify.store import HealthStore
+from slrig.verify.verification import VerificationDesk
+from tests.unit.verify.test_verification import TAME, JobQueue
 
 BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
 
 
 @pytest.fixture
-def lender() -> Lender:
-    return Lender()
+def queue() -> JobQueue:
+    return JobQueue()
 
 
 @pytest.fixture
-def client(tmp_path: Path, lender: Lender) -> Iterator[TestClient]:
+def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
     store = HealthStore(folder.database)
-    desk = VerificationDesk(folder, lender, store, tools=TAME)
+    desk = VerificationDesk(folder, queue, store, tools=TAME)
     service = SimpleNamespace(
         verifications=desk, refuse_when_stale=True, calibrations=SimpleNamespace(active=None)
     )  # fmt: skip
@@ -70,8 +70,8 @@ def test_a_verification_changes_the_health(client: TestClient) -> None:
     assert "Expected error of a scan" in plot.text
 
 
-def test_a_busy_rig_names_its_holder(client: TestClient, lender: Lender) -> None:
-    lender.held = "schedule 'nightly'"
+def test_a_busy_rig_names_its_holder(client: TestClient, queue: JobQueue) -> None:
+    queue.held = "schedule 'nightly'"
     answer = client.post("/rig/verification", json={"board": BOARD})
     assert answer.status_code == 409
     assert "schedule 'nightly'" in answer.json()["detail"]

@@ -13,8 +13,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.devices import Rig
+from slrig.jobs.frame_feed import FrameSink
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.feed import FrameSink
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.unit.api.conftest import KEY, ServedBench, ended
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig

@@ -14,7 +14,7 @@ from slrig.api.openapi import text
 from slrig.api.problems import STATUS, explanations, slug
 from slrig.api.security import claim_key, digest
 from slrig.errors import ConfigError
-from slrig.scan.faults import error_classes
+from slrig.failure import error_classes
 from tests.unit.api.conftest import KEY, ServedBench
 
 OPENAPI = Path(__file__).resolve().parents[3] / "config" / "openapi.json"

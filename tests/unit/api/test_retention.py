@@ -8,8 +8,8 @@ from pathlib import Path
 from fastapi.testclient import TestClient
 
 from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.calibrate.calibration_bench import BOARD
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.sessions.calibration.calibration_bench import BOARD
 
 
 def test_old_calibrations_are_removed_when_the_service_starts(tmp_path: Path) -> None:

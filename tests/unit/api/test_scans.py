@@ -13,7 +13,7 @@ import trimesh
 from fastapi.testclient import TestClient
 
 from slrig.api.schemas import ScanRequest, fingerprint
-from slrig.scan.worker import Worker
+from slrig.jobs.worker import Worker
 from tests.unit.api.conftest import ServedBench, ended
 
 

@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.bundle.calibration_file import write_calibration
-from slrig.scheduling.records import RunState
+from slrig.schedule.records import RunState
 from tests.unit.api.conftest import ServedBench
 from tests.unit.scan.fakes import WAIT_S
 
@@ -178,7 +178,7 @@ def test_metrics_tell_the_calibration_in_use(client: TestClient, served: ServedB
     calibrations = served.service.calibrations
     path = served.service.folder.root / "given.json"
     write_calibration(path, served.tame.calibration)
-    imported = calibrations.take_in(path.read_bytes(), ".json")
+    imported = calibrations.submit(path.read_bytes(), ".json")
     calibrations.activate(imported.id)
     lines = client.get("/metrics").text.splitlines()
     calibrations.deactivate(imported.id)

@@ -16,8 +16,8 @@ from slrig.devices import CameraSettings, Head, Rig, Trigger
 from slrig.errors import BundleError, ConfigError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, LineShift, Pattern, Shot, Size, White
 from slrig.patterns.sequence import encode
-from slrig.scan.holding import pattern_sequence
 from slrig.scan.plan import PatternPlan
+from slrig.scan.plan_check import pattern_sequence
 
 PROJECTOR = Size(16, 8)
 CAMERA = Size(6, 4)

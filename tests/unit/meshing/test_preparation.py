@@ -41,7 +41,7 @@ def _compiled_by(module: str, name: str, given: str = "") -> set[str]:
 @pytest.mark.slow
 def test_it_compiles_what_a_scan_needs() -> None:
     beside = _compiled_by("slrig.meshing.preparation", "mesh_sample")
-    needed = _compiled_by("slrig.scan.pipeline", "warm_kernels", "lambda _: None")
+    needed = _compiled_by("slrig.scan.reconstruct", "warm_kernels", "lambda _: None")
     assert len(beside) > 20
     # Vertices are numbered anew only for what is written.
     assert {each for each in needed - beside if "._renumbered(" not in each} == set()

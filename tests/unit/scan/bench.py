@@ -7,13 +7,13 @@ from pathlib import Path
 from uuid import UUID
 
 from slrig.errors import InvalidInputError
-from slrig.scan.folder import DataFolder
-from slrig.scan.holding import HeldRig
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.worker import Worker
+from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import ScanRecord, ScanState
 from slrig.scan.runner import Runner
 from slrig.scan.store import ScanStore
-from slrig.scan.worker import Worker
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
 PIPELINE = "tests.unit.scan.fake_pipeline"
@@ -32,7 +32,7 @@ class Bench(TameBench):
         self.runner = Runner(
             self.store,
             self.folder,
-            HeldRig("bench", self.open_rig),
+            RigSession("bench", self.open_rig),
             self.worker,
             capture=self.capture,
             queue_length=1,

@@ -1,4 +1,4 @@
-"""Stands in for `slrig.scan.pipeline` in a worker process: what it does is written in the bundle it is given."""
+"""Stands in for `slrig.scan.reconstruct` in a worker process: what it does is written in the bundle it is given."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 
 from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
+from slrig.jobs.frame_feed import FedFrames
 from slrig.model import Calibration, Mesh, Shot
+from slrig.model.header import CaptureHeader
 from slrig.scan.artefacts import write_mesh
-from slrig.scan.feed import FedFrames
-from slrig.scan.outline import Outline
 from slrig.scan.plan import ReconstructionPlan
 
 ARTEFACTS = ("points.ply", "preview.png")
@@ -35,7 +35,7 @@ TRIANGLE = Mesh(
 class LiveScan:
     """Counts the frames that come. The first pixel of a frame says what else to do: die (1), raise (2), hang (3)."""
 
-    def __init__(self, outline: Outline, _calibration: Calibration) -> None:
+    def __init__(self, outline: CaptureHeader, _calibration: Calibration) -> None:
         self.listed = len(outline.frames)
         self.taken = 0
         self.ended = False

@@ -13,16 +13,18 @@ import numpy as np
 from slrig.capture.evidence import EvidenceSummary
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
 from slrig.errors import ScanCancelledError
+from slrig.jobs.frame_feed import FrameSink
 from slrig.model import Black, Calibration, CameraFormat, Frame, PatternSequence, Shot, Size, White
-from slrig.scan.feed import FrameSink
-from slrig.scan.outline import Outline
+from slrig.model.header import CaptureHeader
 from slrig.scan.plan import ScanPlan
 
 WAIT_S = 20.0
 """How long a test waits for an event that must come; a pass never waits for it to run out."""
 
 
-OUTLINE = Outline(Size(64, 40), (White(), Black()), {"cam0": CameraFormat(Size(64, 48), 8)}, ((0, "cam0"), (1, "cam0")))
+OUTLINE = CaptureHeader(
+    Size(64, 40), (White(), Black()), {"cam0": CameraFormat(Size(64, 48), 8)}, ((0, "cam0"), (1, "cam0"))
+)
 CALIBRATION = Calibration({}, None)
 SHOTS = tuple(Shot(index, "cam0", np.zeros((48, 64), dtype=np.uint8)) for index in range(2))
 EVIDENCE = EvidenceSummary(2, 2, {}, {}, {}, ())

@@ -15,10 +15,10 @@ from slrig.bundle import read_bundle
 from slrig.bundle.refused import read_refused
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.errors import DeviceGoneError, FrameTimeoutError, ScanCancelledError, ScanEvidenceError, SlrigError
+from slrig.jobs.frame_feed import Abandon, FrameFeed
 from slrig.model import Calibration, Shot
+from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_bundle
-from slrig.scan.feed import Abandon, FrameFeed
-from slrig.scan.outline import Outline
 from slrig.scan.plan import ScanPlan
 from slrig.scan.report import capture_report
 from slrig.scan.stream import ScanStream
@@ -37,11 +37,11 @@ class Sink:
     """Hears what a reconstruction would."""
 
     def __init__(self) -> None:
-        self.outline: Outline | None = None
+        self.outline: CaptureHeader | None = None
         self.shots: list[Shot] = []
         self.evidence: EvidenceSummary | None = None
 
-    def begin(self, outline: Outline, _calibration: Calibration | None) -> None:
+    def begin(self, outline: CaptureHeader, _calibration: Calibration | None) -> None:
         self.outline = outline
 
     def take(self, shot: Shot) -> None:
@@ -97,7 +97,7 @@ def test_the_report_says_what_was_verified_and_what_was_shot_again(tmp_path: Pat
     captured(faulty(garbled=frozenset({17})), tmp_path / "bundle")
     bundle = read_bundle(tmp_path / "bundle")
     stream = ScanStream(
-        Outline.of(bundle.capture), replace(sample_calibration(), projector=None), entered=lambda *_: None
+        CaptureHeader.of(bundle.capture), replace(sample_calibration(), projector=None), entered=lambda *_: None
     )
     report = capture_report(bundle.capture, stream.axis, check_capture(bundle.capture, read_refused(bundle.folder)))
     assert report["identity"] == "22/22 patterns verified, 1 frame shot again"

@@ -19,9 +19,9 @@ from slrig.cli.commands import app
 from slrig.errors import PatternError
 from slrig.model import Capture, Gray, LineShift, Pixels
 from slrig.scan.decoding_only import decode_bundle
-from slrig.scan.pipeline import reconstruct_bundle
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import sample_scan
+from slrig.scan.reconstruct import reconstruct_bundle
 
 
 def recorded(folder: Path, change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None) -> Path:

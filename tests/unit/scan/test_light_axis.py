@@ -9,9 +9,9 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import LEAST_SHARE, Axis, Calibration, Gray, LineShift, Pinhole, Size
-from slrig.scan.holding import pattern_sequence
 from slrig.scan.light_axis import FAIR_SHARE, chosen_axis, played_axes, weakness
 from slrig.scan.plan import PatternPlan
+from slrig.scan.plan_check import pattern_sequence
 
 BOTH = tuple(Axis)
 

@@ -11,12 +11,13 @@ import pytest
 from numba import config
 
 from slrig.errors import StorageError
+from slrig.jobs.worker import PIPELINE
 from slrig.kernels import Prepared, compilations_told, prepared
-from slrig.scan import pipeline, preparation
+from slrig.scan import preparation
+from slrig.scan import reconstruct as pipeline
+from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels, sample_scan
-from slrig.scan.walking import reconstruction
-from slrig.scan.worker import PIPELINE
 
 
 def test_the_production_pipeline_has_all_that_the_worker_looks_up() -> None:

@@ -13,7 +13,8 @@ import pytest
 from sqlalchemy.orm import Session
 
 from slrig.errors import StorageError
-from slrig.scan import database, endings
+from slrig.jobs import database
+from slrig.scan import endings
 from slrig.scan.records import ScanRecord, ScanState
 from tests.unit.scan.bench import Bench
 

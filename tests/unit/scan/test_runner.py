@@ -18,15 +18,15 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
+from slrig.failure import ScanInterruptedError
 from slrig.model import Calibration
-from slrig.scan.faults import ScanInterruptedError
-from slrig.scan.holding import ActiveCalibration
+from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import ScanState, read_record
 from slrig.scan.sweep import sweep
+from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench, fault_kind
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.sessions.calibration.calibration_bench import tame_calibration
 
 
 def test_scans_that_a_kill_left_are_taken_up_again(tmp_path: Path) -> None:

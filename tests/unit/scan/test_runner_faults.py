@@ -22,7 +22,7 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.scan.holding import HeldRig
+from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import ScanState
 from tests.unit.scan.bench import Bench, fault_kind
@@ -33,7 +33,7 @@ def input_output_error() -> OSError:
     return OSError(errno.EIO, "Input/output error")
 
 
-def told(rig: HeldRig) -> str | None:
+def told(rig: RigSession) -> str | None:
     return None if rig.fault is None else rig.fault.message
 
 
@@ -123,7 +123,7 @@ def test_error_of_the_system_in_a_driver_is_no_fault_of_the_disk(bench: Bench) -
 def test_error_of_the_system_at_opening_is_no_fault_of_the_disk() -> None:
     bench = TameBench()
     bench.open_error = PermissionError(errno.EACCES, "Permission denied", "/dev/video0")
-    rig = HeldRig("bench", bench.open_rig)
+    rig = RigSession("bench", bench.open_rig)
     with pytest.raises(DeviceError, match=r"rig 'bench' failed: .*'/dev/video0'; check cable, power and permissions"):
         rig.open()
     assert rig.fault is not None
@@ -140,7 +140,7 @@ def test_request_that_the_devices_cannot_do_leaves_the_rig_open(bench: Bench) ->
 
 def test_rig_that_was_let_go_is_opened_once_more_and_says_how_that_went() -> None:
     bench = TameBench()
-    rig = HeldRig("bench", bench.open_rig)
+    rig = RigSession("bench", bench.open_rig)
     rig.open()
     rig.let_go(DeviceGoneError("Camera 'cam0' was unplugged."))
     bench.open_error = DeviceGoneError("No camera on usb-3.")

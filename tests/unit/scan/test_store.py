@@ -12,7 +12,7 @@ from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, text
 
 from slrig.errors import IdempotencyError, ScanNotFoundError, StorageError
-from slrig.scan.faults import KeyInFlightError, ScanFault
+from slrig.failure import JobFailure, KeyInFlightError
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import ScanProgress, ScanState
 from slrig.scan.store import ProgressRecorder, ScanStore
@@ -46,13 +46,13 @@ def test_life_of_a_scan_is_told_by_its_events_in_order(store: ScanStore, clock: 
     assert store.advance(scan.id, ScanState.CAPTURING) == clock.now
     store.progress(scan.id, ScanProgress("capture", 0.25, "frame 7 of 28"))
     clock.move(seconds=3)
-    assert store.finish(scan.id, ScanState.FAILED, fault=ScanFault("BundleError", "Frame 3 is cut."))
+    assert store.finish(scan.id, ScanState.FAILED, fault=JobFailure("BundleError", "Frame 3 is cut."))
     events = store.events(scan.id, after=0)
     assert [event.number for event in events] == [1, 2, 3, 4]
     assert [event.data["state"] for event in events] == ["queued", "capturing", "capturing", "failed"]
     assert store.events(scan.id, after=3) == events[3:]
     record = store.get(scan.id)
-    assert record.fault == ScanFault("BundleError", "Frame 3 is cut.")
+    assert record.fault == JobFailure("BundleError", "Frame 3 is cut.")
     assert record.started_at is not None
     assert record.finished_at is not None
     assert (record.finished_at - record.started_at).total_seconds() == 3

@@ -148,7 +148,7 @@ def test_an_unplugged_camera_is_gone_and_can_be_closed(plugged: Plug) -> None:
     with pytest.raises(DeviceGoneError):
         camera.arm(1, Trigger.FREE)
     camera.close()
-    with pytest.raises(DeviceGoneError, match="the camera is gone .*plug it in again"):
+    with pytest.raises(DeviceGoneError, match=r"the camera is gone .*plug it in again"):
         device.open_camera(**GREY)
     device.fault("unplugged", on=False)
     device.open_camera(**GREY).close()

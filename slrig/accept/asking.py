@@ -1,0 +1,103 @@
+"""What is asked of an acceptance test, over HTTP or by a schedule, and the plan that it comes to."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from slrig.accept.plan import (
+    USUAL_REPEATS,
+    AcceptancePlan,
+    Artefacts,
+    Certified,
+    Limits,
+    exact_artefacts,
+    usual_limits,
+)
+from slrig.accept.positions import acceptance_plan, rig_volume_mm
+from slrig.bundle.faults import Strict
+from slrig.errors import InvalidInputError
+from slrig.model import Calibration
+
+Length = Annotated[float, Field(gt=0, le=100_000)]
+Uncertainty = Annotated[float, Field(ge=0, le=1000)]
+Coordinate = Annotated[float, Field(ge=-100_000, le=100_000)]
+Corner = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+"""x, y, z in the world, mm."""
+
+
+class CertifiedRequest(Strict):
+    """A certified value and its expanded uncertainty (k = 2), mm."""
+
+    value_mm: Length
+    uncertainty_mm: Uncertainty
+
+
+class ArtefactsRequest(Strict):
+    """The artefacts, as their certificates have them."""
+
+    sphere: CertifiedRequest = Field(description="diameter")
+    bar: CertifiedRequest = Field(description="distance of the balls' centres")
+    plane_mm: tuple[Length, Length] = Field(strict=False, description="length and width")
+    sphere_form_mm: Uncertainty = Field(description="by how much the sphere itself is out of round")
+    plane_form_mm: Uncertainty = Field(description="by how much the plane itself is out of flat")
+    ball_mm: Length | None = Field(default=None, description="diameter of the bar's balls; absent, the sphere's")
+    certificate: Annotated[str, Field(max_length=200)] = ""
+    temperature_c: Annotated[float, Field(ge=-50, le=100)] | None = None
+
+    def artefacts(self) -> Artefacts:
+        """The artefacts that are meant."""
+        return Artefacts(
+            Certified(self.sphere.value_mm, self.sphere.uncertainty_mm),
+            Certified(self.bar.value_mm, self.bar.uncertainty_mm),
+            self.plane_mm,
+            self.ball_mm,
+            self.sphere_form_mm,
+            self.plane_form_mm,
+            self.certificate,
+            self.temperature_c,
+        )
+
+
+class LimitsRequest(Strict):
+    """Limits in mm; absent ones are the usual: 1/10000 of the diagonal for spacing, 6.5 σ of a point for the others."""
+
+    spacing_mm: Length | None = None
+    form_mm: Length | None = None
+    size_mm: Length | None = None
+    flatness_mm: Length | None = None
+
+
+class AcceptanceRequest(Strict):
+    """What to test with. Without artefacts: the exact ones of a rendered rig."""
+
+    artefacts: ArtefactsRequest | None = None
+    volume_mm: tuple[Corner, Corner] | None = Field(
+        default=None, strict=False, description="least and greatest corner in the world; absent, the calibration's"
+    )
+    limits: LimitsRequest = LimitsRequest()
+    repeats: Annotated[int, Field(ge=1, le=50)] = USUAL_REPEATS
+    exposure_s: Annotated[float, Field(gt=0, le=60)] | None = None
+    notes: Annotated[str, Field(max_length=1000)] = ""
+
+    def plan(self, calibration: Calibration) -> AcceptancePlan:
+        """The plan for a rig so calibrated. Raises InvalidInputError."""
+        rendered = self.artefacts is None
+        volume = rig_volume_mm(calibration) if self.volume_mm is None else np.array(self.volume_mm, np.float64)
+        if not (volume[0] < volume[1]).all():
+            message = f"volume_mm: expected the least corner and then the greatest, found {volume.tolist()}"
+            raise InvalidInputError(message)
+        given = self.limits
+        usual_mm = usual_limits(volume, rendered=rendered).spacing_mm
+        return acceptance_plan(
+            calibration,
+            volume,
+            exact_artefacts(volume) if self.artefacts is None else self.artefacts.artefacts(),
+            rendered=rendered,
+            limits=Limits(given.spacing_mm or usual_mm, given.form_mm, given.size_mm, given.flatness_mm),
+            repeats=self.repeats,
+            exposure_s=self.exposure_s,
+            notes=self.notes,
+        )

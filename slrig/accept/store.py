@@ -1,0 +1,102 @@
+"""Acceptance tests on disk, each a folder.
+
+DATA/acceptance/ID/test.json   what is on record of it
+DATA/acceptance/ID/points/     what each capture gave
+DATA/acceptance/ID/report.html, report.json   when every position is measured; the second is written last
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import uuid
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from uuid import UUID
+
+import structlog
+
+from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
+from slrig.bundle.storage import write_file
+from slrig.calibration.artefacts import Decision
+from slrig.errors import StorageError
+from slrig.failure import JobFailure, ScanInterruptedError, disk_errors
+from slrig.jobs.data_folder import DataFolder
+
+RECORD, HTML, JSON = "test.json", "report.html", "report.json"
+
+_log = structlog.get_logger(__name__)
+
+
+class AcceptanceStore:
+    """Reads and writes tests below a data folder. One process uses it; callers hold their own lock."""
+
+    def __init__(self, folder: DataFolder) -> None:
+        self._data = folder
+        self._root = folder.root / "acceptance"
+
+    def folder(self, test_id: UUID) -> Path:
+        """Where a test lies."""
+        return self._root / str(test_id)
+
+    def load(self) -> Sequence[AcceptanceRecord]:
+        """Return every test on record, oldest first, after what was cut off has been marked as such.
+
+        For the start of the service, when none can be under way. A folder that cannot be read is put aside.
+
+        Raises
+        ------
+        StorageError
+            The disk refused.
+        """
+        found: list[AcceptanceRecord] = []
+        with disk_errors(self._root):
+            self._root.mkdir(exist_ok=True)
+            for place in sorted(each for each in self._root.iterdir() if each.is_dir()):
+                try:
+                    record = record_from_json((place / RECORD).read_bytes(), str(place / RECORD))
+                except (StorageError, FileNotFoundError) as error:
+                    _log.warning("an acceptance test is put aside", folder=place.name, cause=str(error))
+                    self._data.orphans.mkdir(exist_ok=True)
+                    place.rename(self._data.orphans / f"acceptance-{place.name}")
+                    continue
+                for stray in place.glob(".*"):
+                    # Frames of a capture that was cut off, or a part of a file.
+                    shutil.rmtree(stray) if stray.is_dir() else stray.unlink()
+                settled = self._settled(record)
+                if settled is not record:
+                    self.save(settled)
+                found.append(settled)
+        return sorted(found, key=lambda record: record.number)
+
+    def save(self, record: AcceptanceRecord) -> None:
+        """Put a test on record in place of what it was. Raises StorageError."""
+        place = self.folder(record.id)
+        with disk_errors(place):
+            place.mkdir(exist_ok=True)
+        write_file(place / RECORD, record_json(record))
+
+    def delete(self, test_id: UUID) -> None:
+        """Remove a test with all its files: by one rename out of place first. Raises StorageError."""
+        gone = self._data.incoming / f"gone-{uuid.uuid4().hex}"
+        with disk_errors(self.folder(test_id)):
+            self.folder(test_id).rename(gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+    def _settled(self, record: AcceptanceRecord) -> AcceptanceRecord:
+        """The record of a test that nothing is done for; the same object if nothing was."""
+        if record.state is not AcceptanceState.MEASURING:
+            return record
+        report = self.folder(record.id) / JSON
+        if report.is_file():
+            # Cut off between its report and its record.
+            decided = Decision(json.loads(report.read_bytes())["decision"])
+            return replace(record, state=AcceptanceState.FINISHED, decision=decided)
+        return replace(record, state=AcceptanceState.INTERRUPTED, fault=interruption_fault())
+
+
+def interruption_fault() -> JobFailure:
+    """The fault of a test that the end of the service cut off."""
+    message = "The service ended while a position was measured. Measure it again to go on, or cancel the test."
+    return JobFailure(ScanInterruptedError.__name__, message)

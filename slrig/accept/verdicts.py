@@ -1,0 +1,96 @@
+"""What an acceptance test comes to: the verdict on each quantity, and the result of the whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+
+from slrig.accept.evaluation import Reading
+from slrig.accept.plan import AcceptancePlan, Quantity
+from slrig.calibration.artefacts import Decision, decision
+from slrig.model import Calibration
+
+FORMULA = "U = 2 * sqrt((U_certificate / 2)^2 + s^2)"
+"""Expanded uncertainty, k = 2: the certificate's, and the standard deviation s of repeated captures of one position."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One quantity over all positions. error_mm, limit_mm : of the reading that comes nearest to its limit, or is
+    furthest beyond, which is that of `step`, `take`. certificate_mm : the artefact's expanded uncertainty, None where
+    it was not told; scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats :
+    captures that tell it. uncertainty_mm : U by `FORMULA`, what is not known left out.
+    """
+
+    quantity: Quantity
+    error_mm: float
+    limit_mm: float
+    step: str
+    take: int
+    certificate_mm: float | None
+    scatter_mm: float
+    repeats: int
+    uncertainty_mm: float
+    decision: Decision
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceResult:
+    """A test that was done. readings : every capture in order. verdicts : by quantity."""
+
+    rig: str
+    begun: datetime
+    ended: datetime
+    plan: AcceptancePlan
+    calibration: Calibration
+    readings: tuple[Reading, ...]
+    verdicts: tuple[Verdict, ...]
+
+    @property
+    def decision(self) -> Decision:
+        """Fails if any quantity fails, passes if all pass."""
+        told = {verdict.decision for verdict in self.verdicts}
+        for worst in (Decision.FAILS, Decision.UNDECIDED):
+            if worst in told:
+                return worst
+        return Decision.PASSES
+
+    @property
+    def complete(self) -> bool:
+        """Whether every position was measured as often as planned."""
+        return len(self.readings) == len(self.plan.takes)
+
+
+def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[Verdict, ...]:
+    """What is decided of each quantity that was measured."""
+    told = {quantity for each in readings for quantity in each.errors_mm}
+    return tuple(_verdict(quantity, readings, plan) for quantity in Quantity if quantity in told)
+
+
+def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> Verdict:
+    having = [each for each in readings if quantity in each.errors_mm]
+    worst = max(having, key=lambda each: abs(each.errors_mm[quantity]) - each.limits_mm[quantity])
+    scatter_mm, repeats = _scatter(quantity, having)
+    certificate = plan.artefacts.uncertainty_mm(quantity)
+    uncertainty = 2 * float(np.hypot((certificate or 0.0) / 2, 0.0 if np.isnan(scatter_mm) else scatter_mm))
+    error, limit = worst.errors_mm[quantity], worst.limits_mm[quantity]
+    return Verdict(
+        quantity, error, limit, worst.step, worst.take, certificate, scatter_mm, repeats, uncertainty,
+        decision(error, limit, uncertainty),
+    )  # fmt: skip
+
+
+def _scatter(quantity: Quantity, readings: Sequence[Reading]) -> tuple[float, int]:
+    """Standard deviation of repeated captures of one position, mm, and how many they were; NaN and 0 without any."""
+    by_step: dict[str, list[float]] = {}
+    for each in readings:
+        by_step.setdefault(each.step, []).append(each.errors_mm[quantity])
+    repeated = [np.array(errors) for errors in by_step.values() if len(errors) > 1]
+    if not repeated:
+        return float("nan"), 0
+    count = sum(len(errors) for errors in repeated)
+    squares = sum(float(((errors - errors.mean()) ** 2).sum()) for errors in repeated)
+    return float(np.sqrt(squares / (count - len(repeated)))), count

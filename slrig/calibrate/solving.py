@@ -1,0 +1,106 @@
+"""From the poses of a board to a calibration with its error and its verdict: where the rooms of calibration meet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from uuid import uuid4
+
+from slrig.calibration.board import Board, BoardShape
+from slrig.calibration.judging.scale_check import check_scale
+from slrig.calibration.judging.verdict import Verdict, verdict
+from slrig.calibration.observations import Observations, PoseObservation
+from slrig.calibration.poses.coverage import Coverage, coverage
+from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
+from slrig.errors import CalibrationError, SolveRefusedError
+from slrig.jobs.records import utc_now
+from slrig.model import Calibration, Size, Solved
+from slrig.scan.plan import Progress
+
+_SOLVE_SHARE = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class ReadPose:
+    """One pose, as it was read: its observation, and how well each camera saw it."""
+
+    observation: PoseObservation
+    figures: Mapping[str, ViewFigures]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationResult:
+    """A solved calibration with all that is told of it.
+
+    calibration : carries its own error (`solved`). scale : in words, what is wrong with the scale against an earlier
+    calibration of the same devices; nothing where it agrees, or there was none.
+    """
+
+    solution: Solution
+    calibration: Calibration
+    expected: ExpectedError
+    verdict: Verdict
+    coverage: Coverage
+    scale: tuple[str, ...] = ()
+
+
+def solve_poses(
+    board: Board,
+    cameras: Mapping[str, Size],
+    projector: Size | None,
+    poses: Sequence[ReadPose],
+    /,
+    *,
+    progress: Progress = lambda _stage, _fraction, _detail: None,
+    earlier: Calibration | None = None,
+    board_shape: BoardShape = BoardShape.AUTO,
+    clock: Callable[[], datetime] = utc_now,
+) -> CalibrationResult:
+    """Solve the poses, say how far the result may be trusted, and give it an identity.
+
+    cameras : the first one's frame becomes the world; one is enough, also without a projector. projector : None where
+    no light was captured. earlier : a calibration of the same devices, to compare the scale with. board_shape : whether
+    the board may be bowed.
+
+    Raises
+    ------
+    SolveRefusedError
+        The poses determine no calibration, or do not span a volume to state an error for.
+    """
+    # Late: the service knows these values, and loads no compiled kernel before somebody solves.
+    from slrig.calibration.judging.expected_error import expected_error
+    from slrig.calibration.solving.solve import SolveOptions, solve
+
+    observed = tuple(pose.observation for pose in poses)
+    observations = Observations(board, cameras, projector, observed)
+    solution = solve(
+        observations,
+        progress=lambda stage, fraction, detail: progress(stage, _SOLVE_SHARE * fraction, detail),
+        options=SolveOptions(board_shape=board_shape),
+    )
+    progress("expected error", _SOLVE_SHARE, "")
+    try:
+        expected = expected_error(solution, observations)
+    except CalibrationError as error:
+        raise SolveRefusedError(str(error)) from error
+    sizes = dict(cameras) if projector is None else {**cameras, PROJECTOR: projector}
+    used = [pose for pose in observed if pose.name not in solution.outliers]
+    covered = coverage(used, board, sizes)
+    solved = Solved(
+        id=uuid4().hex[:12],
+        solved_at=clock().astimezone(UTC).isoformat(timespec="seconds"),
+        covariance=solution.covariance,
+        volume_mm=expected.volume_mm,
+        expected_error_mm=expected.point_mm,
+    )
+    progress("done", 1.0, "")
+    return CalibrationResult(
+        solution=solution,
+        calibration=replace(solution.calibration, solved=solved),
+        expected=expected,
+        verdict=verdict(solution, expected, covered),
+        coverage=covered,
+        scale=() if earlier is None else check_scale(solution, earlier, board),
+    )

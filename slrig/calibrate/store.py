@@ -1,0 +1,264 @@
+"""Calibrations on disk, each a folder that is whole at every instant.
+
+DATA/calibrations/ID/session.json      the session: board, poses, states, figures
+DATA/calibrations/ID/poses/NN/         a pose: bundle/, answer.json, picture-CAMERA.png, and reading.npz if accepted
+DATA/calibrations/ID/solves/N/         a solve: calibration.json, report.html; never changed once it is there
+DATA/calibrations/active.json          which solve of which calibration scans use
+
+What is being made lies in DATA/.incoming, and is renamed into place once.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import uuid
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from uuid import UUID
+
+from slrig.bundle.calibration_file import read_calibration
+from slrig.bundle.storage import sync_folder, write_durably, write_file
+from slrig.calibrate.records import (
+    PoseState,
+    SessionRecord,
+    SessionState,
+    session_from_json,
+    session_json,
+)
+from slrig.errors import CalibrationError, CalibrationNotFoundError, StorageError
+from slrig.failure import JobFailure, ScanInterruptedError, disk_errors
+from slrig.jobs.data_folder import DataFolder, sync_tree
+from slrig.model import Calibration
+
+SESSION = "session.json"
+CALIBRATION = "calibration.json"
+REPORT = "report.html"
+ANSWER = "answer.json"
+READING = "reading.npz"
+BUNDLE = "bundle"
+
+_ACTIVE_FORMAT = "slrig-active-calibration"
+
+
+@dataclass(frozen=True, slots=True)
+class ActivePointer:
+    """Which solve of which calibration is in use."""
+
+    id: UUID
+    solve: int
+
+
+class CalibrationStore:
+    """Reads and writes calibrations below a data folder. One process uses it; callers hold their own lock."""
+
+    def __init__(self, folder: DataFolder) -> None:
+        self._folder = folder
+
+    def folder(self, session_id: UUID) -> Path:
+        """Where a calibration lies."""
+        return self._folder.calibrations / str(session_id)
+
+    def pose(self, session_id: UUID, number: int) -> Path:
+        """Where a pose lies once it was read."""
+        return self.folder(session_id) / "poses" / f"{number:02d}"
+
+    def staged_pose(self, session_id: UUID, number: int) -> Path:
+        """Where a pose is made."""
+        return self._folder.incoming / f"pose-{session_id}-{number:02d}"
+
+    def solve(self, session_id: UUID, number: int) -> Path:
+        """Where the results of a solve lie."""
+        return self.folder(session_id) / "solves" / str(number)
+
+    def load(self) -> Sequence[SessionRecord]:
+        """Return every calibration on record, oldest first, after what was cut off has been marked as such.
+
+        For the start of the service, when nothing can be under way. A folder that cannot be read is put aside.
+        """
+        found: list[SessionRecord] = []
+        for place in sorted(self._folder.calibrations.iterdir()):
+            if not place.is_dir():
+                continue
+            try:
+                with disk_errors(place):
+                    text = (place / SESSION).read_bytes()
+                session = session_from_json(text, str(place / SESSION))
+            except (StorageError, FileNotFoundError):
+                self._folder.orphans.mkdir(exist_ok=True)
+                place.rename(self._folder.orphans / place.name)
+                continue
+            settled = swept(session)
+            if settled is not session:
+                self.save(settled)
+            self._remove_strays(settled)
+            found.append(settled)
+        return sorted(found, key=lambda session: session.number)
+
+    def create(self, session: SessionRecord) -> None:
+        """Make the folder of a new calibration. Raises StorageError."""
+        staged = self._folder.incoming / f"calibration-{session.id}"
+        with disk_errors(staged):
+            try:
+                for name in ("poses", "solves"):
+                    (staged / name).mkdir(parents=True)
+                write_durably(staged / SESSION, _text(session))
+                sync_tree(staged)
+                staged.rename(self.folder(session.id))
+            except OSError:
+                shutil.rmtree(staged, ignore_errors=True)
+                raise
+            sync_folder(self._folder.calibrations)
+
+    def save(self, session: SessionRecord) -> None:
+        """Put a session on record in place of what it was. Raises StorageError."""
+        write_file(self.folder(session.id) / SESSION, _text(session))
+
+    def stage_pose(self, session_id: UUID, number: int) -> Path:
+        """Make the folder that a pose is made in, empty."""
+        staged = self.staged_pose(session_id, number)
+        with disk_errors(staged):
+            staged.mkdir()
+        return staged
+
+    def commit_pose(self, session_id: UUID, number: int) -> None:
+        """Move a pose into place, whole and durable."""
+        self._commit(self.staged_pose(session_id, number), self.pose(session_id, number))
+
+    def discard_pose(self, session_id: UUID, number: int) -> None:
+        """Remove a pose, staged or in place. Idempotent."""
+        self._remove(self.pose(session_id, number))
+        shutil.rmtree(self.staged_pose(session_id, number), ignore_errors=True)
+
+    def stage_solve(self, session_id: UUID) -> Path:
+        """Make a folder for the results of a solve."""
+        staged = self._folder.incoming / f"solve-{session_id}-{uuid.uuid4().hex[:12]}"
+        with disk_errors(staged):
+            staged.mkdir()
+        return staged
+
+    def commit_solve(self, session_id: UUID, number: int, staged: Path) -> None:
+        """Move the results of a solve into place, whole and durable."""
+        place = self.solve(session_id, number)
+        # A run that was cut off between this and its record may have left one.
+        self._remove(place)
+        self._commit(staged, place)
+
+    def discard(self, staged: Path) -> None:
+        """Remove what was staged. Idempotent."""
+        shutil.rmtree(staged, ignore_errors=True)
+
+    def delete(self, session_id: UUID) -> None:
+        """Remove a calibration with all its files: by one rename out of place first."""
+        self._remove(self.folder(session_id))
+
+    def calibration(self, session_id: UUID, solve: int) -> Calibration:
+        """Return what a solve gave. Raises CalibrationError."""
+        return read_calibration(self.solve(session_id, solve) / CALIBRATION)
+
+    def active(self) -> ActivePointer | None:
+        """Return which calibration is in use; None where none was activated.
+
+        Raises
+        ------
+        StorageError
+            The pointer cannot be read.
+        """
+        path = self._pointer
+        try:
+            with disk_errors(path):
+                document = json.loads(path.read_bytes())
+            if document["format"] != _ACTIVE_FORMAT:
+                raise KeyError(document["format"])  # noqa: TRY301 - told with the other faults of the file
+            return ActivePointer(UUID(document["id"]), int(document["solve"]))
+        except FileNotFoundError:
+            return None
+        except (ValueError, KeyError, TypeError) as error:
+            message = (
+                f"{path} does not say which calibration is active. Remove it to scan with the rig's own calibration, "
+                "then activate one again."
+            )
+            raise StorageError(message) from error
+
+    def activate(self, pointer: ActivePointer | None) -> None:
+        """Put on record which calibration is in use. Raises StorageError."""
+        if pointer is None:
+            with disk_errors(self._pointer):
+                self._pointer.unlink(missing_ok=True)
+                sync_folder(self._folder.calibrations)
+            return
+        document = {"format": _ACTIVE_FORMAT, "version": 1, "id": str(pointer.id), "solve": pointer.solve}
+        write_file(self._pointer, (json.dumps(document) + "\n").encode())
+
+    def active_calibration(self) -> tuple[ActivePointer, Calibration] | None:
+        """Return what is in use, read. Raises StorageError with what to do where that is gone."""
+        pointer = self.active()
+        if pointer is None:
+            return None
+        try:
+            return pointer, self.calibration(pointer.id, pointer.solve)
+        except CalibrationError as error:
+            message = (
+                f"The active calibration {pointer.id} cannot be read ({error}). Remove {self._pointer} to scan with "
+                "the rig's own calibration."
+            )
+            raise StorageError(message) from error
+
+    @property
+    def _pointer(self) -> Path:
+        return self._folder.calibrations / "active.json"
+
+    def _commit(self, staged: Path, place: Path) -> None:
+        with disk_errors(staged):
+            sync_tree(staged)
+            staged.rename(place)
+            sync_folder(place.parent)
+
+    def _remove(self, place: Path) -> None:
+        if not place.is_dir():
+            return
+        gone = self._folder.incoming / f"gone-{uuid.uuid4().hex}"
+        with disk_errors(place):
+            place.rename(gone)
+        shutil.rmtree(gone, ignore_errors=True)
+
+    def _remove_strays(self, session: SessionRecord) -> None:
+        """Remove the folders of poses that were cut off between their rename and their record, or half dropped."""
+        known = {self.pose(session.id, pose.number).name for pose in session.poses}
+        kept = {self.pose(session.id, pose.number).name for pose in session.poses if pose.answer is not None}
+        with suppress(FileNotFoundError):
+            for place in (self.folder(session.id) / "poses").iterdir():
+                if place.name not in known & kept:
+                    self._remove(place)
+
+
+def not_found(session_id: UUID) -> CalibrationNotFoundError:
+    """The error for an id that is on record nowhere."""
+    message = f"No calibration {session_id} is on record here. GET /calibration lists those that are."
+    return CalibrationNotFoundError(message)
+
+
+def pose_interruption() -> JobFailure:
+    """The fault of a pose that the end of the service cut off."""
+    return JobFailure(ScanInterruptedError.__name__, "The service ended while this pose was under way. Shoot it again.")
+
+
+def solve_interruption() -> JobFailure:
+    """The fault of a solve that the end of the service cut off."""
+    return JobFailure(ScanInterruptedError.__name__, "The service ended during the solve. Solve again.")
+
+
+def swept(session: SessionRecord) -> SessionRecord:
+    """The session with what was cut off marked as such; the same object if there was nothing."""
+    for pose in session.poses:
+        if not pose.state.final:
+            session = session.with_pose(replace(pose, state=PoseState.FAILED, fault=pose_interruption()))
+    if session.state is SessionState.SOLVING:
+        session = replace(session, state=SessionState.FAILED, fault=solve_interruption(), progress=None)
+    return replace(session, script=()) if session.script else session
+
+
+def _text(session: SessionRecord) -> bytes:
+    return (json.dumps(session_json(session), indent=1, allow_nan=False) + "\n").encode()

@@ -1,0 +1,144 @@
+"""What a calibration session works with: the shot, the reading, the judgement, the solve and its report.
+
+They are named here rather than imported: the worker does them, the service loads none of their mathematics, and a test
+puts tame ones in their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from slrig.calibrate.records import SessionRecord, plain
+from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibration.board import Board, BoardShape
+from slrig.calibration.judging.comparison import Comparison
+from slrig.calibration.solution import PROJECTOR
+from slrig.devices import Rig
+from slrig.jobs.worker import Worker
+from slrig.model import Calibration, Size
+from slrig.scan.acquisition import capture_bundle
+from slrig.scan.plan import Progress, ScanPlan
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What stands before the rig, and what the rig is: the board, and the extents of the devices.
+
+    projector is None where only the cameras are calibrated.
+    """
+
+    board: Board
+    cameras: Mapping[str, Size]
+    projector: Size | None
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where a session stands: what its poses cover, and what to move next and why; JSON values."""
+
+    coverage: Mapping[str, Any]
+    next_move: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What is told of a pose. refusals : why it cannot be used, in words; none if it can. answer : its figures, as JSON
+    values. standing : where the session stands with it, None where it could not be read.
+    """
+
+    refusals: tuple[str, ...]
+    answer: Mapping[str, Any]
+    standing: Standing | None
+
+
+class CapturePose(Protocol):
+    """`slrig.scan.acquisition.capture_bundle`."""
+
+    def __call__(
+        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
+    ) -> None:
+        """Play the patterns and write a complete bundle into `folder`."""
+        ...
+
+
+class SolvePoses(Protocol):
+    """`slrig.calibrate.solving.solve_poses`."""
+
+    def __call__(
+        self,
+        board: Board,
+        cameras: Mapping[str, Size],
+        projector: Size | None,
+        poses: Sequence[ReadPose],
+        /,
+        *,
+        progress: Progress,
+        earlier: Calibration | None = None,
+        board_shape: BoardShape = BoardShape.AUTO,
+    ) -> CalibrationResult:
+        """Return the calibration. Raises SolveRefusedError."""
+        ...
+
+
+class WriteReport(Protocol):
+    """Writes the report of a solve as a page of its own."""
+
+    def __call__(
+        self,
+        path: Path,
+        result: CalibrationResult,
+        poses: Sequence[ReadPose],
+        record: SessionRecord,
+        bundles: Mapping[str, Path],
+        /,
+    ) -> None:
+        """Write it. bundles : of the accepted poses, by name."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationTools:
+    """Each part of the work. The signatures are those of the functions that `calibration_tools` names.
+
+    parse : of a calibration's file that a stranger sent.
+    """
+
+    capture: CapturePose
+    read: Callable[[Path, Board, str], ReadPose]
+    judge: Callable[[ReadPose, Sequence[ReadPose], Setting], Judgement]
+    survey: Callable[[Sequence[ReadPose], Setting], Standing]
+    picture: Callable[[Path, str, ReadPose | None, Board], bytes]
+    coverage_picture: Callable[[Setting, str, Sequence[ReadPose], Mapping[str, Any]], bytes]
+    solve: SolvePoses
+    report: WriteReport
+    compare: Callable[[Calibration, Calibration], Comparison]
+    parse: Callable[[Path], Calibration]
+    summary: Callable[[CalibrationResult], Mapping[str, Any]] = plain
+    warm: Callable[[], None] = lambda: None
+
+
+def sizes_of(setting: Setting) -> Mapping[str, Size]:
+    """The extents of the devices, the projector among them where there is one."""
+    return setting.cameras if setting.projector is None else {**setting.cameras, PROJECTOR: setting.projector}
+
+
+def calibration_tools(worker: Worker) -> CalibrationTools:
+    """The real ones: the shot is taken here, the mathematics is the worker's."""
+    room = "slrig.calibrate"
+    return CalibrationTools(
+        capture=capture_bundle,
+        read=worker.task(f"{room}.pose_reading:read_pose", "reading of the pose"),
+        judge=worker.task(f"{room}.pose_judging:judgement", "judgement of the pose"),
+        survey=worker.task(f"{room}.pose_judging:standing", "survey of the poses"),
+        picture=worker.task(f"{room}.pose_pictures:pose_png", "picture of the pose"),
+        coverage_picture=worker.task(f"{room}.pose_pictures:coverage_png", "picture of the coverage"),
+        solve=worker.task(f"{room}.solving:solve_poses", "solve"),
+        report=worker.task(f"{room}.pose_judging:write_report", "report of the solve"),
+        summary=worker.task(f"{room}.pose_judging:summary", "summary of the solve"),
+        compare=worker.task("slrig.calibration.judging.comparison:comparison", "comparison"),
+        parse=worker.task("slrig.bundle.calibration_file:read_calibration", "reading of the calibration"),
+        warm=worker.task(f"{room}.pose_judging:warm", "preparation"),
+    )

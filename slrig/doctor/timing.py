@@ -1,0 +1,185 @@
+"""How late the projector's light is, how the cameras' shutters work, and at which rate the display refreshes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from slrig.capture.flashes import CameraLatency
+from slrig.capture.refresh import refresh_hz
+from slrig.capture.synchronisation import LatencyMeasurement, measure_latency
+from slrig.devices import CameraSettings, Rig, Synchronisation
+from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
+from slrig.doctor.light import Seen
+from slrig.doctor.viewing import Viewer
+from slrig.errors import ScanEvidenceError
+from slrig.model import Black, PatternSequence, Size, White
+
+_SHOWS = 48
+_LONGEST_PAUSE_S = 0.04
+_FLASHES = 24
+LATE_S = 1e-3
+"""Light that comes later than a scan waits, by more than this, gets into the wrong frames."""
+
+_NEEDLESS_S = 0.03
+_JITTER_S = 3e-3
+_STRANGE = 0.02
+
+
+def white_and_black(size: Size) -> PatternSequence:
+    """White, then black."""
+    profiles = tuple(np.full((1, 1), level, np.uint8) for level in (255, 0))
+    return PatternSequence(size, (White(), Black()), profiles)
+
+
+def refresh(rig: Rig) -> tuple[float | None, list[Finding]]:
+    """Show patterns at random moments: the rate of the grid on which they become visible, Hz, None without one."""
+    never, rng = threading.Event(), np.random.default_rng(0)
+    seen_ns: list[int] = []
+    try:
+        rig.projector.load(white_and_black(rig.projector.info.size))
+        for number in range(_SHOWS):
+            seen_ns.append(rig.projector.show(number % 2).t_visible_ns)
+            waiting_ns = round(float(rng.uniform(0, _LONGEST_PAUSE_S)) * 1e9)
+            rig.clock.wait_until(rig.clock.now_ns() + waiting_ns, never)
+    finally:
+        with suppress(Exception):
+            rig.projector.blank()
+    rate = refresh_hz(seen_ns)
+    if rate is None:
+        found = "patterns become visible at any instant, by the driver's word: no refresh is to be waited for"
+    else:
+        found = f"patterns become visible at refreshes of {rate:.2f} Hz, {ms(1 / rate)} apart, by the driver's word"
+    return rate, [ok("timing.refresh", "projector", found)]
+
+
+def latency(
+    rig: Rig,
+    seen: Mapping[str, Seen],
+    *,
+    search_s: float,
+    told: Callable[[str, float, str], None],
+) -> tuple[LatencyMeasurement | None, list[Finding]]:
+    """Flash the projector before the cameras that see it; None where no flash can be seen as it happens.
+
+    A camera that waits for triggers while the projector works may see none: what matters then is whether a frame that
+    is taken right after the projector's word has the new light alone.
+    """
+    settings = {name: CameraSettings(each.exposure_s, rig.settings[name].gain) for name, each in seen.items()}
+    watching = replace(rig, cameras={name: rig.cameras[name] for name in seen}, settings=settings)
+    try:
+        measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, told=told)
+    except ScanEvidenceError as error:
+        return None, [punctual(watching, each, error) for each in seen.values()]
+    findings = [_late(measured, rig.synchronisation), *_jitter(measured)]
+    for name, found in measured.cameras.items():
+        findings.append(_shutter(name, found, seen[name].skew_s, rig.synchronisation))
+    return measured, findings
+
+
+def punctual(rig: Rig, seen: Seen, cause: ScanEvidenceError) -> Finding:
+    """Alternate white and black as a scan does, and look for light of the pattern before."""
+    viewer = Viewer(rig, seen.name)
+    strange = 0.0
+    with viewer.armed(white_and_black(rig.projector.info.size), seen.exposure_s, _SHOWS):
+        for number in range(_SHOWS):
+            level = seen.levels.level(viewer.frames(number % 2)[0].image)
+            strange = max(strange, abs(level - (1 - number % 2)))
+    subject = camera_named(seen.name)
+    if strange <= _STRANGE:
+        return ok(
+            "timing.punctual",
+            subject,
+            f"frames that are exposed right after the projector's word hold {1 - strange:.1%} of their own pattern's "
+            "light, or more; how much earlier they could be is not told by its trigger",
+        )
+    return fault(
+        "timing.late",
+        subject,
+        f"frames that are exposed right after the projector's word miss up to {strange:.0%} of their own pattern's "
+        f"light; by how much it is late could not be measured: {cause}",
+        "measure it: slrig latency --exposure-s with more than the projector's latency, or --trigger free; write what "
+        "it says into [synchronisation]",
+    )
+
+
+def waited_s(synchronisation: Synchronisation | None) -> float:
+    """How long a scan waits beyond what the projector states."""
+    return 0.0 if synchronisation is None else max(synchronisation.latency_s + synchronisation.latency_error_s, 0.0)
+
+
+def late_s(measured: LatencyMeasurement) -> float:
+    """How much later than the projector states, its error included, light is stable at the latest."""
+    return measured.slowest.latest_s - measured.shown_error_s
+
+
+def _late(measured: LatencyMeasurement, known: Synchronisation | None) -> Finding:
+    slowest = measured.slowest
+    now_s = waited_s(known)
+    words = (
+        f"light comes {ms(slowest.latency_s)} ± {ms(slowest.standard_error_s)} after the instant that the projector "
+        f"states, and is stable {ms(slowest.latest_s)} after it at the latest"
+    )
+    if late_s(measured) > now_s + LATE_S:
+        table = "its rig file has no [synchronisation]" if known is None else f"its rig file waits {ms(now_s)}"
+        return fault(
+            "timing.late",
+            "projector",
+            f"{words}; {table}: frames would show the pattern before",
+            f"write latency_s = {slowest.latency_s:.6f} and latency_error_s = "
+            f"{measured.synchronisation.latency_error_s:.6f} into [synchronisation], as the rig file of --output has "
+            "it; a game or low-latency mode of the projector, and no picture processing, make it faster",
+        )
+    if known is not None and now_s > waited_s(measured.synchronisation) + _NEEDLESS_S:
+        return note(
+            "timing.needless",
+            "projector",
+            f"{words}; its rig file waits {ms(now_s)}",
+            "measure again and replace the table [synchronisation]: scans get faster",
+        )
+    return ok("timing.late", "projector", words)
+
+
+def _jitter(measured: LatencyMeasurement) -> list[Finding]:
+    slowest = measured.slowest
+    if slowest.jitter_s <= max(_JITTER_S, 2 * measured.shown_error_s):
+        return []
+    return [
+        note(
+            "timing.jitter",
+            "projector",
+            f"the instant of light varies by {ms(slowest.jitter_s)} (standard deviation), the projector states "
+            f"± {ms(measured.shown_error_s)}",
+            "switch off the desktop's compositor and triple buffering, end other programs that draw; scans wait for "
+            "the latest light and stay right",
+        )
+    ]
+
+
+def _shutter(name: str, found: CameraLatency, skew_s: float, known: Synchronisation | None) -> Finding:
+    subject = camera_named(name)
+    if found.rolling:
+        words = (
+            f"rolling shutter: {found.line_time_s * 1e6:.1f} µs from row to row, {ms(found.skew_s)} from the first to "
+            "the last"
+        )
+        if skew_s > 0 or (known is not None and known.line_time_s.get(name, 0.0) > 0):
+            return ok("timing.shutter", subject, words)
+        return note(
+            "timing.shutter",
+            subject,
+            f"{words}; neither its driver nor the rig file says so",
+            f"write {name} = {found.line_time_s:.9f} into [synchronisation.line_time_s], as the rig file of --output "
+            "has it",
+        )
+    if found.scanned:
+        return ok(
+            "timing.shutter",
+            subject,
+            f"the projector builds up its picture row by row, {-found.line_time_s * 1e6:.1f} µs per camera row",
+        )
+    return ok("timing.shutter", subject, "global shutter, as far as the flashes tell")

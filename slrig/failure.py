@@ -1,0 +1,102 @@
+"""Why a scan failed, as a value that crosses processes and survives in the store."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from slrig.errors import IdempotencyError, SlrigError, StorageError
+
+UNEXPECTED = "UnexpectedError"
+"""The kind of a fault that is a defect of slrig: its message is for people, its cause is in the service's log."""
+
+_OPENCV_NO_MEMORY = -4
+"""`cv::Error::StsNoMem`, the code of a `cv2.error`."""
+
+_DISK_REFUSALS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EFBIG}
+
+
+class WorkerLostError(SlrigError):
+    """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
+
+
+class OutOfMemoryError(SlrigError):
+    """A computation asked for more memory than the machine gives."""
+
+
+class ScanInterruptedError(SlrigError):
+    """The service ended while this scan was under way: stopped, killed, or without power. Nobody asked for that scan
+    to stop; where somebody did, it is a ScanCancelledError.
+    """
+
+
+class KeyInFlightError(IdempotencyError):
+    """The first request with this idempotency key is still being answered. Its sibling case, the same key with
+    another body, is a plain IdempotencyError.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class JobFailure:
+    """`kind` is the name of a class of the error tree, or `UNEXPECTED`; `message` is its text."""
+
+    kind: str
+    message: str
+
+
+def error_classes() -> dict[str, type[SlrigError]]:
+    """Every class of the error tree by name, the base included."""
+    found: dict[str, type[SlrigError]] = {}
+    waiting: list[type[SlrigError]] = [SlrigError]
+    while waiting:
+        error = waiting.pop()
+        found[error.__name__] = error
+        waiting.extend(error.__subclasses__())
+    return found
+
+
+def failure_of(error: BaseException) -> JobFailure:
+    """The fault that stands for an exception.
+
+    >>> failure_of(StorageError("The disk is full.")).kind
+    'StorageError'
+    """
+    if isinstance(error, SlrigError):
+        return JobFailure(type(error).__name__, str(error))
+    if isinstance(error, MemoryError) or getattr(error, "code", None) == _OPENCV_NO_MEMORY:
+        message = f"The machine has too little memory for this: {error}. Free some, or use a camera of fewer pixels."
+        return JobFailure(OutOfMemoryError.__name__, message)
+    if isinstance(error, OSError) and error.errno in _DISK_REFUSALS:
+        return JobFailure(StorageError.__name__, disk_refusal(error, None))
+    message = (
+        f"slrig met an error it did not expect ({type(error).__name__}). The service's log has the details under "
+        "this scan's id; please report them."
+    )
+    return JobFailure(UNEXPECTED, message)
+
+
+def interruption() -> ScanInterruptedError:
+    """The error that stands for a scan cut off by the end of the service."""
+    return ScanInterruptedError("The service ended while this scan was under way. Scan again.")
+
+
+def disk_refusal(error: OSError, path: Path | None) -> str:
+    """What to tell a person whose disk refused a write."""
+    where = error.filename or path or "the data folder"
+    reason = error.strerror or str(error)
+    remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "check the disk and its permissions"
+    return f"Writing to {where} failed: {reason}. What was being written has been removed; {remedy} and try again."
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turn a refusal of the disk within the block into a StorageError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISK_REFUSALS:
+            raise
+        raise StorageError(disk_refusal(error, path)) from error

@@ -1,0 +1,1 @@
+"""Work on the rig and in the worker: jobs, their queue, their records and their files."""

@@ -1,0 +1,183 @@
+"""The data folder: where scans and calibrations lie, how scans get there in one rename, and who may use it.
+
+DATA/lock            locked by the one process that owns the folder, as long as it lives; empty
+DATA/holder          that process's id, and that of the last one where none lives
+DATA/slrig.sqlite    the records
+DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
+DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
+DATA/acceptance/     acceptance tests: see `slrig.accept.store`
+DATA/.incoming/ID/   a scan, a pose or a solve being made; swept at the next start
+DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work
+DATA/cache/          compiled kernels, where the package's own folder cannot be written
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from uuid import UUID
+
+from filelock import FileLock, Timeout
+
+from slrig.bundle.storage import sync_file, sync_folder
+from slrig.errors import StorageError
+from slrig.failure import disk_errors
+
+_HOLDER = "holder"
+
+_PROMISED = ("mesh.ply", "report.json")
+"""What every scan has that succeeded."""
+
+
+def free_bytes(folder: Path) -> int:
+    """Bytes that may still be written below `folder`."""
+    return shutil.disk_usage(folder).free
+
+
+class DataFolder:
+    """The data folder, held by this process from construction until `release`.
+
+    Raises
+    ------
+    StorageError
+        Another process holds it, or it cannot be made.
+    """
+
+    def __init__(self, root: Path, *, free: Callable[[Path], int] = free_bytes) -> None:
+        self.root = root.resolve()
+        self._free = free
+        with disk_errors(self.root):
+            for folder in (self.root, self.scans, self.calibrations, self.incoming):
+                folder.mkdir(parents=True, exist_ok=True)
+            # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
+            self._lock = FileLock(self.root / "lock", mode=0o600, thread_local=False, fallback_to_soft=False)
+            try:
+                self._lock.acquire(blocking=False)
+            except Timeout as error:
+                message = (
+                    f"The data folder {self.root} is in use by the slrig service with process id {self._holder()}. "
+                    "Stop that service, or give this one another folder with --data."
+                )
+                raise StorageError(message) from error
+            try:
+                # Beside the lock: Windows lets nobody else read what is locked.
+                (self.root / _HOLDER).write_text(f"{os.getpid()}\n", encoding="ascii")
+            except BaseException:
+                self._lock.release()
+                raise
+
+    def _holder(self) -> str:
+        """The process id of who holds the folder."""
+        try:
+            return (self.root / _HOLDER).read_text(encoding="ascii", errors="replace").strip() or "unknown"
+        except OSError:
+            return "unknown"
+
+    @property
+    def scans(self) -> Path:
+        """Where finished scans lie."""
+        return self.root / "scans"
+
+    @property
+    def calibrations(self) -> Path:
+        """Where calibrations lie."""
+        return self.root / "calibrations"
+
+    @property
+    def incoming(self) -> Path:
+        """Where scans, and what belongs to calibrations, are made."""
+        return self.root / ".incoming"
+
+    @property
+    def orphans(self) -> Path:
+        """Where files without a record are put aside."""
+        return self.root / ".orphans"
+
+    @property
+    def database(self) -> Path:
+        """The records."""
+        return self.root / "slrig.sqlite"
+
+    def release(self) -> None:
+        """Let another process have the folder. Idempotent."""
+        self._lock.release()
+
+    def require_space(self, needed_bytes: int) -> None:
+        """Raise StorageError unless `needed_bytes` can be written."""
+        free = self._free(self.root)
+        if free < needed_bytes:
+            message = (
+                f"This may need {needed_bytes / 1e6:.0f} MB in {self.root}, and {free / 1e6:.0f} MB are free. "
+                "Delete scans that are no longer wanted (DELETE /scan/ID), or move the data folder to a larger disk."
+            )
+            raise StorageError(message)
+
+    def scan(self, scan_id: UUID) -> Path:
+        """Where the files of a finished scan lie."""
+        return self.scans / str(scan_id)
+
+    def staging(self, scan_id: UUID) -> Path:
+        """Where the files of a running scan are made."""
+        return self.incoming / str(scan_id)
+
+    def stage(self, scan_id: UUID) -> Path:
+        """Make the staging folder of a scan, empty."""
+        folder = self.staging(scan_id)
+        with disk_errors(folder):
+            folder.mkdir()
+        return folder
+
+    def commit(self, scan_id: UUID) -> None:
+        """Move a staged scan to its place, whole and durable: fsync everything, then one rename.
+
+        The reconstruction's own folder `result` is dissolved, so that its files lie beside the bundle.
+        """
+        staged = self.staging(scan_id)
+        with disk_errors(staged):
+            result = staged / "result"
+            if result.is_dir():
+                for file in sorted(result.iterdir()):
+                    file.rename(staged / file.name)
+                result.rmdir()
+            sync_tree(staged)
+            staged.rename(self.scan(scan_id))
+            sync_folder(self.scans)
+            sync_folder(self.incoming)
+
+    def keep_bundle(self, scan_id: UUID) -> None:
+        """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it."""
+        self.clear_results(scan_id)
+        self.commit(scan_id)
+
+    def clear_results(self, scan_id: UUID) -> Path:
+        """Remove all that is staged for a scan but its bundle, and return the staging folder."""
+        staged = self.staging(scan_id)
+        for other in staged.iterdir():
+            if other.name != "bundle":
+                shutil.rmtree(other) if other.is_dir() else other.unlink()
+        return staged
+
+    def discard(self, scan_id: UUID) -> None:
+        """Remove what was staged for a scan. Idempotent."""
+        shutil.rmtree(self.staging(scan_id), ignore_errors=True)
+
+    def withdraw(self, scan_id: UUID) -> None:
+        """Take a finished scan's files back into staging by one rename: the first half of a deletion."""
+        if self.scan(scan_id).is_dir():
+            with disk_errors(self.scans):
+                self.scan(scan_id).rename(self.staging(scan_id))
+
+
+def missing_files(scan: Path) -> list[str]:
+    """What a scan that succeeded must have, and is not in its folder."""
+    return [name for name in _PROMISED if not (scan / name).is_file()]
+
+
+def sync_tree(folder: Path) -> None:
+    """Make every file below `folder`, and every folder, durable."""
+    for place, _, files in os.walk(folder):
+        for name in files:
+            sync_file(Path(place, name))
+        sync_folder(Path(place))

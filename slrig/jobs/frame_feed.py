@@ -1,0 +1,195 @@
+"""Frames on their way to the reconstruction process while they are taken.
+
+The recorded bundle is what counts; this is only a head start. So whoever captures is never held up: frames wait in a
+queue of bounded size, and when that is full, or the other process is gone, no more are sent and the reconstruction
+reads the bundle instead.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import structlog
+
+from slrig.capture.evidence import EvidenceSummary
+from slrig.model import Calibration, Shot
+from slrig.model.header import CaptureHeader
+
+MOST_WAITING_BYTES = 128 * 2**20
+"""How much of frames may wait for the reconstruction: a whole scan of a common camera."""
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """Frames of this outline will come."""
+
+    outline: CaptureHeader
+    calibration: Calibration
+
+
+@dataclass(frozen=True, slots=True)
+class Take:
+    """One frame."""
+
+    shot: Shot
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """That was the last frame; `evidence` is what the frames have proven."""
+
+    evidence: EvidenceSummary
+
+
+@dataclass(frozen=True, slots=True)
+class Abandon:
+    """Forget the frames that came."""
+
+
+class FrameSink(Protocol):
+    """Is shown the frames of a capture as they are taken."""
+
+    def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
+        """Hear what will come."""
+        ...
+
+    def take(self, shot: Shot) -> None:
+        """Take a frame that has passed its test. Returns at once. One that comes again takes the place of the first."""
+        ...
+
+    def end(self, evidence: EvidenceSummary) -> None:
+        """Hear that all frames have come."""
+        ...
+
+
+class FrameFeed:
+    """Sends the frames of one capture to the reconstruction process, on a thread of its own.
+
+    send : sends one message, and returns False when nobody receives it any more; it may block.
+    """
+
+    def __init__(self, send: Callable[[object], bool], *, most_bytes: int = MOST_WAITING_BYTES) -> None:
+        self._send = send
+        self._most_bytes = most_bytes
+        self._changed = threading.Condition()
+        self._waiting: deque[Begin | Take | End] = deque()
+        self._waiting_bytes = 0
+        self._taken: set[tuple[int, str, float | None]] = set()
+        self._ended = False
+        self._given_up = False
+        self._thread: threading.Thread | None = None
+
+    def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
+        """Start the thread. Without a calibration nothing can be reconstructed, and nothing is sent."""
+        if calibration is None:
+            self.abandon()
+            return
+        self._put(Begin(outline, calibration))
+        self._thread = threading.Thread(target=self._carry, name="slrig-feed", daemon=True)
+        self._thread.start()
+
+    def take(self, shot: Shot) -> None:
+        """Queue a frame. With too many waiting, or when it takes another one's place, give up."""
+        which = (shot.pattern, shot.camera, shot.exposure_s)
+        again = which in self._taken
+        self._taken.add(which)
+        with self._changed:
+            behind = not self._given_up and self._waiting_bytes + shot.image.nbytes > self._most_bytes
+        if again:
+            # What was concluded from the first one cannot be taken back.
+            _log.info("a frame was shot again; the reconstruction will read the bundle", pattern=shot.pattern)
+            self.abandon()
+        elif behind:
+            _log.info("the reconstruction falls behind the capture; it will read the bundle")
+            self.abandon()
+        else:
+            self._put(Take(shot))
+
+    def end(self, evidence: EvidenceSummary) -> None:
+        """Queue the end."""
+        self._put(End(evidence))
+
+    def abandon(self) -> None:
+        """Send no more, and have what was sent forgotten. After the end has been sent this does nothing."""
+        with self._changed:
+            self._given_up = True
+            self._waiting.clear()
+            self._changed.notify_all()
+
+    def settled(self, timeout_s: float) -> bool:
+        """Wait at most so long; return whether nothing more will be sent."""
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+        return self._thread is None or not self._thread.is_alive()
+
+    @property
+    def whole(self) -> bool:
+        """Whether every frame was sent, and the end."""
+        with self._changed:
+            return self._ended
+
+    def _put(self, message: Begin | Take | End) -> None:
+        with self._changed:
+            if not self._given_up:
+                self._waiting.append(message)
+                self._waiting_bytes += _bytes(message)
+                self._changed.notify_all()
+
+    def _carry(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._given_up)
+                message = None if self._given_up else self._waiting.popleft()
+            if message is None:
+                self._send(Abandon())
+                return
+            if not self._send(message):
+                self.abandon()
+                return
+            with self._changed:
+                self._waiting_bytes -= _bytes(message)
+                if isinstance(message, End):
+                    self._ended = True
+                    return
+
+
+def _bytes(message: Begin | Take | End) -> int:
+    return message.shot.image.nbytes if isinstance(message, Take) else 0
+
+
+class FedFrames:
+    """The other end: the frames of the capture under way, as far as they have come. begin : makes what takes them."""
+
+    def __init__(self, begin: Callable[..., Any]) -> None:
+        self._begin = begin
+        self._live: Any = None
+
+    def hear(self, message: object) -> None:
+        """Take a message of a feed. Frames that cannot be used are forgotten: reading the bundle will tell why."""
+        try:
+            match message:
+                case Begin(outline, calibration):
+                    self._live = self._begin(outline, calibration)
+                case Take(shot) if self._live is not None:
+                    self._live.take(shot)
+                case End(evidence) if self._live is not None:
+                    self._live.end(evidence)
+                case Abandon():
+                    self.forget()
+        except Exception as error:  # noqa: BLE001 - a head start that fails is no failure of the scan
+            _log.warning("frames could not be used while they were taken", cause=repr(error))
+            self.forget()
+
+    def taken(self) -> Any:
+        """What has taken the frames, None when nothing has."""
+        return self._live
+
+    def forget(self) -> None:
+        """Let the frames go."""
+        self._live = None

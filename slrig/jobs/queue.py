@@ -1,0 +1,285 @@
+"""The queue of jobs on a rig: one at a time on one owner thread, a few that wait, pictures in between.
+
+What is done with the rig is not its business: a scan (`slrig.scan.job`), or what a `slrig.jobs.job.RigWork` carries.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TypeVar
+from uuid import UUID
+
+import structlog
+
+from slrig.errors import (
+    CameraNotFoundError,
+    DeviceBusyError,
+    DeviceError,
+    InvalidInputError,
+    QueueFullError,
+    ScanCancelledError,
+    SlrigError,
+)
+from slrig.failure import failure_of, interruption
+from slrig.jobs.job import Holder, Job, busy
+from slrig.rig.preview import Light, Previews, Watch
+from slrig.rig.session import RigSession, driver_errors
+from slrig.rig.watchdog import Call, Watchdog
+
+_log = structlog.get_logger(__name__)
+
+
+_Job = TypeVar("_Job", bound=Job)
+
+
+@dataclass(frozen=True, slots=True)
+class QueueStatus:
+    """Who holds the rig, since when, how many wait, and whether the service is ending."""
+
+    holder: Holder | None
+    since: datetime | None
+    waiting: int
+    ending: bool
+
+
+class JobQueue:
+    """Runs jobs with the rig in the order in which they came.
+
+    Every public method may be called from any thread. `give_up` is told, on the owner thread, when the first opening
+    shows that the rig file is wrong.
+    """
+
+    def __init__(self, rig: RigSession, *, queue_length: int, give_up: Callable[[InvalidInputError], None]) -> None:
+        self.queue_length = queue_length
+        self.rig = rig
+        self._give_up = give_up
+        self._changed = threading.Condition()
+        self._waiting: deque[Job] = deque()
+        self._active: Job | None = None
+        self._previews = Previews(self._wake)
+        self._ending = False
+        self._owner = threading.Thread(target=self._own_rig, name="slrig-rig", daemon=True)
+        self._watchdog = Watchdog(rig.calls, self._give_up_on)
+
+    def start(self) -> None:
+        """Start the owner thread, which opens the rig."""
+        self._owner.start()
+        self._watchdog.start()
+
+    def refuse_while_stuck(self) -> None:
+        """Raise DeviceError while a driver hangs."""
+        call = self.rig.calls.stuck
+        if call is not None:
+            raise DeviceError(call.hangs())
+
+    def submit(self, make: Callable[[], _Job], *, wait: bool) -> _Job:
+        """Put the job that `make` returns in line; `wait` lets it stand behind others.
+
+        Raises
+        ------
+        RigBusyError
+            The rig is held, and `wait` is False. `make` was not called.
+        QueueFullError
+            As many wait as may.
+        ScanInterruptedError
+            The service ends.
+        """
+        with self._changed:
+            if self._ending:
+                raise interruption()
+            ahead = self._active or (self._waiting[0] if self._waiting else None)
+            if ahead is not None and not wait:
+                raise busy(ahead)
+            if len(self._waiting) >= self.queue_length and ahead is not None:
+                message = f"The rig is held and {len(self._waiting)} are waiting, as many as may. Try again later."
+                raise QueueFullError(message)
+            job = make()
+            self._waiting.append(job)
+            self._changed.notify_all()
+        self._previews.interrupt()
+        return job
+
+    def take_up(self, jobs: Sequence[Job]) -> None:
+        """Put jobs of an earlier run in line, however many; before `start`."""
+        self._waiting.extend(jobs)
+
+    def cancel(self, job_id: UUID) -> bool:
+        """Have a job end early. Returns whether it is under way and was told; one that waited has ended."""
+        with self._changed:
+            queued = next((job for job in self._waiting if job.id == job_id), None)
+            if queued is not None:
+                self._waiting.remove(queued)
+                message = f"{_begun(queued.holder.words)} was cancelled while it waited for the rig."
+                queued.cut_off(ScanCancelledError(message))
+            elif self._active is not None and self._active.id == job_id:
+                self._active.stop.set()
+                return True
+        if queued is not None:
+            queued.settle()
+        return False
+
+    def knows(self, job_id: UUID) -> bool:
+        """Whether a job waits or is under way."""
+        with self._changed:
+            return any(job.id == job_id for job in (*self._waiting, self._active) if job is not None)
+
+    def watch(self, camera: str, light: Light) -> Watch:
+        """Look through a camera; pictures come while the rig is idle.
+
+        Raises
+        ------
+        CameraNotFoundError
+            The rig has no camera of that name.
+        RigBusyError
+            The rig is held.
+        DeviceError
+            The rig is not open, or not yet.
+        """
+        self.refuse_while_stuck()
+        facts = self.rig.facts
+        if self.rig.fault is not None:
+            message = f"The rig cannot be opened: {self.rig.fault.message}"
+            raise DeviceError(message)
+        if facts is None:
+            message = "The rig is being opened. Ask again in a moment."
+            raise DeviceBusyError(message)
+        if camera not in facts.cameras:
+            message = f"The rig has no camera '{camera}'; it has {', '.join(facts.cameras)}."
+            raise CameraNotFoundError(message)
+        with self._changed:
+            if self._ending:
+                raise interruption()
+            if self._active is not None:
+                raise busy(self._active)
+        return self._previews.watch(camera, light)
+
+    def status(self) -> QueueStatus:
+        """Return who holds the rig. Touches no device."""
+        with self._changed:
+            active = self._active
+            holder, since = (None, None) if active is None else (active.holder, active.since)
+            return QueueStatus(holder, since, len(self._waiting), self._ending)
+
+    @property
+    def ending(self) -> bool:
+        """Whether the service is ending."""
+        return self._ending
+
+    def end(self) -> None:
+        """Take nothing in any more, and have what is under way end early. `join` has to follow."""
+        with self._changed:
+            self._ending = True
+            cut_off = list(self._waiting)
+            self._waiting.clear()
+            if self._active is not None:
+                self._active.stop.set()
+            for job in cut_off:
+                job.cut_off(interruption())
+            self._changed.notify_all()
+        self._watchdog.stop()
+        self._previews.fail(interruption())
+        for job in cut_off:
+            job.settle()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the owner thread, which darkens and closes the rig; one that hangs is left behind, and darkened
+        past, as far as its driver lets.
+        """
+        if self._owner.is_alive():
+            self._owner.join(timeout_s)
+        if self._owner.is_alive():
+            _log.error("the rig's driver does not return; the service ends without it", rig=self.rig.name)
+            self.rig.darken_from_outside()
+        self._cut_off_active(interruption())
+
+    def _give_up_on(self, call: Call) -> None:
+        """End, on the watchdog's thread, what waits for a call that hangs."""
+        _log.error("a driver hangs", rig=self.rig.name, device=call.device, step=call.step)
+        error = DeviceError(self.rig.give_up(call).message)
+        self.rig.darken_from_outside()
+        self._cut_off_active(error)
+        self._previews.fail(error)
+
+    def _cut_off_active(self, error: SlrigError) -> None:
+        with self._changed:
+            active = self._active
+            if active is not None:
+                active.cut_off(error)
+        if active is not None:
+            active.settle()
+
+    def _own_rig(self) -> None:
+        error = self.rig.try_open()
+        if isinstance(error, InvalidInputError):
+            self._give_up(error)
+        else:
+            self._log_unopened(error)
+        while (job := self._next()) is not None:
+            try:
+                self._run(job)
+            except Exception:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
+                _log.exception("the end of work with the rig went wrong", work=job.holder.words)
+        self.rig.darken()
+        self.rig.let_go()
+
+    def _next(self) -> Job | None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._wanted() or self._previews.wanted)
+                if self._ending:
+                    return None
+                if self._waiting:
+                    self._active = self._waiting.popleft()
+                    return self._active
+            self._show()
+
+    def _wanted(self) -> bool:
+        return self._ending or bool(self._waiting)
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _run(self, job: Job) -> None:
+        try:
+            try:
+                job.run(self.rig)
+            finally:
+                self.rig.darken()
+            job.clear_up()
+        finally:
+            # The rig is free before anyone can read that the work is over: a client may start its next one at once.
+            with self._changed:
+                self._active = None
+                job.conclude()
+            job.settle()
+        if not self._ending:
+            self._log_unopened(self.rig.recover())
+
+    def _show(self) -> None:
+        """Take pictures for those who look, until a job wants the rig."""
+        try:
+            rig = self.rig.open()
+            with driver_errors(self.rig.name):
+                self._previews.run(rig, stop=self._wanted)
+        except Exception as error:  # noqa: BLE001 - the owner thread outlives whatever happens to a picture
+            self.rig.let_go(error)
+            self._log_unopened(error)
+            fault = failure_of(error)
+            self._previews.fail(error if isinstance(error, SlrigError) else DeviceError(fault.message))
+            self._log_unopened(self.rig.recover())
+
+    def _log_unopened(self, error: Exception | None) -> None:
+        if isinstance(error, SlrigError):
+            _log.warning("the rig cannot be opened; the next scan tries again", rig=self.rig.name, cause=str(error))
+        elif error is not None:
+            _log.error("the rig's driver failed with an error of its own", rig=self.rig.name, exc_info=error)
+
+
+def _begun(words: str) -> str:
+    """The words as the beginning of a sentence."""
+    return words[:1].upper() + words[1:]

@@ -1,0 +1,300 @@
+"""The mathematics in a process of its own: it shares no interpreter lock with capture and HTTP, and may end alone.
+
+One process and one pipe rather than a process pool: a pool can report no progress, cannot stop a running task, and
+joins it at exit. Here a lost process is seen at once, and the next job starts a fresh one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from ctypes import c_double
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import RawValue
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from slrig.errors import ScanCancelledError
+from slrig.failure import WorkerLostError, error_classes, interruption
+from slrig.jobs.channel import (
+    Call,
+    Failed,
+    Fed,
+    Preparing,
+    Ready,
+    Run,
+    Unloadable,
+    received,
+    sent,
+)
+from slrig.jobs.frame_feed import FrameFeed
+from slrig.jobs.worker_process import serve
+from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Told
+
+PIPELINE = "slrig.scan.reconstruct"
+"""What the process prepares for: the reconstruction of scans, whose kernels are compiled once on each machine."""
+
+SILENCE_TOLD_S = 5.0
+"""From when on `condition` tells that the process shows no sign of life."""
+
+LOADING = "loading"
+READY = "ok"
+
+WAITING = "waiting for the worker"
+"""The stage of a job while another one is computed."""
+
+_log = structlog.get_logger(__name__)
+
+
+class UnexpectedWorkerError(Exception):
+    """A defect in a task. Carries the traceback of the other process as its text."""
+
+
+def _silent(_stage: str, _fraction: float, _detail: str) -> None:
+    pass
+
+
+def _never() -> bool:
+    return False
+
+
+class Worker:
+    """Runs one task at a time in a child process, in the order in which they come. Any thread may call."""
+
+    def __init__(self, module: str = PIPELINE) -> None:
+        """`module` : see `slrig.jobs.worker_process.serve`."""
+        self.module = module
+        self._spawning = multiprocessing.get_context("spawn")
+        self._process: BaseProcess | None = None
+        self._pipe: Connection | None = None
+        self._stops: Connection | None = None
+        self._heartbeat: c_double = RawValue(c_double, 0.0)
+        self._guard = threading.Lock()
+        self._sending = threading.Lock()
+        self._turns: deque[int] = deque()
+        self._turn = threading.Condition()
+        self._numbers = itertools.count(1)
+        self._fed: tuple[FrameFeed, Connection | None, int] | None = None
+        self._closed = False
+        self._running = False
+        self._condition, self._loading = LOADING, True
+
+    @property
+    def condition(self) -> str:
+        """`READY` once the process has loaded its kernels, `LOADING` or how far that is, or why it cannot compute."""
+        with self._guard:
+            # While a job is under way `run` reads the pipe, and an answer read here would be lost.
+            while self._loading and not self._running and self._pipe is not None and self._pipe.poll():
+                self._note(received(self._pipe))
+            silence_s = self._silence_s()
+            if self._condition == READY and silence_s > SILENCE_TOLD_S:
+                return (
+                    f"the worker shows no sign of life for {silence_s:.0f} s; a job that waits for it has it replaced"
+                )
+            return self._condition
+
+    def _silence_s(self) -> float:
+        if self._process is None or not self._process.is_alive():
+            return 0.0
+        return time.monotonic() - self._heartbeat.value
+
+    @property
+    def loading(self) -> bool:
+        """Whether the process is not ready yet, and there is hope, as `condition` found it last."""
+        return self._loading
+
+    def _note(self, told: object | None) -> None:
+        """Take what a process says before its first answer; None stands for its death."""
+        if isinstance(told, Preparing):
+            self._condition = f"{PREPARING}, {told}"
+        elif isinstance(told, Ready):
+            self._condition, self._loading = READY, False
+        elif self._loading:
+            # Of a process that is gone, and nothing more is to be read from its pipe, whoever ended it.
+            self._loading = False
+            if self._closed:
+                return
+            cause = told.cause if isinstance(told, Unloadable) else "its process ended"
+            self._condition = f"the reconstruction cannot be loaded: {cause}; the service's log has the details"
+            _log.error("the reconstruction cannot be loaded", cause=cause)
+
+    @property
+    def process_id(self) -> int | None:
+        """The process id of the child, None when there is none."""
+        return None if self._process is None else self._process.pid
+
+    @property
+    def jobs(self) -> int:
+        """How many jobs are under way or wait."""
+        with self._turn:
+            return len(self._turns)
+
+    def start(self) -> None:
+        """Start the process unless one lives. Returns at once; the process loads its kernels by itself."""
+        with self._guard:
+            if self._closed or (self._process is not None and self._process.is_alive()):
+                return
+            if self._pipe is not None and self._stops is not None:
+                # A feed may still be in the middle of a message to the process that ended.
+                with self._sending:
+                    self._pipe.close()
+                    self._stops.close()
+            self._condition, self._loading = LOADING, True
+            self._pipe, far_end = self._spawning.Pipe()
+            stops, self._stops = self._spawning.Pipe(duplex=False)
+            self._heartbeat = RawValue(c_double, time.monotonic())
+            self._process = self._spawning.Process(
+                target=serve, args=(far_end, stops, self._heartbeat, self.module), name="slrig-worker", daemon=True
+            )
+            self._process.start()
+            # The child holds the only other ends now, so its death reads as end of file here.
+            far_end.close()
+            stops.close()
+
+    def feed(self) -> FrameFeed:
+        """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards."""
+        self.start()
+        number = next(self._numbers)
+        with self._guard:
+            pipe = self._pipe
+
+        def send(message: object) -> bool:
+            # A feed that was abandoned in the middle of a message finishes it before anyone sends the next.
+            with self._sending:
+                return pipe is not None and sent(pipe, Fed(number, message))
+
+        self._fed = FrameFeed(send), pipe, number
+        return self._fed[0]
+
+    def run(
+        self,
+        call: Call,
+        *,
+        progress: Told = _silent,
+        cancelled: Callable[[], bool] = _never,
+        feed: FrameFeed | None = None,
+    ) -> Any:
+        """Do a task when it is its turn, and return its result. Frames that `feed` has sent, all of them, are used.
+
+        Whatever but an answer ends the wait, the process is replaced: what it still computes belongs to nobody.
+
+        Raises
+        ------
+        SlrigError
+            Whatever the task raised, by class and message.
+        ScanCancelledError
+            `cancelled` turned true.
+        ScanInterruptedError
+            The worker was closed.
+        WorkerLostError
+            The process ended, showed no sign of life, or told no progress for too long.
+        UnexpectedWorkerError
+            The task has a defect.
+        """
+        with self._its_turn(call, progress, cancelled):
+            self.start()
+            with self._guard:
+                process, pipe, stops = self._process, self._pipe, self._stops
+                self._running = True
+            if process is None or pipe is None or stops is None:
+                raise interruption()
+            number, fed = next(self._numbers), False
+            # A process that was started since the capture has not seen its frames.
+            if feed is not None and self._fed is not None and self._fed[:2] == (feed, pipe):
+                number, fed = self._fed[2], True
+            job = JobWait(call, number, process, pipe, stops, self._heartbeat, progress, cancelled, self._noted)
+            try:
+                if fed and feed is not None:
+                    fed = job.settled(feed)
+                with self._sending:
+                    begun = sent(pipe, Run(number, call, fed))
+                if not begun:
+                    # What it last said may lie in the pipe still: why it could not be loaded.
+                    self._noted(received(pipe))
+                    raise job.lost()
+                answer = job.answer()
+            except WorkerLostError as error:
+                if self._closed:
+                    raise interruption() from error
+                if not self._loading and self._condition != READY:
+                    message = f"The {call.what} did not begin: {self._condition}. {call.remedy}"
+                    raise WorkerLostError(message) from error
+                raise
+            finally:
+                with self._guard:
+                    self._running = False
+                if not job.answered:
+                    process.kill()
+                    process.join()
+            if isinstance(answer, Failed):
+                raise _error(answer)
+            return answer.result
+
+    def _noted(self, told: object | None) -> None:
+        with self._guard:
+            self._note(told)
+
+    def task(self, function: str, what: str) -> Callable[..., Any]:
+        """A function of the mathematics, "module:function", done by the worker; see `run` for the two callables."""
+
+        def call(*given: Any, progress: Told = _silent, cancelled: Callable[[], bool] = _never, **options: Any) -> Any:
+            return self.run(Call(function, given, options, what=what), progress=progress, cancelled=cancelled)
+
+        return call
+
+    @contextmanager
+    def _its_turn(self, call: Call, progress: Told, cancelled: Callable[[], bool]) -> Iterator[None]:
+        """Wait until the jobs that came before are over."""
+        turn, told = next(self._numbers), False
+        with self._turn:
+            self._turns.append(turn)
+        try:
+            while True:
+                with self._turn:
+                    if self._turn.wait_for(lambda: self._turns[0] == turn, timeout=POLL_S):
+                        break
+                if not told:
+                    progress(WAITING, 0.0, "another job is computed first")
+                    told = True
+                if cancelled():
+                    message = f"The {call.what} was cancelled."
+                    raise ScanCancelledError(message)
+            yield
+        finally:
+            with self._turn:
+                self._turns.remove(turn)
+                self._turn.notify_all()
+
+    def close(self) -> None:
+        """End the process, whatever it does. Idempotent."""
+        with self._guard:
+            self._closed = True
+            process = self._process
+        if process is not None:
+            process.kill()
+            process.join()
+
+
+def prepare_kernel_cache(folder: Path) -> None:
+    """Tell numba where to keep compiled kernels when slrig's own folder is read-only; call before numba is loaded.
+
+    numba itself refuses to load a cached kernel when it finds no place to write, as under systemd or in a container.
+    """
+    package = Path(__file__).resolve().parent.parent
+    if "NUMBA_CACHE_DIR" not in os.environ and not os.access(package, os.W_OK):
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)
+
+
+def _error(failed: Failed) -> Exception:
+    known = error_classes().get(failed.fault.kind)
+    return UnexpectedWorkerError(failed.trace) if known is None else known(failed.fault.message)

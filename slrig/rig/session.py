@@ -1,0 +1,219 @@
+"""The rig as the service holds it: opened once, kept, let go when a device vanishes, opened again for the next scan."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import structlog
+
+from slrig.bundle.calibration_file import check_calibration, check_rays
+from slrig.devices import CameraInfo, ProjectorInfo, Rig
+from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
+from slrig.failure import UNEXPECTED, JobFailure, failure_of
+from slrig.model import Calibration, Size
+from slrig.rig.positioner import GuardedPositioner
+from slrig.rig.watchdog import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
+
+_LAST_RESORT_S = 1.0
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RigFacts:
+    """What an open rig declares about itself: data that any thread may read.
+
+    calibration : of the rig file, or of the head. positions : the poses that what moves the board can take, by name;
+    none where a person does.
+    """
+
+    cameras: Mapping[str, CameraInfo]
+    projector: ProjectorInfo
+    calibration: Calibration | None
+    positions: tuple[str, ...] = ()
+
+    @property
+    def sizes(self) -> Mapping[str, Size]:
+        """The extent of each camera's frames."""
+        return {name: camera.format.size for name, camera in self.cameras.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveCalibration:
+    """A calibration that takes the place of the rig's own. name : the id that it is on record by."""
+
+    name: str
+    calibration: Calibration
+
+
+@contextmanager
+def driver_errors(rig: str) -> Iterator[None]:
+    """Turn what the operating system tells a driver within the block into a DeviceError.
+
+    Whatever writes to a disk there has to tell its refusals as StorageError itself.
+    """
+    try:
+        yield
+    except OSError as error:
+        message = f"a driver of rig '{rig}' failed: {error}; check cable, power and permissions"
+        raise DeviceError(message) from error
+
+
+class RigSession:
+    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `active`, `calibration`, `misfit`,
+    `refuse_misfit`, `give_up` and `darken_from_outside` belong to it.
+
+    Whoever sets `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
+    for other devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
+    """
+
+    def __init__(self, name: str, open_rig: Callable[[], Rig], *, calls: Calls | None = None) -> None:
+        self.name = name
+        self.calls = Calls() if calls is None else calls
+        self._open_rig = open_rig
+        self._rig: Rig | None = None
+        self._bare: Rig | None = None
+        self.facts: RigFacts | None = None
+        self.fault: JobFailure | None = None
+        self.active: ActiveCalibration | None = None
+        self._dropped = False
+
+    def open(self) -> Rig:
+        """Return the rig, opened if it is not open yet. Raises what the driver raises, an OSError as DeviceError."""
+        self._drop_failed()
+        if self._rig is None:
+            self._dropped = False
+            rig: Rig | None = None
+            try:
+                rig = self.calls.make(f"rig '{self.name}'", OPEN, OPEN_LIMIT_S, self._opened)
+                self.facts = _facts(rig)
+            except Exception as error:
+                self.fault = failure_of(error)
+                if rig is not None:
+                    self._close(rig)
+                raise
+            self._rig, self._bare = _guarded(rig, self.calls), rig
+            self.calls.failure = None
+            self.fault = None
+        active = self.active
+        return self._rig if active is None else replace(self._rig, calibration=self._fitting(active))
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What work that is begun now uses: the active one, or else the rig's own; None before the rig was open."""
+        active = self.active
+        if active is not None:
+            return self._fitting(active)
+        return None if self.facts is None else self.facts.calibration
+
+    def misfit(self, active: ActiveCalibration) -> CalibrationError | None:
+        """Why a calibration cannot be used with the devices of this rig; None if it can, or before it was open."""
+        if self.facts is None:
+            return None
+        try:
+            source = f"calibration {active.name}"
+            check_calibration(active.calibration, self.facts.projector.size, self.facts.sizes, source)
+            check_rays(active.calibration, self.facts.sizes, source)
+        except CalibrationError as error:
+            return error
+        return None
+
+    def _fitting(self, active: ActiveCalibration) -> Calibration | None:
+        return None if self.misfit(active) else active.calibration
+
+    def refuse_misfit(self) -> None:
+        """Raise CalibrationError if the calibration in use is for other devices."""
+        active = self.active
+        error = None if active is None else self.misfit(active)
+        if error is not None:
+            message = f"{error}\nActivate another one (POST /calibration/ID/activate), or calibrate this rig."
+            raise CalibrationError(message)
+
+    def doubt(self, error: Exception) -> None:
+        """Let the rig go if an error leaves the state of its devices unknown; the next work opens them afresh."""
+        failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
+        if failed or failure_of(error).kind == UNEXPECTED:
+            self.let_go(error)
+
+    def _opened(self) -> Rig:
+        with driver_errors(self.name):
+            return self._open_rig()
+
+    def _drop_failed(self) -> None:
+        """Let the rig go if a device failed and nobody was told, as at the end of a scan that had all its frames."""
+        if self._rig is not None and self.calls.failure is not None:
+            self.let_go(self.calls.failure)
+
+    def try_open(self) -> Exception | None:
+        """Open the rig, or return why it cannot be opened, which `fault` keeps. The next scan tries again."""
+        try:
+            self.open()
+        except Exception as error:  # noqa: BLE001 - a driver may raise anything, and must not end the owner thread
+            return error
+        return None
+
+    def recover(self) -> Exception | None:
+        """Open the rig again, once, if it was let go because of a failure; return why that cannot be done."""
+        self._drop_failed()
+        return self.try_open() if self._dropped else None
+
+    def darken(self) -> None:
+        """Make the projector dark. One that will not is let go with all other devices."""
+        if self._rig is None:
+            return
+        try:
+            with driver_errors(self.name):
+                self._rig.projector.blank()
+        except Exception as error:  # noqa: BLE001 - a driver may raise anything, and must not end the owner thread
+            _log.error("the projector does not go dark; the rig is closed", rig=self.name, cause=repr(error))
+            self.let_go(error)
+
+    def darken_from_outside(self) -> None:
+        """Try to make the projector dark past the thread that owns it: for when that one does not come back."""
+        rig = self._bare
+        if rig is None:
+            return
+
+        def darken() -> None:
+            try:
+                rig.projector.blank()
+            except Exception as error:  # noqa: BLE001 - nothing is left to be tried
+                _log.error("the projector may still be lit", rig=self.name, cause=repr(error))
+
+        # On a thread of its own: a driver that hangs may hold back this call as well.
+        last_resort = threading.Thread(target=darken, name="slrig-dark", daemon=True)
+        last_resort.start()
+        last_resort.join(_LAST_RESORT_S)
+
+    def let_go(self, error: BaseException | None = None) -> None:
+        """Close every device. `error` says why, where that is a failure."""
+        rig, self._rig = self._rig, None
+        if error is not None:
+            self.fault = failure_of(error)
+        if rig is not None:
+            self._dropped = error is not None
+            self._close(rig)
+            self._bare = None
+
+    def give_up(self, call: Call) -> JobFailure:
+        """Take note that a call hangs, and return what to tell of it. It ends the rig when it returns after all."""
+        fault = self.fault = failure_of(DeviceError(call.hangs()))
+        return fault
+
+    def _close(self, rig: Rig) -> None:
+        for fault in rig.close():
+            _log.error("a device could not be closed in good order", rig=self.name, cause=repr(fault))
+
+
+def _facts(rig: Rig) -> RigFacts:
+    cameras = {name: camera.info for name, camera in rig.cameras.items()}
+    positions = () if rig.positioner is None else tuple(rig.positioner.poses)
+    return RigFacts(cameras, rig.projector.info, rig.calibration, positions)
+
+
+def _guarded(rig: Rig, calls: Calls) -> Rig:
+    positioner = None if rig.positioner is None else GuardedPositioner(rig.positioner, calls)
+    return replace(guarded(rig, calls), positioner=positioner)

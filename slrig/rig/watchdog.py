@@ -1,0 +1,307 @@
+"""Devices as the service calls them: what they raise says which device and which call, and no call hangs unnoticed.
+
+Drivers raise what the operating system gives them, in its words; a scan is on record with words that a person can act
+on. And a call that does not return, because a driver or the kernel hangs, must not leave a scan under way for ever with
+the projector's light on.
+"""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import structlog
+
+from slrig.devices import (
+    AppliedSettings,
+    Camera,
+    CameraInfo,
+    CameraSettings,
+    Projector,
+    ProjectorInfo,
+    Rig,
+    Shown,
+    Trigger,
+    progress_heard,
+)
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    DriverBrokenError,
+    FrameTimeoutError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Frame, PatternSequence
+
+OPEN = "open"
+"""The step of opening a whole rig."""
+
+OPEN_LIMIT_S = 60.0
+"""How long opening a rig may take without telling of progress: network cameras are looked for, some projectors boot."""
+
+LOOK_S = 0.5
+"""How often the watchdog looks."""
+
+_GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN}
+
+_log = structlog.get_logger(__name__)
+
+_Value = TypeVar("_Value")
+
+
+@dataclass(slots=True)
+class Call:
+    """A call of a device that is under way. `since_s` : when it was begun, or last told how far it is; `doing` : what
+    it told; `late` : how often it was found to be; `given_up` : nobody waits for it.
+    """
+
+    device: str
+    step: str
+    limit_s: float
+    since_s: float
+    computed: bool = False
+    doing: str = ""
+    late: int = 0
+    given_up: bool = False
+
+    def hangs(self) -> str:
+        """What to tell of a call that does not return."""
+        what = f"{self.device}: its driver has not come back from {self.step} for {self.limit_s:.0f} s"
+        if self.computed:
+            return f"{what}, nor told how far it is; restart the service, and report this to the driver's maintainer"
+        if self.step == OPEN:
+            return (
+                f"{what}, nor told how far it is; restart the service, after unplugging and plugging in again what of "
+                "the rig is on a cable, and report this to the driver's maintainer"
+            )
+        return (
+            f"{what} and does not keep its time-out; unplug the device, plug it in again and scan again; if that is "
+            "refused, restart the service, and report this to the driver's maintainer"
+        )
+
+
+class Calls:
+    """Whatever the thread that owns a rig asks of its devices goes through here; any thread may look."""
+
+    def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._current: Call | None = None
+        self.failure: DeviceError | None = None
+        """The last error of a device that leaves its state unknown, also where whoever called passed over it."""
+
+    def make(
+        self, device: str, step: str, limit_s: float, function: Callable[[], _Value], *, computed: bool = False
+    ) -> _Value:
+        """Call a device. It may take limit_s without telling how far it is. computed : see `CallLimits`.
+
+        Raises
+        ------
+        SlrigError
+            What the driver raised, with the device and the call in its text.
+        DeviceBusyError, DeviceGoneError, DeviceError
+            What the system told the driver, by its number.
+        DriverBrokenError
+            The driver has a defect.
+        DeviceError
+            The call took so long that it was given up; nobody waits for its result any more.
+        """
+        call = self._current = Call(device, step, limit_s, self._now_s(), computed)
+
+        def heard(doing: str) -> None:
+            call.doing, call.since_s, call.late = doing, self._now_s(), 0
+
+        try:
+            with progress_heard(heard):
+                value = function()
+        except SlrigError as error:
+            self._note(_placed(error, device, step))
+            raise
+        except OSError as error:
+            told = _of_the_system(error, call)
+            self._note(told)
+            raise told from error
+        except Exception as error:
+            # A driver may raise the same error again and again, and not every renderer bears the ring that this makes.
+            trace = "".join(traceback.format_exception(error))
+            _log.error("a driver failed with an error of its own", device=device, step=step, exception=trace)
+            message = (
+                f"{device}: its driver failed in {step} ({type(error).__name__}: {error}); scan again, and report it "
+                "to the driver's maintainer with the service's log"
+            )
+            self.failure = DriverBrokenError(message)
+            raise self.failure from error
+        finally:
+            self._current = None
+        if call.given_up:
+            self.failure = DeviceError(call.hangs())
+            raise self.failure
+        return value
+
+    def overdue(self) -> Call | None:
+        """Return the call under way if it has taken too long, once, and give it up. For the watchdog, which looks twice
+        before it believes that: the whole process may have been stopped meanwhile.
+        """
+        call = self._current
+        if call is None or call.given_up or self._now_s() - call.since_s <= call.limit_s:
+            return None
+        call.late += 1
+        call.given_up = call.late > 1
+        return call if call.given_up else None
+
+    @property
+    def doing(self) -> str:
+        """What the call under way has told that it is at; "" where it has told nothing."""
+        call = self._current
+        return "" if call is None else call.doing
+
+    @property
+    def stuck(self) -> Call | None:
+        """The call that was given up, as long as it does not return."""
+        call = self._current
+        return call if call is not None and call.given_up else None
+
+    def _note(self, error: SlrigError) -> None:
+        # After these the device is as it was before.
+        if isinstance(error, DeviceError) and not isinstance(error, (FrameTimeoutError, UnsupportedByDeviceError)):
+            self.failure = error
+
+
+class Watchdog:
+    """Looks after the calls of a rig on a thread of its own; `on_hang` is told there of each one that hangs, once."""
+
+    def __init__(self, calls: Calls, on_hang: Callable[[Call], None], *, look_s: float = LOOK_S) -> None:
+        self._calls = calls
+        self._on_hang = on_hang
+        self._look_s = look_s
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="slrig-watchdog", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no more. Idempotent."""
+        self._ended.set()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(self._look_s):
+            call = self._calls.overdue()
+            if call is not None:
+                self._on_hang(call)
+
+
+def guarded(rig: Rig, calls: Calls) -> Rig:
+    """The same rig, all calls of its devices by way of `calls`."""
+    cameras: dict[str, Camera] = {name: _GuardedCamera(camera, name, calls) for name, camera in rig.cameras.items()}
+    return replace(rig, cameras=cameras, projector=_GuardedProjector(rig.projector, calls))
+
+
+class _GuardedCamera:
+    """Implements `slrig.devices.Camera` by another one."""
+
+    def __init__(self, camera: Camera, name: str, calls: Calls) -> None:
+        self._camera = camera
+        self._device = f"camera '{name}'"
+        self._calls = calls
+
+    @property
+    def info(self) -> CameraInfo:
+        return self._camera.info
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        return self._made("configure", lambda: self._camera.configure(settings))
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        self._made("arm", lambda: self._camera.arm(count, trigger))
+
+    def trigger(self) -> None:
+        self._made("trigger", self._camera.trigger)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        limits = self._camera.info.limits
+        limit_s = 2 * timeout_s + limits.read_slack_s
+        read = partial(self._camera.read, after_ns, timeout_s)
+        return self._calls.make(self._device, "read", limit_s, read, computed=limits.computed)
+
+    def disarm(self) -> None:
+        self._made("disarm", self._camera.disarm)
+
+    def close(self) -> None:
+        self._made("close", self._camera.close)
+
+    def _made(self, step: str, function: Callable[[], _Value]) -> _Value:
+        limits = self._camera.info.limits
+        return self._calls.make(self._device, step, limits.call_s, function, computed=limits.computed)
+
+
+class _GuardedProjector:
+    """Implements `slrig.devices.Projector` by another one."""
+
+    def __init__(self, projector: Projector, calls: Calls) -> None:
+        self._projector = projector
+        self._calls = calls
+
+    @property
+    def info(self) -> ProjectorInfo:
+        return self._projector.info
+
+    def load(self, sequence: PatternSequence) -> None:
+        self._made("load", lambda: self._projector.load(sequence))
+
+    def show(self, index: int) -> Shown:
+        return self._made("show", lambda: self._projector.show(index))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        self._made("play", lambda: self._projector.play(exposure_s, period_s))
+
+    def stop(self) -> None:
+        self._made("stop", self._projector.stop)
+
+    def blank(self) -> None:
+        self._made("blank", self._projector.blank)
+
+    def close(self) -> None:
+        self._made("close", self._projector.close)
+
+    def _made(self, step: str, function: Callable[[], _Value]) -> _Value:
+        info = self._projector.info
+        device = f"projector '{info.name}'"
+        return self._calls.make(device, step, info.limits.call_s, function, computed=info.limits.computed)
+
+
+def _placed(error: SlrigError, device: str, step: str) -> SlrigError:
+    """The error itself, with the place where it happened at the end of its text, once."""
+    place = f"({device}, in {step})"
+    text = str(error)
+    # Whoever opens a device names it; and capture tells of a frame that did not come in words of its own.
+    unplaced = isinstance(error, DeviceError) and not isinstance(error, FrameTimeoutError) and step != OPEN
+    if unplaced and not text.endswith(place):
+        error.args = (f"{text} {place}", *error.args[1:])
+    return error
+
+
+def _of_the_system(error: OSError, call: Call) -> DeviceError:
+    """What the system told a driver, in words that a person can act on."""
+    device, step = call.device, call.step
+    if call.computed:
+        return DeviceError(
+            f"{device} failed in {step}: {error}; check its files and their permissions, then scan again"
+        )
+    if error.errno == errno.EBUSY:
+        return DeviceBusyError(
+            f"{device} is held by another program (in {step}: {error}); end that program, then scan again"
+        )
+    if error.errno in _GONE:
+        return DeviceGoneError(
+            f"{device} is gone (in {step}: {error}); check its cable and power, plug it in, then scan again"
+        )
+    return DeviceError(f"{device} failed in {step}: {error}; check cable, power and permissions, then scan again")

@@ -1,0 +1,82 @@
+"""What a plan means on the rig that is there: its patterns, and whether the devices can do it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from slrig.bundle.description import MOST_CAPTURE_BYTES
+from slrig.errors import UnsupportedByDeviceError
+from slrig.model import Axis, Calibration, Pattern, PatternSequence, Size
+from slrig.patterns.sequence import encode, scan_patterns
+from slrig.rig.session import RigFacts
+from slrig.scan.light_axis import played_axes
+from slrig.scan.plan import PatternPlan, ScanPlan
+
+
+def pattern_sequence(
+    plan: PatternPlan,
+    size: Size,
+    calibration: Calibration | None = None,
+    cameras: Iterable[str] = (),
+    *,
+    axis: Axis | None = None,
+    recorded: tuple[Pattern, ...] = (),
+) -> PatternSequence:
+    """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError.
+
+    axis : the one to triangulate by, if that was asked for. recorded : of `ProjectorInfo`; they are played unless the
+    plan asks for patterns of its own.
+    """
+    if recorded and plan == PatternPlan():
+        return encode(recorded, size)
+    axes = played_axes(plan.rows, calibration, cameras, axis=axis)
+    patterns = scan_patterns(
+        size,
+        line_shift=plan.line_shift,
+        period_px=plan.line_shift_period_px,
+        line_width_px=plan.line_width_px,
+        gray_cell_px=plan.gray_cell_px,
+        gray_offset_px=plan.gray_offset_px,
+        rows=plan.codes and Axis.ROW in axes,
+        columns=plan.codes and Axis.COLUMN in axes,
+    )
+    return encode(patterns, size)
+
+
+def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
+    """Return the bytes that the frames of a scan take on this rig, uncompressed. calibration : that it is to use.
+
+    Raises
+    ------
+    PatternError
+        The patterns do not fit the projector, or by the calibration they tell no depth.
+    UnsupportedByDeviceError
+        A camera cannot expose that long, or that briefly, or the frames are more than a bundle holds.
+    """
+    exposures_s = plan.rising_exposures_s
+    axis = plan.reconstruction.axis
+    projector = facts.projector
+    sequence = pattern_sequence(
+        plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded
+    )
+    count = len(sequence) * max(len(exposures_s), 1)
+    key = "exposure_s" if plan.exposures_s is None else "exposures_s"
+    total = 0
+    for name, camera in facts.cameras.items():
+        least_s, most_s = camera.exposure_range_s
+        for asked_s in exposures_s:
+            if not least_s <= asked_s <= most_s:
+                message = (
+                    f"{key}: {asked_s:g} s was asked for, camera '{name}' can do {least_s:g} s to {most_s:g} s. "
+                    "Ask for a value in that range."
+                )
+                raise UnsupportedByDeviceError(message)
+        size = camera.format.size
+        total += count * size.width_px * size.height_px * (1 if camera.format.bit_depth <= 8 else 2)
+    if total > MOST_CAPTURE_BYTES:
+        message = (
+            f"The frames of this scan would take {total / 1e9:.1f} GB, a bundle holds {MOST_CAPTURE_BYTES / 1e9:.1f} "
+            "GB at most. Ask for fewer exposures or fewer patterns."
+        )
+        raise UnsupportedByDeviceError(message)
+    return total

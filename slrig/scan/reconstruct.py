@@ -1,0 +1,259 @@
+"""The second half of a scan, walked: the one file where the rooms of its mathematics meet.
+
+A live scan is recorded as a bundle first (`slrig.scan.acquisition`), so that what was measured can always be computed
+again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.bundle import read_truth
+from slrig.bundle.health import read_health
+from slrig.bundle.storage import write_file
+from slrig.errors import ScanCancelledError
+from slrig.jobs.frame_feed import FedFrames
+from slrig.kernels import Prepared, compilations_told
+from slrig.meshing.quality import mesh_figures, score
+from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
+from slrig.meshing.vertices import brightness, compact_mesh
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves
+from slrig.reconstruction.agreement import disagreement
+from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
+from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
+from slrig.scan.artefacts import encode_points_ply, write_mesh, write_report
+from slrig.scan.calibration_report import calibration_report
+from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.measured import Walked, measured
+from slrig.scan.offered import rejected_picture
+from slrig.scan.pictures import preview, rejection_picture, write_png
+from slrig.scan.plan import Progress, ReconstructionPlan
+from slrig.scan.preparation import prepare_kernels
+from slrig.scan.report import (
+    Stopwatch,
+    camera_report,
+    mesh_report,
+    redundancy_report,
+    with_seconds,
+)
+from slrig.scan.resolved import steps
+from slrig.scan.staging import REPORT, staged_folder
+from slrig.scan.stream import LiveScan, Seen
+from slrig.scan.triangulated import Triangulated, widest_gap_px
+
+
+@dataclass(frozen=True, slots=True)
+class _Meshed:
+    """The mesh and its points, the cameras with all their refusals, and what the report says.
+
+    share_mm : (n,) float64, the calibration's part of each point's standard deviation, and mesh_share_mm : (V,) of each
+    vertex's; None where the calibration does not state its error. notes : for the report.
+    """
+
+    mesh: Mesh
+    curves: PointCurves
+    share_mm: FloatArray | None
+    mesh_share_mm: FloatArray | None
+    cameras: list[Seen]
+    stages: tuple[Stage, ...]
+    figures: Mapping[str, object]
+    redundancy: Mapping[str, object]
+    notes: tuple[str, ...]
+
+
+def reconstruct_bundle(
+    bundle: Path,
+    output: Path,
+    *,
+    plan: ReconstructionPlan,
+    calibration: Path | None = None,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    live: LiveScan | None = None,
+) -> dict[str, object]:
+    """Reconstruct a recorded bundle into `output` and return the report.
+
+    `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
+
+    Writes mesh.ply, mesh.glb, points.ply, report.json, preview.png and a picture of the refused pixels per
+    camera. `output` appears whole or not at all; results of an earlier run there are replaced.
+
+    Raises
+    ------
+    BundleError, CalibrationError, PatternError
+        The bundle cannot be used as it is.
+    NothingToReconstructError
+        The frames hold no surface.
+    ScanCancelledError
+        `cancelled()` became true.
+    """
+    watch = Stopwatch() if live is None else live.watch
+
+    at = ("", 0.0)
+
+    def entered(stage: str, fraction: float, detail: str) -> None:
+        nonlocal at
+        if cancelled():
+            message = f"the scan was cancelled before '{stage}'"
+            raise ScanCancelledError(message)
+        watch.enter(stage)
+        at = (stage, fraction)
+        progress(stage, fraction, detail)
+
+    def compiling(kernel: str) -> None:
+        # What only some scans need is compiled when the first one comes.
+        progress(*at, f"preparing kernels, first time only: {kernel}")
+
+    with compilations_told(compiling), staged_folder(output) as staging:
+        entered("read bundle", 0.0, str(bundle))
+        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis)
+        meshed = _meshed(bundle, found, walked, plan, entered)
+        mesh, cameras = meshed.mesh, meshed.cameras
+        entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
+        points = encode_points_ply(meshed.curves, sigma_calibration_mm=meshed.share_mm)
+        write_file(staging / "points.ply", points)
+        write_mesh(mesh, staging, sigma_calibration_mm=meshed.mesh_share_mm)
+        entered("pictures", 0.85, "")
+        _write_pictures(mesh, cameras, staging)
+        covered = covered_share(mesh, cameras[0])
+        known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
+        entered("write report", 0.98, "")
+        figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
+        seconds = watch.finished()
+        report = {
+            **walked.sections,
+            "notes": [*walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
+            "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
+            "health": read_health(bundle),
+            "plan": asdict(plan),
+            "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
+            "redundancy": dict(meshed.redundancy),
+            "mesh": {**figures, "covers_of_decoded": covered, "stages": with_seconds(meshed.stages, seconds)},
+            **known,
+            "stages_s": seconds,
+        }
+        write_report(report, staging / REPORT)
+    progress("done", 1.0, f"{len(mesh.faces)} triangles")
+    return report
+
+
+def frame_receiver() -> FedFrames:
+    """What takes the frames of a capture while they come: see `slrig.jobs.worker_process.serve`."""
+    return FedFrames(LiveScan)
+
+
+def warm_kernels(told: Callable[[Prepared], None]) -> None:
+    """Load every kernel that a usual scan needs; see `slrig.scan.preparation.prepare_kernels`."""
+    prepare_kernels(reconstruct_bundle, told)
+
+
+def _meshed(
+    folder: Path,
+    found: Triangulated,
+    walked: Walked,
+    plan: ReconstructionPlan,
+    entered: Callable[[str, float, str], None],
+) -> _Meshed:
+    """From points to the mesh."""
+    first, axis, step_px = walked.seen[0], walked.axis, walked.step_px
+    cameras, joined_curves = found.cameras, found.joined
+    points = joined_curves.curves
+    require_surface(len(points.points_mm) > 0, folder, "no stripe could be triangulated", cameras)
+    count = f"{len(points.points_mm)} points"
+    projector = walked.devices.projector
+    gap_px = widest_gap_px(projector, axis)
+    beside = steps(cameras, joined_curves, step_px, walked.cell_px, max_gap=plan.max_code_gap, widest_gap_px=gap_px)
+    sampling = sampling_mm(points.points_mm, first.device, projector, axis, beside.at_points_px)
+    surface = finished_mesh(
+        points.points_mm, points.offsets, points.position_px, points.bridge_after,
+        # Two points of one place are as far apart as noise has them.
+        np.hypot(sampling, np.linalg.norm(points.deviation_mm, axis=1)), first.device.centre_mm,
+        MeshingLimits(
+            widest_step_px=step_px * plan.max_code_gap,
+            depth_edge_ratio=plan.depth_edge_ratio,
+            keep_holes=plan.keep_holes,
+            flip_rule=plan.flip_rule,
+            smooth_boundary=plan.smooth_boundary,
+        ),
+        entered=lambda stage: entered(stage, 0.68, count),
+        runs=beside.runs,
+    )  # fmt: skip
+    require_surface(len(surface.faces) > 0, folder, "no two neighbouring stripes could be meshed", cameras)
+    entered("vertices", 0.72, count)
+    sigma = sigma_along_normal(points.deviation_mm, surface.normals)
+    share = _calibration_share(walked.devices, found, axis, surface.normals)
+    if share is not None:
+        sigma = np.hypot(sigma, share)
+    apart = disagreement(joined_curves, share)
+    if apart is not None:
+        sigma = np.hypot(sigma, apart.sigma_mm)
+    grey = brightness(
+        points.pixels_px, joined_curves.camera,
+        [seen.white for seen in cameras], [float(seen.full_scale) for seen in cameras],
+    )  # fmt: skip
+    curves = PointCurves(
+        offsets=points.offsets,
+        column_px=points.position_px,
+        points_mm=points.points_mm,
+        sigma_mm=sigma,
+        bridge_after=points.bridge_after,
+        source=points.source,
+        grey=grey,
+    )
+    mesh = compact_mesh(
+        surface.faces, points.points_mm, surface.normals, grey, sigma, points.offsets, points.position_px
+    )
+    return _Meshed(
+        mesh=mesh,
+        curves=curves,
+        share_mm=share,
+        mesh_share_mm=None if share is None else share[_used(surface.faces, len(share))],
+        cameras=cameras,
+        stages=surface.stages,
+        figures=mesh_report(surface, mesh, curves),
+        redundancy=redundancy_report(joined_curves, points.source, found.spare),
+        notes=() if apart is None else (str(apart),),
+    )
+
+
+def _used(faces: IntArray, count: int) -> NDArray[np.bool_]:
+    """(count,) bool: the points that a triangle uses, which are the vertices of the mesh in the same order."""
+    used = np.zeros(count, dtype=np.bool_)
+    used[faces] = True
+    return used
+
+
+def _calibration_share(
+    calibration: Calibration, found: Triangulated, axis: Axis, normals: NDArray[np.float32]
+) -> FloatArray | None:
+    """(n,) float64: the calibration's part of each point's standard deviation; None where it states no error."""
+    modes = calibration_modes(calibration, [seen.name for seen in found.cameras], axis, second=found.second)
+    if modes is None:
+        return None
+    points = found.joined.curves
+    tangents = stripe_tangents(points.points_mm, points.offsets, points.bridge_after)
+    return calibration_sigma(modes, points.points_mm, normals, points.source, found.joined.camera, tangents)
+
+
+def _write_pictures(mesh: Mesh, cameras: list[Seen], staging: Path) -> None:
+    first = cameras[0]
+    write_png(staging / "preview.png", preview(mesh, first.device, first.white, int(first.full_scale)))
+    for seen in cameras:
+        picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
+        write_png(staging / rejected_picture(seen.name), picture)
+
+
+def _compared_with_truth(
+    bundle: Path, mesh: Mesh, camera: Pinhole, entered: Callable[[str, float, str], None]
+) -> dict[str, object]:
+    """The report's section on truth, for bundles that bring it."""
+    truth = read_truth(bundle)
+    if truth is None:
+        return {}
+    entered("compare with truth", 0.9, "")
+    return {"truth": score(mesh, truth.surface, truth.visible_points_mm, camera.centre_mm).as_dict()}

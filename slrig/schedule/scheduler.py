@@ -1,0 +1,194 @@
+"""Keeps the schedule: looks at the clock, starts what is due, and records what became of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from datetime import datetime, timedelta
+from typing import Any, Protocol
+
+import structlog
+
+from slrig.errors import DeviceError, RigBusyError, ScheduleNotFoundError, SlrigError, UnsupportedByDeviceError
+from slrig.failure import WorkerLostError
+from slrig.jobs.records import Clock, utc_now
+from slrig.schedule.records import Run, RunState, Schedule
+from slrig.schedule.store import ScheduleStore
+
+LOOK_S = 10.0
+"""The clock is looked at this often at the least, so that one that is set anew is noticed."""
+
+_LEAST_WAIT_S = 0.05
+
+_log = structlog.get_logger(__name__)
+
+
+class Work(Protocol):
+    """Does what a schedule asks for, on a thread of the scheduler's."""
+
+    def __call__(self, schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """Do it, and return what there is to tell.
+
+        Raises
+        ------
+        RigBusyError
+            Somebody holds the rig: before anything was done.
+        SlrigError
+            It could not be done. What may pass, see `passes`, has the run try again within its grace.
+        """
+        ...
+
+
+class Notice(Protocol):
+    """Told of every run that came to an end, or never began."""
+
+    def __call__(self, schedule: Schedule, run: Run, /) -> None:
+        """Take note. Must not raise."""
+        ...
+
+
+def passes(error: SlrigError) -> bool:
+    """Whether a run that met this may go well a little later: the rig was held, a device failed, the worker was lost.
+
+    >>> passes(DeviceError("no answer")), passes(UnsupportedByDeviceError("no such trigger"))
+    (True, False)
+    """
+    return isinstance(error, RigBusyError | DeviceError | WorkerLostError) and not isinstance(
+        error, UnsupportedByDeviceError
+    )
+
+
+def in_a_thread(work: Callable[[], None]) -> None:
+    """Do something on a thread of its own, and return at once."""
+    threading.Thread(target=work, name="slrig-scheduled", daemon=True).start()
+
+
+class Scheduler:
+    """One loop over the schedules of one database. Public methods may be called from any thread.
+
+    alone : no other process uses the database. execute : has a call made, at once or later.
+    """
+
+    def __init__(
+        self,
+        store: ScheduleStore,
+        work: Work,
+        *,
+        clock: Clock = utc_now,
+        alone: bool = True,
+        execute: Callable[[Callable[[], None]], None] = in_a_thread,
+        notice: Notice = lambda _schedule, _run: None,
+    ) -> None:
+        self._store = store
+        self._work = work
+        self._clock = clock
+        self._alone = alone
+        self._execute = execute
+        self._notice = notice
+        self._wanted = threading.Event()
+        self._stop = threading.Event()
+        self._idle = threading.Event()
+        self._idle.set()
+        self._loop = threading.Thread(target=self._look_again, name="slrig-schedule", daemon=True)
+
+    def start(self) -> None:
+        """Record what a process before this one left behind, and look at the clock from now on."""
+        self._tell(self._store.interrupt_dead(self._clock(), alone=self._alone))
+        self._loop.start()
+
+    def wake(self) -> None:
+        """Look at the clock now: a schedule was changed, or the rig became free."""
+        self._wanted.set()
+
+    def close(self, *, timeout_s: float = 3.0) -> None:
+        """Stop. A run under way is asked to end, and recorded as interrupted if it does not in time. Idempotent."""
+        self._stop.set()
+        self.wake()
+        if self._loop.is_alive():
+            self._loop.join(timeout_s)
+        self._idle.wait(timeout_s)
+
+    def tick(self) -> datetime:
+        """Look at the clock once. Returns when to look again."""
+        now = self._clock()
+        if self._idle.is_set():
+            self._tell(self._store.interrupt_own(now))
+        self._store.beat(now)
+        self._tell(self._store.interrupt_dead(now))
+        self._tell(run for run in self._store.reckon(now) if run.state.final)
+        self._tell(self._store.expire(now))
+        for run in self._store.startable(now):
+            if self._stop.is_set() or not self._idle.is_set():
+                break
+            if self._store.start(run, now):
+                self._begin(run)
+        return self._next_look(now)
+
+    def _next_look(self, now: datetime) -> datetime:
+        look = now + timedelta(seconds=LOOK_S)
+        following = self._store.next_moment()
+        return look if following is None else min(following, look)
+
+    def _begin(self, run: Run) -> None:
+        schedule = self._store.get(run.schedule)
+        self._idle.clear()
+
+        def do() -> None:
+            try:
+                self._end(schedule, run)
+            except SlrigError:
+                # A full disk: the next look takes down that it is over.
+                _log.exception("the end of a scheduled run could not be put on record", schedule=str(schedule.id))
+            finally:
+                self._idle.set()
+                self.wake()
+
+        self._execute(do)
+
+    def _end(self, schedule: Schedule, run: Run) -> None:
+        state, reason, result = RunState.FAILED, None, None
+        try:
+            result = self._work(schedule, run, cancelled=self._stop.is_set)
+            state = RunState.SUCCEEDED
+            reason = f"at try {run.attempts + 1}" if run.attempts else run.reason
+        except SlrigError as error:
+            busy = isinstance(error, RigBusyError)
+            reason = f"rig busy: {error}" if busy else str(error)
+            again = self._clock() + timedelta(seconds=schedule.order.retry_s)
+            if passes(error) and again <= run.deadline and not self._stop.is_set():
+                self._store.postpone(run, reason, again)
+                return
+            state = RunState.SKIPPED if busy else RunState.FAILED
+        except Exception as error:  # noqa: BLE001 - the schedule outlives whatever happens in one run
+            _log.exception("a scheduled run failed", schedule=str(schedule.id), due=run.due.isoformat())
+            reason = f"an error of its own: {error!r}"
+        if self._stop.is_set() and state is not RunState.SUCCEEDED:
+            state, reason = RunState.INTERRUPTED, "the service ended in the middle of it"
+        self._store.finish(run, state, self._clock(), reason=reason, result=result)
+        self._tell(each for each in self._runs(schedule) if each.number == run.number)
+
+    def _runs(self, schedule: Schedule) -> Iterable[Run]:
+        """The newest runs of a schedule; none if it was removed meanwhile."""
+        try:
+            return self._store.runs(schedule.id)
+        except ScheduleNotFoundError:
+            return ()
+
+    def _tell(self, runs: Iterable[Run]) -> None:
+        for run in runs:
+            schedule = self._store.get(run.schedule)
+            log = _log.info if run.state in {RunState.SUCCEEDED, RunState.COALESCED} else _log.warning
+            log("scheduled run", schedule=str(run.schedule), due=run.due.isoformat(), state=run.state, cause=run.reason)
+            self._notice(schedule, run)
+
+    def _look_again(self) -> None:
+        while not self._stop.is_set():
+            # Before the look: what is wanted while it lasts is looked at once more.
+            self._wanted.clear()
+            try:
+                wait_s = (self.tick() - self._clock()).total_seconds()
+            except Exception:  # noqa: BLE001 - a full disk may be emptied; the schedule goes on
+                _log.exception("the schedule could not be looked at")
+                wait_s = LOOK_S
+            if not self._stop.is_set():
+                self._wanted.wait(min(max(wait_s, _LEAST_WAIT_S), LOOK_S))

@@ -1,0 +1,310 @@
+"""The record of schedules and their runs, in the service's database.
+
+Two processes may look at one database: a due time has one row, which the first to see it makes, and a run is started by
+the one that changes its row from waiting to running. A run that is under way keeps saying so (`beat`); one whose
+process died stops saying so, and is recorded as interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+from uuid import UUID, uuid4
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from slrig.errors import ScheduleNotFoundError
+from slrig.jobs.database import Database
+from slrig.schedule.cron import Cron
+from slrig.schedule.migrations import upgrade
+from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.recurrence import DueRun, reckon
+from slrig.schedule.tables import RunRow, ScheduleRow
+
+LIFE_S = 60.0
+"""How long a run counts as alive after its process last said so."""
+
+_KEPT_RUNS = 5000
+
+
+class ScheduleStore:
+    """Schedules and runs. Safe to call from any thread and from several processes. `now` is a moment with a zone."""
+
+    def __init__(self, database: Path) -> None:
+        self._database = Database(database, upgrade=upgrade)
+        self._owner = str(uuid4())
+
+    def close(self) -> None:
+        """Let the database go."""
+        self._database.close()
+
+    def create(self, order: Order, now: datetime) -> Schedule:
+        """Put a new schedule on record. It is due from now on."""
+        row = ScheduleRow(
+            id=str(uuid4()),
+            label=order.label,
+            cron=order.cron.text,
+            time_zone=order.cron.time_zone,
+            task=order.task,
+            options=dict(order.options),
+            grace_s=order.grace_s,
+            retry_s=order.retry_s,
+            catch_up=order.catch_up,
+            enabled=order.enabled,
+            created_at=_stamp(now),
+            next_due=_stamp(order.cron.after(now)),
+        )
+        with self._database.changing() as session:
+            session.add(row)
+            return _schedule(row)
+
+    def get(self, schedule_id: UUID) -> Schedule:
+        """Return a schedule. Raises ScheduleNotFoundError."""
+        with self._database.reading() as session:
+            return _schedule(_found(session, schedule_id))
+
+    def all(self) -> Sequence[Schedule]:
+        """Every schedule, oldest first."""
+        with self._database.reading() as session:
+            query = select(ScheduleRow).order_by(ScheduleRow.created_at, ScheduleRow.id)
+            return [_schedule(row) for row in session.scalars(query)]
+
+    def enable(self, schedule_id: UUID, *, enabled: bool) -> Schedule:
+        """Pause a schedule, or let it go on. What was due during the pause is then reckoned as after any other.
+
+        Raises
+        ------
+        ScheduleNotFoundError
+            There is no such schedule.
+        """
+        with self._database.changing() as session:
+            row = _found(session, schedule_id)
+            row.enabled = enabled
+            return _schedule(row)
+
+    def remove(self, schedule_id: UUID) -> None:
+        """Forget a schedule and its runs. Raises ScheduleNotFoundError."""
+        with self._database.changing() as session:
+            session.delete(_found(session, schedule_id))
+
+    def runs(self, schedule_id: UUID, *, before: int | None = None, limit: int = 50) -> Sequence[Run]:
+        """Up to `limit` runs of a schedule, newest first, whose number is below `before`."""
+        with self._database.reading() as session:
+            _found(session, schedule_id)
+            query = select(RunRow).where(RunRow.schedule_id == str(schedule_id))
+            if before is not None:
+                query = query.where(RunRow.number < before)
+            return [_run(row) for row in session.scalars(query.order_by(RunRow.number.desc()).limit(limit))]
+
+    def counts(self) -> dict[tuple[TaskKind, RunState], int]:
+        """How many runs of each task are on record in each state. A row that stands for several counts as those."""
+        query = (
+            select(ScheduleRow.task, RunRow.state, func.sum(RunRow.count))
+            .join(RunRow, RunRow.schedule_id == ScheduleRow.id)
+            .group_by(ScheduleRow.task, RunRow.state)
+        )
+        with self._database.reading() as session:
+            return {(TaskKind(task), RunState(state)): int(count) for task, state, count in session.execute(query)}
+
+    def reckon(self, now: datetime) -> Sequence[Run]:
+        """Record what has become due. Returns the rows made."""
+        made: list[RunRow] = []
+        with self._database.changing() as session:
+            for row in session.scalars(select(ScheduleRow).where(ScheduleRow.enabled)):
+                order = _order(row)
+                found = reckon(order, _moment(row.next_due), now)
+                for due in found.runs:
+                    made += self._recorded(session, row, due, now)
+                following = found.next_due
+                while self._row(session, row.id, following) is not None:
+                    following = order.cron.after(following)
+                row.next_due = _stamp(following)
+                if made:
+                    _prune(session, row.id)
+            session.flush()
+            return [_run(each) for each in made]
+
+    def startable(self, now: datetime) -> Sequence[Run]:
+        """The runs that wait for the rig and may try it now, the one due first first."""
+        query = (
+            select(RunRow)
+            .where(RunRow.state == RunState.WAITING, RunRow.next_attempt <= _stamp(now))
+            .order_by(RunRow.due, RunRow.number)
+        )
+        with self._database.reading() as session:
+            return [_run(row) for row in session.scalars(query)]
+
+    def next_moment(self) -> datetime | None:
+        """When something is due or wants to try again next; None if nothing ever is."""
+        due = select(func.min(ScheduleRow.next_due)).where(ScheduleRow.enabled)
+        attempt = select(func.min(RunRow.next_attempt)).where(RunRow.state == RunState.WAITING)
+        with self._database.reading() as session:
+            found = [stamp for query in (due, attempt) if (stamp := session.scalar(query)) is not None]
+            return _moment(min(found)) if found else None
+
+    def start(self, run: Run, now: datetime) -> bool:
+        """Take a waiting run; False if somebody else has it, or another run is under way."""
+        with self._database.changing() as session:
+            row = session.get(RunRow, run.number)
+            under_way = session.scalar(select(RunRow.number).where(RunRow.state == RunState.RUNNING).limit(1))
+            if row is None or row.state != RunState.WAITING or under_way is not None:
+                return False
+            row.state, row.owner, row.attempts = RunState.RUNNING, self._owner, row.attempts + 1
+            row.started_at, row.alive_until = _stamp(now), _stamp(now + timedelta(seconds=LIFE_S))
+            return True
+
+    def postpone(self, run: Run, reason: str, next_attempt: datetime) -> None:
+        """Put a run that could not have the rig back among those that wait."""
+        with self._database.changing() as session:
+            row = session.get(RunRow, run.number)
+            if row is not None and not RunState(row.state).final:
+                row.state, row.reason, row.next_attempt = RunState.WAITING, reason, _stamp(next_attempt)
+                row.owner = row.alive_until = row.started_at = None
+
+    def finish(
+        self, run: Run, state: RunState, now: datetime, *, reason: str | None, result: Mapping[str, Any] | None = None
+    ) -> None:
+        """Record what became of a run. The first final state stands."""
+        with self._database.changing() as session:
+            row = session.get(RunRow, run.number)
+            if row is not None and not RunState(row.state).final:
+                _close(row, state, now, reason)
+                row.reason = reason
+                row.result = None if result is None else dict(result)
+
+    def beat(self, now: datetime) -> None:
+        """Say that this process is alive, and with it the run that it has under way."""
+        with self._database.changing() as session:
+            query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
+            for row in session.scalars(query):
+                row.alive_until = _stamp(now + timedelta(seconds=LIFE_S))
+
+    def interrupt_dead(self, now: datetime, *, alone: bool = False) -> Sequence[Run]:
+        """Record runs whose process died as interrupted: those that did not say for long that they are alive.
+
+        alone : no other process uses the database, so that every run of another one is dead.
+        """
+        query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner != self._owner)
+        if not alone:
+            # The second test is for a clock that was set back: nobody says that far ahead that he is alive.
+            query = query.where(
+                (RunRow.alive_until < _stamp(now)) | (RunRow.alive_until > _stamp(now + timedelta(seconds=2 * LIFE_S)))
+            )
+        with self._database.changing() as session:
+            dead = list(session.scalars(query))
+            for row in dead:
+                _close(row, RunState.INTERRUPTED, now, "the service ended in the middle of it")
+            return [_run(row) for row in dead]
+
+    def interrupt_own(self, now: datetime) -> Sequence[Run]:
+        """Record the runs that this process began as interrupted. Only while it has none under way: what it still has
+        on record as running ended while the disk refused to take that down.
+        """
+        query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
+        with self._database.changing() as session:
+            ended = list(session.scalars(query))
+            for row in ended:
+                _close(row, RunState.INTERRUPTED, now, "it ended, and how could not be put on record")
+            return [_run(row) for row in ended]
+
+    def expire(self, now: datetime) -> Sequence[Run]:
+        """Record runs that waited for the whole of their grace as skipped, each with what it waited for."""
+        query = select(RunRow).where(RunRow.state == RunState.WAITING, RunRow.deadline < _stamp(now))
+        with self._database.changing() as session:
+            late = list(session.scalars(query))
+            for row in late:
+                waited = f"for the whole of its grace: {row.reason}" if row.attempts else "before it could be started"
+                _close(row, RunState.SKIPPED, now, f"its time passed {waited}")
+            return [_run(row) for row in late]
+
+    def _recorded(self, session: Session, schedule: ScheduleRow, due: DueRun, now: datetime) -> list[RunRow]:
+        if self._row(session, schedule.id, due.due) is not None:
+            return []
+        if due.state is RunState.WAITING:
+            waiting = select(RunRow).where(RunRow.schedule_id == schedule.id, RunRow.state == RunState.WAITING)
+            for older in session.scalars(waiting):
+                _close(older, RunState.COALESCED, now, f"overtaken by the next due time; it had waited: {older.reason}")
+        row = RunRow(
+            schedule_id=schedule.id,
+            due=_stamp(due.due),
+            state=due.state,
+            reason=due.reason,
+            count=due.count,
+            attempts=0,
+            deadline=_stamp(due.deadline),
+            next_attempt=_stamp(now) if due.state is RunState.WAITING else None,
+            finished_at=_stamp(now) if due.state.final else None,
+        )
+        session.add(row)
+        session.flush()
+        return [row]
+
+    def _row(self, session: Session, schedule_id: str, due: datetime) -> RunRow | None:
+        return session.scalar(select(RunRow).where(RunRow.schedule_id == schedule_id, RunRow.due == _stamp(due)))
+
+
+def _found(session: Session, schedule_id: UUID) -> ScheduleRow:
+    row = session.get(ScheduleRow, str(schedule_id))
+    if row is None:
+        message = f"No schedule {schedule_id} is on record here. GET /schedule lists those that are."
+        raise ScheduleNotFoundError(message)
+    return row
+
+
+def _prune(session: Session, schedule_id: str) -> None:
+    """Forget the oldest runs of a schedule that has very many."""
+    query = select(RunRow).where(RunRow.schedule_id == schedule_id).order_by(RunRow.number.desc()).offset(_KEPT_RUNS)
+    for row in session.scalars(query):
+        if RunState(row.state).final:
+            session.delete(row)
+
+
+def _close(row: RunRow, state: RunState, now: datetime, reason: str | None) -> None:
+    row.state, row.finished_at, row.next_attempt, row.alive_until = state, _stamp(now), None, None
+    row.reason = reason if reason is not None else row.reason
+
+
+def _order(row: ScheduleRow) -> Order:
+    return Order(
+        Cron(row.cron, row.time_zone),
+        TaskKind(row.task),
+        row.options,
+        row.label,
+        row.grace_s,
+        row.retry_s,
+        row.catch_up,
+        row.enabled,
+    )
+
+
+def _schedule(row: ScheduleRow) -> Schedule:
+    return Schedule(UUID(row.id), _order(row), _moment(row.created_at), _moment(row.next_due))
+
+
+def _run(row: RunRow) -> Run:
+    return Run(
+        number=row.number,
+        schedule=UUID(row.schedule_id),
+        due=_moment(row.due),
+        state=RunState(row.state),
+        reason=row.reason,
+        count=row.count,
+        attempts=row.attempts,
+        deadline=_moment(row.deadline),
+        next_attempt=None if row.next_attempt is None else _moment(row.next_attempt),
+        started_at=None if row.started_at is None else _moment(row.started_at),
+        finished_at=None if row.finished_at is None else _moment(row.finished_at),
+        result=row.result,
+    )
+
+
+def _stamp(moment: datetime) -> str:
+    # One zone and one length: the texts sort as the moments do.
+    return moment.astimezone(UTC).isoformat(timespec="milliseconds")
+
+
+def _moment(stamp: str) -> datetime:
+    return datetime.fromisoformat(stamp)

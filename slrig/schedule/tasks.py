@@ -1,0 +1,124 @@
+"""What schedules do with the rig: each task's options checked, and its work done in line with the scans."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+from uuid import UUID
+
+from slrig.accept.desk import AcceptanceDesk
+from slrig.calibrate.calibrating import Calibrations
+from slrig.errors import ScanStateError
+from slrig.jobs.job import Holder
+from slrig.schedule.acceptance_task import AcceptanceTask
+from slrig.schedule.calibration_task import CalibrationTask
+from slrig.schedule.holder import NamedHolder
+from slrig.schedule.polling import until
+from slrig.schedule.records import Order, Run, Schedule, TaskKind
+from slrig.schedule.verification_task import VerificationTask
+from slrig.verify.verification import VerificationDesk
+
+
+class Task(Protocol):
+    """One kind of work."""
+
+    def check(self, options: Mapping[str, Any], /) -> None:
+        """Raise ScheduleError for options that no run could be done with, as far as is known now."""
+        ...
+
+    def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """Do it, the rig held by `holder`, and return what there is to tell, as JSON values.
+
+        Raises
+        ------
+        RigBusyError
+            Somebody holds the rig: before anything was done.
+        SlrigError
+            It could not be done.
+        """
+        ...
+
+
+class Tasks:
+    """Every kind of work: a `slrig.schedule.scheduler.Work`. Any thread may call.
+
+    The desks have to submit their work to `queue`: it is by it that a refusal names the schedule. tidy : called after
+    each calibration, see `slrig.calibrate.retention`.
+    """
+
+    def __init__(
+        self,
+        queue: NamedHolder,
+        calibrations: Calibrations,
+        verifications: VerificationDesk,
+        acceptance: AcceptanceDesk,
+        *,
+        tidy: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._queue = queue
+        self._of: Mapping[TaskKind, Task] = {
+            TaskKind.VERIFICATION: VerificationTask(queue, calibrations, verifications),
+            TaskKind.CALIBRATION: CalibrationTask(queue, calibrations, tidy),
+            TaskKind.ACCEPTANCE: AcceptanceTask(queue, acceptance),
+        }
+        self._lock = threading.Lock()
+        self._stops: dict[UUID, threading.Event] = {}
+
+    def check(self, order: Order) -> None:
+        """Raise ScheduleError, with every fault, for options that no run could be done with."""
+        self._of[order.task].check(order.options)
+
+    def __call__(self, schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """See `slrig.schedule.scheduler.Work`."""
+        holder, stop = holder_of(schedule, run), threading.Event()
+
+        def ends() -> bool:
+            return cancelled() or stop.is_set()
+
+        with self._lock:
+            self._stops[schedule.id] = stop
+        try:
+            self._open_rig(holder, ends)
+            return self._of[schedule.order.task].do(holder, schedule.order.options, cancelled=ends)
+        finally:
+            with self._lock:
+                self._stops.pop(schedule.id, None)
+
+    def cancel(self, schedule: Schedule) -> None:
+        """Ask the run of a schedule that is under way to end early. Returns at once. Raises ScanStateError."""
+        with self._lock:
+            stop = self._stops.get(schedule.id)
+        if stop is None:
+            message = f"Schedule {schedule.id} has no run under way. GET /schedule/{schedule.id}/runs lists its runs."
+            raise ScanStateError(message)
+        stop.set()
+
+    def _open_rig(self, holder: Holder, cancelled: Callable[[], bool]) -> None:
+        """Have a rig opened that was not open yet: what it can do is known only then. Raises as a scan does."""
+        if self._queue.status().facts is not None:
+            return
+        errors: list[Exception | None] = []
+        with self._queue.named(holder):
+            work_id = self._queue.submit_work(lambda *_: None, holder=holder, wait=False, ended=errors.append)
+        until(lambda: bool(errors), cancelled, cancel=lambda: self._queue.cancel_work(work_id))
+        if errors[0] is not None:
+            raise errors[0]
+
+
+def holder_of(schedule: Schedule, run: Run) -> Holder:
+    """Who holds the rig for a run.
+
+    >>> from datetime import UTC, datetime
+    >>> from slrig.schedule.cron import Cron
+    >>> from slrig.schedule.records import RunState
+    >>> due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
+    >>> order = Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION)
+    >>> schedule = Schedule(UUID(int=7), order, due, due)
+    >>> run = Run(1, schedule.id, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
+    >>> holder_of(schedule, run).name
+    'schedule 00000000, verification due 06:30'
+    """
+    due = schedule.order.cron.local(run.due)
+    words = f"schedule {str(schedule.id)[:8]}, {schedule.order.task} due {due:%H:%M}"
+    return Holder(words, words, f"/schedule/{schedule.id}")

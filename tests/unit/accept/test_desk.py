@@ -1,0 +1,361 @@
+"""Acceptance tests on a service's rig: held for each position, kept in between, cancelled, refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID, uuid4
+
+import pytest
+
+from slrig.accept import running as acceptance
+from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.plan import AcceptancePlan
+from slrig.accept.records import AcceptanceState, RequestKey, record_from_json, record_json
+from slrig.accept.report import write_reports
+from slrig.accept.running import evaluated
+from slrig.accept.store import interruption_fault
+from slrig.calibration.artefacts import Decision
+from slrig.devices import Rig
+from slrig.errors import (
+    ArtefactNotReadyError,
+    CalibrationError,
+    CalibrationStateError,
+    DeviceBusyError,
+    IdempotencyError,
+    InvalidInputError,
+    NothingToReconstructError,
+    RigBusyError,
+    ScanNotFoundError,
+    ScanStateError,
+    StorageError,
+    UnsupportedByDeviceError,
+)
+from slrig.failure import ScanInterruptedError, interruption
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.job import Holder
+from slrig.model import Calibration
+from slrig.scan.artefacts import encode_mesh_ply
+from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, scan_of
+
+PLAN = replace(SHORT, rendered=False)
+
+
+class TameLender:
+    """Does work with a rig on the caller's own thread; `holder` is who holds it meanwhile."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.facts: object = SimpleNamespace(calibration=rig.calibration)
+        self.busy = False
+        self.cancelled: Callable[[], bool] = lambda: False
+        self.holders: list[str] = []
+
+    def submit_work(
+        self,
+        work: Callable[[Rig, Callable[[], bool]], None],
+        *,
+        holder: Holder,
+        wait: bool,
+        ended: Callable[[Exception | None], None],
+        begun: Callable[[UUID], None],
+    ) -> UUID:
+        if self.busy and not wait:
+            message = "The rig is held by scan 1."
+            raise RigBusyError(message, holder="1", since="")
+        work_id = uuid4()
+        begun(work_id)
+        self.holders.append(holder.name)
+        try:
+            work(self.rig, self.cancelled)
+        except Exception as error:  # noqa: BLE001 - as the real one
+            ended(error)
+        else:
+            ended(None)
+        return work_id
+
+    def cancel_work(self, work_id: UUID) -> None:
+        """Nothing is under way between two calls."""
+
+    def status(self) -> Any:
+        return SimpleNamespace(rig="tame", facts=self.facts, active=None)
+
+
+@pytest.fixture
+def queue() -> TameLender:
+    positioner = TamePositioner(tuple(step.name for step in PLAN.steps))
+    return TameLender(Rig("tame", {}, None, {}, RIG, positioner=positioner))  # type: ignore[arg-type]
+
+
+Desks = Callable[[], AcceptanceDesk]
+
+
+@pytest.fixture
+def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameLender) -> Desks:
+    """Makes the desk of a service, and of one after it over the same folder."""
+    folder = DataFolder(tmp_path)
+    monkeypatch.setattr(acceptance, "capture_bundle", lambda _rig, _plan, folder, **_: folder.mkdir())
+
+    def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
+        name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
+        output.mkdir()
+        step = next(step for step in PLAN.steps if step.name == name)
+        (output / "mesh.ply").write_bytes(encode_mesh_ply(scan_of(step)))
+        return {}
+
+    return lambda: AcceptanceDesk(
+        folder, queue, evaluate=partial(evaluated, reconstruct=reconstruct), report=write_reports
+    )
+
+
+@pytest.fixture
+def desk(desks: Desks) -> AcceptanceDesk:
+    return desks()
+
+
+def fault_kind(desk: AcceptanceDesk, test_id: UUID) -> str | None:
+    fault = desk.get(test_id).fault
+    return None if fault is None else fault.kind
+
+
+def the_plan(_: Calibration) -> AcceptancePlan:
+    return PLAN
+
+
+def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: AcceptanceDesk, queue: TameLender) -> None:
+    test = desk.open(the_plan)
+    done = []
+    while (record := desk.get(test.id)).state is AcceptanceState.OPEN:
+        following = record.next_take
+        assert following is not None
+        assert following[1] == 0
+        done.append(following[0].name)
+        desk.measure(test.id, wait=False, scripted=False)
+    assert done == ["sphere-1", "sphere-2", "bar-1", "plane-1"]
+    assert queue.rig.positioner.moves == []  # type: ignore[union-attr]
+    assert desk.get(test.id).decision is Decision.PASSES
+    assert desk.get(test.id).state is AcceptanceState.FINISHED
+    assert desk.file(test.id, "report.html").is_file()
+    assert set(queue.holders) == {f"acceptance test {test.id}"}
+    with pytest.raises(ScanStateError, match="is finished"):
+        desk.measure(test.id, wait=False, scripted=False)
+
+
+def test_a_script_measures_all_that_are_left_in_one_loan(desk: AcceptanceDesk, queue: TameLender) -> None:
+    test = desk.open(the_plan)
+    desk.measure(test.id, wait=False, scripted=True)
+    assert desk.get(test.id).state is AcceptanceState.FINISHED
+    assert len(queue.holders) == 1
+    assert queue.rig.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    assert desk.latest() == (desk.get(test.id),)
+
+
+def test_a_position_that_went_wrong_may_be_measured_again(
+    desk: AcceptanceDesk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test = desk.open(the_plan)
+
+    def lost(*_: object, **__: object) -> None:
+        message = "nothing there"
+        raise NothingToReconstructError(message)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(acceptance, "reading", lost)
+        desk.measure(test.id, wait=False, scripted=False)
+    record = desk.get(test.id)
+    assert record.state is AcceptanceState.OPEN
+    assert record.fault is not None
+    assert record.fault.kind == NothingToReconstructError.__name__
+    assert record.readings == ()
+    desk.measure(test.id, wait=False, scripted=False)
+    assert desk.get(test.id).fault is None
+    assert len(desk.get(test.id).readings) == PLAN.repeats
+
+
+def test_a_cancelled_test_is_over(desk: AcceptanceDesk, queue: TameLender) -> None:
+    waiting, running = desk.open(the_plan), desk.open(the_plan)
+    assert desk.cancel(waiting.id).state is AcceptanceState.CANCELLED
+    queue.cancelled = lambda: True
+    desk.measure(running.id, wait=False, scripted=True)
+    assert desk.get(running.id).state is AcceptanceState.CANCELLED
+    with pytest.raises(ScanStateError, match="is cancelled"):
+        desk.measure(running.id, wait=False, scripted=True)
+    with pytest.raises(ArtefactNotReadyError, match="is cancelled"):
+        desk.file(running.id, "report.json")
+
+
+def test_a_held_rig_is_refused_and_the_test_stays_open(desk: AcceptanceDesk, queue: TameLender) -> None:
+    test = desk.open(the_plan)
+    queue.busy = True
+    with pytest.raises(RigBusyError):
+        desk.measure(test.id, wait=False, scripted=False)
+    assert desk.get(test.id).state is AcceptanceState.OPEN
+
+
+def test_what_cannot_be_tested_is_refused(desk: AcceptanceDesk, queue: TameLender) -> None:
+    with pytest.raises(ScanNotFoundError, match="No acceptance test"):
+        desk.get(uuid4())
+    exact = desk.open(lambda _: replace(PLAN, rendered=True))
+    desk.measure(exact.id, wait=False, scripted=True)
+    assert fault_kind(desk, exact.id) == InvalidInputError.__name__
+    queue.rig.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
+    test = desk.open(the_plan)
+    desk.measure(test.id, wait=False, scripted=True)
+    assert fault_kind(desk, test.id) == UnsupportedByDeviceError.__name__
+    queue.facts = SimpleNamespace(calibration=None)
+    with pytest.raises(CalibrationError, match="has no calibration"):
+        desk.open(the_plan)
+    queue.facts = None
+    with pytest.raises(DeviceBusyError, match="being opened"):
+        desk.open(the_plan)
+
+
+def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks) -> None:
+    before = desks()
+    waiting, test = before.open(the_plan), before.open(the_plan)
+    before.measure(waiting.id, wait=False, scripted=False)
+    before.measure(test.id, wait=False, scripted=True)
+    after = desks()
+    for each in (waiting.id, test.id):
+        assert record_json(after.get(each)) == record_json(before.get(each))
+    assert [each.id for each in after.latest()] == [test.id, waiting.id]
+    assert after.get(test.id).decision is Decision.PASSES
+    assert after.file(test.id, "report.html").is_file()
+    # One that waits for its next position goes on.
+    assert after.get(waiting.id).state is AcceptanceState.OPEN
+    after.measure(waiting.id, wait=False, scripted=True)
+    assert after.get(waiting.id).state is AcceptanceState.FINISHED
+    third = after.open(the_plan)
+    assert third.number == 3
+    after.delete(test.id)
+    assert [each.id for each in desks().latest()] == [third.id, waiting.id]
+
+
+def cut_off(desk: AcceptanceDesk, test_id: UUID, queue: TameLender, *, after_captures: int) -> None:
+    """Have the service end, as it were, in the middle of a capture: nothing is told of how it ended."""
+
+    class PowerCut(BaseException):
+        """Nobody catches it."""
+
+    def cancelled() -> bool:
+        if len(desk.get(test_id).readings) == after_captures:
+            raise PowerCut
+        return False
+
+    queue.cancelled = cancelled
+    with pytest.raises(PowerCut):
+        desk.measure(test_id, wait=False, scripted=True)
+    queue.cancelled = lambda: False
+
+
+def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks, queue: TameLender) -> None:
+    before = desks()
+    test = before.open(the_plan)
+    cut_off(before, test.id, queue, after_captures=1)
+    stray = before._store.folder(test.id) / ".sphere-1-2"
+    stray.mkdir()
+    after = desks()
+    record = after.get(test.id)
+    assert record.state is AcceptanceState.INTERRUPTED
+    assert fault_kind(after, test.id) == ScanInterruptedError.__name__
+    assert not stray.exists()
+    with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
+        after.file(test.id, "report.json")
+    assert desks().get(test.id).state is AcceptanceState.INTERRUPTED
+    queue.rig.positioner.moves.clear()  # type: ignore[union-attr]
+    after.measure(test.id, wait=False, scripted=True)
+    # Between repeats nothing may be moved: the first position begins anew.
+    assert queue.rig.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    assert after.get(test.id).state is AcceptanceState.FINISHED
+    assert [each.take for each in after.get(test.id).readings if each.step == "sphere-1"] == [0, 1]
+
+
+def test_a_service_that_ends_in_good_order_interrupts_a_test_too(desks: Desks, queue: TameLender) -> None:
+    before = desks()
+    test = before.open(the_plan)
+
+    def ending() -> bool:
+        raise interruption()
+
+    queue.cancelled = ending
+    before.measure(test.id, wait=False, scripted=True)
+    for desk in (before, desks()):
+        assert desk.get(test.id).state is AcceptanceState.INTERRUPTED
+        assert desk.get(test.id).fault == interruption_fault()
+
+
+def test_a_test_that_was_cut_off_after_its_report_is_finished(desks: Desks, tmp_path: Path) -> None:
+    before = desks()
+    test = before.open(the_plan)
+    before.measure(test.id, wait=False, scripted=True)
+    finished = before.get(test.id)
+    kept = tmp_path / "acceptance" / str(test.id) / "test.json"
+    kept.write_bytes(record_json(replace(finished, state=AcceptanceState.MEASURING, decision=None)))
+    assert record_json(desks().get(test.id)) == record_json(finished)
+
+
+def test_what_cannot_be_read_is_put_aside(desks: Desks, tmp_path: Path) -> None:
+    test = desks().open(the_plan)
+    kept = tmp_path / "acceptance" / str(test.id) / "test.json"
+    text = kept.read_text()
+    with pytest.raises(StorageError, match="not an acceptance test as this version"):
+        record_from_json(text.replace("slrig-acceptance-test", "letter").encode(), "x")
+    kept.write_text(text[:-30])
+    assert desks().latest() == ()
+    assert (tmp_path / ".orphans" / f"acceptance-{test.id}" / "test.json").is_file()
+
+
+def test_a_request_with_a_key_that_came_before_changes_nothing(desks: Desks, queue: TameLender) -> None:
+    before, key = desks(), RequestKey("a", "body")
+    test = before.open(the_plan, key=key)
+    before.measure(test.id, wait=False, scripted=False, key=key)
+    for desk in (before, desks()):
+        assert desk.open(the_plan, key=key).id == test.id
+        assert len(desk.measure(test.id, wait=False, scripted=False, key=key).readings) == PLAN.repeats
+        with pytest.raises(IdempotencyError, match="another request body"):
+            desk.open(the_plan, key=RequestKey("a", "other"))
+        with pytest.raises(IdempotencyError, match="another request body"):
+            desk.measure(test.id, wait=False, scripted=True, key=RequestKey("a", "other"))
+    assert len(queue.holders) == 1
+    assert len(before.latest()) == 1
+    # A refused request may be tried again with its key.
+    queue.busy, again = True, RequestKey("b", "body")
+    with pytest.raises(RigBusyError):
+        before.measure(test.id, wait=False, scripted=False, key=again)
+    queue.busy = False
+    before.measure(test.id, wait=False, scripted=False, key=again)
+    assert len(queue.holders) == 2
+
+
+def test_positions_of_one_test_are_measured_with_one_calibration(desk: AcceptanceDesk, queue: TameLender) -> None:
+    test = desk.open(the_plan)
+    desk.measure(test.id, wait=False, scripted=False)
+    camera = RIG.cameras["left"]
+    other = replace(camera, translation_mm=camera.translation_mm + 1)
+    queue.rig = replace(queue.rig, calibration=Calibration({"left": other}, RIG.projector))
+    desk.measure(test.id, wait=False, scripted=False)
+    assert fault_kind(desk, test.id) == CalibrationStateError.__name__
+    assert len(desk.get(test.id).readings) == PLAN.repeats
+    assert desk.cancel(test.id).state is AcceptanceState.CANCELLED
+
+
+def test_a_test_under_way_is_not_deleted(desk: AcceptanceDesk, queue: TameLender) -> None:
+    test = desk.open(the_plan)
+    refused: list[str] = []
+
+    def cancelled() -> bool:
+        with pytest.raises(ScanStateError, match="Cancel it, then delete it"):
+            desk.delete(test.id)
+        refused.append("refused")
+        return True
+
+    queue.cancelled = cancelled
+    desk.measure(test.id, wait=False, scripted=True)
+    assert refused
+    desk.delete(test.id)
+    with pytest.raises(ScanNotFoundError):
+        desk.get(test.id)

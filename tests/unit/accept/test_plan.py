@@ -1,0 +1,193 @@
+"""The prescribed positions of an acceptance test, its limits, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from slrig.accept.plan import (
+    AcceptancePlan,
+    Artefact,
+    Artefacts,
+    Certified,
+    Limits,
+    Quantity,
+    exact_artefacts,
+    usual_limits,
+)
+from slrig.accept.positions import acceptance_plan, rig_volume_mm
+from slrig.accept.scene import turn_deg
+from slrig.config import read_rig
+from slrig.discovery import open_rig
+from slrig.errors import InvalidInputError
+from slrig.model import Calibration, Pinhole, Size
+
+RIGS = Path(__file__).parents[3] / "config" / "rigs"
+VOLUME = np.array([[-100.0, -75.0, -40.0], [100.0, 75.0, 40.0]])
+GOOD = Artefacts(
+    Certified(30.0, 0.001), Certified(110.0, 0.002), (160.0, 110.0), sphere_form_mm=0.001, plane_form_mm=0.002
+)
+
+
+def device(*, turned: np.ndarray | None = None) -> Pinhole:
+    matrix = np.array([[1000.0, 0, 500], [0, 1000.0, 400], [0, 0, 1]])
+    rotation = np.eye(3) if turned is None else turned
+    return Pinhole(Size(1000, 800), matrix, np.zeros(5), rotation, np.array([0.0, 0.0, 600.0]))
+
+
+def plan_of(artefacts: Artefacts = GOOD, *, turned: np.ndarray | None = None, rendered: bool = False) -> AcceptancePlan:
+    camera = device(turned=turned)
+    return acceptance_plan(Calibration({"left": camera}, camera), VOLUME, artefacts, rendered=rendered)
+
+
+def test_there_are_as_many_positions_as_are_prescribed_and_each_is_another() -> None:
+    plan = plan_of()
+    counts = {artefact: sum(step.artefact is artefact for step in plan.steps) for artefact in Artefact}
+    assert counts == {Artefact.SPHERE: 10, Artefact.BAR: 7, Artefact.PLANE: 6}
+    assert len({step.words for step in plan.steps}) == len({step.name for step in plan.steps}) == 23
+    lies = {(*step.centre_mm.round(3), *step.axis.round(3)) for step in plan.steps}
+    assert len(lies) == 23
+
+
+def test_balls_lie_wholly_inside_the_volume_and_fill_it() -> None:
+    plan = plan_of()
+    balls = [(step.centre_mm, 15.0) for step in plan.steps if step.artefact is Artefact.SPHERE]
+    for step in plan.steps:
+        if step.artefact is Artefact.BAR:
+            assert np.linalg.norm(step.axis) == pytest.approx(1)
+            balls += [(step.centre_mm + side * 55.0 * step.axis, 15.0) for side in (-1, 1)]
+    centres = np.array([centre for centre, _ in balls])
+    assert (centres - 15 >= VOLUME[0] - 1e-9).all()
+    assert (centres + 15 <= VOLUME[1] + 1e-9).all()
+    spheres = centres[:10]
+    assert np.allclose(np.ptp(spheres, axis=0), VOLUME[1] - VOLUME[0] - 30)
+
+
+def test_bars_lie_along_all_four_diagonals_an_edge_a_face_and_the_depth() -> None:
+    bars = [step for step in plan_of().steps if step.artefact is Artefact.BAR]
+    signs = {tuple(np.sign(step.axis[1:] * np.sign(step.axis[0]))) for step in bars[:4]}
+    assert signs == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    assert bars[4].axis.tolist() == [1, 0, 0]
+    assert bars[5].axis[2] == 0
+    # As deep as the volume lets it.
+    assert 110 * bars[6].axis[2] == pytest.approx(min(0.8 * 110, 80 - 30))
+    assert "from the upper left front to the lower right back" in bars[0].words
+
+
+def test_planes_face_the_rig_and_tilted_ones_stay_within_the_depth() -> None:
+    planes = [step for step in plan_of().steps if step.artefact is Artefact.PLANE]
+    for step in planes:
+        assert step.axis[2] < -0.8
+        tilt = np.arccos(-step.axis[2])
+        assert 80 * np.sin(tilt) <= 40 + 1e-9
+    assert {round(float(step.centre_mm[2])) for step in planes} == {-32, 0, 32}
+
+
+def test_words_follow_the_camera_however_the_world_stands() -> None:
+    upside_down = Rotation.from_rotvec([0, 0, np.pi]).as_matrix()
+    upright, turned = plan_of().steps, plan_of(turned=upside_down).steps
+    assert "upper left front" in upright[1].words
+    assert "lower right front" in turned[1].words
+    assert np.array_equal(upright[1].centre_mm, turned[1].centre_mm)
+
+
+@pytest.mark.parametrize("number", range(23))
+def test_a_pose_turns_an_artefact_into_its_position(number: int) -> None:
+    step = plan_of().steps[number]
+    turn = Rotation.from_euler("xyz", turn_deg(step), degrees=True)
+    if step.artefact is Artefact.BAR:
+        assert turn.apply([1.0, 0.0, 0.0]) == pytest.approx(step.axis, abs=1e-12)
+    if step.artefact is Artefact.PLANE:
+        assert turn.apply([0.0, 0.0, -1.0]) == pytest.approx(step.axis, abs=1e-12)
+
+
+def test_the_first_position_of_each_artefact_is_measured_again() -> None:
+    plan = replace(plan_of(), repeats=3)
+    assert len(plan.takes) == 23 + 3 * 2
+    again = [(step.name, take) for step, take in plan.takes if take]
+    assert again == [(f"{artefact}-1", take) for artefact in ("sphere", "bar", "plane") for take in (1, 2)]
+
+
+def test_usual_limits_follow_the_diagonal_and_the_noise() -> None:
+    diagonal = float(np.linalg.norm(VOLUME[1] - VOLUME[0]))
+    assert plan_of().limits.spacing_mm == pytest.approx(diagonal / 10_000)
+    rendered = usual_limits(VOLUME, rendered=True)
+    assert rendered.limit_mm(Quantity.SPACING, 0.004) == pytest.approx(diagonal / 20_000)
+    assert rendered.limit_mm(Quantity.FORM, 0.004) == pytest.approx(0.026)
+    given = Limits(0.01, form_mm=0.02)
+    assert given.limit_mm(Quantity.FORM, 0.004) == 0.02
+    assert given.limit_mm(Quantity.FLATNESS, 0.004) == pytest.approx(0.026)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"diameter": Certified(4.0, 0.001)}, "expected a diameter of 5.2 to 52.5 mm"),
+        ({"diameter": Certified(-30.0, 0.001)}, "expected a length above 0 mm, found -30 mm"),
+        ({"diameter": Certified(30.0, -1.0)}, "the uncertainty of the sphere's diameter: expected 0 mm or more"),
+        ({"diameter": Certified(30.0)}, "uncertainty of the sphere's diameter is not told"),
+        ({"distance": Certified(60.0, 0.001)}, "expected 78.7 mm or more between the balls"),
+        ({"distance": Certified(180.0, 0.001)}, "expected 170.0 mm or less between the balls"),
+        ({"distance": Certified(float("nan"), 0.001)}, "the bar's distance: expected a length above 0 mm, found nan"),
+        ({"plane_mm": (100.0, 60.0)}, "expected 131.2 mm or more in length"),
+        ({"plane_mm": (160.0, 40.0)}, "50 mm in width, found 160 x 40 mm"),
+    ],
+)
+def test_artefacts_that_do_not_suit_the_volume_are_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(InvalidInputError) as refused:
+        plan_of(replace(GOOD, **change))  # type: ignore[arg-type]
+    assert words in str(refused.value)
+
+
+def test_a_refusal_lists_all_faults() -> None:
+    with pytest.raises(InvalidInputError) as refused:
+        plan_of(replace(GOOD, diameter=Certified(4.0), plane_mm=(100.0, 60.0)))
+    assert all(words in str(refused.value) for words in ("the sphere:", "the plane:", "is not told"))
+
+
+def test_a_volume_turned_inside_out_and_no_captures_are_refused() -> None:
+    camera = device()
+    rig = Calibration({"left": camera}, camera)
+    with pytest.raises(InvalidInputError, match="least corner and then of the greatest"):
+        acceptance_plan(rig, VOLUME[::-1], GOOD, rendered=False)
+    with pytest.raises(InvalidInputError, match="repeats: expected 1 or more, found 0"):
+        acceptance_plan(rig, VOLUME, GOOD, rendered=False, repeats=0)
+
+
+def test_the_volume_of_a_rig_without_a_stated_one_is_what_all_devices_see() -> None:
+    camera = device()
+    volume = rig_volume_mm(Calibration({"left": camera}, camera))
+    # Near the front the view is narrowest: there the corners touch the margin, 3 % of the image.
+    near = 600 + volume[0, 2]
+    assert 1000 * volume[1, 0] / near == pytest.approx(470, rel=0.01) or (
+        1000 * volume[1, 1] / near == pytest.approx(376, rel=0.01)
+    )
+
+
+def test_devices_that_look_past_one_another_have_no_volume() -> None:
+    camera = device()
+    away = replace(camera, translation_mm=np.array([5000.0, 0.0, 600.0]))
+    with pytest.raises(InvalidInputError, match="no common view"):
+        rig_volume_mm(Calibration({"left": camera}, away))
+
+
+@pytest.mark.slow
+def test_the_shipped_rig_takes_the_positions_that_are_prescribed_for_it() -> None:
+    config = read_rig(RIGS / "rendered-acceptance.toml")
+    assert config.head is not None
+    with open_rig(config) as rig:
+        calibration = rig.calibration
+    assert calibration is not None
+    volume = rig_volume_mm(calibration)
+    plan = acceptance_plan(calibration, volume, exact_artefacts(volume), rendered=True)
+    poses: dict[str, dict[str, object]] = {pose["name"]: pose for pose in config.head.options["pose"]}  # type: ignore[attr-defined]
+    for step in plan.steps:
+        pose = poses.pop(step.name)
+        assert pose["object"] == step.artefact
+        assert pose["position_mm"] == pytest.approx(step.centre_mm, abs=2e-3)
+        assert pose.get("rotation_deg", (0, 0, 0)) == pytest.approx(turn_deg(step), abs=1e-3)
+    assert not poses

@@ -1,0 +1,350 @@
+"""An acceptance test's figures against artefacts of known form, its decisions, and its run with a tame rig."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from slrig.accept import running as acceptance
+from slrig.accept.evaluation import Reading, near_border, reading
+from slrig.accept.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
+from slrig.accept.positions import acceptance_plan
+from slrig.accept.running import Place, evaluated, run_acceptance
+from slrig.accept.verdicts import AcceptanceResult, verdicts
+from slrig.calibration.artefacts import Decision
+from slrig.devices import Rig
+from slrig.errors import (
+    CalibrationError,
+    InvalidInputError,
+    NothingToReconstructError,
+    ScanCancelledError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Calibration, FloatArray, Mesh
+from slrig.scan.artefacts import encode_mesh_ply
+from tests.unit.accept.test_plan import GOOD, VOLUME, device
+
+CAMERA = device()
+RIG = Calibration({"left": CAMERA}, CAMERA)
+PLAN = acceptance_plan(RIG, VOLUME, GOOD, rendered=True, repeats=2)
+NOISE_MM = 0.005
+GRID = 90
+
+
+def step_of(artefact: Artefact, number: int = 1) -> Step:
+    return next(step for step in PLAN.steps if step.name == f"{artefact}-{number}")
+
+
+def grid_faces(first: int) -> NDArray[np.int32]:
+    corner = first + (np.arange(GRID - 1)[:, None] * GRID + np.arange(GRID - 1)).ravel()
+    a, b, c, d = corner, corner + 1, corner + GRID + 1, corner + GRID
+    return np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)]).astype(np.int32)
+
+
+def ball(centre: FloatArray, radius: float, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The front of a ball, to 75 degrees off its middle, and its normals."""
+    across, down = np.meshgrid(*[np.deg2rad(np.linspace(-75, 75, GRID))] * 2)
+    angle = np.maximum(np.hypot(across, down), 1e-9)
+    polar = np.minimum(angle, np.deg2rad(80))
+    normal = np.stack([np.sin(polar) * across / angle, np.sin(polar) * down / angle, -np.cos(polar)], axis=-1).reshape(
+        -1, 3
+    )
+    return centre + normal * (radius + noise)[:, None], normal
+
+
+def flat(step: Step, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    right = np.cross(step.axis, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, step.axis)
+    across, down = np.meshgrid(np.linspace(-80, 80, GRID), np.linspace(-55, 55, GRID))
+    places = step.centre_mm + across.reshape(-1, 1) * right + down.reshape(-1, 1) * up
+    return places + noise[:, None] * step.axis, np.tile(step.axis, (GRID * GRID, 1))
+
+
+def scan_of(step: Step, *, scale: float = 1.0, noise_mm: float = NOISE_MM, seed: int = 1) -> Mesh:
+    """A scan of an artefact in its position by a scanner that measures everything `scale` times too large."""
+    rng = np.random.default_rng((seed, *step.name.encode()))
+
+    def noise() -> FloatArray:
+        return rng.normal(0, noise_mm, GRID * GRID)
+
+    if step.artefact is Artefact.PLANE:
+        parts = [flat(step, noise())]
+    elif step.artefact is Artefact.SPHERE:
+        parts = [ball(step.centre_mm, 15.0, noise())]
+    else:
+        parts = [ball(step.centre_mm + side * 55.0 * step.axis, 15.0, noise()) for side in (-1, 1)]
+    points = np.concatenate([part[0] for part in parts]) * scale
+    count = len(points)
+    return Mesh(
+        points.astype(np.float32),
+        np.concatenate([grid_faces(at * GRID * GRID) for at in range(len(parts))]),
+        np.concatenate([part[1] for part in parts]).astype(np.float32),
+        np.zeros(count, np.uint8),
+        np.full(count, noise_mm, np.float32),
+        np.zeros(count, np.int32),
+    )
+
+
+@pytest.mark.parametrize("artefact", Artefact)
+def test_noise_alone_gives_the_form_error_of_noise(artefact: Artefact) -> None:
+    found, evidence = reading(scan_of(step_of(artefact)), step_of(artefact), 0, PLAN, RIG)
+    form = {Artefact.SPHERE: Quantity.FORM, Artefact.PLANE: Quantity.FLATNESS}.get(artefact)
+    if form is not None:
+        assert 5.0 * NOISE_MM < found.errors_mm[form] < 6.5 * NOISE_MM
+        assert found.limits_mm[form] == pytest.approx(6.5 * NOISE_MM, rel=1e-3)
+    assert found.sigma_mm == pytest.approx(NOISE_MM, rel=0.06)
+    assert found.dispersion_mm == pytest.approx(3.92 * NOISE_MM, rel=0.06)
+    assert 0.002 < found.rejected_share <= 0.003
+    assert found.used == evidence.used.sum() == found.on_artefact - found.steep - found.at_border
+    if artefact is not Artefact.PLANE:
+        assert found.steep > 0
+
+
+@pytest.mark.parametrize("scale", [0.999, 1.0, 1.002])
+def test_a_scanner_that_measures_too_large_is_told_by_how_much(scale: float) -> None:
+    sphere, _ = reading(scan_of(step_of(Artefact.SPHERE), scale=scale), step_of(Artefact.SPHERE), 0, PLAN, RIG)
+    bar, _ = reading(scan_of(step_of(Artefact.BAR), scale=scale), step_of(Artefact.BAR), 0, PLAN, RIG)
+    assert sphere.errors_mm[Quantity.SIZE] == pytest.approx(30 * (scale - 1), abs=0.001)
+    assert bar.errors_mm[Quantity.SPACING] == pytest.approx(110 * (scale - 1), abs=0.001)
+
+
+def test_what_is_steep_or_at_a_border_does_not_count() -> None:
+    step = step_of(Artefact.SPHERE)
+    mesh = scan_of(step)
+    border = near_border(mesh.faces, len(mesh.vertices_mm), rings=2)
+    centre = step.centre_mm
+    towards = (CAMERA.centre_mm - mesh.vertices_mm) / np.linalg.norm(CAMERA.centre_mm - mesh.vertices_mm, axis=1)[
+        :, None
+    ]
+    steep = (mesh.normals * towards).sum(axis=1) < 0.5
+    bad = border | steep
+    assert 0.2 < bad.mean() < 0.8
+    outwards = (mesh.vertices_mm - centre) / 15
+    spoilt = replace(
+        mesh,
+        vertices_mm=np.where(bad[:, None], mesh.vertices_mm + 0.02 * outwards, mesh.vertices_mm).astype(np.float32),
+    )
+    clean, dirty = (reading(each, step, 0, PLAN, RIG)[0] for each in (mesh, spoilt))
+    # Shifted points may turn a little steeper or less: all but a handful are the same.
+    assert dirty.errors_mm[Quantity.FORM] == pytest.approx(clean.errors_mm[Quantity.FORM], rel=0.02)
+    assert dirty.errors_mm[Quantity.SIZE] == pytest.approx(clean.errors_mm[Quantity.SIZE], abs=1e-4)
+
+
+def test_a_hole_has_a_border() -> None:
+    faces = grid_faces(0)
+    middle = GRID * (GRID // 2) + GRID // 2
+    pierced = faces[(faces != middle).all(axis=1)]
+    whole, holed = (near_border(each, GRID * GRID, rings=1).reshape(GRID, GRID) for each in (faces, pierced))
+    assert not whole[2:-2, 2:-2].any()
+    inside = holed[2:-2, 2:-2]
+    assert inside.any()
+    rows, columns = np.nonzero(holed[3:-3, 3:-3])
+    assert (np.abs(rows + 3 - GRID // 2) <= 2).all()
+    assert (np.abs(columns + 3 - GRID // 2) <= 2).all()
+
+
+@pytest.mark.parametrize("artefact", [Artefact.SPHERE, Artefact.BAR])
+def test_an_artefact_that_is_not_there_is_told_by_its_position(artefact: Artefact) -> None:
+    step = step_of(artefact)
+    with pytest.raises(NothingToReconstructError, match=f"{step.name}: expected .* of 30 mm, found"):
+        reading(scan_of(step_of(Artefact.PLANE)), step, 0, PLAN, RIG)
+
+
+def told(step: str, take: int, error: float, *, limit: float = 0.02) -> Reading:
+    return Reading(
+        step, take, {Quantity.SPACING: error}, {Quantity.SPACING: limit}, 0.005, 0.005, 0.02, 9, 0, 0, 9, 0.0
+    )
+
+
+def test_the_worst_position_decides_with_certificate_and_scatter() -> None:
+    readings = [told("bar-1", 0, 0.004), told("bar-1", 1, 0.006), told("bar-2", 0, -0.012)]
+    (found,) = verdicts(readings, PLAN)
+    assert (found.step, found.error_mm, found.repeats) == ("bar-2", -0.012, 2)
+    scatter = np.std([0.004, 0.006], ddof=1)
+    assert found.scatter_mm == pytest.approx(scatter)
+    assert found.uncertainty_mm == pytest.approx(2 * np.hypot(0.002 / 2, scatter))
+    assert found.decision is Decision.PASSES
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [(0.016, Decision.PASSES), (0.019, Decision.UNDECIDED), (0.0215, Decision.UNDECIDED), (-0.023, Decision.FAILS)],
+)
+def test_an_error_within_its_uncertainty_of_the_limit_is_undecided(error: float, expected: Decision) -> None:
+    (found,) = verdicts([told("bar-1", 0, error)], PLAN)
+    # One capture tells no scatter: only the certificate's 0.002 mm is in U.
+    assert np.isnan(found.scatter_mm)
+    assert found.uncertainty_mm == pytest.approx(0.002)
+    assert found.decision is expected
+
+
+class TamePositioner:
+    """Stands where it was sent."""
+
+    def __init__(self, poses: tuple[str, ...]) -> None:
+        self.poses = poses
+        self.moves: list[int] = []
+
+    def move(self, index: int) -> None:
+        self.moves.append(index)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+Scan = Callable[[Step], Mesh]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., AcceptanceResult]:
+    """Run a test with a rig whose scans are made by `scan`."""
+
+    def capture(rig: Rig, _plan: object, folder: Path, **_: object) -> None:
+        assert rig.truth() is None
+        folder.mkdir()
+
+    monkeypatch.setattr(acceptance, "capture_bundle", capture)
+
+    def go(
+        plan: AcceptancePlan = PLAN,
+        *,
+        scan: Scan = scan_of,
+        names: tuple[str, ...] | None = None,
+        place: Place | None = None,
+        again: Callable[[Step, SlrigError], bool] | None = None,
+        cancelled: Callable[[], bool] = lambda: False,
+        calibration: Calibration | None = RIG,
+    ) -> AcceptanceResult:
+        positioner = TamePositioner(tuple(step.name for step in plan.steps) if names is None else names)
+        rig = Rig("tame", {}, None, {}, calibration, positioner=positioner)  # type: ignore[arg-type]
+
+        def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
+            name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
+            output.mkdir()
+            step = next(step for step in plan.steps if step.name == name)
+            (output / "mesh.ply").write_bytes(encode_mesh_ply(scan(step)))
+            return {}
+
+        return run_acceptance(
+            rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, place=place, again=again,
+            evaluate=partial(evaluated, reconstruct=reconstruct),
+        )  # fmt: skip
+
+    return go
+
+
+def shortened(*names: str, repeats: int = 2) -> AcceptancePlan:
+    steps = tuple(step for step in PLAN.steps if step.name in names)
+    return replace(PLAN, steps=steps, repeats=repeats)
+
+
+SHORT = replace(
+    shortened("sphere-1", "sphere-2", "bar-1", "plane-1"),
+    # The certificates' uncertainties have room below these.
+    limits=Limits(0.02, form_sigmas=8.0),
+)
+
+
+def test_a_run_measures_every_position_and_writes_what_it_found(
+    run: Callable[..., AcceptanceResult], tmp_path: Path
+) -> None:
+    result = run(SHORT)
+    assert result.complete
+    assert result.decision is Decision.PASSES
+    written = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert written["format"] == "slrig-acceptance"
+    assert written["decision"] == "passes"
+    assert "No conformity" in written["manner"]
+    assert [each["quantity"] for each in written["quantities"]] == ["PF", "PS", "SD", "F"]
+    assert sum(len(position["captures"]) for position in written["positions"]) == 4 + 3
+    capture = written["positions"][0]["captures"][0]
+    kept = np.load(tmp_path / "out" / capture["points_file"])
+    assert kept["used"].sum() == capture["points_used"]
+    # The kept points give the same figure again, without slrig.
+    used = kept["points_mm"][kept["used"]].astype(np.float64)
+    radial = np.linalg.norm(used - SHORT.steps[0].centre_mm, axis=1)
+    assert 2 * radial.mean() - 30 == pytest.approx(capture["errors_mm"]["PS"], abs=0.001)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"points", "report.json", "report.html"}
+
+
+def test_the_page_holds_everything_and_says_what_it_is_not(
+    run: Callable[..., AcceptanceResult], tmp_path: Path
+) -> None:
+    artefacts = replace(SHORT.artefacts, certificate="<script>alert(1)</script>")
+    run(replace(SHORT, notes="after <moving> the bench", artefacts=artefacts))
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "No conformity" in page
+    assert "after &lt;moving&gt; the bench" in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
+    assert "<script" not in page
+
+
+def test_a_bad_scanner_fails(run: Callable[..., AcceptanceResult]) -> None:
+    result = run(shortened("bar-1"), scan=lambda step: scan_of(step, scale=1.001))
+    assert result.decision is Decision.FAILS
+    assert result.verdicts[0].error_mm == pytest.approx(0.11, abs=0.002)
+
+
+def test_a_positioner_that_does_not_know_the_positions_is_refused(
+    run: Callable[..., AcceptanceResult], tmp_path: Path
+) -> None:
+    with pytest.raises(UnsupportedByDeviceError, match=r"needs the positions sphere-2, bar-1, plane-1"):
+        run(SHORT, names=("sphere-1", "pose 2"))
+    with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
+        run(SHORT, names=())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_rig_without_calibration_is_refused(run: Callable[..., AcceptanceResult]) -> None:
+    with pytest.raises(CalibrationError, match="has no calibration"):
+        run(SHORT, calibration=None)
+
+
+def test_results_are_not_mixed_with_other_files(run: Callable[..., AcceptanceResult], tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "letter.txt").write_text("dear")
+    with pytest.raises(InvalidInputError, match="is not empty"):
+        run(SHORT)
+
+
+def test_a_cancelled_test_keeps_its_points_and_writes_no_report(
+    run: Callable[..., AcceptanceResult], tmp_path: Path
+) -> None:
+    answers = iter([False, True])
+    with pytest.raises(ScanCancelledError, match="cancelled before"):
+        run(SHORT, cancelled=lambda: next(answers))
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["points"]
+    assert [path.name for path in (tmp_path / "out" / "points").iterdir()] == ["sphere-1-1.npz"]
+
+
+def test_an_artefact_that_was_not_found_is_placed_again(run: Callable[..., AcceptanceResult]) -> None:
+    plan = shortened("sphere-1", "sphere-2", repeats=1)
+    placed: list[str] = []
+    refused: list[str] = []
+
+    def scan(step: Step) -> Mesh:
+        # The person had forgotten the sphere.
+        forgotten = step.name == "sphere-2" and placed.count("sphere-2") == 1
+        return scan_of(step_of(Artefact.PLANE)) if forgotten else scan_of(step)
+
+    def again(step: Step, error: SlrigError) -> bool:
+        refused.append(f"{step.name} {error}")
+        return True
+
+    result = run(plan, scan=scan, place=lambda _rig, step, /: placed.append(step.name), again=again)
+    assert placed == ["sphere-1", "sphere-2", "sphere-2"]
+    assert result.complete
+    assert len(refused) == 1
+    assert "found 0" in refused[0]

@@ -1,0 +1,242 @@
+"""Calibration sessions over a tame bench: poses that show what a test says, and a solve that gives what it says."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+from uuid import UUID
+
+import numpy as np
+
+from slrig.bundle import read_calibration
+from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState
+from slrig.calibrate.solving import CalibrationResult, ReadPose
+from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
+from slrig.calibration.board import Board, BoardKind, BoardShape
+from slrig.calibration.judging.comparison import comparison
+from slrig.calibration.observations import BoardView, PoseObservation
+from slrig.calibration.poses.figures import ViewFigures
+from slrig.devices import Rig
+from slrig.errors import PoseRefusedError, ScanCancelledError
+from slrig.model import Calibration, Pinhole, Size, Solved
+from slrig.scan.plan import Progress, ScanPlan
+from tests.unit.scan.bench import Bench
+from tests.unit.scan.fakes import WAIT_S, TameBench
+
+BOARD = Board(BoardKind.CHESSBOARD, 4, 3, 10.0)
+PNG = b"\x89PNG tame"
+POSITIONS = ("near", "far", "tilted")
+
+
+CAMERA, PROJECTOR_SIZE = Size(64, 48), Size(64, 40)
+"""Of the tame devices."""
+
+
+def tame_calibration(
+    *, camera: Size = CAMERA, projector: Size = PROJECTOR_SIZE, focal_px: float = 80.0, sigma: float = 0.1
+) -> Calibration:
+    """A calibration of the tame bench's devices; `sigma` is the deviation of every number."""
+    eye, there = np.eye(3), np.array([-100.0, 0.0, 0.0])
+    lens = np.array([[focal_px, 0.0, 31.5], [0.0, focal_px, 23.5], [0.0, 0.0, 1.0]])
+    volume = np.array([[-40.0, -30.0, 450.0], [40.0, 30.0, 550.0]])
+    solved = Solved("tame", "2026-11-21T11:00:00+00:00", np.eye(30) * sigma**2, volume, 0.02)
+    cameras = {"cam0": Pinhole(camera, lens, np.zeros(5), eye, np.zeros(3))}
+    return Calibration(cameras, Pinhole(projector, lens, np.zeros(5), eye, there), solved)
+
+
+@dataclass(frozen=True, slots=True)
+class TameResult:
+    """As much of a CalibrationResult as a session looks at."""
+
+    calibration: Calibration
+
+
+class TamePositioner:
+    """A positioner that remembers where it was sent."""
+
+    def __init__(self, visited: list[int]) -> None:
+        self._visited = visited
+
+    @property
+    def poses(self) -> Sequence[str]:
+        return POSITIONS
+
+    def move(self, index: int) -> None:
+        self._visited.append(index)
+
+    def close(self) -> None:
+        return
+
+
+class TameCalibrating:
+    """What a session works with, as a test says, over the tame devices of a bench.
+
+    refusals : of the next poses; unseen : the next pose's frames show no board; read_error, solve_error : raised.
+    solving : while it is clear a solve goes on.
+    """
+
+    def __init__(self, bench: TameBench) -> None:
+        self.bench = bench
+        self.refusals: tuple[str, ...] = ()
+        self.unseen = False
+        self.read_error: Exception | None = None
+        self.solve_error: Exception | None = None
+        self.solving = threading.Event()
+        self.solving.set()
+        self.visited: list[int] = []
+        self.captured: list[tuple[Rig, ScanPlan]] = []
+        self.judged: list[list[str]] = []
+        self.solved: list[list[str]] = []
+        self.earlier: list[Calibration | None] = []
+        self.board_shapes: list[BoardShape] = []
+        self.calibration = tame_calibration()
+
+    def tools(self) -> CalibrationTools:
+        return CalibrationTools(
+            capture=self._capture,
+            read=self._read,
+            judge=self._judge,
+            survey=lambda poses, _: Standing({"poses": [each.observation.name for each in poses]}, {}),
+            picture=lambda *_: PNG,
+            coverage_picture=lambda _, device, poses, __: f"{device} {len(poses)}".encode(),
+            solve=self._solve,
+            compare=comparison,
+            parse=read_calibration,
+            report=lambda path, *_: cast("None", path.write_text("<html>report</html>")),
+            summary=lambda _: {"verdict": {"grade": "good", "summary": "good", "reasons": []}},
+        )
+
+    def _capture(
+        self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
+    ) -> None:
+        self.captured.append((rig, plan))
+        rig.projector.show(0)
+        progress("capture", 0.5, "frame 1 of 2")
+        self.bench.began.set()
+        while not self.bench.gate.wait(0.01):
+            if cancelled():
+                message = "The scan was cancelled."
+                raise ScanCancelledError(message)
+        if self.bench.error is not None:
+            error, self.bench.error = self.bench.error, None
+            raise error
+        folder.mkdir()
+        (folder / "bundle.json").write_text("{}")
+
+    def _read(self, folder: Path, board: Board, name: str) -> ReadPose:
+        assert (folder / "bundle.json").is_file()
+        if self.read_error is not None:
+            raise self.read_error
+        if self.unseen:
+            message = f"pose '{name}': no camera sees the board. Move it into view."
+            raise PoseRefusedError(message)
+        count = board.corner_count
+        view = BoardView(np.arange(count, dtype=np.int32), board.points_mm[:, :2].copy(), np.full(count, 0.05))
+        return ReadPose(PoseObservation(name, {"cam0": view}), {"cam0": ViewFigures(0.01, 0.0, 0.4, 1.0, np.nan)})
+
+    def _judge(self, pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
+        assert setting.board == BOARD
+        names = [each.observation.name for each in earlier]
+        self.judged.append(names)
+        if not self.refusals:
+            names = [*names, pose.observation.name]
+        standing = Standing({"poses": names}, {"words": "tilt it", "enough": False})
+        return Judgement(self.refusals, {"corners_found": {"cam0": 12}}, standing)
+
+    def _solve(
+        self,
+        board: Board,
+        cameras: Mapping[str, Size],
+        projector: Size | None,
+        poses: Sequence[ReadPose],
+        /,
+        *,
+        progress: Progress,
+        earlier: Calibration | None = None,
+        board_shape: BoardShape = BoardShape.AUTO,
+    ) -> CalibrationResult:
+        assert (board, dict(cameras), projector) == (BOARD, {"cam0": Size(64, 48)}, Size(64, 40))
+        progress("adjust", 0.5, "turn 3")
+        assert self.solving.wait(WAIT_S)
+        if self.solve_error is not None:
+            raise self.solve_error
+        self.solved.append([each.observation.name for each in poses])
+        self.earlier.append(earlier)
+        self.board_shapes.append(board_shape)
+        return cast("CalibrationResult", TameResult(self.calibration))
+
+
+class CalibrationBench(Bench):
+    """A runner over a tame bench, and calibrations beside it. solve : a task of the worker, for the tame one."""
+
+    def __init__(self, tmp_path: Path, *, positioner: bool = False, solve: str | None = None) -> None:
+        super().__init__(tmp_path)
+        self.tame = TameCalibrating(self)
+        self._positioner = positioner
+        tools = self.tame.tools()
+        if solve is not None:
+            tools = replace(tools, solve=self.worker.task(solve, "solve"))
+        self.calibrations = Calibrations(self.folder, self.runner, rig_name="bench", tools=tools)
+
+    def open_rig(self) -> Rig:
+        rig = super().open_rig()
+        return replace(rig, positioner=TamePositioner(self.tame.visited)) if self._positioner else rig
+
+    def until_pose(self, session_id: UUID, number: int) -> PoseRecord:
+        """The pose once it is in a final state."""
+        self.until_session(session_id, lambda record: all(each.state.final for each in record.poses))
+        return self.calibrations.register.pose(session_id, number)
+
+    def until_session(self, session_id: UUID, done: Callable[[SessionRecord], bool]) -> SessionRecord:
+        """The session once `done` says so."""
+        register, reached = self.calibrations.register, threading.Event()
+
+        def look() -> None:
+            if done(register.get(session_id)):
+                reached.set()
+
+        unwatch = register.watch(session_id, look)
+        look()
+        assert reached.wait(WAIT_S)
+        unwatch()
+        return register.get(session_id)
+
+    def session(self) -> UUID:
+        """A session that was opened."""
+        return self.calibrations.open(BOARD).id
+
+    def shot(self, session_id: UUID, request: PoseRequest = PoseRequest()) -> PoseRecord:  # noqa: B008 - frozen
+        """A pose that has its answer."""
+        pose = self.calibrations.poses.shoot(session_id, request, wait=True)
+        return self.until_pose(session_id, pose.number)
+
+    def held_pose(self, session_id: UUID) -> PoseRecord:
+        """A pose that is being shot until `gate` is set."""
+        self.began.clear()
+        self.gate.clear()
+        pose = self.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
+        assert self.began.wait(WAIT_S)
+        return pose
+
+    def solved(self, *, poses: int = 2) -> UUID:
+        """A session that was solved."""
+        session_id = self.session()
+        for _ in range(poses):
+            self.shot(session_id)
+        self.calibrations.solves.solve(session_id)
+        record = self.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
+        assert record.state is SessionState.SOLVED, record.fault
+        return session_id
+
+    def close(self) -> None:
+        self.gate.set()
+        self.tame.solving.set()
+        self.runner.close()
+        self.calibrations.close()
+        self.store.close()
+        self.folder.release()

@@ -1,0 +1,484 @@
+"""A session from its first pose to the calibration in use, and what it bears on the way."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import uuid4
+
+import numpy as np
+import pytest
+
+from slrig.bundle.calibration_file import read_calibration, write_calibration
+from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.records import PoseState, SessionState
+from slrig.calibrate.store import CalibrationStore
+from slrig.errors import (
+    ArtefactNotReadyError,
+    CalibrationError,
+    CalibrationNotFoundError,
+    CalibrationStateError,
+    DeviceGoneError,
+    IdempotencyError,
+    RigBusyError,
+    SolveRefusedError,
+    StorageError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Size
+from slrig.scan.records import ScanState
+from slrig.scan.sweep import sweep
+from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
+from tests.unit.scan.fakes import WAIT_S
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[CalibrationBench]:
+    bench = CalibrationBench(tmp_path)
+    bench.runner.start()
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def moved(tmp_path: Path) -> Iterator[CalibrationBench]:
+    """A bench with a positioner, open."""
+    bench = CalibrationBench(tmp_path, positioner=True)
+    bench.runner.start()
+    bench.until(bench.scan().id)
+    yield bench
+    bench.close()
+
+
+def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    first, second = bench.shot(session_id), bench.shot(session_id)
+    assert [first.state, second.state] == [PoseState.ACCEPTED] * 2
+    assert first.answer == {"corners_found": {"cam0": 12}}
+    assert bench.tame.judged == [[], ["pose 1"]]
+    record = bench.calibrations.register.get(session_id)
+    assert record.coverage == {"poses": ["pose 1", "pose 2"]}
+    assert record.next_move == {"words": "tilt it", "enough": False}
+    assert (dict(record.cameras), record.projector) == ({"cam0": Size(64, 48)}, Size(64, 40))
+    place = bench.calibrations.store.pose(session_id, 1)
+    assert {path.name for path in place.iterdir()} == {"bundle", "answer.json", "picture-cam0.png", "reading.npz"}
+    assert (place / "picture-cam0.png").read_bytes() == PNG
+
+    bench.calibrations.solves.solve(session_id)
+    done = bench.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
+    assert (done.state, done.solve) == (SessionState.SOLVED, 1)
+    assert bench.tame.solved == [["pose 1", "pose 2"]]
+    path = bench.calibrations.file(session_id, "calibration.json")
+    solved = read_calibration(path).solved
+    assert solved is not None
+    assert solved.id == str(session_id)
+    assert bench.calibrations.file(session_id, "report.html").read_text() == "<html>report</html>"
+
+    assert bench.runner.status().active is None
+    bench.calibrations.activate(session_id)
+    active = bench.runner.status().active
+    assert active is not None
+    assert active.name == str(session_id)
+    assert bench.calibrations.active == session_id
+    assert list(bench.folder.incoming.iterdir()) == []
+    assert bench.opened[0][1].dark
+
+
+def test_pose_is_shot_along_both_axes_and_knows_no_earlier_calibration(bench: CalibrationBench) -> None:
+    bench.calibrations.activate(bench.solved())
+    bench.shot(bench.session(), PoseRequest(exposure_s=0.02))
+    rig, plan = bench.tame.captured[-1]
+    assert plan.patterns.rows
+    assert plan.patterns.line_shift
+    assert plan.exposure_s == 0.02
+    assert (rig.calibration, rig.head) == (None, None)
+
+
+def test_bad_pose_is_refused_with_its_cause_and_its_picture(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.tame.refusals = ("camera 'cam0' saw the board move: hold it still.",)
+    judged = bench.shot(session_id)
+    bench.tame.refusals = ()
+    bench.tame.unseen = True
+    unseen = bench.shot(session_id)
+    bench.tame.unseen = False
+    for pose, words in ((judged, "hold it still."), (unseen, "no camera sees the board. Move it into view.")):
+        assert pose.state is PoseState.REFUSED
+        assert pose.fault is not None
+        assert pose.fault.kind == "PoseRefusedError"
+        assert pose.fault.message.endswith(words)
+        assert "pose '" not in pose.fault.message
+        place = bench.calibrations.store.pose(session_id, pose.number)
+        assert (place / "picture-cam0.png").read_bytes() == PNG
+        assert words in json.loads((place / "answer.json").read_text())["refused"][0]
+        assert not (place / "reading.npz").exists()
+    good = bench.shot(session_id)
+    assert good.number == 3
+    assert bench.tame.judged[-1] == []
+    bench.calibrations.solves.solve(session_id)
+    bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
+    assert bench.tame.solved == [["pose 3"]]
+
+
+def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    pose = bench.held_pose(session_id)
+    with pytest.raises(RigBusyError, match=f"held by calibration {session_id}, pose 1 since .*POST .*/pose/1/cancel"):
+        bench.scan()
+    assert bench.runner.status().holder == f"calibration {session_id}, pose 1"
+    queued = bench.scan(wait=True)
+    bench.gate.set()
+    assert bench.until_pose(session_id, pose.number).state is PoseState.ACCEPTED
+    assert bench.until(queued.id).state is ScanState.SUCCEEDED
+
+    scan = bench.held()
+    with pytest.raises(RigBusyError) as busy:
+        bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
+    assert busy.value.holder == str(scan.id)
+    assert bench.calibrations.register.get(session_id).latest_pose == 1
+    waiting = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
+    assert bench.calibrations.register.pose(session_id, waiting.number).state is PoseState.QUEUED
+    bench.gate.set()
+    assert bench.until_pose(session_id, waiting.number).state is PoseState.ACCEPTED
+
+
+def test_cancel_ends_a_pose_under_way_and_one_that_waits(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    first = bench.held_pose(session_id)
+    second = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
+    assert bench.calibrations.poses.cancel(session_id, second.number).state is PoseState.CANCELLED
+    bench.calibrations.poses.cancel(session_id, first.number)
+    assert bench.until_pose(session_id, first.number).state is PoseState.CANCELLED
+    assert bench.opened[0][1].dark
+    assert list(bench.folder.incoming.iterdir()) == []
+    assert bench.calibrations.poses.cancel(session_id, first.number).state is PoseState.CANCELLED
+
+
+def test_device_that_vanishes_fails_the_pose_and_is_opened_again(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
+    pose = bench.shot(session_id)
+    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "DeviceGoneError")
+    assert bench.opened_again.wait(WAIT_S)
+    assert bench.shot(session_id).state is PoseState.ACCEPTED
+
+
+def test_full_disk_during_a_pose_fails_it_and_leaves_nothing(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.error = StorageError("000.png: the disk refused: No space left on device")
+    pose = bench.shot(session_id)
+    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "StorageError")
+    assert list(bench.folder.incoming.iterdir()) == []
+    assert not bench.calibrations.store.pose(session_id, 1).exists()
+    assert not bench.opened[0][1].closed
+    bench.free_bytes = 1000
+    with pytest.raises(StorageError, match="are free"):
+        bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
+    assert bench.calibrations.register.get(session_id).latest_pose == 1
+
+
+def test_full_disk_while_a_pose_is_read_fails_it(bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    session_id = bench.session()
+
+    def commit(*_: object) -> None:
+        message = "Writing failed: No space left on device."
+        raise StorageError(message)
+
+    monkeypatch.setattr(CalibrationStore, "commit_pose", commit)
+    pose = bench.shot(session_id)
+    monkeypatch.undo()
+    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "StorageError")
+    assert list(bench.folder.incoming.iterdir()) == []
+    assert bench.shot(session_id).state is PoseState.ACCEPTED
+
+
+def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    session_id = bench.session()
+    pose = bench.held_pose(session_id)
+
+    def save(*_: object) -> None:
+        message = "session.json: the disk refused."
+        raise StorageError(message)
+
+    monkeypatch.setattr(CalibrationStore, "save", save)
+    bench.gate.set()
+    assert bench.until_pose(session_id, pose.number).state is PoseState.ACCEPTED
+    monkeypatch.undo()
+    assert bench.shot(session_id).state is PoseState.ACCEPTED
+    (record,) = CalibrationStore(bench.folder).load()
+    assert [each.state for each in record.poses] == [PoseState.ACCEPTED] * 2
+
+
+def test_defect_in_the_reading_is_told_without_its_traceback(bench: CalibrationBench) -> None:
+    bench.tame.read_error = ZeroDivisionError("secret")
+    pose = bench.shot(bench.session())
+    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "UnexpectedError")
+    assert pose.fault is not None
+    assert "secret" not in pose.fault.message
+
+
+def test_dropped_pose_is_in_no_solve_and_its_number_is_not_given_again(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.shot(session_id)
+    bench.shot(session_id)
+    bench.calibrations.poses.drop(session_id, 1)
+    record = bench.calibrations.register.get(session_id)
+    assert [pose.number for pose in record.poses] == [2]
+    assert record.coverage == {"poses": ["pose 2"]}
+    assert not bench.calibrations.store.pose(session_id, 1).exists()
+    with pytest.raises(CalibrationNotFoundError, match="its poses: 2"):
+        bench.calibrations.poses.drop(session_id, 1)
+    assert bench.shot(session_id).number == 3
+    held = bench.held_pose(session_id)
+    with pytest.raises(CalibrationStateError, match="Pose 4 is shooting"):
+        bench.calibrations.poses.drop(session_id, held.number)
+
+
+def test_repeated_request_shoots_nothing(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    request = PoseRequest(key="k", fingerprint="a")
+    first = bench.shot(session_id, request)
+    again = bench.calibrations.poses.shoot(session_id, request, wait=False)
+    assert again.number == first.number
+    assert len(bench.tame.captured) == 1
+    with pytest.raises(IdempotencyError):
+        bench.calibrations.poses.shoot(session_id, PoseRequest(key="k", fingerprint="b"), wait=False)
+    bench.calibrations.poses.drop(session_id, first.number)
+    with pytest.raises(CalibrationNotFoundError):
+        bench.calibrations.poses.shoot(session_id, request, wait=False)
+
+
+def test_positioner_takes_a_pose_or_all_in_turn(moved: CalibrationBench) -> None:
+    session_id = moved.session()
+    pose = moved.shot(session_id, PoseRequest(position="far"))
+    assert (pose.position, pose.position_name) == (1, "far")
+    assert moved.tame.visited == [1]
+    moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=False)
+    record = moved.until_session(session_id, lambda found: len(found.accepted) == 4)
+    assert moved.tame.visited == [1, 0, 1, 2]
+    assert record.script == ()
+    moved.calibrations.poses.script(session_id, ("tilted", 0), PoseRequest(exposure_s=0.02), wait=False)
+    moved.until_session(session_id, lambda found: len(found.accepted) == 6)
+    assert moved.tame.visited[4:] == [2, 0]
+    assert [plan.exposure_s for _, plan in moved.tame.captured] == [None] * 4 + [0.02] * 2
+    with pytest.raises(UnsupportedByDeviceError, match="found 7, this rig has 0 to 2: near, far, tilted"):
+        moved.calibrations.poses.shoot(session_id, PoseRequest(position=7), wait=False)
+
+
+def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> None:
+    session_id = moved.session()
+    moved.began.clear()
+    moved.gate.clear()
+    first = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=False)
+    assert moved.began.wait(WAIT_S)
+    assert moved.calibrations.register.get(session_id).script == (1, 2)
+    moved.calibrations.poses.cancel(session_id, first.number)
+    assert moved.until_pose(session_id, first.number).state is PoseState.CANCELLED
+    moved.gate.set()
+    moved.error = DeviceGoneError("Camera 'cam0' was unplugged.")
+    second = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=True)
+    assert moved.until_pose(session_id, second.number).state is PoseState.FAILED
+    record = moved.calibrations.register.get(session_id)
+    assert (record.script, record.latest_pose, moved.tame.visited) == ((), 2, [0, 0])
+
+
+def test_rig_without_a_positioner_says_so(bench: CalibrationBench) -> None:
+    bench.until(bench.scan().id)
+    with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
+        bench.calibrations.poses.shoot(bench.session(), PoseRequest(position=0), wait=False)
+    with pytest.raises(UnsupportedByDeviceError, match="no positioner"):
+        bench.calibrations.poses.script(bench.session(), (), PoseRequest(), wait=False)
+
+
+def test_solve_is_refused_until_it_makes_sense(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    with pytest.raises(SolveRefusedError, match="no accepted pose"):
+        bench.calibrations.solves.solve(session_id)
+    bench.held_pose(session_id)
+    with pytest.raises(CalibrationStateError, match="pose 1 is still under way"):
+        bench.calibrations.solves.solve(session_id)
+    bench.gate.set()
+    bench.until_pose(session_id, 1)
+    bench.tame.solving.clear()
+    bench.calibrations.solves.solve(session_id)
+    with pytest.raises(CalibrationStateError, match="is being solved already"):
+        bench.calibrations.solves.solve(session_id)
+    with pytest.raises(CalibrationStateError, match="is being solved"):
+        bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=False)
+    with pytest.raises(CalibrationStateError, match="under way"):
+        bench.calibrations.delete(session_id)
+    bench.tame.solving.set()
+    bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
+
+
+def test_failed_solve_tells_why_and_another_pose_opens_the_session_again(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.shot(session_id)
+    bench.tame.solve_error = SolveRefusedError("All poses are parallel: tilt the board.")
+    bench.calibrations.solves.solve(session_id)
+    failed = bench.until_session(session_id, lambda found: found.state is SessionState.FAILED)
+    assert failed.fault is not None
+    assert (failed.fault.kind, failed.solve) == ("SolveRefusedError", 0)
+    with pytest.raises(CalibrationStateError, match="was not solved yet"):
+        bench.calibrations.activate(session_id)
+    bench.tame.solve_error = None
+    bench.shot(session_id)
+    assert bench.calibrations.register.get(session_id).state is SessionState.OPEN
+    bench.calibrations.solves.solve(session_id)
+    bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
+
+
+def test_second_solve_changes_no_calibration_in_use(bench: CalibrationBench) -> None:
+    session_id = bench.solved()
+    bench.calibrations.activate(session_id)
+    bench.shot(session_id)
+    bench.tame.calibration = tame_calibration(focal_px=81.0)
+    bench.calibrations.solves.solve(session_id)
+    record = bench.until_session(session_id, lambda found: found.state is SessionState.SOLVED)
+    assert record.solve == 2
+    # The solve was held against the one in use.
+    assert [None if each is None else each.cameras["cam0"].matrix[0, 0] for each in bench.tame.earlier] == [None, 80.0]
+    active = bench.runner.status().active
+    assert active is not None
+    assert active.calibration.cameras["cam0"].matrix[0, 0] == 80.0
+    bench.calibrations.activate(session_id)
+    active = bench.runner.status().active
+    assert active is not None
+    assert active.calibration.solved is not None
+    assert active.calibration.solved.id == f"{session_id}.2"
+    assert active.calibration.cameras["cam0"].matrix[0, 0] == 81.0
+
+
+def test_calibration_in_use_is_not_deleted_and_can_be_let_go(bench: CalibrationBench) -> None:
+    session_id = bench.solved()
+    bench.calibrations.activate(session_id)
+    with pytest.raises(CalibrationStateError, match=r"is in use.*deactivate"):
+        bench.calibrations.delete(session_id)
+    bench.calibrations.deactivate(session_id)
+    assert bench.runner.status().active is None
+    with pytest.raises(CalibrationStateError, match="not in use"):
+        bench.calibrations.deactivate(session_id)
+    bench.calibrations.delete(session_id)
+    assert not bench.calibrations.store.folder(session_id).exists()
+    with pytest.raises(CalibrationNotFoundError):
+        bench.calibrations.register.get(session_id)
+
+
+def test_scan_uses_the_active_calibration(bench: CalibrationBench) -> None:
+    seen = []
+    capture = bench.runner._tools.capture
+
+    def watched(rig: object, *given: object, **options: object) -> None:
+        seen.append(getattr(rig, "calibration"))  # noqa: B009 - any rig
+        capture(rig, *given, **options)  # type: ignore[arg-type] # as it came
+
+    object.__setattr__(bench.runner._tools, "capture", watched)
+    bench.until(bench.scan().id)
+    bench.calibrations.activate(bench.solved())
+    bench.until(bench.scan().id)
+    assert seen[0] is None
+    assert seen[1].cameras["cam0"].matrix[0, 0] == 80.0
+
+
+def test_calibration_of_other_devices_is_not_activated(bench: CalibrationBench) -> None:
+    bench.until(bench.scan().id)
+    path = bench.folder.root / "other.json"
+    write_calibration(path, tame_calibration(camera=Size(640, 480)))
+    record = bench.calibrations.submit(path.read_bytes(), ".json")
+    with pytest.raises(CalibrationError, match="expected 64 x 48 as the camera's frames are, found 640 x 480"):
+        bench.calibrations.activate(record.id)
+    assert bench.calibrations.active is None
+
+
+@pytest.mark.parametrize("name", ["calibration.json", "calibration.yml", "calibration.xml"])
+def test_exported_calibration_comes_in_again(bench: CalibrationBench, name: str) -> None:
+    session_id = bench.solved()
+    text = bench.calibrations.exported(session_id, name)
+    record = bench.calibrations.submit(text, Path(name).suffix, label="from elsewhere")
+    assert (record.state, record.label, record.board) == (SessionState.SOLVED, "from elsewhere", None)
+    again = bench.calibrations.calibration(record.id)
+    np.testing.assert_allclose(again.cameras["cam0"].matrix, tame_calibration().cameras["cam0"].matrix)
+    assert again.solved is not None
+    assert again.solved.expected_error_mm == 0.02
+    with pytest.raises(CalibrationStateError, match="was imported and has no board"):
+        bench.calibrations.poses.shoot(record.id, PoseRequest(), wait=False)
+    with pytest.raises(ArtefactNotReadyError, match="was imported"):
+        bench.calibrations.file(record.id, "report.html")
+    bench.calibrations.activate(record.id)
+
+
+def test_text_that_is_no_calibration_is_refused_without_a_trace(bench: CalibrationBench) -> None:
+    with pytest.raises(CalibrationError, match="the calibration sent") as refused:
+        bench.calibrations.submit(b"{}", ".json")
+    assert str(bench.folder.root) not in str(refused.value)
+    assert bench.calibrations.latest() == []
+    assert list(bench.folder.incoming.iterdir()) == []
+
+
+def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: CalibrationBench) -> None:
+    active = bench.solved()
+    bench.calibrations.activate(active)
+    session_id = bench.session()
+    bench.shot(session_id)
+    bench.held_pose(session_id)
+    staged = bench.calibrations.store.staged_pose(session_id, 2)
+    assert staged.is_dir()
+    # What a power cut leaves, seen by the next start.
+    sweep(bench.store, bench.folder)
+    again = Calibrations(bench.folder, bench.runner, rig_name="bench", tools=bench.tame.tools())
+    assert not staged.exists()
+    assert again.active == active
+    record = again.register.get(session_id)
+    assert [pose.state for pose in record.poses] == [PoseState.ACCEPTED, PoseState.FAILED]
+    fault = record.poses[1].fault
+    assert fault is not None
+    assert (fault.kind, "Shoot it again" in fault.message) == ("ScanInterruptedError", True)
+    assert [each.id for each in again.latest()] == [session_id, active]
+    assert [each.observation.name for each in again.answers.readings(record)] == ["pose 1"]
+
+
+def test_end_of_the_service_cuts_off_what_is_under_way(bench: CalibrationBench) -> None:
+    session_id, other = bench.session(), bench.session()
+    bench.shot(other)
+    bench.tame.solving.clear()
+    bench.calibrations.solves.solve(other)
+    bench.held_pose(session_id)
+    bench.runner.close()
+    bench.calibrations.close()
+    assert bench.opened[0][1].dark
+    records = {record.id: record for record in CalibrationStore(bench.folder).load()}
+    assert records[session_id].poses[0].state is PoseState.FAILED
+    assert records[other].state is SessionState.FAILED
+    bench.tame.solving.set()
+
+
+def test_folder_that_is_no_session_is_put_aside(bench: CalibrationBench) -> None:
+    stray = bench.folder.calibrations / str(uuid4())
+    stray.mkdir()
+    (stray / "session.json").write_text('{"number": 1}')
+    assert CalibrationStore(bench.folder).load() == []
+    assert (bench.folder.orphans / stray.name / "session.json").is_file()
+
+
+def test_active_calibration_that_is_gone_ends_the_start(bench: CalibrationBench) -> None:
+    session_id = bench.solved()
+    bench.calibrations.activate(session_id)
+    (bench.calibrations.store.solve(session_id, 1) / "calibration.json").unlink()
+    with pytest.raises(StorageError, match=r"active calibration .* cannot be read .* Remove .*active\.json"):
+        Calibrations(bench.folder, bench.runner, rig_name="bench", tools=bench.tame.tools())
+
+
+def test_events_tell_of_poses_and_of_the_solve(bench: CalibrationBench) -> None:
+    session_id = bench.solved(poses=1)
+    events = bench.calibrations.register.events(session_id, after=0)
+    assert [event.number for event in events] == list(range(1, len(events) + 1))
+    assert [event.data["state"] for event in events if event.kind == "pose"] == [
+        "queued",
+        "shooting",
+        "reading",
+        "accepted",
+    ]
+    assert [event.data["state"] for event in events if event.kind == "state"] == ["solving", "solved"]
+    assert {"capture", "adjust"} <= {event.data["stage"] for event in events if event.kind == "progress"}

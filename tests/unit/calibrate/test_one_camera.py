@@ -1,0 +1,127 @@
+"""One camera calibrated alone: solved from made-up poses, told on screen and page, kept as a file, and no scan's."""
+
+from __future__ import annotations
+
+import io
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from slrig.bundle import read_calibration, write_calibration
+from slrig.bundle.calibration_file import check_rays
+from slrig.bundle.opencv_calibration import read_opencv_calibration, write_opencv_calibration
+from slrig.calibrate.pose_judging import judgement, summary
+from slrig.calibrate.report import report_html
+from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
+from slrig.calibrate.tools import Setting
+from slrig.calibration.board import BoardShape
+from slrig.calibration.health.looking import look_at_board
+from slrig.calibration.judging.comparison import comparison
+from slrig.calibration.poses.figures import ViewFigures
+from slrig.cli.calibration_screen import tell_result
+from slrig.errors import CalibrationError
+from slrig.model import Calibration, Size
+from tests.unit.calibrate.test_report import Page
+from tests.unit.calibration.synthetic import CHESSBOARD, Recipe, made
+
+SIZE = Size(1280, 1024)
+FIGURES = ViewFigures(moved_px=0.01, saturated=0.0, contrast=0.6, sharpness_px=1.1, decoded=float("nan"))
+
+
+@cache
+def poses() -> tuple[tuple[ReadPose, ...], Calibration]:
+    """Poses of a board that one camera saw in white light, and that camera."""
+    observations, truth = made(Recipe(poses=8, projector=False, seed=4))
+    return tuple(ReadPose(pose, {"left": FIGURES}) for pose in observations.poses), truth
+
+
+@cache
+def result() -> CalibrationResult:
+    return solve_poses(CHESSBOARD, {"left": SIZE}, None, poses()[0], board_shape=BoardShape.FLAT)
+
+
+def test_the_camera_is_known_with_its_deviations() -> None:
+    found, true = result().calibration, poses()[1].cameras["left"]
+    assert found.projector is None
+    assert found.solved is not None
+    assert found.solved.covariance.shape == (15, 15)
+    assert found.solved.expected_error_mm == result().expected.point_mm > 0
+    sigma = np.sqrt(np.diag(found.solved.covariance))
+    for row, place in enumerate(((0, 0), (1, 1), (0, 2), (1, 2))):
+        assert abs(found.cameras["left"].matrix[place] - true.matrix[place]) < 3.5 * sigma[row]
+
+
+def test_the_error_is_said_to_be_across_the_line_of_sight() -> None:
+    told = result().verdict
+    assert "a point of known distance is expected within" in told.summary
+    assert "mm across the line of sight (1 in" in told.summary
+    assert told.summary.endswith(
+        "; it cannot scan alone: that takes a projector or a second camera, calibrated with it"
+    )
+    (error,) = (each for each in told.judged if each.figure == "error_share")
+    assert "off across the line of sight by the calibration, 1 in" in error.words
+    assert "noise of the light" not in error.words
+
+
+def test_what_is_not_known_is_null_in_json_and_no_number_on_screen_and_page() -> None:
+    document = summary(result())
+    json.dumps(document, allow_nan=False)
+    expected = document["expected"]
+    assert expected["across"] is True
+    assert [expected[name] for name in ("noise_mm", "total_mm", "length_share")] == [None] * 3
+    assert document["baselines"] == []
+    stream = io.StringIO()
+    tell_result(document, Console(file=stream, width=200))
+    assert "(1 σ) across the line of sight by the calibration\n" in stream.getvalue()
+    page = Page(report_html(result(), poses()[0], board=CHESSBOARD, title="one camera"))
+    assert page.number("point_mm") == pytest.approx(result().expected.point_mm, rel=5e-3)
+    assert not {"noise_mm", "total_mm", "length_mm_per_m"} & set(page.figures)
+    words = " ".join(" ".join(page.words).split())
+    assert "Expected error across the line of sight" in words
+    assert "by how much a point of known distance may lie wrong across the line of sight there" in words
+    for told in (stream.getvalue(), words):
+        assert not {"nan", "inf", "none"} & set(told.lower().split())
+
+
+def test_each_pose_is_judged_without_a_word_of_light() -> None:
+    setting = Setting(CHESSBOARD, {"left": SIZE}, None)
+    found = judgement(poses()[0][5], poses()[0][:5], setting)
+    assert found.refusals == ()
+    assert found.standing is not None
+    words = json.dumps([found.answer, found.standing.coverage, found.standing.next_move], allow_nan=False)
+    assert "projector" not in words
+    first = judgement(poses()[0][0], (), setting)
+    assert first.standing is not None
+    assert "projector" not in json.dumps(first.standing.next_move)
+
+
+def test_it_is_kept_and_exchanged_as_any_other(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "a.json", result().calibration)
+    write_opencv_calibration(tmp_path / "a.yml", result().calibration)
+    for found in (read_calibration(tmp_path / "a.json"), read_opencv_calibration(tmp_path / "a.yml")):
+        assert found.projector is None
+        assert found.solved is not None
+        np.testing.assert_array_equal(found.cameras["left"].matrix, result().calibration.cameras["left"].matrix)
+        np.testing.assert_array_equal(found.solved.covariance, result().solution.covariance)
+
+
+def test_two_of_them_are_compared_by_their_lenses() -> None:
+    found = comparison(result().calibration, result().calibration)
+    assert found.words[0].endswith("they have one device in common, and a point takes two.")
+    assert found.devices["left"].focal_percent.value == 0
+
+
+def test_it_is_no_calibration_for_scans_or_looks_at_a_board() -> None:
+    with pytest.raises(CalibrationError) as refusal:
+        check_rays(result().calibration, ["left", "right"], "calibration 3f2a")
+    assert str(refusal.value) == (
+        "calibration 3f2a: expected a calibration with two rays for each point, found that of camera 'left' alone, "
+        "without a projector: it tells no depth, and cannot scan; calibrate the camera together with the projector or "
+        "with a second camera"
+    )
+    with pytest.raises(CalibrationError, match="one of camera 'left' alone: calibrate it again"):
+        look_at_board([poses()[0][0].observation], CHESSBOARD, result().calibration)

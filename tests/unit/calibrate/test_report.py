@@ -1,0 +1,325 @@
+"""The report of a calibration: its numbers are the result's, and it stands on its own."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from slrig.calibrate.charts import error_slices
+from slrig.calibrate.figures import baselines, device_figures, pose_figures
+from slrig.calibrate.report import report_html
+from slrig.calibrate.solving import CalibrationResult
+from slrig.calibration.judging.verdict import Grade
+from slrig.calibration.solution import PROJECTOR
+from tests.unit.calibrate.solved import (
+    BOARD,
+    BUMP,
+    BUMPED,
+    CALIBRATION_ID,
+    POSES,
+    SOLVED_AT,
+    board_poses,
+    devices,
+    read_poses,
+    solved_result,
+)
+
+VOID = {"br", "img", "meta", "hr"}
+
+
+class Page(HTMLParser):
+    """A page, read strictly: every element closes where it should. figures : the text of each `data-figure`."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[tuple[str, str | None]] = []
+        self.figures: dict[str, str] = {}
+        self.addresses: list[str] = []
+        self.tags: list[str] = []
+        self.ids: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        assert len(given) == len(attrs), tag
+        self.tags.append(tag)
+        self.addresses += [
+            value or "" for name, value in attrs if name in {"src", "href", "xlink:href", "data", "action"}
+        ]
+        self.ids += [value or "" for name, value in attrs if name == "id"]
+        if tag not in VOID:
+            figure = given.get("data-figure")
+            self.open.append((tag, figure))
+            if figure is not None:
+                assert figure not in self.figures, figure
+                self.figures[figure] = ""
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, tag
+        assert self.open[-1][0] == tag
+        self.open.pop()
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+        for _, figure in self.open:
+            if figure is not None:
+                self.figures[figure] += data
+
+    def number(self, figure: str) -> float:
+        """The first number of a figure, and how it is rounded does not matter here."""
+        found = re.match(r"[−-]?[\d,]*\.?\d+", self.figures[figure])
+        assert found is not None, (figure, self.figures[figure])
+        return float(found.group().replace("−", "-").replace(",", ""))
+
+
+@cache
+def result() -> CalibrationResult:
+    return solved_result()
+
+
+@cache
+def report(*, pictured: bool = False) -> str:
+    white = np.full((1024, 1280), 90, dtype=np.uint8)
+    pictures = {name: {"left": white} for name in (POSES[0], BUMPED)} if pictured else {}
+    return report_html(
+        result(),
+        list(read_poses().values()),
+        pictures,
+        board=BOARD,
+        title="Calibration of <bench> & co",
+        remarks={POSES[3]: ["a third of the board is < 1 m away"]},
+        refused={"pose_20": "camera 'left': no board is in view"},
+        machine="on a bench",
+    )
+
+
+@cache
+def page() -> Page:
+    return Page(report())
+
+
+def close(shown: float, value: float, *, digits: int) -> bool:
+    """Whether a number was shown with so many digits after the point."""
+    return bool(abs(shown - value) <= 0.5001 * 10**-digits)
+
+
+def test_page_is_sound_and_names_what_it_is_about() -> None:
+    words = " ".join(page().words)
+    for expected in (
+        "Calibration of <bench> & co",
+        CALIBRATION_ID,
+        SOLVED_AT.replace("T", " "),
+        BOARD.title,
+        "on a bench",
+    ):
+        assert expected in words
+    assert "<bench>" not in report()
+    assert report().startswith("<!DOCTYPE html>")
+
+
+def test_page_asks_nobody_for_anything() -> None:
+    found = Page(report(pictured=True))
+    assert found.addresses
+    assert all(address.startswith("data:image/jpeg;base64,") for address in found.addresses)
+    assert not {"script", "link", "iframe", "object", "embed", "form"} & set(found.tags)
+    style = re.search(r"<style>(.*?)</style>", report(), re.DOTALL)
+    assert style is not None
+    assert "url(" not in style.group(1)
+    assert "@import" not in style.group(1)
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg)", report())
+
+
+def test_whatever_a_person_or_a_device_named_is_text() -> None:
+    label = '"><script>alert(1)</script>'
+    whole, solution = result(), result().solution
+    cameras = {label: whole.calibration.cameras["left"]}
+    residuals = {label: solution.residuals["left"], PROJECTOR: solution.residuals[PROJECTOR]}
+    named = replace(
+        whole,
+        solution=replace(solution, residuals=residuals, outliers={BUMPED: label}),
+        calibration=replace(whole.calibration, cameras=cameras),
+        verdict=replace(whole.verdict, summary=label, reasons=(label,)),
+        scale=(label,),
+    )
+    white = {BUMPED: {label: np.full((1024, 1280), 90, dtype=np.uint8)}}
+    found = report_html(
+        named, [], white, board=BOARD, title=label, remarks={POSES[3]: [label]}, refused={label: label}, machine=label
+    )
+    assert "<script" not in found
+    assert "script" not in Page(found).tags
+    assert Page(found).words.count(label) > 5
+
+
+def test_verdict_comes_first_and_in_words() -> None:
+    verdict = result().verdict
+    assert page().figures["grade"] == verdict.grade.words.capitalize()
+    words = "".join(page().words)
+    assert words.index(verdict.grade.words.capitalize()) < words.index("Expected error of a point")
+    for reason in verdict.reasons:
+        assert reason[1:] in words
+    worse = replace(
+        result(), verdict=replace(verdict, grade=Grade.DO_NOT_USE, summary="do not use: it is bad", reasons=("a", "b"))
+    )
+    found = Page(report_html(worse, [], board=BOARD, title="bad"))
+    assert found.figures["grade"] == "Do not use"
+    assert "It is bad." in found.words
+
+
+def test_scale_that_disagrees_with_an_earlier_calibration_is_told() -> None:
+    told = replace(result(), scale=("everything is 4 % larger than before: is a square 12.5 mm?",))
+    assert (
+        "Everything is 4 % larger than before: is a square 12.5 mm?"
+        in Page(report_html(told, [], board=BOARD, title="x")).words
+    )
+
+
+def test_expected_error_is_the_results() -> None:
+    expected = result().expected
+    assert page().number("point_mm") == pytest.approx(expected.point_mm, rel=5e-3)
+    assert page().number("noise_mm") == pytest.approx(expected.noise_mm, rel=5e-3)
+    assert page().number("total_mm") == pytest.approx(expected.total_mm, rel=5e-3)
+    assert page().number("length_mm_per_m") == pytest.approx(1000 * expected.length_share, rel=5e-3)
+
+
+def test_what_the_board_was_taken_for_is_told() -> None:
+    told = "The board is flat as far as the poses tell: 0.031 ± 0.012 mm from its lowest to its highest corner."
+    assert told in page().words
+
+
+def test_every_number_of_every_device_is_the_results() -> None:
+    seen = 0
+    for device in device_figures(result()):
+        left = device.residuals
+        assert page().number(f"{device.name}.rms_px") == pytest.approx(left.rms_px, rel=5e-3)
+        assert page().number(f"{device.name}.rms_px.tile") == pytest.approx(left.rms_px, rel=5e-3)
+        assert page().number(f"{device.name}.held_out_rms_px") == pytest.approx(left.held_out_rms_px, rel=5e-3)
+        assert page().number(f"{device.name}.stated_rms_px") == pytest.approx(left.stated_rms_px, rel=5e-3)
+        assert page().number(f"{device.name}.count") == left.count
+        assert page().number(f"{device.name}.outlying") == left.outlying
+        for name, figure in device.values.items():
+            # The deviation shows two digits, and the number as many decimals.
+            assert page().number(f"{device.name}.{name}.sigma") == pytest.approx(figure.sigma, rel=0.05)
+            assert page().number(f"{device.name}.{name}") == pytest.approx(figure.value, abs=0.06 * figure.sigma)
+            seen += 1
+    assert seen == 4 + 2 + 4 + 1
+    assert f"{PROJECTOR}.k2" not in page().figures
+
+
+def test_numbers_come_from_calibration_and_covariance() -> None:
+    camera, projector = device_figures(result())
+    assert camera.values["cx"].value == 641.2
+    assert camera.values["k2"].sigma == pytest.approx(2e-3)
+    assert projector.values["cy"].value == 842.4
+    assert projector.values["cy"].sigma == pytest.approx(0.61)
+    assert [axis.sigma for axis in camera.centre_mm] == [0, 0, 0]
+    np.testing.assert_allclose([axis.value for axis in projector.centre_mm], devices()[PROJECTOR].centre_mm)
+
+
+def test_baseline_and_its_deviation_are_those_of_drawn_calibrations() -> None:
+    """The deviation that is propagated, against the spread of projectors drawn from the covariance."""
+    (pair,) = baselines(result())
+    projector, covariance = devices()[PROJECTOR], result().solution.covariance[15:, 15:]
+    drawn = np.random.default_rng(5).multivariate_normal(np.zeros(15), covariance, 4000)
+    # The turn does not move |t|, which is the distance from a camera at the origin.
+    lengths = np.linalg.norm(projector.translation_mm + drawn[:, 12:], axis=1)
+    assert pair.length_mm.value == pytest.approx(float(np.linalg.norm(projector.centre_mm)))
+    assert pair.length_mm.sigma == pytest.approx(float(lengths.std()), rel=0.05)
+    assert close(page().number(f"left-{PROJECTOR}.mm"), pair.length_mm.value, digits=3)
+    middle = result().expected.volume_mm.mean(axis=0)
+    own, its = middle, middle - projector.centre_mm
+    cosine = own @ its / np.linalg.norm(own) / np.linalg.norm(its)
+    assert pair.angle_deg.value == pytest.approx(math.degrees(math.acos(cosine)))
+
+
+def test_every_pose_is_listed_with_its_figures_and_reasons() -> None:
+    poses = {pose.name: pose for pose in pose_figures(result(), BOARD, POSES)}
+    assert list(poses) == list(POSES)
+    for name, pose in poses.items():
+        if name == BUMPED:
+            continue
+        for device, rms in pose.rms_px.items():
+            assert close(page().number(f"{name}.{device}.rms_px"), rms, digits=3)
+        stood = board_poses()[name]
+        middle = stood.rotation @ BOARD.points_mm.mean(axis=0) + stood.translation_mm
+        steep = math.degrees(math.acos(abs(stood.rotation[:, 2] @ middle) / np.linalg.norm(middle)))
+        assert close(page().number(f"{name}.tilt_deg"), steep, digits=0)
+        assert close(page().number(f"{name}.distance_mm"), middle[2], digits=0)
+    words = "".join(page().words)
+    assert f"Left out: {BUMP}" in words
+    assert page().figures[f"{BUMPED}.tilt_deg"] == "–"
+    assert "Not used: camera 'left': no board is in view" in words
+    assert "a third of the board is < 1 m away" in words
+
+
+def test_slices_show_the_error_of_the_places_in_them() -> None:
+    slices = error_slices(result().expected)
+    assert [z_mm for z_mm, _ in slices] == sorted({z_mm for z_mm, _ in slices})
+    assert len(slices) == 3
+    grid, errors = result().expected.grid_mm, result().expected.grid_point_mm
+    for z_mm, picture in slices:
+        told = {
+            (float(x), float(y)): float(error)
+            for x, y, error in re.findall(r"<title>x (-?\d+), y (-?\d+), z -?\d+ mm: ([\d.]+) mm</title>", picture)
+        }
+        here = np.abs(grid[:, 2] - z_mm) < 1e-6
+        assert len(told) == here.sum() == 63
+        for place, error in zip(grid[here], errors[here], strict=True):
+            assert told[round(place[0]), round(place[1])] == pytest.approx(error, rel=5e-3)
+
+
+def test_maps_show_every_cell_of_what_is_left_over() -> None:
+    left = result().solution.residuals["left"]
+    for rms, count in zip(left.map_rms_px.ravel(), left.map_count.ravel(), strict=True):
+        if not math.isnan(rms):
+            assert f"<title>rms {rms:.3f} px of {count:,};" in report()
+    assert report().count("<title>nothing was seen here</title>") == 2
+
+
+def test_pictures_of_used_poses_and_of_those_left_out_travel_along() -> None:
+    found = Page(report(pictured=True))
+    assert found.tags.count("img") == 2
+    assert f"{BUMPED}, camera 'left' — left out" in found.words
+    assert "img" not in page().tags
+
+
+def test_what_could_not_be_measured_is_said_so() -> None:
+    solution = result().solution
+    left = replace(solution.residuals["left"], held_out_rms_px=math.nan)
+    few = replace(
+        result(),
+        solution=replace(solution, residuals={**solution.residuals, "left": left}),
+        expected=replace(result().expected, length_share=math.nan),
+    )
+    found = Page(report_html(few, [], board=BOARD, title="few"))
+    assert found.figures["left.held_out_rms_px"] == "too few poses"
+    assert found.figures["length_mm_per_m"] == "not known"
+    assert "nan" not in " ".join(found.words).lower().split()
+
+
+def test_report_of_cameras_alone_needs_no_projector() -> None:
+    whole = result()
+    cameras = {"left": whole.calibration.cameras["left"]}
+    covariance = whole.solution.covariance[:15, :15]
+    solution = replace(
+        whole.solution,
+        calibration=replace(whole.solution.calibration, cameras=cameras, projector=None),
+        covariance=covariance,
+        residuals={"left": whole.solution.residuals["left"]},
+    )
+    alone = replace(
+        whole,
+        solution=solution,
+        calibration=replace(whole.calibration, cameras=cameras, projector=None, solved=None),
+    )
+    found = Page(report_html(alone, [], board=BOARD, title="one camera"))
+    assert "left.fx" in found.figures
+    assert not any(name.startswith(PROJECTOR) for name in found.figures)

@@ -1,0 +1,251 @@
+"""The data folder: one owner, one rename, and a sweep that loses nothing."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from uuid import UUID, uuid4
+
+import pytest
+
+from slrig.errors import StorageError
+from slrig.failure import disk_errors
+from slrig.jobs.data_folder import DataFolder
+from slrig.scan.plan import ScanPlan
+from slrig.scan.records import KeptRecord, ScanState, write_record
+from slrig.scan.store import ScanStore
+from slrig.scan.sweep import sweep
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[DataFolder]:
+    folder = DataFolder(tmp_path / "data")
+    yield folder
+    folder.release()
+
+
+@pytest.fixture
+def store(folder: DataFolder) -> Iterator[ScanStore]:
+    store = ScanStore(folder.database)
+    yield store
+    store.close()
+
+
+def running(store: ScanStore, state: ScanState) -> UUID:
+    scan = store.create(ScanPlan(), rig="bench", label=None)
+    store.advance(scan.id, state)
+    return scan.id
+
+
+def staged_bundle(folder: DataFolder, scan_id: UUID) -> Path:
+    bundle = folder.stage(scan_id) / "bundle"
+    bundle.mkdir()
+    (bundle / "bundle.json").write_text("{}")
+    return bundle
+
+
+def test_second_owner_is_refused_and_told_the_first(folder: DataFolder) -> None:
+    code = "import sys; from pathlib import Path; from slrig.jobs.data_folder import DataFolder; "
+    code += "DataFolder(Path(sys.argv[1]))"
+    second = subprocess.run(  # noqa: S603 - our own interpreter and code
+        [sys.executable, "-c", code, str(folder.root)], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert second.returncode == 1
+    assert f"process id {os.getpid()}" in second.stderr
+
+
+def test_second_owner_in_the_same_process_is_refused_and_leaves_the_first_its_lock(folder: DataFolder) -> None:
+    for _ in range(2):
+        with pytest.raises(StorageError, match=f"process id {os.getpid()}"):
+            DataFolder(folder.root)
+    (folder.root / "holder").unlink()
+    with pytest.raises(StorageError, match="process id unknown"):
+        DataFolder(folder.root)
+
+
+def test_folder_of_a_process_that_was_killed_may_be_taken(tmp_path: Path) -> None:
+    code = (
+        "import sys, time; from pathlib import Path; from slrig.jobs.data_folder import DataFolder\n"
+        "held = DataFolder(Path(sys.argv[1])); print('held', flush=True); time.sleep(600)"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)  # noqa: S603
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"held\n"
+    with pytest.raises(StorageError, match=f"process id {holder.pid}"):
+        DataFolder(tmp_path)
+    holder.kill()
+    holder.wait()
+    holder.stdout.close()
+    DataFolder(tmp_path).release()
+
+
+def test_released_folder_may_be_taken_again(folder: DataFolder) -> None:
+    # By whichever thread ends the service.
+    other = threading.Thread(target=folder.release)
+    other.start()
+    other.join()
+    folder.release()
+    DataFolder(folder.root).release()
+
+
+def finished(folder: DataFolder, scan_id: UUID) -> None:
+    """The files of a scan that succeeded."""
+    folder.scan(scan_id).mkdir()
+    (folder.scan(scan_id) / "mesh.ply").write_bytes(b"ply")
+    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"truth": {"rms_mm": 0.01}, "stages": []}))
+
+
+def test_space_is_asked_for_before_a_scan(tmp_path: Path) -> None:
+    folder = DataFolder(tmp_path, free=lambda _: 1_000_000)
+    folder.require_space(1_000_000)
+    with pytest.raises(StorageError, match=r"2 MB .* 1 MB are free"):
+        folder.require_space(2_000_000)
+    folder.release()
+
+
+def test_committed_scan_has_its_results_beside_its_bundle(folder: DataFolder) -> None:
+    scan_id = uuid4()
+    staged_bundle(folder, scan_id)
+    result = folder.staging(scan_id) / "result"
+    result.mkdir()
+    (result / "mesh.ply").write_bytes(b"ply")
+    folder.commit(scan_id)
+    assert {path.name for path in folder.scan(scan_id).iterdir()} == {"bundle", "mesh.ply"}
+    assert list(folder.incoming.iterdir()) == []
+
+
+def test_refusal_of_the_disk_names_the_place_and_the_remedy(tmp_path: Path) -> None:
+    with (
+        pytest.raises(StorageError, match=r"mesh\.ply.*No space left on device.*free some space"),
+        disk_errors(tmp_path),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "mesh.ply")
+
+
+def test_other_errors_pass_through(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), disk_errors(tmp_path):
+        (tmp_path / "absent").read_bytes()
+
+
+def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
+    store: ScanStore, folder: DataFolder
+) -> None:
+    scan_id = running(store, ScanState.CAPTURING)
+    staged_bundle(folder, scan_id)
+    swept = sweep(store, folder)
+    assert swept.interrupted == (scan_id,)
+    record = store.get(scan_id)
+    assert record.state is ScanState.INTERRUPTED
+    assert record.fault is not None
+    assert record.fault.kind == "ScanInterruptedError"
+    assert not folder.scan(scan_id).exists()
+    assert list(folder.incoming.iterdir()) == []
+
+
+def test_sweep_leaves_what_the_runner_takes_up_again(store: ScanStore, folder: DataFolder) -> None:
+    cut_off = running(store, ScanState.RECONSTRUCTING)
+    staged_bundle(folder, cut_off)
+    queued = store.create(ScanPlan(), rig="bench", label=None).id
+    swept = sweep(store, folder)
+    assert (swept.resumed, swept.interrupted) == ((cut_off, queued), ())
+    assert [record.id for record in store.unfinished()] == [cut_off, queued]
+    assert (folder.staging(cut_off) / "bundle").is_dir()
+
+
+def test_sweep_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice(
+    store: ScanStore, folder: DataFolder
+) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    store.advance(scan_id, ScanState.RECONSTRUCTING)
+    staged_bundle(folder, scan_id)
+    (folder.staging(scan_id) / "result.part").mkdir()
+    sweep(store, folder)
+    assert store.get(scan_id).state is ScanState.INTERRUPTED
+    assert [path.name for path in folder.scan(scan_id).iterdir()] == ["bundle"]
+
+
+def test_sweep_recognises_a_scan_that_lacked_only_its_last_record(store: ScanStore, folder: DataFolder) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    finished(folder, scan_id)
+    assert sweep(store, folder).recovered == (scan_id,)
+    assert store.get(scan_id).state is ScanState.SUCCEEDED
+    assert store.get(scan_id).summary == {"truth": {"rms_mm": 0.01}}
+
+
+def test_sweep_completes_a_deletion_that_was_cut_off(store: ScanStore, folder: DataFolder) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    finished(folder, scan_id)
+    store.finish(scan_id, ScanState.SUCCEEDED)
+    folder.withdraw(scan_id)
+    sweep(store, folder)
+    assert scan_id not in store.states()
+    assert list(folder.incoming.iterdir()) == []
+
+
+@pytest.mark.parametrize("gone", [("mesh.ply",), ("report.json",), ("mesh.ply", "report.json")])
+def test_sweep_says_when_the_files_of_a_scan_are_gone(
+    store: ScanStore, folder: DataFolder, gone: tuple[str, ...]
+) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    store.finish(scan_id, ScanState.SUCCEEDED)
+    finished(folder, scan_id)
+    for name in gone:
+        (folder.scan(scan_id) / name).unlink()
+    assert sweep(store, folder).lost == (scan_id,)
+    record = store.get(scan_id)
+    assert record.state is ScanState.FAILED
+    assert record.fault is not None
+    assert record.fault.message.startswith(f"{' and '.join(gone)} of this scan is gone")
+
+
+def test_sweep_takes_no_scan_without_a_mesh_for_a_finished_one(store: ScanStore, folder: DataFolder) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    finished(folder, scan_id)
+    (folder.scan(scan_id) / "mesh.ply").unlink()
+    assert sweep(store, folder).interrupted == (scan_id,)
+
+
+def test_sweep_puts_finished_scans_on_record_again_beside_a_database_that_was_lost(
+    store: ScanStore, folder: DataFolder
+) -> None:
+    plan = ScanPlan(exposure_s=0.02)
+    made = datetime(2026, 11, 23, 12, 0, tzinfo=UTC)
+    records = [KeptRecord(uuid4(), "bench", f"part {i}", plan, made - timedelta(hours=i), made) for i in range(3)]
+    for record in records:
+        finished(folder, record.id)
+        write_record(folder.scan(record.id), record)
+    (folder.scan(records[1].id) / "mesh.ply").unlink()
+    swept = sweep(store, folder)
+    assert set(swept.recovered) == {records[0].id, records[2].id}
+    assert swept.put_aside == (str(records[1].id),)
+    newest, oldest = store.page(before=None, limit=10)
+    assert (newest.id, oldest.id) == (records[0].id, records[2].id)
+    assert (newest.state, newest.label, newest.plan, newest.created_at) == (ScanState.SUCCEEDED, "part 0", plan, made)
+    assert newest.summary == {"truth": {"rms_mm": 0.01}}
+    assert [event.kind for event in store.events(newest.id, after=0)] == ["state"]
+    assert sweep(store, folder).recovered == ()
+
+
+def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: ScanStore, folder: DataFolder) -> None:
+    stray = folder.scans / "somebody"
+    stray.mkdir()
+    (stray / "mesh.ply").write_bytes(b"work")
+    assert sweep(store, folder).put_aside == ("somebody",)
+    assert (folder.orphans / "somebody" / "mesh.ply").read_bytes() == b"work"
+
+
+def test_sweep_of_a_sound_folder_changes_nothing(store: ScanStore, folder: DataFolder) -> None:
+    scan_id = running(store, ScanState.RECONSTRUCTING)
+    finished(folder, scan_id)
+    store.finish(scan_id, ScanState.SUCCEEDED)
+    before = store.get(scan_id)
+    swept = sweep(store, folder)
+    assert (swept.interrupted, swept.recovered, swept.lost, swept.put_aside) == ((), (), (), ())
+    assert store.get(scan_id) == before

@@ -1,0 +1,293 @@
+"""Work with the rig that is no scan: one at a time, dark afterwards, told once, whatever happens."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+from structlog.testing import capture_logs
+
+from slrig.devices import Rig
+from slrig.errors import (
+    CalibrationError,
+    DeviceError,
+    DeviceGoneError,
+    QueueFullError,
+    RigBusyError,
+    ScanCancelledError,
+)
+from slrig.failure import ScanInterruptedError
+from slrig.jobs.job import Holder
+from slrig.rig.positioner import MOVE_LIMIT_S, GuardedPositioner
+from slrig.rig.session import ActiveCalibration
+from slrig.rig.watchdog import Calls
+from slrig.scan.records import ScanState
+from tests.unit.calibrate.calibration_bench import tame_calibration
+from tests.unit.scan.bench import Bench
+from tests.unit.scan.fakes import WAIT_S
+
+HOLDER = Holder("measuring 7", "measuring 7", "/measuring/7")
+
+
+@dataclass(slots=True)
+class Work:
+    """Work that holds the rig, its light on, until `gate` is set. `told` has how it ended, each time it was told."""
+
+    error: Exception | None = None
+    gate: threading.Event = field(default_factory=threading.Event)
+    began: threading.Event = field(default_factory=threading.Event)
+    over: threading.Event = field(default_factory=threading.Event)
+    told: list[Exception | None] = field(default_factory=list)
+    threads: list[str] = field(default_factory=list)
+    rigs: list[Rig] = field(default_factory=list)
+
+    def __call__(self, rig: Rig, cancelled: Callable[[], bool]) -> None:
+        self.threads.append(threading.current_thread().name)
+        self.rigs.append(rig)
+        rig.projector.show(0)
+        self.began.set()
+        while not self.gate.wait(0.01):
+            if cancelled():
+                message = "measuring was cancelled"
+                raise ScanCancelledError(message)
+        if self.error is not None:
+            raise self.error
+
+    def ended(self, error: Exception | None) -> None:
+        self.told.append(error)
+        self.over.set()
+
+
+@pytest.fixture
+def works() -> Iterator[Callable[..., Work]]:
+    made: list[Work] = []
+
+    def work(error: Exception | None = None) -> Work:
+        made.append(Work(error))
+        return made[-1]
+
+    yield work
+    for each in made:
+        each.gate.set()
+
+
+def submitted(bench: Bench, work: Work, *, wait: bool = False) -> UUID:
+    return bench.runner.submit_work(work, holder=HOLDER, wait=wait, ended=work.ended)
+
+
+def held(bench: Bench, work: Work) -> UUID:
+    """Work that has begun."""
+    work_id = submitted(bench, work)
+    assert work.began.wait(WAIT_S)
+    return work_id
+
+
+def test_rig_is_lent_on_its_owner_thread_and_dark_afterwards(bench: Bench, works: Callable[..., Work]) -> None:
+    work = works()
+    held(bench, work)
+    _, projector = bench.opened[0]
+    lit = not projector.dark
+    work.gate.set()
+    assert work.over.wait(WAIT_S)
+    assert (lit, projector.dark, work.told, work.threads) == (True, True, [None], ["slrig-rig"])
+    # Whoever was told that it is over may begin at once.
+    assert bench.runner.status().holder is None
+    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert len(bench.opened) == 1
+
+
+def test_busy_names_whatever_holds_the_rig(bench: Bench, works: Callable[..., Work]) -> None:
+    work = works()
+    held(bench, work)
+    with pytest.raises(RigBusyError, match=r"held by measuring 7 since .* POST /measuring/7/cancel") as busy:
+        bench.scan()
+    assert busy.value.holder == bench.runner.status().holder == "measuring 7"
+    with pytest.raises(RigBusyError):
+        submitted(bench, works())
+
+
+def test_work_and_scans_wait_in_one_line(bench: Bench, works: Callable[..., Work]) -> None:
+    work, second = works(), works()
+    held(bench, work)
+    scan = bench.scan(wait=True)
+    with pytest.raises(QueueFullError):
+        submitted(bench, second, wait=True)
+    assert second.told == []
+    work.gate.set()
+    assert bench.until(scan.id).state is ScanState.SUCCEEDED
+    running = bench.held()
+    submitted(bench, second, wait=True)
+    second.gate.set()
+    assert not second.began.is_set()
+    bench.gate.set()
+    assert second.over.wait(WAIT_S)
+    assert bench.store.get(running.id).state is ScanState.SUCCEEDED
+
+
+def test_recalled_work_ends_early_and_waiting_work_at_once(bench: Bench, works: Callable[..., Work]) -> None:
+    work, second = works(), works()
+    work_id = held(bench, work)
+    waiting = submitted(bench, second, wait=True)
+    bench.runner.cancel_work(waiting)
+    assert second.over.wait(WAIT_S)
+    assert isinstance(second.told[0], ScanCancelledError)
+    assert "Measuring 7 was cancelled while it waited" in str(second.told[0])
+    assert not second.began.is_set()
+    bench.runner.cancel_work(work_id)
+    assert work.over.wait(WAIT_S)
+    assert isinstance(work.told[0], ScanCancelledError)
+    bench.runner.cancel_work(work_id)
+    assert (len(work.told), bench.opened[0][1].dark) == (1, True)
+
+
+@pytest.mark.parametrize("error", [DeviceGoneError("Camera 'cam0' was unplugged."), ZeroDivisionError("a defect")])
+def test_failed_work_has_the_rig_opened_again(bench: Bench, works: Callable[..., Work], error: Exception) -> None:
+    work = works(error)
+    work.gate.set()
+    with capture_logs():
+        held(bench, work)
+        assert work.over.wait(WAIT_S)
+    assert work.told == [error]
+    assert bench.opened_again.wait(WAIT_S)
+    assert bench.opened[0][1].closed
+
+
+def test_error_of_the_system_in_work_is_one_of_a_driver(bench: Bench, works: Callable[..., Work]) -> None:
+    work = works(OSError(5, "Input/output error"))
+    work.gate.set()
+    held(bench, work)
+    assert work.over.wait(WAIT_S)
+    assert isinstance(work.told[0], DeviceError)
+
+
+def test_end_of_the_service_ends_what_runs_and_what_waits(bench: Bench, works: Callable[..., Work]) -> None:
+    work, second = works(), works()
+    held(bench, work)
+    submitted(bench, second, wait=True)
+    bench.runner.close()
+    for each in (work, second):
+        assert [type(told) for told in each.told] == [ScanInterruptedError]
+    assert bench.opened[0][1].dark
+    with pytest.raises(ScanInterruptedError):
+        submitted(bench, works())
+
+
+def test_work_that_never_returns_is_darkened_past_and_told_once(bench: Bench, works: Callable[..., Work]) -> None:
+    work = works()
+    stubborn = threading.Event()
+
+    def deaf(rig: Rig, _cancelled: Callable[[], bool]) -> None:
+        rig.projector.show(0)
+        work.began.set()
+        stubborn.wait(WAIT_S)
+
+    bench.runner.submit_work(deaf, holder=HOLDER, wait=False, ended=work.ended)
+    assert work.began.wait(WAIT_S)
+    bench.runner.close(timeout_s=0.01)
+    assert bench.opened[0][1].dark
+    assert [type(told) for told in work.told] == [ScanInterruptedError]
+    stubborn.set()
+    bench.runner._queue._owner.join(WAIT_S)
+    assert len(work.told) == 1
+
+
+def test_teller_that_fails_does_not_end_the_owner_thread(bench: Bench, works: Callable[..., Work]) -> None:
+    work = works()
+    work.gate.set()
+
+    def fail(_error: Exception | None) -> None:
+        work.over.set()
+        message = "a defect of the teller"
+        raise ValueError(message)
+
+    with capture_logs() as logs:
+        bench.runner.submit_work(work, holder=HOLDER, wait=False, ended=fail)
+        assert work.over.wait(WAIT_S)
+        assert bench.until(bench.scan(wait=True).id).state is ScanState.SUCCEEDED
+    assert "the end of work with the rig went wrong" in [each["event"] for each in logs]
+
+
+def test_loan_is_known_before_its_work_begins(bench: Bench, works: Callable[..., Work]) -> None:
+    work = works()
+    known: list[tuple[UUID, bool]] = []
+    work.gate.set()
+    work_id = bench.runner.submit_work(
+        work,
+        holder=HOLDER,
+        wait=False,
+        ended=work.ended,
+        begun=lambda number: known.append((number, work.began.is_set())),
+    )
+    assert work.over.wait(WAIT_S)
+    assert known == [(work_id, False)]
+
+
+def test_active_calibration_is_lent_with_the_rig(bench: Bench, works: Callable[..., Work]) -> None:
+    work, second = works(), works()
+    work.gate.set()
+    held(bench, work)
+    assert work.over.wait(WAIT_S)
+    active = ActiveCalibration("spring", tame_calibration())
+    bench.runner.use_calibration(active)
+    second.gate.set()
+    held(bench, second)
+    assert second.over.wait(WAIT_S)
+    assert work.rigs[0].calibration is None
+    assert second.rigs[0].calibration is active.calibration
+    assert bench.runner.status().active is active
+
+
+def test_calibration_that_turns_out_to_be_for_others_leaves_the_rig_to_be_calibrated(
+    tmp_path: Path, works: Callable[..., Work]
+) -> None:
+    """Activated before the rig was open, or kept over a change of its cameras."""
+    bench = Bench(tmp_path)
+    other = tame_calibration(projector=tame_calibration().cameras["cam0"].size)
+    bench.runner.use_calibration(ActiveCalibration("spring", other))
+    queued = bench.scan()
+    bench.runner.start()
+    record = bench.until(queued.id)
+    assert record.fault is not None
+    assert record.fault.kind == "CalibrationError"
+    assert "calibration spring: the calibration is for other devices" in record.fault.message
+    assert "POST /calibration/ID/activate" in record.fault.message
+    assert bench.runner.status().misfit is not None
+    with pytest.raises(CalibrationError, match="spring"):
+        bench.scan()
+    assert bench.given_up == []
+    work = works()
+    work.gate.set()
+    held(bench, work)
+    assert work.over.wait(WAIT_S)
+    assert (work.told, work.rigs[0].calibration) == ([None], None)
+    bench.close()
+
+
+def test_positioner_is_watched_like_the_other_devices() -> None:
+    seen: list[tuple[str, str, float]] = []
+
+    class Stage:
+        poses = ("home",)
+
+        def move(self, index: int) -> None:
+            call = calls._current
+            assert call is not None
+            seen.append((call.device, call.step, call.limit_s))
+            if index:
+                raise OSError(19, "No such device")
+
+        def close(self) -> None:
+            return
+
+    calls = Calls()
+    stage = GuardedPositioner(Stage(), calls)
+    stage.move(0)
+    with pytest.raises(DeviceGoneError, match="the positioner is gone"):
+        stage.move(1)
+    stage.close()
+    assert seen[0] == ("the positioner", "move", MOVE_LIMIT_S)
+    assert tuple(stage.poses) == ("home",)

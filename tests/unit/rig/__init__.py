@@ -1,0 +1,1 @@
+"""Records, data folder, runner and worker."""

@@ -1,0 +1,267 @@
+"""Guarded devices: what they raise says where, in words to act on; a call that hangs is found out, once."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import pytest
+from structlog.testing import capture_logs
+
+from slrig.devices import CallLimits, CameraSettings, Rig, Trigger, progress_reporter
+from slrig.errors import (
+    ConfigError,
+    DeviceBusyError,
+    DeviceError,
+    DeviceGoneError,
+    DeviceStateError,
+    DriverBrokenError,
+    FrameTimeoutError,
+    SlrigError,
+    UnsupportedByDeviceError,
+)
+from slrig.rig.session import RigSession
+from slrig.rig.watchdog import OPEN, Call, Calls, Watchdog, guarded
+from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
+
+
+@dataclass
+class Time:
+    """A clock that a test moves."""
+
+    now_s: float = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def failing(error: Exception) -> Callable[[], None]:
+    def call() -> None:
+        raise error
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind", "text"),
+    [
+        (DeviceGoneError("no answer"), DeviceGoneError, r"^no answer \(camera 'left', in read\)$"),
+        (UnsupportedByDeviceError("too long"), UnsupportedByDeviceError, r"^too long \(camera 'left', in read\)$"),
+        (FrameTimeoutError("no frame"), FrameTimeoutError, r"^no frame$"),
+        (ConfigError("no key"), ConfigError, r"^no key$"),
+        (OSError(errno.EBUSY, "busy"), DeviceBusyError, r"^camera 'left' is held .*in read: \[Errno 16\].*end that"),
+        (OSError(errno.ENODEV, "gone"), DeviceGoneError, r"^camera 'left' is gone \(in read: .*plug it in, then scan"),
+        (OSError(errno.EIO, "bad"), DeviceError, r"^camera 'left' failed in read: \[Errno 5\] bad; check cable"),
+        (
+            IndexError("5"),
+            DriverBrokenError,
+            r"^camera 'left': its driver failed in read \(IndexError: 5\).*maintainer",
+        ),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+)
+def test_error_says_which_device_which_call_and_what_to_do(
+    raised: Exception, kind: type[SlrigError], text: str
+) -> None:
+    with capture_logs(), pytest.raises(SlrigError, match=text) as caught:
+        Calls().make("camera 'left'", "read", 1.0, failing(raised))
+    assert type(caught.value) is kind
+
+
+def test_error_that_is_raised_again_is_placed_once() -> None:
+    error, calls = DeviceGoneError("no answer"), Calls()
+    for _ in range(2):
+        with pytest.raises(DeviceGoneError):
+            calls.make("projector 'p'", "blank", 1.0, failing(error))
+    assert str(error) == "no answer (projector 'p', in blank)"
+
+
+def test_whoever_opens_a_device_names_it() -> None:
+    with pytest.raises(DeviceGoneError, match=r"^no camera on usb-3$"):
+        Calls().make("rig 'bench'", OPEN, 1.0, failing(DeviceGoneError("no camera on usb-3")))
+
+
+@pytest.mark.parametrize(
+    ("raised", "noted"),
+    [
+        (DeviceGoneError("gone"), True),
+        (DeviceStateError("armed already"), True),
+        (OSError(errno.EIO, "bad"), True),
+        (ZeroDivisionError(), True),
+        (FrameTimeoutError("late"), False),
+        (UnsupportedByDeviceError("too long"), False),
+        (ConfigError("no key"), False),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+)
+def test_failure_that_leaves_a_device_in_doubt_is_noted(raised: Exception, noted: bool) -> None:
+    calls = Calls()
+    with capture_logs(), pytest.raises(SlrigError):
+        calls.make("camera 'left'", "disarm", 1.0, failing(raised))
+    assert (calls.failure is not None) == noted
+
+
+def test_call_is_given_up_at_the_second_look_and_raises_when_it_returns() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    found: list[Call | None] = []
+
+    def slow() -> int:
+        found.append(calls.overdue())
+        time_s.now_s += 9.1
+        # One look may find a process that was stopped for a while, and goes on now.
+        found.extend(calls.overdue() for _ in range(3))
+        assert calls.stuck is found[2]
+        return 1
+
+    with pytest.raises(DeviceError, match=r"camera 'left': its driver has not come back from read for 9 s.*restart"):
+        calls.make("camera 'left'", "read", 9.0, slow)
+    assert [call is not None for call in found] == [False, False, True, False]
+    assert calls.stuck is None
+    assert calls.overdue() is None
+    assert calls.failure is not None
+
+
+def test_a_call_that_tells_how_far_it_is_is_not_hung() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    shown: list[str] = []
+    overdue: list[Call | None] = []
+
+    def opening() -> None:
+        tell = progress_reporter()
+        for share in ("10 %", "60 %", "90 %"):
+            time_s.now_s += 50.0
+            overdue.extend((calls.overdue(), calls.overdue()) if share == "90 %" else (calls.overdue(),))
+            tell(f"tracing light, {share}")
+            shown.append(calls.doing)
+
+    calls.make("rig 'demo'", OPEN, 60.0, opening)
+    assert overdue == [None, None, None, None]
+    assert shown == ["tracing light, 10 %", "tracing light, 60 %", "tracing light, 90 %"]
+    assert calls.doing == ""
+    # Nobody listens outside of a call.
+    progress_reporter()("nothing")
+
+
+def test_limits_are_those_that_a_device_declares_and_nothing_computed_is_unplugged() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    camera = TameCamera()
+    camera.info = replace(camera.info, limits=CallLimits(call_s=200.0, read_slack_s=90.0, computed=True))
+    found: list[Call | None] = []
+
+    def slow(*_: object) -> None:
+        for seconds in (91.0, 2.0):
+            time_s.now_s += seconds
+            found.append(calls.overdue())
+            found.append(calls.overdue())
+
+    camera.read = slow  # type: ignore[assignment, method-assign]
+    rig = guarded(Rig("bench", {"cam0": camera}, TameProjector(), {}), calls)
+    with pytest.raises(DeviceError) as told:
+        rig.cameras["cam0"].read(0, 1.0)
+    assert [call is not None for call in found] == [False, False, False, True]
+    assert "restart the service" in str(told.value)
+    assert "plug" not in str(told.value)
+    with pytest.raises(DeviceError, match="check its files") as refused:
+        calls.make("camera 'cam0'", "read", 1.0, failing(OSError(errno.EIO, "bad")), computed=True)
+    assert "cable" not in str(refused.value)
+
+
+def test_watchdog_barks_once_for_each_call_that_hangs() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    barked: list[str] = []
+    heard = threading.Event()
+
+    def on_hang(call: Call) -> None:
+        barked.append(f"{call.device} {call.step}")
+        heard.set()
+
+    def hang() -> None:
+        time_s.now_s += 2.0
+        assert heard.wait(WAIT_S)
+
+    dog = Watchdog(calls, on_hang, look_s=0.001)
+    dog.start()
+    for step in ("show", "blank"):
+        heard.clear()
+        with pytest.raises(DeviceError, match=f"not come back from {step}"):
+            calls.make("projector 'p'", step, 1.0, hang)
+    dog.stop()
+    assert barked == ["projector 'p' show", "projector 'p' blank"]
+
+
+def test_every_call_of_a_device_is_guarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera, projector, calls = TameCamera(), TameProjector(), Calls()
+    made: list[str] = []
+    real = calls.make
+
+    def make(
+        device: str, step: str, limit_s: float, function: Callable[[], object], *, computed: bool = False
+    ) -> object:
+        made.append(f"{device} {step}")
+        return real(device, step, limit_s, function, computed=computed)
+
+    monkeypatch.setattr(calls, "make", make)
+    rig = guarded(Rig("bench", {"cam0": camera}, projector, {}), calls)
+    eye = rig.cameras["cam0"]
+    assert (eye.info, rig.projector.info) == (camera.info, projector.info)
+    assert eye.configure(CameraSettings(0.01)).exposure_s == 0.01
+    assert rig.projector.show(3).index == 3
+    refused: list[Callable[[], object]] = [
+        lambda: eye.arm(1, Trigger.FREE),
+        eye.trigger,
+        lambda: eye.read(0, 1.0),
+        eye.disarm,
+        lambda: rig.projector.play(0.1, 0.2),
+    ]
+    for call in refused:
+        with capture_logs(), pytest.raises(DriverBrokenError):
+            call()
+    rig.projector.stop()
+    assert rig.close() == ()
+    steps = ["configure", "arm", "trigger", "read", "disarm"]
+    assert [step for step in made if "camera" in step] == [f"camera 'cam0' {step}" for step in [*steps, "close"]]
+    shown = ["show", "play", "stop", "blank", "close"]
+    assert [step for step in made if "projector" in step] == [f"projector 'projector' {step}" for step in shown]
+
+
+def test_rig_with_a_failure_that_nobody_was_told_of_is_opened_afresh() -> None:
+    bench = TameBench()
+    held = RigSession("bench", bench.open_rig)
+    held.open()
+    with capture_logs(), pytest.raises(DriverBrokenError):
+        held.open().cameras["cam0"].disarm()
+    assert held.open() is held.open()
+    assert len(bench.opened) == 2
+    assert bench.opened[0][0].closed
+    with capture_logs(), pytest.raises(DriverBrokenError):
+        held.open().cameras["cam0"].disarm()
+    assert held.recover() is None
+    assert len(bench.opened) == 3
+
+
+def test_light_is_put_out_past_a_call_that_hangs() -> None:
+    bench = TameBench()
+    held = RigSession("bench", bench.open_rig)
+    projector = held.open().projector
+    tame = bench.opened[0][1]
+    reached, go = threading.Event(), threading.Event()
+
+    def show() -> None:
+        tame.dark = False
+        reached.set()
+        assert go.wait(WAIT_S)
+
+    owner = threading.Thread(target=lambda: held.calls.make("projector 'projector'", "show", 1.0, show))
+    owner.start()
+    assert reached.wait(WAIT_S)
+    held.darken_from_outside()
+    assert tame.dark
+    assert projector is held.open().projector, "the rig stays with its owner"
+    go.set()
+    owner.join(WAIT_S)

@@ -1,0 +1,375 @@
+"""What schedules do with the rig: options refused early, the rig held in the schedule's name, results and failures."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, cast
+from uuid import UUID
+
+import pytest
+
+from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.report import write_reports
+from slrig.accept.running import evaluated
+from slrig.calibrate.calibrating import CalibratedRig, Calibrations
+from slrig.errors import (
+    CalibrationError,
+    DeviceError,
+    PoseRefusedError,
+    RigBusyError,
+    ScanCancelledError,
+    ScanStateError,
+    ScheduleError,
+    SlrigError,
+    SolveRefusedError,
+    UnsupportedByDeviceError,
+)
+from slrig.failure import JobFailure
+from slrig.jobs.job import Holder
+from slrig.scan.records import ScanState
+from slrig.schedule.acceptance_task import AcceptanceTask
+from slrig.schedule.cron import Cron
+from slrig.schedule.holder import NamedHolder
+from slrig.schedule.polling import error_of
+from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.scheduler import Scheduler
+from slrig.schedule.store import ScheduleStore
+from slrig.schedule.tasks import Tasks, holder_of
+from slrig.verify.store import HealthStore
+from slrig.verify.verification import VerificationDesk, VerificationTools
+from tests.unit.accept.test_desk import PLAN, TameLender, desk, desks, queue
+from tests.unit.calibrate.calibration_bench import CalibrationBench
+from tests.unit.scan.fakes import WAIT_S, SetClock
+from tests.unit.verify.health_bench import a_look
+
+__all__ = ["desk", "desks", "queue"]
+
+BOARD = {"kind": "chessboard", "corners": [4, 3], "square_mm": 10.0}
+
+
+class TaskBench(CalibrationBench):
+    """A runner over a tame bench, the desks beside it, and a schedule over them on a clock that a test sets."""
+
+    def __init__(self, tmp_path: Path, *, positioner: bool = True) -> None:
+        super().__init__(tmp_path, positioner=positioner)
+        self.queue = NamedHolder(self.runner)
+        self.calibrations = Calibrations(self.folder, self.queue, rig_name="bench", tools=self.tame.tools())
+        self.health = HealthStore(self.folder.database)
+        tools = self.tame.tools()
+        verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_look())
+        self.verifications = VerificationDesk(self.folder, self.queue, self.health, tools=verifying)
+        self.acceptance = AcceptanceDesk(self.folder, self.queue, evaluate=evaluated, report=write_reports)
+        self.tidied: list[int] = []
+        self.tasks = Tasks(
+            self.queue, self.calibrations, self.verifications, self.acceptance,
+            tidy=lambda: self.tidied.append(len(self.calibrations.latest())),
+        )  # fmt: skip
+        self.clock = SetClock()
+        self.schedules = ScheduleStore(self.folder.database)
+        self.scheduler = Scheduler(self.schedules, self.tasks, clock=self.clock, execute=lambda call: call())
+
+    def do(self, task: TaskKind, *, cancelled: Callable[[], bool] = lambda: False, **options: Any) -> Mapping[str, Any]:
+        """One run."""
+        return self.tasks(*scheduled(task, options), cancelled=cancelled)
+
+    def use_a_calibration(self) -> None:
+        """Have scans use a calibration whose board is known."""
+        self.calibrations.activate(self.solved())
+
+    def open(self) -> None:
+        """Wait until the rig is open."""
+        opened = threading.Event()
+        self.queue.submit_work(lambda *_: None, holder=Holder("a", "b", "/c"), wait=True, ended=lambda _: opened.set())
+        assert opened.wait(WAIT_S)
+
+    def close(self) -> None:
+        super().close()
+        self.health.close()
+        self.schedules.close()
+
+
+def scheduled(task: TaskKind, options: Mapping[str, Any]) -> tuple[Schedule, Run]:
+    due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
+    schedule = Schedule(ID, Order(Cron("30 6 * * *", "Europe/Berlin"), task, options), due, due)
+    return schedule, Run(1, ID, due, RunState.RUNNING, None, 1, 1, due, None, None, None, None)
+
+
+ID = UUID("3f2a0000-9f0e-4c57-8a39-5f8a4f0c2b11")
+HOLDER = "schedule 3f2a0000, {} due 06:30"
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[TaskBench]:
+    made = TaskBench(tmp_path)
+    made.runner.start()
+    yield made
+    made.close()
+
+
+def checked(tasks: Tasks, task: TaskKind, options: Mapping[str, Any]) -> None:
+    tasks.check(Order(Cron("* * * * *", "UTC"), task, options))
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "words"),
+    [
+        ("verification", {"bord": 1}, "bord: unknown key; did you mean 'board'.*are: board, position, exposure_s"),
+        ("verification", {"position": -1}, "position"),
+        ("verification", {"exposure_s": "1"}, "exposure_s"),
+        ("verification", {"board": {**BOARD, "corners": [4]}}, "corners"),
+        ("verification", {"board": {**BOARD, "corners": [1, 3]}}, "found 1 x 3"),
+        ("calibration", {}, "board: missing.*are: board, positions, exposure_s, activate"),
+        ("calibration", {"board": BOARD, "activate": "yes", "poses": 3}, "activate.*poses"),
+        ("acceptance", {"repeats": 0}, "repeats.*are: artefacts, volume_mm, limits"),
+        ("acceptance", {"artefacts": {"plane_mm": [1, 2]}}, "sphere: missing"),
+    ],
+)
+def test_options_that_no_run_could_be_done_with_are_refused_at_once(
+    bench: TaskBench, task: str, options: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ScheduleError, match=words):
+        checked(bench.tasks, TaskKind(task), options)
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "words"),
+    [
+        ("verification", {}, r"not known: no calibration that was made here is in use\. Give the schedule .*\"board\""),
+        ("verification", {"board": BOARD, "position": 3}, "no 3; it has 0 to 2: near, far"),
+        ("calibration", {"board": BOARD, "positions": [0, "upside down", 7]}, "no 'upside down', 7; it has 0 to 2"),
+    ],
+)
+def test_work_that_can_only_fail_on_this_rig_is_refused_at_once(
+    bench: TaskBench, task: str, options: dict[str, Any], words: str
+) -> None:
+    bench.open()
+    with pytest.raises(ScheduleError, match=words):
+        checked(bench.tasks, TaskKind(task), options)
+
+
+def test_work_that_needs_a_positioner_is_refused_where_there_is_none(tmp_path: Path) -> None:
+    bench = TaskBench(tmp_path, positioner=False)
+    orders: list[tuple[TaskKind, dict[str, Any]]] = [
+        (TaskKind.CALIBRATION, {"board": BOARD}),
+        (TaskKind.ACCEPTANCE, {}),
+        (TaskKind.VERIFICATION, {"board": BOARD, "position": 0}),
+    ]
+    for task, options in orders:
+        # Nobody knows before the rig is open: a run is refused then.
+        checked(bench.tasks, task, options)
+    bench.runner.start()
+    bench.open()
+    for task, options in orders:
+        with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
+            checked(bench.tasks, task, options)
+    checked(bench.tasks, TaskKind.VERIFICATION, {"board": BOARD})
+    bench.close()
+
+
+def test_options_that_are_right_are_taken(bench: TaskBench) -> None:
+    bench.use_a_calibration()
+    exact = {"value_mm": 30, "uncertainty_mm": 0.001}
+    artefacts = {"sphere": exact, "bar": exact, "plane_mm": [160, 110], "sphere_form_mm": 0, "plane_form_mm": 0}
+    for task, options in (
+        (TaskKind.VERIFICATION, {}),
+        (TaskKind.VERIFICATION, {"board": BOARD, "position": 2}),
+        (TaskKind.CALIBRATION, {"board": BOARD, "positions": [0, "far"], "activate": True}),
+        (TaskKind.ACCEPTANCE, {}),
+        (TaskKind.ACCEPTANCE, {"artefacts": artefacts, "volume_mm": [[0, 0, 0], [1, 1, 1.5]], "repeats": 2}),
+    ):
+        checked(bench.tasks, task, options)
+
+
+def test_calibration_takes_every_pose_solves_and_is_used_only_if_asked(bench: TaskBench) -> None:
+    told = bench.do(TaskKind.CALIBRATION, board=BOARD)
+    assert bench.tame.visited == [0, 1, 2]
+    assert bench.tame.solved == [["pose 1", "pose 2", "pose 3"]]
+    assert bench.tidied == [1]
+    assert (told["poses"], told["accepted"], told["refused"], told["activated"]) == (3, 3, {}, False)
+    assert bench.calibrations.active is None
+    told = bench.do(TaskKind.CALIBRATION, board=BOARD, positions=["far", 0], activate=True)
+    assert bench.tame.visited[3:] == [1, 0]
+    assert str(bench.calibrations.active) == told["calibration"]
+    assert bench.calibrations.latest()[0].label == HOLDER.format("calibration")
+
+
+def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = {"verdict": {"grade": "do_not_use", "summary": "do not use: 9 px", "reasons": []}}
+    monkeypatch.setattr(bench.calibrations.solves, "_tools", replace(bench.tame.tools(), summary=lambda _: bad))
+    told = bench.do(TaskKind.CALIBRATION, board=BOARD, activate=True)
+    assert (told["activated"], told["verdict"]) == (False, "do not use: 9 px")
+    assert bench.calibrations.active is None
+
+
+def test_poses_that_are_refused_are_told_and_a_solve_that_fails_fails_the_run(bench: TaskBench) -> None:
+    bench.tame.unseen = True
+    with pytest.raises(SolveRefusedError, match="no accepted pose"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    (record,) = bench.calibrations.latest()
+    assert len(record.poses) == 3
+    bench.tame.unseen = False
+    bench.tame.solve_error = SolveRefusedError("all poses are parallel")
+    with pytest.raises(SolveRefusedError, match="all poses are parallel"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+
+
+def test_device_that_fails_ends_the_run(bench: TaskBench) -> None:
+    bench.error = DeviceError("the camera does not answer")
+    with pytest.raises(DeviceError, match="the camera does not answer"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    # It is tried again from the first pose on, and nothing is left of it.
+    assert bench.calibrations.latest() == []
+    assert bench.tidied == [0]
+
+
+def test_rig_without_a_positioner_is_told_in_words(tmp_path: Path) -> None:
+    bench = TaskBench(tmp_path, positioner=False)
+    bench.runner.start()
+    with pytest.raises(UnsupportedByDeviceError, match="no positioner, and nobody is there to move the board"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    assert bench.calibrations.latest() == []
+    bench.close()
+
+
+def test_rig_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
+    bench = TaskBench(tmp_path)
+    bench.open_error = DeviceError("no camera is plugged in")
+    bench.runner.start()
+    with pytest.raises(DeviceError, match="no camera is plugged in"):
+        bench.do(TaskKind.CALIBRATION, board=BOARD)
+    bench.open_error = None
+    assert bench.do(TaskKind.CALIBRATION, board=BOARD)["accepted"] == 3
+    bench.close()
+
+
+def test_verification_is_of_the_board_in_use(bench: TaskBench) -> None:
+    with pytest.raises(CalibrationError, match=r"that was made here is in use\. Give the schedule the option .board"):
+        bench.do(TaskKind.VERIFICATION)
+    bench.use_a_calibration()
+    told = bench.do(TaskKind.VERIFICATION, position=2)
+    assert bench.tame.visited == [2]
+    latest = bench.health.latest()
+    assert latest is not None
+    assert told["verification"] == str(latest.id)
+    assert (told["state"], told["expected_mm"]) == ("good", 0.01)
+    bench.tame.unseen = True
+    with pytest.raises(PoseRefusedError, match="no camera sees the board"):
+        bench.do(TaskKind.VERIFICATION)
+
+
+def test_busy_rig_is_told_before_anything_was_done(bench: TaskBench) -> None:
+    bench.use_a_calibration()
+    before = len(bench.calibrations.latest())
+    scan = bench.held()
+    for task in (TaskKind.VERIFICATION, TaskKind.CALIBRATION):
+        with pytest.raises(RigBusyError) as error:
+            bench.do(task, board=BOARD)
+        assert error.value.holder == str(scan.id)
+    assert len(bench.calibrations.latest()) == before
+
+
+def test_scan_that_finds_the_rig_held_reads_which_schedule_holds_it(bench: TaskBench) -> None:
+    bench.use_a_calibration()
+    bench.gate.clear()
+    bench.began.clear()
+    told: list[Mapping[str, Any]] = []
+    run = threading.Thread(target=lambda: told.append(bench.do(TaskKind.VERIFICATION)))
+    run.start()
+    assert bench.began.wait(WAIT_S)
+    with pytest.raises(RigBusyError) as error:
+        bench.scan()
+    assert error.value.holder == HOLDER.format("verification")
+    assert f"POST /schedule/{ID}/cancel" in str(error.value)
+    bench.gate.set()
+    run.join(WAIT_S)
+    assert told[0]["state"] == "good"
+
+
+@pytest.mark.parametrize("task", [TaskKind.VERIFICATION, TaskKind.CALIBRATION])
+def test_run_that_is_cancelled_lets_the_rig_go(bench: TaskBench, task: TaskKind) -> None:
+    bench.use_a_calibration()
+    schedule, _ = scheduled(task, {})
+    with pytest.raises(ScanStateError, match="no run under way"):
+        bench.tasks.cancel(schedule)
+    bench.gate.clear()
+    bench.began.clear()
+    errors: list[BaseException] = []
+
+    def do() -> None:
+        with pytest.raises(ScanCancelledError) as caught:
+            bench.do(task, board=BOARD)
+        errors.append(caught.value)
+
+    run = threading.Thread(target=do)
+    run.start()
+    assert bench.began.wait(WAIT_S)
+    bench.tasks.cancel(schedule)
+    run.join(WAIT_S)
+    assert len(errors) == 1
+    bench.gate.set()
+    assert bench.until(bench.scan(wait=True).id).state is ScanState.SUCCEEDED
+
+
+def test_schedule_that_finds_a_scan_tries_again_within_its_grace(bench: TaskBench) -> None:
+    bench.use_a_calibration()
+    order = Order(Cron("30 12 * * *", "UTC"), TaskKind.VERIFICATION, retry_s=60.0)
+    schedule = bench.schedules.create(order, bench.clock())
+    scan = bench.held()
+    bench.clock.move(minutes=30)
+    bench.scheduler.tick()
+    (waiting,) = bench.schedules.runs(schedule.id)
+    assert (waiting.state, waiting.attempts) == (RunState.WAITING, 1)
+    assert f"rig busy: The rig is held by scan {scan.id}" in (waiting.reason or "")
+    bench.gate.set()
+    bench.until(scan.id)
+    bench.clock.move(minutes=1)
+    bench.scheduler.tick()
+    (done,) = bench.schedules.runs(schedule.id)
+    assert (done.state, done.reason) == (RunState.SUCCEEDED, "at try 2")
+    assert done.result is not None
+    assert done.result["state"] == "good"
+
+
+def test_schedule_that_is_removed_during_its_run_is_forgotten(bench: TaskBench) -> None:
+    bench.use_a_calibration()
+    schedule = bench.schedules.create(Order(Cron("30 12 * * *", "UTC"), TaskKind.VERIFICATION), bench.clock())
+    bench.clock.move(minutes=30)
+    bench.gate.clear()
+    bench.began.clear()
+    run = threading.Thread(target=bench.scheduler.tick)
+    run.start()
+    assert bench.began.wait(WAIT_S)
+    bench.schedules.remove(schedule.id)
+    bench.gate.set()
+    run.join(WAIT_S)
+    assert bench.schedules.all() == []
+    bench.scheduler.tick()
+
+
+def test_acceptance_is_measured_by_script_and_tells_its_decision(
+    desk: AcceptanceDesk, queue: TameLender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
+    schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
+    named = NamedHolder(cast("CalibratedRig", queue))
+    desk._queue = named
+    tasks = Tasks(named, cast("Any", None), cast("Any", None), desk)
+    told = tasks(schedule, run, cancelled=lambda: False)
+    assert queue.holders == [HOLDER.format("acceptance")]
+    assert told["decision"] == "passes"
+    assert told["quantities"]["PF"]["position"].startswith("sphere-")
+    assert desk.file(UUID(told["acceptance"]), "report.html").is_file()
+    queue.busy = True
+    with pytest.raises(RigBusyError):
+        AcceptanceTask(named, desk).do(holder_of(schedule, run), {}, cancelled=lambda: False)
+
+
+def test_fault_of_a_busy_rig_is_not_told_as_one() -> None:
+    assert type(error_of(JobFailure("RigBusyError", "held"))) is DeviceError
+    assert type(error_of(JobFailure("UnexpectedError", "odd"))) is SlrigError
+    assert type(error_of(JobFailure("PoseRefusedError", "dark"))) is PoseRefusedError

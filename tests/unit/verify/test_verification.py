@@ -1,0 +1,216 @@
+"""A verification in line with the scans: shot, read, judged, put on record; refused, cancelled, busy: told in words."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+from uuid import UUID, uuid4
+
+import pytest
+
+from slrig.calibrate.solving import ReadPose
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.health.look import Look
+from slrig.calibration.health.verdict import Health, HealthState
+from slrig.calibration.observations import PoseObservation
+from slrig.calibration.poses.figures import ViewFigures
+from slrig.devices import Rig
+from slrig.errors import (
+    CalibrationNotFoundError,
+    CalibrationStateError,
+    PoseRefusedError,
+    RigBusyError,
+    ScanCancelledError,
+)
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.job import Holder
+from slrig.model import Calibration
+from slrig.scan.runner import RunnerStatus
+from slrig.verify.store import HealthStore
+from slrig.verify.verification import (
+    JobState,
+    VerificationDesk,
+    VerificationJob,
+    VerificationTools,
+    health_stamp,
+    require_healthy,
+    verify_bundle,
+)
+from tests.unit.calibration.health.drifting import bench
+from tests.unit.verify.health_bench import a_look, hours
+
+BOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
+CALIBRATION = bench().calibration
+
+
+@dataclass
+class JobQueue:
+    """Does work with a rig that is no rig, at once, on this thread."""
+
+    calibration: Calibration | None = CALIBRATION
+    held: str | None = None
+    error: Exception | None = None
+    recalled: list[UUID] = field(default_factory=list)
+
+    def submit_work(
+        self,
+        work: Callable[[Rig, Callable[[], bool]], None],
+        *,
+        holder: Holder,  # noqa: ARG002 - as the real one
+        wait: bool,
+        ended: Callable[[Exception | None], None],
+        begun: Callable[[UUID], None],
+    ) -> UUID:
+        if self.held and not wait:
+            message = f"The rig is held by {self.held} since 06:00."
+            raise RigBusyError(message, holder=self.held, since="06:00")
+        work_id = uuid4()
+        begun(work_id)
+        rig = Rig("bench", {}, cast("Any", None), {}, self.calibration)
+        error: Exception | None = self.error
+        if error is None:
+            try:
+                work(rig, lambda: False)
+            except Exception as found:  # noqa: BLE001 - as the real one
+                error = found
+        ended(error)
+        return work_id
+
+    def cancel_work(self, work_id: UUID) -> None:
+        self.recalled.append(work_id)
+
+    def status(self) -> RunnerStatus:
+        active = None if self.calibration is None else SimpleNamespace(calibration=self.calibration)
+        return cast("RunnerStatus", SimpleNamespace(active=active, facts=None))
+
+
+def capture(_rig: Rig, _plan: object, folder: Path, /, **_options: object) -> None:
+    """Writes a bundle that is none."""
+    folder.mkdir()
+    (folder / "frames").write_text("frames")
+
+
+def read(folder: Path, _board: Board, name: str) -> ReadPose:
+    assert (folder / "frames").exists()
+    return ReadPose(PoseObservation(name, {}), {"left": ViewFigures(0.02, 0.0, 0.5, 0.7, 1.0)})
+
+
+def moving(_folder: Path, _board: Board, name: str) -> ReadPose:
+    return ReadPose(PoseObservation(name, {}), {"left": ViewFigures(0.9, 0.0, 0.5, 0.7, 1.0)})
+
+
+def look(_poses: Sequence[Any], _board: Board, _calibration: Calibration) -> Look:
+    return a_look()
+
+
+TAME = VerificationTools(capture=cast("Any", capture), read=read, look=look)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[DataFolder]:
+    found = DataFolder(tmp_path / "data")
+    yield found
+    found.release()
+
+
+@pytest.fixture
+def store(folder: DataFolder) -> Iterator[HealthStore]:
+    found = HealthStore(folder.database)
+    yield found
+    found.close()
+
+
+def done(desk: VerificationDesk, **options: Any) -> VerificationJob:
+    """A verification from beginning to end."""
+    over = threading.Event()
+    last: list[VerificationJob] = []
+
+    def ended(job: VerificationJob) -> None:
+        last.append(job)
+        over.set()
+
+    desk.shoot(BOARD, ended=ended, **options)
+    assert over.wait(30)
+    return last[0]
+
+
+def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, store: HealthStore) -> None:
+    desk = VerificationDesk(folder, JobQueue(), store, tools=TAME, clock=lambda: hours(1))
+    assert desk.health()[0].state is HealthState.UNKNOWN
+    job = done(desk)
+    assert job.state is JobState.DONE
+    assert job.record is not None
+    assert job.record.at == hours(1)
+    assert job.record.calibration == "0123456789ab"
+    assert store.latest() == job.record
+    health, latest, calibration = desk.health()
+    assert health.state is HealthState.GOOD
+    assert latest == job.record
+    assert calibration is CALIBRATION
+    assert list(folder.incoming.iterdir()) == []
+
+
+def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthStore) -> None:
+    desk = VerificationDesk(folder, JobQueue(held="scan 7"), store, tools=TAME)
+    with pytest.raises(RigBusyError, match="scan 7"):
+        desk.shoot(BOARD)
+    assert done(desk, wait=True).state is JobState.DONE
+
+
+def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, store: HealthStore) -> None:
+    desk = VerificationDesk(folder, JobQueue(calibration=None), store, tools=TAME)
+    job = done(desk)
+    assert job.state is JobState.FAILED
+    assert job.fault is not None
+    assert job.fault.kind == "CalibrationStateError"
+    assert "Calibrate it" in job.fault.message
+    assert desk.health()[0].state is HealthState.UNKNOWN
+
+
+def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, store: HealthStore) -> None:
+    tools = VerificationTools(capture=cast("Any", capture), read=moving, look=look)
+    job = done(VerificationDesk(folder, JobQueue(), store, tools=tools))
+    assert job.state is JobState.FAILED
+    assert job.fault is not None
+    assert "camera 'left': the board moved by 0.90 px while it was shot" in job.fault.message
+    assert store.latest() is None
+    assert list(folder.incoming.iterdir()) == []
+
+
+def test_a_cancelled_one_is_cancelled(folder: DataFolder, store: HealthStore) -> None:
+    desk = VerificationDesk(folder, JobQueue(error=ScanCancelledError("asked to")), store, tools=TAME)
+    job = done(desk)
+    assert job.state is JobState.CANCELLED
+    assert desk.cancel(job.id).state is JobState.CANCELLED
+    with pytest.raises(CalibrationNotFoundError, match="GET /rig/health/history"):
+        desk.job(uuid4())
+
+
+def test_a_recorded_pose_is_judged(tmp_path: Path) -> None:
+    capture(cast("Rig", None), None, tmp_path / "pose")
+    assert verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=TAME).document() == a_look().document()
+    tools = VerificationTools(read=moving, look=look)
+    with pytest.raises(PoseRefusedError, match="put it on a stand"):
+        verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=tools)
+
+
+def test_a_stale_rig_refuses_scans_if_its_file_says_so() -> None:
+    stale = Health(HealthState.STALE, ("the projector turned by 0.05°",), "check its mount, and calibrate again")
+    require_healthy(stale, refuse_when_stale=False)
+    require_healthy(Health(HealthState.WATCH, ("it warms up",)), refuse_when_stale=True)
+    require_healthy(Health(HealthState.UNKNOWN, ()), refuse_when_stale=True)
+    with pytest.raises(CalibrationStateError, match=r"the projector turned by 0.05°\. What to do: check its mount"):
+        require_healthy(stale, refuse_when_stale=True)
+
+
+def test_a_scan_is_stamped_with_the_health_of_its_time(store: HealthStore) -> None:
+    record = store.add(a_look(), calibration=CALIBRATION.solve_id, at=hours(2))
+    stamp = health_stamp(record.health, record)
+    assert stamp["state"] == "good"
+    assert stamp["verification"] == str(record.id)
+    assert stamp["verified_at"] == "2026-11-20T10:00:00+00:00"
+    assert health_stamp(Health(HealthState.UNKNOWN, ()), None)["verified_at"] is None
