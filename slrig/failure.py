@@ -1,4 +1,4 @@
-"""Why a scan failed, as a value that crosses processes and survives in the store."""
+"""Why a job failed, as a value that crosses processes and survives in the store."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from slrig.errors import IdempotencyError, SlrigError, StorageError
+from slrig.errors import OutOfMemoryError, ScanInterruptedError, SlrigError, StorageError
 
-UNEXPECTED = "UnexpectedError"
-"""The kind of a fault that is a defect of slrig: its message is for people, its cause is in the service's log."""
+UNEXPECTED = "unexpected"
+"""The code of a failure that is a defect of slrig: its message is for people, its cause is in the service's log."""
 
 _OPENCV_NO_MEMORY = -4
 """`cv::Error::StsNoMem`, the code of a `cv2.error`."""
@@ -19,41 +19,22 @@ _OPENCV_NO_MEMORY = -4
 _DISK_REFUSALS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EFBIG}
 
 
-class WorkerLostError(SlrigError):
-    """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
-
-
-class OutOfMemoryError(SlrigError):
-    """A computation asked for more memory than the machine gives."""
-
-
-class ScanInterruptedError(SlrigError):
-    """The service ended while this scan was under way: stopped, killed, or without power. Nobody asked for that scan
-    to stop; where somebody did, it is a ScanCancelledError.
-    """
-
-
-class KeyInFlightError(IdempotencyError):
-    """The first request with this idempotency key is still being answered. Its sibling case, the same key with
-    another body, is a plain IdempotencyError.
-    """
-
-
 @dataclass(frozen=True, slots=True)
 class JobFailure:
-    """`kind` is the name of a class of the error tree, or `UNEXPECTED`; `message` is its text."""
+    """`code` is that of a class of the error tree, or `UNEXPECTED`; `message` is its text."""
 
-    kind: str
+    code: str
     message: str
 
 
-def error_classes() -> dict[str, type[SlrigError]]:
-    """Every class of the error tree by name, the base included."""
+def errors_by_code() -> dict[str, type[SlrigError]]:
+    """Every class of the error tree that has a code of its own, the base included."""
     found: dict[str, type[SlrigError]] = {}
     waiting: list[type[SlrigError]] = [SlrigError]
     while waiting:
         error = waiting.pop()
-        found[error.__name__] = error
+        if "code" in vars(error):
+            found[error.code] = error
         waiting.extend(error.__subclasses__())
     return found
 
@@ -61,16 +42,16 @@ def error_classes() -> dict[str, type[SlrigError]]:
 def failure_of(error: BaseException) -> JobFailure:
     """The fault that stands for an exception.
 
-    >>> failure_of(StorageError("The disk is full.")).kind
-    'StorageError'
+    >>> failure_of(StorageError("The disk is full.")).code
+    'storage'
     """
     if isinstance(error, SlrigError):
-        return JobFailure(type(error).__name__, str(error))
+        return JobFailure(error.code, str(error))
     if isinstance(error, MemoryError) or getattr(error, "code", None) == _OPENCV_NO_MEMORY:
         message = f"The machine has too little memory for this: {error}. Free some, or use a camera of fewer pixels."
-        return JobFailure(OutOfMemoryError.__name__, message)
+        return JobFailure(OutOfMemoryError.code, message)
     if isinstance(error, OSError) and error.errno in _DISK_REFUSALS:
-        return JobFailure(StorageError.__name__, disk_refusal(error, None))
+        return JobFailure(StorageError.code, disk_refusal(error, None))
     message = (
         f"slrig met an error it did not expect ({type(error).__name__}). The service's log has the details under "
         "this scan's id; please report them."

@@ -41,14 +41,14 @@ class _Request(ctypes.Structure):
 
 
 class RequestRefusedError(DeviceError):
-    """The X server answered a request with an error; `code` is that of the protocol (8 is BadMatch)."""
+    """The X server answered a request with an error; `number` is that of the protocol (8 is BadMatch)."""
 
-    def __init__(self, code: int, major: int, minor: int) -> None:
+    def __init__(self, number: int, major: int, minor: int) -> None:
         super().__init__(
-            f"the X server refused request {major}.{minor} with error {code}; see the server's log "
+            f"the X server refused request {major}.{minor} with error {number}; see the server's log "
             "(/var/log/Xorg.0.log), and report it to slrig's maintainers"
         )
-        self.code = code
+        self.number = number
 
 
 @dataclass(frozen=True, slots=True)

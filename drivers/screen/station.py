@@ -258,7 +258,7 @@ class Station:
         try:
             connection.do(6, struct.pack("<II", window, name), extension=_COMPOSITE)
         except RequestRefusedError as refused:
-            if refused.code == _BAD_MATCH:
+            if refused.number == _BAD_MATCH:
                 return False
             raise
         free_pixmap(connection, name)

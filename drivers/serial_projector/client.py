@@ -218,9 +218,9 @@ class Client:
                 for _ in range(_PINGS):
                     self._pinged(self._link.ask("PING"))
             except RefusedError as refusal:
-                if refusal.code == Refused.RANGE:
+                if refusal.number == Refused.RANGE:
                     raise UnsupportedByDeviceError(self._beyond(refusal)) from refusal
-                if refusal.code not in {Refused.BUSY, Refused.SESSION}:
+                if refusal.number not in {Refused.BUSY, Refused.SESSION}:
                     raise
                 # Another host's session may be about to end; and a box that restarts just now has forgotten ours.
                 if left_s > 0 and not self._link.closing.wait(_AGAIN_S):

@@ -21,12 +21,12 @@ _EVENTS = 4096
 
 
 class RefusedError(DeviceError):
-    """The box answered, and does not obey. `code` is one of `Refused` (or a number that newer firmware knows)."""
+    """The box answered, and does not obey. `number` is one of `Refused` (or a number that newer firmware knows)."""
 
-    def __init__(self, verb: str, code: int, words: tuple[str, ...]) -> None:
-        self.verb, self.code, self.words = verb, code, words
-        name = Refused(code).name.lower() if code in set(Refused) else "unknown"
-        super().__init__(f"the trigger box refused {verb}: error {code} ({name}) {' '.join(words)}".rstrip())
+    def __init__(self, verb: str, number: int, words: tuple[str, ...]) -> None:
+        self.verb, self.number, self.words = verb, number, words
+        name = Refused(number).name.lower() if number in set(Refused) else "unknown"
+        super().__init__(f"the trigger box refused {verb}: error {number} ({name}) {' '.join(words)}".rstrip())
 
 
 class SilentError(DeviceError):

@@ -196,7 +196,7 @@ class SerialProjector:
         try:
             return command()
         except RefusedError as refusal:
-            match refusal.code:
+            match refusal.number:
                 case Refused.SESSION:
                     raise _RestartedError from refusal
                 case Refused.STATE:

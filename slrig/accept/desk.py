@@ -24,17 +24,17 @@ from slrig.errors import (
     CalibrationStateError,
     DeviceBusyError,
     InvalidInputError,
+    JobNotFoundError,
     ScanCancelledError,
-    ScanNotFoundError,
+    ScanInterruptedError,
     ScanStateError,
     StorageError,
 )
-from slrig.failure import ScanInterruptedError, failure_of
+from slrig.failure import failure_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
-from slrig.jobs.records import Clock, require_same_body, utc_now
+from slrig.jobs.records import Clock, JobProgress, require_same_body, utc_now
 from slrig.model import Calibration
-from slrig.scan.records import ScanProgress
 
 _log = structlog.get_logger(__name__)
 
@@ -115,7 +115,7 @@ class AcceptanceDesk:
         return record
 
     def get(self, test_id: UUID) -> AcceptanceRecord:
-        """Return a test. Raises ScanNotFoundError."""
+        """Return a test. Raises JobNotFoundError."""
         return self._held(test_id).record
 
     def latest(self) -> tuple[AcceptanceRecord, ...]:
@@ -131,7 +131,7 @@ class AcceptanceDesk:
 
         Raises
         ------
-        ScanNotFoundError, ScanStateError
+        JobNotFoundError, ScanStateError
             There is no such test, or it is being measured, or it is over.
         IdempotencyError
             The key was sent before with another request.
@@ -168,7 +168,7 @@ class AcceptanceDesk:
             return held.record
 
     def cancel(self, test_id: UUID) -> AcceptanceRecord:
-        """End a test. Returns at once; one that is over stays so. Raises ScanNotFoundError, StorageError."""
+        """End a test. Returns at once; one that is over stays so. Raises JobNotFoundError, StorageError."""
         with self._lock:
             held = self._held(test_id)
             work_id = held.work_id
@@ -179,7 +179,7 @@ class AcceptanceDesk:
         return held.record
 
     def delete(self, test_id: UUID) -> None:
-        """Forget a test and remove its files. Raises ScanNotFoundError, ScanStateError, StorageError."""
+        """Forget a test and remove its files. Raises JobNotFoundError, ScanStateError, StorageError."""
         with self._lock:
             held = self._held(test_id)
             if held.record.state is AcceptanceState.MEASURING:
@@ -189,7 +189,7 @@ class AcceptanceDesk:
             del self._tests[test_id]
 
     def file(self, test_id: UUID, name: str) -> Path:
-        """Return where a report lies. Raises ScanNotFoundError, ArtefactNotReadyError."""
+        """Return where a report lies. Raises JobNotFoundError, ArtefactNotReadyError."""
         record = self.get(test_id)
         path = self._store.folder(test_id) / name
         if record.state is not AcceptanceState.FINISHED or not path.is_file():
@@ -204,7 +204,7 @@ class AcceptanceDesk:
             held = self._tests.get(test_id)
         if held is None:
             message = f"No acceptance test {test_id} is on record here. GET /acceptance lists those that are."
-            raise ScanNotFoundError(message)
+            raise JobNotFoundError(message)
         return held
 
     def _measure(self, held: _Held, rig: Rig, cancelled: Callable[[], bool], *, scripted: bool) -> None:
@@ -226,7 +226,7 @@ class AcceptanceDesk:
             def told(stage: str, fraction: float, detail: str, /, name: str = step.name, done: int = done) -> None:
                 share = (done + min(max(fraction, 0.0), 1.0)) / count
                 with self._lock:
-                    held.record = replace(held.record, progress=ScanProgress(f"{name}: {stage}", share, detail))
+                    held.record = replace(held.record, progress=JobProgress(f"{name}: {stage}", share, detail))
 
             if cancelled():
                 message = f"the acceptance test was cancelled before {step.name}"

@@ -19,7 +19,7 @@ from slrig.calibrate.records import plain
 from slrig.calibration.artefacts import Decision
 from slrig.errors import StorageError
 from slrig.failure import JobFailure
-from slrig.scan.records import ScanProgress
+from slrig.jobs.records import JobProgress
 
 _FORMAT = "slrig-acceptance-test"
 
@@ -70,7 +70,7 @@ class AcceptanceRecord:
     state: AcceptanceState = AcceptanceState.OPEN
     readings: tuple[Reading, ...] = ()
     fault: JobFailure | None = None
-    progress: ScanProgress | None = None
+    progress: JobProgress | None = None
     decision: Decision | None = None
     opened_by: RequestKey | None = None
     measured_by: Mapping[str, str] = field(default_factory=dict)

@@ -20,8 +20,8 @@ import structlog
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import Decision
-from slrig.errors import StorageError
-from slrig.failure import JobFailure, ScanInterruptedError, disk_errors
+from slrig.errors import ScanInterruptedError, StorageError
+from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import DataFolder
 
 RECORD, HTML, JSON = "test.json", "report.html", "report.json"
@@ -99,4 +99,4 @@ class AcceptanceStore:
 def interruption_fault() -> JobFailure:
     """The fault of a test that the end of the service cut off."""
     message = "The service ended while a position was measured. Measure it again to go on, or cancel the test."
-    return JobFailure(ScanInterruptedError.__name__, message)
+    return JobFailure(ScanInterruptedError.code, message)

@@ -18,9 +18,9 @@ from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.records import JobRecord, JobState
 from slrig.scan.artefacts import MESH, ON_REQUEST, write_converted
 from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, rejected_picture
-from slrig.scan.records import ScanRecord, ScanState
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
 _converting = threading.Lock()
@@ -33,7 +33,7 @@ router = APIRouter(prefix="/scan/{scan_id}", tags=["files"])
 KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an ETag; 304 if it still holds")]
 
 
-def ready_files(folder: DataFolder, record: ScanRecord) -> dict[str, str]:
+def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
     """Name to URL path of each file of a scan that can be fetched now."""
     place = folder.scan(record.id)
     if not record.state.final or not place.is_dir():
@@ -46,13 +46,13 @@ def ready_files(folder: DataFolder, record: ScanRecord) -> dict[str, str]:
     return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
 
 
-def _refuse_absent(record: ScanRecord, name: str) -> None:
+def _refuse_absent(record: JobRecord, name: str) -> None:
     if not record.state.final:
         message = (
             f"{name} of scan {record.id} is not ready: the scan is {record.state}. "
             f"Follow /scan/{record.id}/events until it is over."
         )
-    elif record.state is ScanState.SUCCEEDED:
+    elif record.state is JobState.SUCCEEDED:
         message = f"Scan {record.id} has no file {name}. GET /scan/{record.id} names those it has."
     else:
         why = "" if record.fault is None else f" ({record.fault.message})"

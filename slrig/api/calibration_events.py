@@ -14,7 +14,7 @@ from slrig.api.service import Serving
 from slrig.api.streams import Followed, LastEventId, event_stream, stream_answers
 from slrig.calibrate.register import CalibrationRegister
 from slrig.errors import CalibrationNotFoundError
-from slrig.scan.records import ScanEvent
+from slrig.jobs.records import JobEvent
 
 router = APIRouter(prefix="/calibration/{calibration_id}", tags=["calibration"])
 
@@ -41,7 +41,7 @@ async def follow_calibration(
     return await event_stream(request, service.settings, followed, last_event_id)
 
 
-def _look(register: CalibrationRegister, calibration_id: UUID, after: int) -> tuple[Sequence[ScanEvent], bool]:
+def _look(register: CalibrationRegister, calibration_id: UUID, after: int) -> tuple[Sequence[JobEvent], bool]:
     try:
         # In this order: what ends between the two looks has its last event among those found.
         over = not register.get(calibration_id).under_way

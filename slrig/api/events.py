@@ -14,10 +14,10 @@ from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
 from slrig.api.service import Serving
 from slrig.api.streams import Followed, LastEventId, event_stream, stream_answers
-from slrig.errors import ScanNotFoundError
+from slrig.errors import JobNotFoundError
 from slrig.failure import JobFailure
-from slrig.scan.records import ScanEvent
-from slrig.scan.store import ScanStore
+from slrig.jobs.records import JobEvent
+from slrig.jobs.store import JobStore
 
 router = APIRouter(prefix="/scan", tags=["scan"])
 
@@ -36,32 +36,32 @@ async def follow_scan(request: Request, service: Serving, scan_id: UUID, last_ev
     return await event_stream(request, service.settings, followed_scan(service.store, scan_id), last_event_id)
 
 
-def followed_scan(store: ScanStore, scan_id: UUID) -> Followed:
+def followed_scan(store: JobStore, scan_id: UUID) -> Followed:
     """A scan as it is followed."""
     return Followed(
         partial(_look, store, scan_id), partial(store.watch, scan_id), partial(_last_event, store, scan_id), _data
     )
 
 
-def _last_event(store: ScanStore, scan_id: UUID) -> int:
+def _last_event(store: JobStore, scan_id: UUID) -> int:
     try:
         return store.last_event(scan_id)
-    except ScanNotFoundError:
+    except JobNotFoundError:
         return 0
 
 
-def _look(store: ScanStore, scan_id: UUID, after: int) -> tuple[Sequence[ScanEvent], bool]:
+def _look(store: JobStore, scan_id: UUID, after: int) -> tuple[Sequence[JobEvent], bool]:
     try:
         # In this order: what ends between the two looks has its last event among those found.
         over = store.get(scan_id).state.final
         return store.events(scan_id, after=after), over
-    except ScanNotFoundError:
+    except JobNotFoundError:
         return (), True
 
 
-def _data(event: ScanEvent) -> dict[str, Any]:
+def _data(event: JobEvent) -> dict[str, Any]:
     data = dict(event.data)
     fault = data.get("error")
     if fault is not None:
-        data["error"] = fault_problem(JobFailure(fault["kind"], fault["message"]))
+        data["error"] = fault_problem(JobFailure(fault["code"], fault["message"]))
     return data

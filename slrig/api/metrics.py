@@ -14,8 +14,7 @@ from prometheus_client.registry import Collector
 
 from slrig.api.service import Service, Serving
 from slrig.calibration.health.verdict import HealthState
-from slrig.jobs.records import utc_now
-from slrig.scan.records import ScanState
+from slrig.jobs.records import JobState, utc_now
 from slrig.schedule.records import RunState, TaskKind
 
 router = APIRouter(tags=["system"])
@@ -50,7 +49,7 @@ class _Figures(Collector):
     def _rig(self) -> Iterator[Metric]:
         states = Counter(self._service.store.states().values())
         scans = GaugeMetricFamily("slrig_scans", "Scans on record, by state.", labels=["state"])
-        for state in ScanState:
+        for state in JobState:
             scans.add_metric([state], states[state])
         yield scans
         status = self._service.runner.status()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
@@ -16,9 +15,8 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig import errors
-from slrig import failure as faults
 from slrig.errors import RigBusyError, SlrigError
-from slrig.failure import JobFailure, error_classes
+from slrig.failure import UNEXPECTED, JobFailure, errors_by_code
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -51,26 +49,26 @@ STATUS: Mapping[type[SlrigError], int] = {
     errors.SolveRefusedError: 422,
     errors.CalibrationNotFoundError: 404,
     errors.CalibrationStateError: 409,
-    errors.ScanNotFoundError: 404,
+    errors.JobNotFoundError: 404,
     errors.ArtefactNotReadyError: 409,
     errors.ScanStateError: 409,
     errors.IdempotencyError: 422,
     errors.StorageError: 507,
     errors.ServiceError: 502,
-    faults.WorkerLostError: 500,
-    faults.OutOfMemoryError: 500,
-    faults.ScanInterruptedError: 503,
-    faults.KeyInFlightError: 409,
+    errors.WorkerLostError: 500,
+    errors.OutOfMemoryError: 500,
+    errors.ScanInterruptedError: 503,
+    errors.KeyInFlightError: 409,
 }
 """Which status stands for which error. A test holds it against the whole error tree."""
 
 RETRY_AFTER_S: Mapping[type[SlrigError], int] = {
     errors.RigBusyError: 5,
     errors.QueueFullError: 30,
-    faults.KeyInFlightError: 1,
+    errors.KeyInFlightError: 1,
 }
 
-_NAMES = {413: "ContentTooLarge", 416: "RangeNotSatisfiable", 422: "InvalidRequest"}
+_NAMES = {413: "content-too-large", 416: "range-not-satisfiable", 422: "invalid-request"}
 # Python's own names for these differ from version to version.
 
 _MESSAGES = {
@@ -108,21 +106,11 @@ class Problem(BaseModel):
     since: str | None = Field(default=None, description="since when")
 
 
-def slug(kind: str) -> str:
-    """The part of a problem's type that names it.
-
-    >>> slug("RigBusyError")
-    'rig-busy'
-    """
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", kind.removesuffix("Error")).lower()
-
-
-def problem(status: int, kind: str, detail: str, **members: Any) -> dict[str, Any]:
+def problem(status: int, code: str, detail: str, **members: Any) -> dict[str, Any]:
     """The members of a problem document, without those that are None."""
-    name = slug(kind)
     document = {
-        "type": f"/problems/{name}",
-        "title": name.replace("-", " ").capitalize(),
+        "type": f"/problems/{code}",
+        "title": code.replace("-", " ").capitalize(),
         "status": status,
         "detail": detail,
         **members,
@@ -132,8 +120,8 @@ def problem(status: int, kind: str, detail: str, **members: Any) -> dict[str, An
 
 def fault_problem(fault: JobFailure) -> dict[str, Any]:
     """The problem that stands for a scan's recorded fault."""
-    known = error_classes().get(fault.kind)
-    return problem(500 if known is None else STATUS[known], fault.kind, fault.message)
+    known = errors_by_code().get(fault.code)
+    return problem(500 if known is None else STATUS[known], fault.code, fault.message)
 
 
 def answer(document: Mapping[str, Any], *, headers: Mapping[str, str] | None = None) -> JSONResponse:
@@ -148,14 +136,14 @@ def answer(document: Mapping[str, Any], *, headers: Mapping[str, str] | None = N
 
 def explanations() -> dict[str, str]:
     """What each kind of problem means, by its slug: the docstrings of the error tree, and of HTTP's own refusals."""
-    tree = {slug(name): " ".join((error.__doc__ or "").split()) for name, error in error_classes().items()}
+    tree = {code: " ".join((error.__doc__ or "").split()) for code, error in errors_by_code().items()}
     own = {
         "invalid-request": "The request does not fit what is documented in /openapi.json. `errors` has every fault.",
         "unauthorized": "The request carries no API key, or a wrong one. The key was printed at the first start.",
         "unexpected": "slrig met an error it did not expect. The service's log has the details.",
         "not-ready": "The service runs and cannot scan. `checks` says why.",
     }
-    http = {slug(_http_kind(status)): status.description or status.phrase for status in HTTPStatus if status >= 400}
+    http = {_http_code(status): status.description or status.phrase for status in HTTPStatus if status >= 400}
     return {**http, **tree, **own}
 
 
@@ -168,11 +156,10 @@ def install_problems(app: FastAPI) -> None:
 
 
 async def _slrig_error(_request: Request, error: Exception) -> JSONResponse:
-    kind = type(error)
     if not isinstance(error, SlrigError):
         raise error
     held = {"holder": error.holder, "since": error.since} if isinstance(error, RigBusyError) else {}
-    document = problem(STATUS[type(error)], kind.__name__, str(error), **held)
+    document = problem(STATUS[errors_by_code()[error.code]], error.code, str(error), **held)
     wait_s = RETRY_AFTER_S.get(type(error))
     return answer(document, headers=None if wait_s is None else {"Retry-After": str(wait_s)})
 
@@ -184,7 +171,7 @@ async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
     names = ", ".join(fault["field"] for fault in found)
     noun = "fault" if len(found) == 1 else "faults"
     detail = f"The request has {len(found)} {noun}: {names}. See errors."
-    return answer(problem(422, "InvalidRequest", detail, errors=found))
+    return answer(problem(422, "invalid-request", detail, errors=found))
 
 
 async def _http_error(_request: Request, error: Exception) -> JSONResponse:
@@ -201,7 +188,7 @@ async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
         f"slrig met an error it did not expect ({type(error).__name__}) while it answered this request. The service's "
         "log has the details; please report them."
     )
-    return answer(problem(500, "Unexpected", detail))
+    return answer(problem(500, UNEXPECTED, detail))
 
 
 def field_faults(found: Sequence[Any], *, is_json: bool = True) -> list[dict[str, Any]]:
@@ -244,11 +231,11 @@ def printable(text: str) -> str:
 
 
 def _http_problem(status: HTTPStatus, detail: str) -> dict[str, Any]:
-    return problem(status.value, _http_kind(status), detail)
+    return problem(status.value, _http_code(status), detail)
 
 
-def _http_kind(status: HTTPStatus) -> str:
-    return _NAMES.get(status.value) or "".join(word.capitalize() for word in status.name.split("_"))
+def _http_code(status: HTTPStatus) -> str:
+    return _NAMES.get(status.value) or status.name.lower().replace("_", "-")
 
 
 class PlainErrorsToProblems:

@@ -12,7 +12,7 @@ from slrig.api.artefacts import ready_files
 from slrig.api.openapi import problems
 from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, fingerprint, scan_body, scan_plan
 from slrig.api.service import Service, Serving
-from slrig.scan.records import ScanProgress, ScanRecord, ScanState
+from slrig.jobs.records import JobProgress, JobRecord, JobState
 from slrig.verify.verification import require_healthy
 
 USUAL_PAGE = 50
@@ -41,7 +41,7 @@ def start_scan(
     return scan_body(record, {})
 
 
-def _started(service: Service, request: ScanRequest, key: str | None) -> ScanRecord:
+def _started(service: Service, request: ScanRequest, key: str | None) -> JobRecord:
     plan = scan_plan(request, service.scan_defaults)
     wait = request.if_busy == "queue"
     if key is None:
@@ -63,14 +63,14 @@ def _require_healthy(service: Service) -> None:
     require_healthy(health, refuse_when_stale=service.refuse_when_stale)
 
 
-def _first_answer(record: ScanRecord) -> ScanRecord:
+def _first_answer(record: JobRecord) -> JobRecord:
     """The record as it was when the scan was made, so that a repeated request gets the same answer."""
     return replace(
         record,
-        state=ScanState.QUEUED,
+        state=JobState.QUEUED,
         started_at=None,
         finished_at=None,
-        progress=ScanProgress("waiting", 0.0, ""),
+        progress=JobProgress("waiting", 0.0, ""),
         fault=None,
         summary=None,
     )

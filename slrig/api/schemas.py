@@ -15,9 +15,9 @@ from slrig.api.problems import fault_problem
 from slrig.bundle.faults import Strict
 from slrig.config import BracketSeconds, ScanDefaults
 from slrig.failure import JobFailure
+from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.records import ScanRecord, ScanState
 
 MOST_EXPOSURE_S = 60.0
 Body = TypeVar("Body", bound=BaseModel)
@@ -187,7 +187,7 @@ class ScanBody(BaseModel):
     """A scan on record."""
 
     id: UUID
-    state: ScanState
+    state: JobState
     label: str | None
     rig: str
     created_at: datetime
@@ -207,7 +207,7 @@ class ScanPage(BaseModel):
     next: str | None
 
 
-def scan_body(record: ScanRecord, files: Mapping[str, str]) -> ScanBody:
+def scan_body(record: JobRecord, files: Mapping[str, str]) -> ScanBody:
     """A record as an answer; `files` maps the names of those that are ready to their paths."""
     here = f"/scan/{record.id}"
     links = ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=dict(files))

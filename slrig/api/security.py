@@ -84,7 +84,7 @@ class KeyCheck:
                     "Send the key that was printed at the first start as 'Authorization: Bearer KEY' or 'X-API-Key: "
                     "KEY'; if it is lost, start the service with --new-key."
                 )
-                refusal = answer(problem(401, "Unauthorized", detail), headers={"WWW-Authenticate": "Bearer"})
+                refusal = answer(problem(401, "unauthorized", detail), headers={"WWW-Authenticate": "Bearer"})
                 await refusal(scope, receive, send)
                 return
         await self._app(scope, receive, send)

@@ -25,11 +25,13 @@ from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ServiceError
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.records import JobKind
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.runner import Runner
-from slrig.scan.store import ScanStore
 from slrig.scan.sweep import sweep
 
 ADDRESS_FILE = "service.json"
@@ -56,7 +58,7 @@ def open_service(
     folder = DataFolder(settings.data_dir)
     try:
         prepare_kernel_cache(folder.root / "cache")
-        store = ScanStore(folder.database, key_life_s=settings.idempotency_keep_s)
+        store = JobStore(Database(folder.database), JobKind.SCAN, key_life_s=settings.idempotency_keep_s)
         swept = sweep(store, folder)
     except BaseException:
         folder.release()
@@ -94,7 +96,7 @@ def open_service(
             refuse_when_stale=rig.refuse_when_stale,
         )
     except BaseException:
-        store.close()
+        store.database.close()
         folder.release()
         raise
 

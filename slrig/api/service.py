@@ -15,9 +15,9 @@ from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.runner import Runner
-from slrig.scan.store import ScanStore
 from slrig.schedule.holder import NamedHolder
 from slrig.schedule.notices import NoticedHealth, Notices
 from slrig.schedule.scheduler import Scheduler
@@ -39,7 +39,7 @@ class Service:
     settings: ServiceSettings
     scan_defaults: ScanDefaults
     folder: DataFolder
-    store: ScanStore
+    store: JobStore
     runner: Runner
     calibrations: Calibrations
     verifications: VerificationDesk
@@ -70,9 +70,7 @@ class Service:
         """Stop scanning, then let records and data folder go. Idempotent."""
         self.end_work()
         self.notices.close()
-        self.schedules.close()
-        self.verifications.store.close()
-        self.store.close()
+        self.store.database.close()
         self.folder.release()
 
 
@@ -80,7 +78,7 @@ def assembled_service(
     settings: ServiceSettings,
     scan_defaults: ScanDefaults,
     folder: DataFolder,
-    store: ScanStore,
+    store: JobStore,
     runner: Runner,
     worker: Worker,
     *,
@@ -106,9 +104,9 @@ def assembled_service(
         tools=calibration_tools or usual_calibration_tools(worker),
         spare_bytes=spare_bytes,
     )
-    schedules = ScheduleStore(folder.database)
+    schedules = ScheduleStore(store.database)
     notices = Notices(settings.webhook_url, rig=rig_name)
-    health = NoticedHealth(folder.database, notices)
+    health = NoticedHealth(store.database, notices)
     verifications = VerificationDesk(folder, queue, health, tools=verification_tools(worker), spare_bytes=spare_bytes)
     runner.watch_health(verifications)
     acceptance = AcceptanceDesk(

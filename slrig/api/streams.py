@@ -14,7 +14,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.exceptions import HTTPException
 
 from slrig.config import ServiceSettings
-from slrig.scan.records import ScanEvent
+from slrig.jobs.records import JobEvent
 
 _LAST_WORD_S = 2.0
 """How much longer than the work that it follows an event stream may live when the service ends."""
@@ -55,10 +55,10 @@ class Followed:
     number of the newest event. data : an event's data as it is sent.
     """
 
-    look: Callable[[int], tuple[Sequence[ScanEvent], bool]]
+    look: Callable[[int], tuple[Sequence[JobEvent], bool]]
     watch: Callable[[Callable[[], None]], Callable[[], None]]
     last: Callable[[], int]
-    data: Callable[[ScanEvent], Mapping[str, Any]] = lambda event: event.data
+    data: Callable[[JobEvent], Mapping[str, Any]] = lambda event: event.data
 
 
 def stream_answers(events: str, nothing: str) -> dict[int | str, dict[str, Any]]:

@@ -43,7 +43,7 @@ def readyz(service: Serving) -> Response | Probe:
     opening = status.facts is None and status.fault is None and not status.ending
     pending = [name for name, waits in (("rig", opening), ("reconstruction", status.preparing)) if waits]
     detail = f"The service runs and cannot scan: {wrong}"
-    return answer(problem(503, "NotReady", detail, checks=checks, pending=pending))
+    return answer(problem(503, "not-ready", detail, checks=checks, pending=pending))
 
 
 @router.get("/problems/{name}", responses=problems(404, 422))

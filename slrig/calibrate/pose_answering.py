@@ -18,8 +18,8 @@ from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.store import ANSWER, BUNDLE, READING, pose_interruption
 from slrig.calibrate.tools import CalibrationTools, Judgement, Setting
 from slrig.calibration.board import Board
-from slrig.errors import CalibrationStateError, PoseRefusedError, ScanCancelledError, SlrigError
-from slrig.failure import JobFailure, ScanInterruptedError, disk_errors, failure_of
+from slrig.errors import CalibrationStateError, PoseRefusedError, ScanCancelledError, ScanInterruptedError, SlrigError
+from slrig.failure import JobFailure, disk_errors, failure_of
 
 _log = structlog.get_logger(__name__)
 
@@ -54,8 +54,8 @@ class PoseAnswers:
             fault = pose_interruption()
         elif isinstance(error, ScanCancelledError):
             message = "The pose was cancelled."
-            state, fault = PoseState.CANCELLED, JobFailure(fault.kind, message)
-        _log.warning("pose not shot", calibration=str(session_id), pose=number, kind=fault.kind, cause=fault.message)
+            state, fault = PoseState.CANCELLED, JobFailure(fault.code, message)
+        _log.warning("pose not shot", calibration=str(session_id), pose=number, code=fault.code, cause=fault.message)
         hidden = f"{self._store.staged_pose(session_id, number)}/"
         fault = replace(fault, message=fault.message.replace(hidden, ""))
 
@@ -95,7 +95,7 @@ class PoseAnswers:
             if reading is not None and not judged.refusals:
                 write_durably(staged / READING, reading_bytes(reading))
         self._store.commit_pose(session_id, number)
-        fault = JobFailure(PoseRefusedError.__name__, " ".join(judged.refusals)) if judged.refusals else None
+        fault = JobFailure(PoseRefusedError.code, " ".join(judged.refusals)) if judged.refusals else None
         state = PoseState.ACCEPTED if fault is None else PoseState.REFUSED
         seconds = round(time.monotonic() - since_s, 3)
 

@@ -17,9 +17,9 @@ from pydantic import TypeAdapter, ValidationError
 from slrig.calibration.board import Board
 from slrig.errors import InvalidInputError, StorageError
 from slrig.failure import JobFailure
+from slrig.jobs.records import JobProgress
 from slrig.model import Size
 from slrig.scan.plan import PatternPlan
-from slrig.scan.records import ScanProgress
 
 USUAL_PATTERNS = PatternPlan(rows=True)
 """White, Gray code and line shift along both axes: the projector has columns and rows to be calibrated."""
@@ -113,7 +113,7 @@ class SessionRecord:
     state: SessionState = SessionState.OPEN
     poses: tuple[PoseRecord, ...] = ()
     latest_pose: int = 0
-    progress: ScanProgress | None = None
+    progress: JobProgress | None = None
     fault: JobFailure | None = None
     solve: int = 0
     solved_at: datetime | None = None

@@ -14,7 +14,7 @@ import structlog
 from slrig.calibrate.records import PoseRecord, SessionRecord
 from slrig.calibrate.store import CalibrationStore, not_found, swept
 from slrig.errors import CalibrationNotFoundError, StorageError
-from slrig.scan.records import ScanEvent, ScanProgress
+from slrig.jobs.records import JobEvent, JobProgress
 
 MOST_EVENTS = 2000
 """Of one calibration, that are remembered; not beyond the end of the service."""
@@ -29,7 +29,7 @@ class _News:
     """What happened to one calibration since the service began."""
 
     last: int = 0
-    events: deque[ScanEvent] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
+    events: deque[JobEvent] = field(default_factory=lambda: deque(maxlen=MOST_EVENTS))
     watchers: list[Callable[[], None]] = field(default_factory=list)
 
 
@@ -131,7 +131,7 @@ class CalibrationRegister:
 
     def progress(self, session_id: UUID, stage: str, fraction: float, detail: str, *, pose: int | None = None) -> None:
         """Tell how far a pose or a solve is; worth telling are a new stage, and a hundredth of the way."""
-        now = ScanProgress(stage, min(max(fraction, 0.0), 1.0), detail)
+        now = JobProgress(stage, min(max(fraction, 0.0), 1.0), detail)
         with self.lock:
             record = self._records.get(session_id)
             if record is None or self._closed:
@@ -144,7 +144,7 @@ class CalibrationRegister:
             self._append(session_id, "progress", {**now.as_json(), "pose": pose})
         self._wake(session_id)
 
-    def events(self, session_id: UUID, *, after: int) -> Sequence[ScanEvent]:
+    def events(self, session_id: UUID, *, after: int) -> Sequence[JobEvent]:
         """Return what happened to a calibration since the service began, after the event of a number."""
         with self.lock:
             return [event for event in self._news[session_id].events if event.number > after]
@@ -184,7 +184,7 @@ class CalibrationRegister:
     def _append(self, session_id: UUID, kind: str, data: dict[str, Any]) -> None:
         news = self._news[session_id]
         news.last += 1
-        news.events.append(ScanEvent(news.last, kind, data))
+        news.events.append(JobEvent(news.last, kind, data))
 
     def _wake(self, session_id: UUID) -> None:
         with self.lock:

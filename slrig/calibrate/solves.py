@@ -17,11 +17,10 @@ from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.store import BUNDLE, CALIBRATION, REPORT
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibration.board import BoardShape
-from slrig.errors import CalibrationError, CalibrationStateError, SlrigError, SolveRefusedError
-from slrig.failure import ScanInterruptedError, failure_of
-from slrig.jobs.records import Clock
+from slrig.errors import CalibrationError, CalibrationStateError, ScanInterruptedError, SlrigError, SolveRefusedError
+from slrig.failure import failure_of
+from slrig.jobs.records import Clock, JobProgress
 from slrig.model import Calibration
-from slrig.scan.records import ScanProgress
 
 _log = structlog.get_logger(__name__)
 
@@ -83,7 +82,7 @@ class SolveDesk:
                     f"(POST /calibration/{session_id}/pose); GET /calibration/{session_id} tells what to shoot."
                 )
                 raise SolveRefusedError(message)
-            begun = ScanProgress("solve", 0.0, "")
+            begun = JobProgress("solve", 0.0, "")
             record = self._register.change(
                 session_id, lambda found: replace(found, state=SessionState.SOLVING, fault=None, progress=begun)
             )
@@ -100,7 +99,7 @@ class SolveDesk:
         except Exception as error:  # noqa: BLE001 - whatever goes wrong, the session gets out of SOLVING
             fault = failure_of(error)
             if isinstance(error, SlrigError):
-                _log.warning("solve failed", calibration=str(record.id), kind=fault.kind, cause=fault.message)
+                _log.warning("solve failed", calibration=str(record.id), code=fault.code, cause=fault.message)
             else:
                 _log.exception("solve failed", calibration=str(record.id))
             self._register.change(

@@ -28,8 +28,8 @@ from slrig.calibrate.records import (
     session_from_json,
     session_json,
 )
-from slrig.errors import CalibrationError, CalibrationNotFoundError, StorageError
-from slrig.failure import JobFailure, ScanInterruptedError, disk_errors
+from slrig.errors import CalibrationError, CalibrationNotFoundError, ScanInterruptedError, StorageError
+from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import DataFolder, sync_tree
 from slrig.model import Calibration
 
@@ -242,12 +242,12 @@ def not_found(session_id: UUID) -> CalibrationNotFoundError:
 
 def pose_interruption() -> JobFailure:
     """The fault of a pose that the end of the service cut off."""
-    return JobFailure(ScanInterruptedError.__name__, "The service ended while this pose was under way. Shoot it again.")
+    return JobFailure(ScanInterruptedError.code, "The service ended while this pose was under way. Shoot it again.")
 
 
 def solve_interruption() -> JobFailure:
     """The fault of a solve that the end of the service cut off."""
-    return JobFailure(ScanInterruptedError.__name__, "The service ended during the solve. Solve again.")
+    return JobFailure(ScanInterruptedError.code, "The service ended during the solve. Solve again.")
 
 
 def swept(session: SessionRecord) -> SessionRecord:

@@ -15,7 +15,7 @@ from slrig.cli.display import progress_shown
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, not_offered, rejected_picture
 
-_STATES = {"queued": "waiting for the rig", "capturing": "preparing the rig", "reconstructing": "reconstructing"}
+_STATES = {"queued": "waiting for the rig", "capturing": "preparing the rig", "computing": "reconstructing"}
 
 FILES = ("mesh.ply", "preview.png", "report.json")
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import DatabaseError, OperationalError
@@ -24,7 +26,7 @@ _PATIENCE = "slrig_patience_ms"
 
 
 class Database:
-    """One file, opened by one part of the service, which brings its own tables. Safe to call from any thread.
+    """The file with every record of the service, and its tables. Safe to call from any thread.
 
     A change holds the file's one write lock from its first statement on: what it reads is what it changes, whatever
     another thread or process does meanwhile.
@@ -32,18 +34,17 @@ class Database:
     Raises
     ------
     StorageError
-        The disk refuses: here, and wherever it is read or changed.
+        The disk refuses: here, and wherever it is read or changed. Or another version of slrig wrote the file.
     """
 
-    def __init__(self, path: Path, *, upgrade: Callable[[Connection], None]) -> None:
-        """`upgrade` brings the part's tables up to date."""
+    def __init__(self, path: Path) -> None:
         self.path = path
         self._writing = threading.Lock()
         self._engine = create_engine(f"sqlite:///{path}")
         event.listen(self._engine, "connect", _set_up)
         event.listen(self._engine, "begin", _begin)
         with self._refusals(), self._writer(PATIENCE_S).begin() as connection:
-            upgrade(connection)
+            _upgrade(connection, path)
 
     def close(self) -> None:
         """Let the file go. Idempotent."""
@@ -103,13 +104,18 @@ def _begin(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN" if patience_ms is None else "BEGIN IMMEDIATE")
 
 
-def run_migrations(connection: Connection, package: str) -> None:
-    """Bring the tables behind `connection` up to date by the Alembic scripts in `package`, as "slrig.scan:migrations".
-
-    Does nothing when they are.
-    """
+def _upgrade(connection: Connection, path: Path) -> None:
+    """Bring the tables up to date by the scripts of `slrig.jobs.migrations`. Does nothing when they are."""
     config = Config()
-    config.set_main_option("script_location", package)
+    config.set_main_option("script_location", "slrig.jobs:migrations")
     config.set_main_option("path_separator", "os")
     config.attributes["connection"] = connection
+    known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
+    if found := set(MigrationContext.configure(connection).get_current_heads()) - known:
+        message = (
+            f"{path} was written by another version of slrig (its records are of version {', '.join(sorted(found))}), "
+            "and this one cannot read it. Move that file out of the data folder: finished scans and calibrations are "
+            "found again by their own files, schedules have to be made anew. Or name another folder with --data."
+        )
+        raise StorageError(message)
     command.upgrade(config, "head")

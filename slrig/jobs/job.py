@@ -93,7 +93,7 @@ class RigWork:
             if self.ending():
                 self._keep(interruption())
                 return
-            if failure_of(error).kind == UNEXPECTED:
+            if failure_of(error).code == UNEXPECTED:
                 _log.exception("work with the rig failed", work=self.holder.words)
             held.doubt(error)
             self._keep(error)

@@ -23,8 +23,8 @@ from typing import Any
 
 import structlog
 
-from slrig.errors import ScanCancelledError
-from slrig.failure import WorkerLostError, error_classes, interruption
+from slrig.errors import ScanCancelledError, WorkerLostError
+from slrig.failure import errors_by_code, interruption
 from slrig.jobs.channel import (
     Call,
     Failed,
@@ -296,5 +296,5 @@ def prepare_kernel_cache(folder: Path) -> None:
 
 
 def _error(failed: Failed) -> Exception:
-    known = error_classes().get(failed.fault.kind)
+    known = errors_by_code().get(failed.fault.code)
     return UnexpectedWorkerError(failed.trace) if known is None else known(failed.fault.message)

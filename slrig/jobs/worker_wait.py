@@ -12,8 +12,7 @@ from multiprocessing.process import BaseProcess
 
 import structlog
 
-from slrig.errors import ScanCancelledError
-from slrig.failure import WorkerLostError
+from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.jobs.channel import Call, Done, Failed, Preparing, Progressed, Unloadable, received, sent
 from slrig.jobs.frame_feed import FrameFeed
 

@@ -135,7 +135,7 @@ class RigSession:
     def doubt(self, error: Exception) -> None:
         """Let the rig go if an error leaves the state of its devices unknown; the next work opens them afresh."""
         failed = isinstance(error, DeviceError) and not isinstance(error, UnsupportedByDeviceError)
-        if failed or failure_of(error).kind == UNEXPECTED:
+        if failed or failure_of(error).code == UNEXPECTED:
             self.let_go(error)
 
     def _opened(self) -> Rig:

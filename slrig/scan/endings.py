@@ -12,8 +12,8 @@ import structlog
 
 from slrig.errors import StorageError
 from slrig.failure import JobFailure
-from slrig.scan.records import ScanState
-from slrig.scan.store import ScanStore
+from slrig.jobs.records import JobState
+from slrig.jobs.store import JobStore
 
 RETRY_S = 2.0
 """How long after a refusal the records are tried again: soon enough for whoever waits for the end of a scan."""
@@ -26,7 +26,7 @@ class Ending:
     """The final state of a scan, why where that is not success, and the summary of its report where it is."""
 
     id: UUID
-    state: ScanState
+    state: JobState
     fault: JobFailure | None
     summary: Mapping[str, Any] | None = None
 
@@ -34,7 +34,7 @@ class Ending:
 class Endings:
     """The endings that are not on record yet. Any thread may call."""
 
-    def __init__(self, store: ScanStore) -> None:
+    def __init__(self, store: JobStore) -> None:
         self._store = store
         self._lock = threading.Lock()
         self._unrecorded: list[Ending] = []

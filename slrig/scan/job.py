@@ -12,19 +12,20 @@ import structlog
 
 from slrig.bundle.health import write_health
 from slrig.devices import Rig
-from slrig.errors import ScanCancelledError, SlrigError, StorageError
-from slrig.failure import UNEXPECTED, JobFailure, ScanInterruptedError, disk_errors, failure_of, interruption
+from slrig.errors import ScanCancelledError, ScanInterruptedError, SlrigError, StorageError
+from slrig.failure import UNEXPECTED, JobFailure, disk_errors, failure_of, interruption
 from slrig.jobs.channel import Call
 from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
 from slrig.jobs.job import Holder
+from slrig.jobs.records import JobRecord, JobState
+from slrig.jobs.store import JobStore, ProgressRecorder
 from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession, driver_errors
 from slrig.scan.endings import Ending, Endings
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import check_plan
-from slrig.scan.records import KeptRecord, ScanRecord, ScanState, report_summary, write_record
-from slrig.scan.store import ProgressRecorder, ScanStore
+from slrig.scan.records import KeptRecord, plan_from_json, report_summary, write_record
 
 CAPTURE_SHARE = 0.5
 """The part of a scan's progress that is capture."""
@@ -70,7 +71,7 @@ class ScanTools:
     calibration still holds, if anybody does.
     """
 
-    store: ScanStore
+    store: JobStore
     folder: DataFolder
     worker: Worker
     capture: CaptureBundle
@@ -83,15 +84,15 @@ class ScanTools:
 class ScanJob:
     """One scan that waits or is under way. Implements `slrig.jobs.job.Job`."""
 
-    def __init__(self, record: ScanRecord, tools: ScanTools) -> None:
+    def __init__(self, record: JobRecord, tools: ScanTools) -> None:
         self._record = record
         self.id = record.id
         self.holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
         self.since = record.created_at
         self.stop = threading.Event()
-        self._plan = record.plan
+        self._plan = plan_from_json(record.plan)
         self._tools = tools
-        self._ending = Ending(record.id, ScanState.FAILED, failure_of(RuntimeError()))
+        self._ending = Ending(record.id, JobState.FAILED, failure_of(RuntimeError()))
 
     def run(self, held: RigSession) -> None:
         """See `Job`."""
@@ -100,7 +101,7 @@ class ScanJob:
 
     def clear_up(self) -> None:
         """See `Job`."""
-        if self._ending.state is not ScanState.SUCCEEDED:
+        if self._ending.state is not JobState.SUCCEEDED:
             self._keep_evidence(self._ending.state)
         self._tools.worker.start()
 
@@ -110,11 +111,11 @@ class ScanJob:
 
     def cut_off(self, error: SlrigError) -> None:
         """See `Job`."""
-        state = ScanState.FAILED
+        state = JobState.FAILED
         if isinstance(error, ScanInterruptedError):
-            state = ScanState.INTERRUPTED
+            state = JobState.INTERRUPTED
         elif isinstance(error, ScanCancelledError) or self.stop.is_set():
-            state = ScanState.CANCELLED
+            state = JobState.CANCELLED
         self._tools.endings.add(Ending(self.id, state, failure_of(error)))
 
     def settle(self) -> None:
@@ -123,34 +124,34 @@ class ScanJob:
 
     def _ended(self, held: RigSession) -> Ending:
         log = _log.bind(scan=str(self.id))
-        state, summary, fault = ScanState.FAILED, None, None
+        state, summary, fault = JobState.FAILED, None, None
         try:
             summary = self._walk(held)
-            state = ScanState.SUCCEEDED
+            state = JobState.SUCCEEDED
         except Exception as error:
             fault = self._told(error)
             if self._tools.ending():
-                state, fault = ScanState.INTERRUPTED, failure_of(interruption())
+                state, fault = JobState.INTERRUPTED, failure_of(interruption())
             elif isinstance(error, ScanCancelledError):
-                state = ScanState.CANCELLED
-            elif fault.kind == UNEXPECTED:
-                log.exception("scan failed", kind=fault.kind)
+                state = JobState.CANCELLED
+            elif fault.code == UNEXPECTED:
+                log.exception("scan failed", code=fault.code)
             else:
-                log.warning("scan failed", kind=fault.kind, cause=fault.message)
+                log.warning("scan failed", code=fault.code, cause=fault.message)
         return Ending(self.id, state, fault, summary)
 
     def _told(self, error: Exception) -> JobFailure:
         # The staging folder is gone when the message is read: what it names is then the scan's own bundle.
         fault = failure_of(error)
-        return JobFailure(fault.kind, fault.message.replace(f"{self._tools.folder.staging(self.id)}/", ""))
+        return JobFailure(fault.code, fault.message.replace(f"{self._tools.folder.staging(self.id)}/", ""))
 
     def _walk(self, held: RigSession) -> Mapping[str, Any]:
         tools = self._tools
         progress = ProgressRecorder(tools.store, self.id, hidden=f"{tools.folder.staging(self.id)}/")
-        if self._record.state is ScanState.RECONSTRUCTING:
+        if self._record.state is JobState.COMPUTING:
             # The service was killed in the middle of it: all that is needed lies there.
             return self._reconstructed(tools.folder.clear_results(self.id), progress, None)
-        self.since = tools.store.advance(self.id, ScanState.CAPTURING)
+        self.since = tools.store.advance(self.id, JobState.CAPTURING)
         rig = held.open()
         held.refuse_misfit()
         if held.facts is not None:
@@ -188,7 +189,7 @@ class ScanJob:
         report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=self.stop.is_set, feed=feed)
         _require_promised(staged / "result")
         record = self._record
-        write_record(staged, KeptRecord(self.id, record.rig, record.label, record.plan, record.created_at, self.since))
+        write_record(staged, KeptRecord(self.id, record.rig, record.label, self._plan, record.created_at, self.since))
         tools.folder.commit(self.id)
         if (health := tools.health()) is not None:
             _noted(health, report)
@@ -197,15 +198,15 @@ class ScanJob:
     def _reconstructing(self) -> None:
         """Record that the bundle is whole. That record is for whoever looks on; the scan goes on without."""
         try:
-            self._tools.store.advance(self.id, ScanState.RECONSTRUCTING)
+            self._tools.store.advance(self.id, JobState.COMPUTING)
         except StorageError as error:
             _log.warning("that a scan is reconstructed could not be recorded", scan=str(self.id), cause=str(error))
 
-    def _keep_evidence(self, state: ScanState) -> None:
+    def _keep_evidence(self, state: JobState) -> None:
         """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
         folder = self._tools.folder
         try:
-            if state is not ScanState.CANCELLED and (folder.staging(self.id) / "bundle").is_dir():
+            if state is not JobState.CANCELLED and (folder.staging(self.id) / "bundle").is_dir():
                 folder.keep_bundle(self.id)
         except Exception:  # noqa: BLE001 - see below
             # The scan's own fault is the one to tell; without its bundle it is told all the same.

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -14,67 +13,11 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle.storage import write_file
-from slrig.failure import JobFailure
 from slrig.scan.plan import ScanPlan
 
 _RECORD = "record.json"
 
 _plan_adapter = TypeAdapter(ScanPlan)
-
-
-class ScanState(StrEnum):
-    """Where a scan stands. The last four are final: a scan never leaves them."""
-
-    QUEUED = "queued"
-    CAPTURING = "capturing"
-    RECONSTRUCTING = "reconstructing"
-    SUCCEEDED = "succeeded"
-    FAILED = "failed"
-    CANCELLED = "cancelled"
-    INTERRUPTED = "interrupted"
-
-    @property
-    def final(self) -> bool:
-        """True when nothing more will happen to the scan.
-
-        >>> ScanState.CANCELLED.final, ScanState.QUEUED.final
-        (True, False)
-        """
-        return self not in {ScanState.QUEUED, ScanState.CAPTURING, ScanState.RECONSTRUCTING}
-
-
-@dataclass(frozen=True, slots=True)
-class ScanProgress:
-    """How far a scan is: the stage's name, the fraction 0..1 of the whole scan, and a detail for people."""
-
-    stage: str
-    fraction: float
-    detail: str
-
-    def as_json(self) -> dict[str, Any]:
-        """As events and answers carry it."""
-        return {"stage": self.stage, "fraction": round(self.fraction, 4), "detail": self.detail}
-
-
-@dataclass(frozen=True, slots=True)
-class ScanRecord:
-    """One row of the scan table. `number` rises with every scan and orders lists; times are UTC.
-
-    `summary` is the part of the report worth showing in a list; None until the scan has succeeded.
-    """
-
-    number: int
-    id: UUID
-    state: ScanState
-    label: str | None
-    rig: str
-    plan: ScanPlan
-    created_at: datetime
-    started_at: datetime | None
-    finished_at: datetime | None
-    progress: ScanProgress
-    fault: JobFailure | None
-    summary: Mapping[str, Any] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,15 +33,6 @@ class KeptRecord:
 
 
 _record_adapter = TypeAdapter(KeptRecord)
-
-
-@dataclass(frozen=True, slots=True)
-class ScanEvent:
-    """One thing that happened to a scan. `number` counts from 1 within the scan and never changes."""
-
-    number: int
-    kind: str
-    data: Mapping[str, Any]
 
 
 def plan_json(plan: ScanPlan) -> dict[str, Any]:

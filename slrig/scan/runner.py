@@ -11,12 +11,13 @@ from uuid import UUID, uuid4
 import structlog
 
 from slrig.devices import Rig
-from slrig.errors import InvalidInputError, ScanStateError
-from slrig.failure import ScanInterruptedError, failure_of
+from slrig.errors import InvalidInputError, ScanInterruptedError, ScanStateError
+from slrig.failure import failure_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder, RigWork
 from slrig.jobs.queue import JobQueue
-from slrig.jobs.records import utc_now
+from slrig.jobs.records import JobRecord, JobState, utc_now
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.preview import Light, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
@@ -24,8 +25,7 @@ from slrig.scan.endings import Endings
 from slrig.scan.job import CaptureBundle, ScanJob, ScanTools, WatchesHealth
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
-from slrig.scan.records import ScanRecord, ScanState
-from slrig.scan.store import ScanStore
+from slrig.scan.records import plan_json
 
 _log = structlog.get_logger(__name__)
 
@@ -62,7 +62,7 @@ class Runner:
 
     def __init__(
         self,
-        store: ScanStore,
+        store: JobStore,
         folder: DataFolder,
         rig: RigSession,
         worker: Worker,
@@ -102,7 +102,7 @@ class Runner:
         """Put scans in line that a kill of the service left unfinished, see `slrig.scan.sweep`; before `start`."""
         self._queue.take_up([ScanJob(self._store.get(scan), self._tools) for scan in scans])
 
-    def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> ScanRecord:
+    def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
         """Record a scan and have it done; `wait` lets it queue behind others.
 
         Raises
@@ -127,11 +127,11 @@ class Runner:
         rig.refuse_misfit()
         # Frames once as captured, and as much again for meshes and the zipped bundle of a careful client.
         self._folder.require_space(2 * frame_bytes + self._spare_bytes)
-        record: ScanRecord | None = None
+        record: JobRecord | None = None
 
         def make() -> ScanJob:
             nonlocal record
-            record = self._store.create(plan, rig=rig.name, label=label, key=key)
+            record = self._store.create(plan_json(plan), rig=rig.name, label=label, key=key)
             return ScanJob(record, self._tools)
 
         self._queue.submit(make, wait=wait)
@@ -193,8 +193,8 @@ class Runner:
         """Look through a camera: see `JobQueue.watch`."""
         return self._queue.watch(camera, light)
 
-    def cancel(self, scan_id: UUID) -> ScanRecord:
-        """Ask a scan to stop. Returns at once; a scan that has finished stays as it is. Raises ScanNotFoundError."""
+    def cancel(self, scan_id: UUID) -> JobRecord:
+        """Ask a scan to stop. Returns at once; a scan that has finished stays as it is. Raises JobNotFoundError."""
         record = self._store.get(scan_id)
         if self._queue.cancel(scan_id):
             return record
@@ -202,7 +202,7 @@ class Runner:
         if scan_id not in self._endings:
             # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
             message = "Nothing works on this scan any more. Scan again."
-            self._store.finish(scan_id, ScanState.INTERRUPTED, fault=failure_of(ScanInterruptedError(message)))
+            self._store.finish(scan_id, JobState.INTERRUPTED, fault=failure_of(ScanInterruptedError(message)))
         return self._store.get(scan_id)
 
     def delete(self, scan_id: UUID) -> None:
@@ -210,7 +210,7 @@ class Runner:
 
         Raises
         ------
-        ScanNotFoundError
+        JobNotFoundError
             There is no such scan.
         ScanStateError
             It is not finished.

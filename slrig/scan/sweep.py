@@ -11,8 +11,9 @@ from uuid import UUID
 from slrig.errors import StorageError
 from slrig.failure import failure_of, interruption
 from slrig.jobs.data_folder import DataFolder, missing_files
-from slrig.scan.records import ScanState, read_record, report_summary
-from slrig.scan.store import ScanStore
+from slrig.jobs.records import JobState
+from slrig.jobs.store import JobStore
+from slrig.scan.records import plan_json, read_record, report_summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,7 @@ class Swept:
     put_aside: tuple[str, ...]
 
 
-def sweep(store: ScanStore, folder: DataFolder) -> Swept:
+def sweep(store: JobStore, folder: DataFolder) -> Swept:
     """Settle every scan that the last run left open. Only for the process that holds the folder, before it scans.
 
     - A running scan whose mesh and report are in place had only its record missing: succeeded.
@@ -46,20 +47,20 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
         placed = folder.scan(record.id)
         if not missing_files(placed):
             report = json.loads((placed / "report.json").read_bytes())
-            store.finish(record.id, ScanState.SUCCEEDED, summary=report_summary(report))
+            store.finish(record.id, JobState.SUCCEEDED, summary=report_summary(report))
             recovered.append(record.id)
             continue
         # Reconstruction starts only after the bundle was made durable, so this bundle is whole.
-        whole = record.state is ScanState.RECONSTRUCTING and (folder.staging(record.id) / "bundle").is_dir()
-        if record.state is ScanState.QUEUED or (whole and _attempts(store, record.id) == 1):
+        whole = record.state is JobState.COMPUTING and (folder.staging(record.id) / "bundle").is_dir()
+        if record.state is JobState.QUEUED or (whole and _attempts(store, record.id) == 1):
             resumed.append(record.id)
             continue
         if whole:
             folder.keep_bundle(record.id)
-        store.finish(record.id, ScanState.INTERRUPTED, fault=failure_of(interruption()))
+        store.finish(record.id, JobState.INTERRUPTED, fault=failure_of(interruption()))
         interrupted.append(record.id)
     for scan_id, state in store.states().items():
-        if state is ScanState.SUCCEEDED and (missing := missing_files(folder.scan(scan_id))):
+        if state is JobState.SUCCEEDED and (missing := missing_files(folder.scan(scan_id))):
             if folder.staging(scan_id).is_dir():
                 store.delete(scan_id)
                 continue
@@ -73,27 +74,36 @@ def sweep(store: ScanStore, folder: DataFolder) -> Swept:
     return Swept(tuple(interrupted), tuple(resumed), tuple(recovered), tuple(lost), _put_aside(store, folder))
 
 
-def _attempts(store: ScanStore, scan_id: UUID) -> int:
+def _attempts(store: JobStore, scan_id: UUID) -> int:
     """How often the reconstruction of a scan was begun."""
     states = [event.data["state"] for event in store.events(scan_id, after=0) if event.kind == "state"]
-    return states.count(ScanState.RECONSTRUCTING)
+    return states.count(JobState.COMPUTING)
 
 
-def _restored(store: ScanStore, folder: DataFolder) -> list[UUID]:
+def _restored(store: JobStore, folder: DataFolder) -> list[UUID]:
     """Finished scans that tell what their record was, and have none; put on record in the order of their making."""
     whole = [path for path in _strays(store, folder) if not missing_files(path)]
     kept = [record for path in whole if (record := read_record(path)) is not None and str(record.id) == path.name]
     for record in sorted(kept, key=lambda each: each.created_at):
-        store.restore(record, report_summary(json.loads((folder.scan(record.id) / "report.json").read_bytes())))
+        report = json.loads((folder.scan(record.id) / "report.json").read_bytes())
+        store.restore(
+            record.id,
+            plan_json(record.plan),
+            report_summary(report),
+            rig=record.rig,
+            label=record.label,
+            created_at=record.created_at,
+            started_at=record.started_at,
+        )
     return [record.id for record in kept]
 
 
-def _strays(store: ScanStore, folder: DataFolder) -> list[Path]:
+def _strays(store: JobStore, folder: DataFolder) -> list[Path]:
     known = {str(scan_id) for scan_id in store.states()}
     return [path for path in folder.scans.iterdir() if path.name not in known]
 
 
-def _put_aside(store: ScanStore, folder: DataFolder) -> tuple[str, ...]:
+def _put_aside(store: JobStore, folder: DataFolder) -> tuple[str, ...]:
     strays = _strays(store, folder)
     for stray in strays:
         folder.orphans.mkdir(exist_ok=True)

@@ -11,8 +11,13 @@ from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseState, SessionRecord, SessionState
 from slrig.calibration.judging.verdict import Grade
-from slrig.errors import CalibrationNotFoundError, CalibrationStateError, DeviceError, UnsupportedByDeviceError
-from slrig.failure import WorkerLostError
+from slrig.errors import (
+    CalibrationNotFoundError,
+    CalibrationStateError,
+    DeviceError,
+    UnsupportedByDeviceError,
+    WorkerLostError,
+)
 from slrig.jobs.job import Holder
 from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import error_of, until

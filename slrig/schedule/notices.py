@@ -10,7 +10,6 @@ import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,6 +17,7 @@ import structlog
 
 from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import HealthState
+from slrig.jobs.database import Database
 from slrig.jobs.records import Clock, utc_now
 from slrig.schedule.records import Run, RunState, Schedule
 from slrig.verify.store import HealthStore, VerificationRecord
@@ -143,7 +143,7 @@ class Notices:
 class NoticedHealth(HealthStore):
     """The history of a rig's health, every change of which is told."""
 
-    def __init__(self, database: Path, notices: Notices) -> None:
+    def __init__(self, database: Database, notices: Notices) -> None:
         super().__init__(database)
         self._notices = notices
         self._adding = threading.Lock()

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from slrig.errors import DeviceError, LibraryMissingError, RigBusyError, ScanCancelledError, SlrigError
-from slrig.failure import JobFailure, error_classes
+from slrig.failure import JobFailure, errors_by_code
 
 LOOK_S = 0.1
 
@@ -31,9 +31,9 @@ def until(reached: Callable[[], bool], cancelled: Callable[[], bool], *, cancel:
 def error_of(fault: JobFailure) -> SlrigError:
     """The error that a recorded fault stands for.
 
-    >>> error_of(JobFailure("PoseRefusedError", "no camera sees the board"))
+    >>> error_of(JobFailure("pose-refused", "no camera sees the board"))
     PoseRefusedError('no camera sees the board')
     """
-    kind = error_classes().get(fault.kind, SlrigError)
+    kind = errors_by_code().get(fault.code, SlrigError)
     # These two take more than a message.
     return DeviceError(fault.message) if kind in {RigBusyError, LibraryMissingError} else kind(fault.message)

@@ -9,8 +9,14 @@ from typing import Any, Protocol
 
 import structlog
 
-from slrig.errors import DeviceError, RigBusyError, ScheduleNotFoundError, SlrigError, UnsupportedByDeviceError
-from slrig.failure import WorkerLostError
+from slrig.errors import (
+    DeviceError,
+    RigBusyError,
+    ScheduleNotFoundError,
+    SlrigError,
+    UnsupportedByDeviceError,
+    WorkerLostError,
+)
 from slrig.jobs.records import Clock, utc_now
 from slrig.schedule.records import Run, RunState, Schedule
 from slrig.schedule.store import ScheduleStore

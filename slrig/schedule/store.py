@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -18,11 +17,10 @@ from sqlalchemy.orm import Session
 
 from slrig.errors import ScheduleNotFoundError
 from slrig.jobs.database import Database
+from slrig.jobs.tables import RunRow, ScheduleRow
 from slrig.schedule.cron import Cron
-from slrig.schedule.migrations import upgrade
 from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.recurrence import DueRun, reckon
-from slrig.schedule.tables import RunRow, ScheduleRow
 
 LIFE_S = 60.0
 """How long a run counts as alive after its process last said so."""
@@ -33,13 +31,9 @@ _KEPT_RUNS = 5000
 class ScheduleStore:
     """Schedules and runs. Safe to call from any thread and from several processes. `now` is a moment with a zone."""
 
-    def __init__(self, database: Path) -> None:
-        self._database = Database(database, upgrade=upgrade)
+    def __init__(self, database: Database) -> None:
+        self.database = database
         self._owner = str(uuid4())
-
-    def close(self) -> None:
-        """Let the database go."""
-        self._database.close()
 
     def create(self, order: Order, now: datetime) -> Schedule:
         """Put a new schedule on record. It is due from now on."""
@@ -57,18 +51,18 @@ class ScheduleStore:
             created_at=_stamp(now),
             next_due=_stamp(order.cron.after(now)),
         )
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             session.add(row)
             return _schedule(row)
 
     def get(self, schedule_id: UUID) -> Schedule:
         """Return a schedule. Raises ScheduleNotFoundError."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return _schedule(_found(session, schedule_id))
 
     def all(self) -> Sequence[Schedule]:
         """Every schedule, oldest first."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             query = select(ScheduleRow).order_by(ScheduleRow.created_at, ScheduleRow.id)
             return [_schedule(row) for row in session.scalars(query)]
 
@@ -80,19 +74,19 @@ class ScheduleStore:
         ScheduleNotFoundError
             There is no such schedule.
         """
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             row = _found(session, schedule_id)
             row.enabled = enabled
             return _schedule(row)
 
     def remove(self, schedule_id: UUID) -> None:
         """Forget a schedule and its runs. Raises ScheduleNotFoundError."""
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             session.delete(_found(session, schedule_id))
 
     def runs(self, schedule_id: UUID, *, before: int | None = None, limit: int = 50) -> Sequence[Run]:
         """Up to `limit` runs of a schedule, newest first, whose number is below `before`."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             _found(session, schedule_id)
             query = select(RunRow).where(RunRow.schedule_id == str(schedule_id))
             if before is not None:
@@ -106,13 +100,13 @@ class ScheduleStore:
             .join(RunRow, RunRow.schedule_id == ScheduleRow.id)
             .group_by(ScheduleRow.task, RunRow.state)
         )
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return {(TaskKind(task), RunState(state)): int(count) for task, state, count in session.execute(query)}
 
     def reckon(self, now: datetime) -> Sequence[Run]:
         """Record what has become due. Returns the rows made."""
         made: list[RunRow] = []
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             for row in session.scalars(select(ScheduleRow).where(ScheduleRow.enabled)):
                 order = _order(row)
                 found = reckon(order, _moment(row.next_due), now)
@@ -134,20 +128,20 @@ class ScheduleStore:
             .where(RunRow.state == RunState.WAITING, RunRow.next_attempt <= _stamp(now))
             .order_by(RunRow.due, RunRow.number)
         )
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return [_run(row) for row in session.scalars(query)]
 
     def next_moment(self) -> datetime | None:
         """When something is due or wants to try again next; None if nothing ever is."""
         due = select(func.min(ScheduleRow.next_due)).where(ScheduleRow.enabled)
         attempt = select(func.min(RunRow.next_attempt)).where(RunRow.state == RunState.WAITING)
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             found = [stamp for query in (due, attempt) if (stamp := session.scalar(query)) is not None]
             return _moment(min(found)) if found else None
 
     def start(self, run: Run, now: datetime) -> bool:
         """Take a waiting run; False if somebody else has it, or another run is under way."""
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             row = session.get(RunRow, run.number)
             under_way = session.scalar(select(RunRow.number).where(RunRow.state == RunState.RUNNING).limit(1))
             if row is None or row.state != RunState.WAITING or under_way is not None:
@@ -158,7 +152,7 @@ class ScheduleStore:
 
     def postpone(self, run: Run, reason: str, next_attempt: datetime) -> None:
         """Put a run that could not have the rig back among those that wait."""
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             row = session.get(RunRow, run.number)
             if row is not None and not RunState(row.state).final:
                 row.state, row.reason, row.next_attempt = RunState.WAITING, reason, _stamp(next_attempt)
@@ -168,7 +162,7 @@ class ScheduleStore:
         self, run: Run, state: RunState, now: datetime, *, reason: str | None, result: Mapping[str, Any] | None = None
     ) -> None:
         """Record what became of a run. The first final state stands."""
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             row = session.get(RunRow, run.number)
             if row is not None and not RunState(row.state).final:
                 _close(row, state, now, reason)
@@ -177,7 +171,7 @@ class ScheduleStore:
 
     def beat(self, now: datetime) -> None:
         """Say that this process is alive, and with it the run that it has under way."""
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
             for row in session.scalars(query):
                 row.alive_until = _stamp(now + timedelta(seconds=LIFE_S))
@@ -193,7 +187,7 @@ class ScheduleStore:
             query = query.where(
                 (RunRow.alive_until < _stamp(now)) | (RunRow.alive_until > _stamp(now + timedelta(seconds=2 * LIFE_S)))
             )
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             dead = list(session.scalars(query))
             for row in dead:
                 _close(row, RunState.INTERRUPTED, now, "the service ended in the middle of it")
@@ -204,7 +198,7 @@ class ScheduleStore:
         on record as running ended while the disk refused to take that down.
         """
         query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             ended = list(session.scalars(query))
             for row in ended:
                 _close(row, RunState.INTERRUPTED, now, "it ended, and how could not be put on record")
@@ -213,7 +207,7 @@ class ScheduleStore:
     def expire(self, now: datetime) -> Sequence[Run]:
         """Record runs that waited for the whole of their grace as skipped, each with what it waited for."""
         query = select(RunRow).where(RunRow.state == RunState.WAITING, RunRow.deadline < _stamp(now))
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             late = list(session.scalars(query))
             for row in late:
                 waited = f"for the whole of its grace: {row.reason}" if row.attempts else "before it could be started"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -14,8 +13,7 @@ from sqlalchemy import select
 from slrig.calibration.health.look import Look, look_from_document
 from slrig.calibration.health.verdict import Health, HealthState, judged
 from slrig.jobs.database import Database
-from slrig.verify.migrations import upgrade
-from slrig.verify.tables import VerificationRow
+from slrig.jobs.tables import VerificationRow
 
 _TREND = 60
 _KEPT = 20_000
@@ -51,12 +49,8 @@ class VerificationRecord:
 class HealthStore:
     """Verifications. Safe to call from any thread and from several processes."""
 
-    def __init__(self, database: Path) -> None:
-        self._database = Database(database, upgrade=upgrade)
-
-    def close(self) -> None:
-        """Let the database go."""
-        self._database.close()
+    def __init__(self, database: Database) -> None:
+        self.database = database
 
     def add(self, look: Look, *, calibration: str, at: datetime) -> VerificationRecord:
         """Judge a look together with those before it since the calibration, and put it on record.
@@ -66,7 +60,7 @@ class HealthStore:
         StorageError
             The disk refused.
         """
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             query = select(VerificationRow).where(VerificationRow.calibration == calibration)
             # The first few too: a trend starts from them.
             first = list(session.scalars(query.order_by(VerificationRow.number).limit(3)))
@@ -88,7 +82,7 @@ class HealthStore:
         query = select(VerificationRow)
         if since is not None:
             query = query.where(VerificationRow.at >= _stamp(since))
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             return [_record(row) for row in session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))]
 
     def latest(self) -> VerificationRecord | None:
@@ -98,7 +92,7 @@ class HealthStore:
     def since_calibration(self, calibration: str, *, limit: int = 1000) -> Sequence[VerificationRecord]:
         """The verifications of one calibration, oldest first; the newest `limit` of them."""
         query = select(VerificationRow).where(VerificationRow.calibration == calibration)
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             rows = session.scalars(query.order_by(VerificationRow.number.desc()).limit(limit))
             return [_record(row) for row in rows][::-1]
 

@@ -66,6 +66,13 @@ def test_an_error_says_when_to_raise_it(error: type[slrig.errors.SlrigError]) ->
     assert len(own.split()) >= 5
 
 
+def test_an_error_has_a_code_of_its_own() -> None:
+    # Clients and records know errors by these, whatever becomes of the names of classes.
+    codes = {error.__name__: vars(error).get("code") for error in ERRORS}
+    assert [name for name, code in codes.items() if not re.fullmatch(r"[a-z]+(-[a-z]+)*", code or "")] == []
+    assert len(set(codes.values())) == len(codes)
+
+
 def test_errors_are_one_tree() -> None:
     tree = set(ERRORS)
     defined = {found for _, found in inspect.getmembers(slrig.errors, inspect.isclass)}

@@ -17,7 +17,7 @@ from slrig.errors import setting
 ROOT = Path(__file__).parents[2]
 # What only a terminal shows: commands by hand, words to whoever starts the service, and what is printed on a board.
 OF_THE_COMMAND_LINE = (
-    "slrig/cli", "slrig/api", "slrig/doctor", "slrig/jobs/data_folder.py",
+    "slrig/cli", "slrig/api", "slrig/doctor", "slrig/jobs/data_folder.py", "slrig/jobs/database.py",
     "slrig/calibration/boards/printing.py",
     "drivers/screen/refusals.py",  # options of xrandr
 )  # fmt: skip

@@ -116,7 +116,7 @@ def test_ended_in_the_middle_of_the_reconstruction(service: ServiceProcess, desk
         with service.client() as client:
             scan = client.start({})
             for event in client.follow(scan):
-                if event.get("state") == "reconstructing":
+                if event.get("state") == "computing":
                     break
             assert not desk.lit
         service.process.send_signal(how)

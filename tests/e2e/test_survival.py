@@ -91,7 +91,7 @@ def test_killed_reconstruction_fails_its_scan_and_the_next_one_succeeds(start: S
         worker = service.worker_id()
         os.kill(worker, signal.SIGSTOP)
         scan = client.start({})
-        followed_to(client, scan, "reconstructing")
+        followed_to(client, scan, "computing")
         os.kill(worker, signal.SIGKILL)
         record = ended(client, scan)
         assert record["state"] == "failed"

@@ -28,14 +28,15 @@ from slrig.errors import (
     DeviceBusyError,
     IdempotencyError,
     InvalidInputError,
+    JobNotFoundError,
     NothingToReconstructError,
     RigBusyError,
-    ScanNotFoundError,
+    ScanInterruptedError,
     ScanStateError,
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.failure import ScanInterruptedError, interruption
+from slrig.failure import interruption
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
 from slrig.model import Calibration
@@ -117,9 +118,9 @@ def desk(desks: Desks) -> AcceptanceDesk:
     return desks()
 
 
-def fault_kind(desk: AcceptanceDesk, test_id: UUID) -> str | None:
+def failure_code(desk: AcceptanceDesk, test_id: UUID) -> str | None:
     fault = desk.get(test_id).fault
-    return None if fault is None else fault.kind
+    return None if fault is None else fault.code
 
 
 def the_plan(_: Calibration) -> AcceptancePlan:
@@ -169,7 +170,7 @@ def test_a_position_that_went_wrong_may_be_measured_again(
     record = desk.get(test.id)
     assert record.state is AcceptanceState.OPEN
     assert record.fault is not None
-    assert record.fault.kind == NothingToReconstructError.__name__
+    assert record.fault.code == NothingToReconstructError.code
     assert record.readings == ()
     desk.measure(test.id, wait=False, scripted=False)
     assert desk.get(test.id).fault is None
@@ -197,15 +198,15 @@ def test_a_held_rig_is_refused_and_the_test_stays_open(desk: AcceptanceDesk, que
 
 
 def test_what_cannot_be_tested_is_refused(desk: AcceptanceDesk, queue: TameLender) -> None:
-    with pytest.raises(ScanNotFoundError, match="No acceptance test"):
+    with pytest.raises(JobNotFoundError, match="No acceptance test"):
         desk.get(uuid4())
     exact = desk.open(lambda _: replace(PLAN, rendered=True))
     desk.measure(exact.id, wait=False, scripted=True)
-    assert fault_kind(desk, exact.id) == InvalidInputError.__name__
+    assert failure_code(desk, exact.id) == InvalidInputError.code
     queue.rig.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=True)
-    assert fault_kind(desk, test.id) == UnsupportedByDeviceError.__name__
+    assert failure_code(desk, test.id) == UnsupportedByDeviceError.code
     queue.facts = SimpleNamespace(calibration=None)
     with pytest.raises(CalibrationError, match="has no calibration"):
         desk.open(the_plan)
@@ -261,7 +262,7 @@ def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks
     after = desks()
     record = after.get(test.id)
     assert record.state is AcceptanceState.INTERRUPTED
-    assert fault_kind(after, test.id) == ScanInterruptedError.__name__
+    assert failure_code(after, test.id) == ScanInterruptedError.code
     assert not stray.exists()
     with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
         after.file(test.id, "report.json")
@@ -338,7 +339,7 @@ def test_positions_of_one_test_are_measured_with_one_calibration(desk: Acceptanc
     other = replace(camera, translation_mm=camera.translation_mm + 1)
     queue.rig = replace(queue.rig, calibration=Calibration({"left": other}, RIG.projector))
     desk.measure(test.id, wait=False, scripted=False)
-    assert fault_kind(desk, test.id) == CalibrationStateError.__name__
+    assert failure_code(desk, test.id) == CalibrationStateError.code
     assert len(desk.get(test.id).readings) == PLAN.repeats
     assert desk.cancel(test.id).state is AcceptanceState.CANCELLED
 
@@ -357,5 +358,5 @@ def test_a_test_under_way_is_not_deleted(desk: AcceptanceDesk, queue: TameLender
     desk.measure(test.id, wait=False, scripted=True)
     assert refused
     desk.delete(test.id)
-    with pytest.raises(ScanNotFoundError):
+    with pytest.raises(JobNotFoundError):
         desk.get(test.id)

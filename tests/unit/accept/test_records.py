@@ -30,7 +30,7 @@ RECORD = AcceptanceRecord(
     replace(PLAN, exposure_s=0.02, notes="after the move"),
     AcceptanceState.INTERRUPTED,
     (told("sphere-1", 0, 0.004), replace(told("sphere-1", 1, -0.001), noise_mm=math.nan)),
-    JobFailure("NothingToReconstructError", "sphere-1: nothing there"),
+    JobFailure("nothing-to-reconstruct", "sphere-1: nothing there"),
     decision=Decision.UNDECIDED,
     opened_by=RequestKey("key", "body"),
     measured_by={"other": "position"},

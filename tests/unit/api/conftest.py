@@ -15,10 +15,12 @@ from slrig.api.security import digest
 from slrig.api.service import assembled_service
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.records import JobKind
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession
 from slrig.scan.runner import Runner
-from slrig.scan.store import ScanStore
 from tests.unit.calibrate.calibration_bench import TameCalibrating
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
@@ -35,7 +37,7 @@ class ServedBench(TameBench):
             data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, keep_calibrations=keep_calibrations
         )
         folder = DataFolder(root, free=lambda _: self.free_bytes)
-        store = ScanStore(folder.database)
+        store = JobStore(Database(folder.database), JobKind.SCAN)
         self.worker = Worker("tests.unit.scan.fake_pipeline")
         rig = RigSession("bench", self.open_rig)
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)

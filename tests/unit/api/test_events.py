@@ -13,33 +13,35 @@ from sse_starlette import ServerSentEvent
 from slrig.api.events import followed_scan
 from slrig.api.streams import OpenStreams
 from slrig.api.streams import told as stream_of
+from slrig.jobs.database import Database
+from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobRecord, JobState
+from slrig.jobs.store import JobStore
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import ScanEvent, ScanProgress, ScanRecord, ScanState
-from slrig.scan.store import ScanStore
+from slrig.scan.records import plan_json
 from tests.unit.scan.fakes import WAIT_S
 
 
-class ActingStore(ScanStore):
+class ActingStore(JobStore):
     """Does something of its own before the next look at a scan's events, on the thread that looks."""
 
     act: Callable[[], None] | None = None
 
-    def events(self, scan_id: UUID, *, after: int) -> Sequence[ScanEvent]:
+    def events(self, job_id: UUID, *, after: int) -> Sequence[JobEvent]:
         act, self.act = self.act, None
         if act is not None:
             act()
-        return super().events(scan_id, after=after)
+        return super().events(job_id, after=after)
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[ActingStore]:
-    store = ActingStore(tmp_path / "slrig.sqlite")
+    store = ActingStore(Database(tmp_path / "slrig.sqlite"), JobKind.SCAN)
     yield store
-    store.close()
+    store.database.close()
 
 
-def made(store: ScanStore) -> ScanRecord:
-    return store.create(ScanPlan(), rig="bench", label=None)
+def made(store: JobStore) -> JobRecord:
+    return store.create(plan_json(ScanPlan()), rig="bench", label=None)
 
 
 async def told(stream: AsyncIterator[ServerSentEvent]) -> list[str | None]:
@@ -52,8 +54,8 @@ def test_stream_ahead_of_its_scan_is_told_what_comes_next(store: ActingStore) ->
     scan = made(store)
 
     def go_on() -> None:
-        store.progress(scan.id, ScanProgress("capture", 0.5, ""))
-        store.finish(scan.id, ScanState.SUCCEEDED)
+        store.progress(scan.id, JobProgress("capture", 0.5, ""))
+        store.finish(scan.id, JobState.SUCCEEDED)
 
     store.act = go_on
     assert asyncio.run(told(stream_of(followed_scan(store, scan.id), 1000, OpenStreams(1)))) == ["2", "3"]
@@ -69,7 +71,7 @@ def test_stream_of_a_scan_that_is_deleted_ends(store: ActingStore, final: bool) 
         if final:
             # It is woken by the last event, and finds it gone.
             store.act = lambda: store.delete(scan.id)
-            store.finish(scan.id, ScanState.SUCCEEDED)
+            store.finish(scan.id, JobState.SUCCEEDED)
         else:
             store.delete(scan.id)
         return await told(stream)

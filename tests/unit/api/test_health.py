@@ -15,6 +15,7 @@ from slrig.api import health
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
 from slrig.verify.store import HealthStore
 from slrig.verify.verification import VerificationDesk
 from tests.unit.verify.test_verification import TAME, JobQueue
@@ -30,7 +31,7 @@ def queue() -> JobQueue:
 @pytest.fixture
 def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
-    store = HealthStore(folder.database)
+    store = HealthStore(Database(folder.database))
     desk = VerificationDesk(folder, queue, store, tools=TAME)
     service = SimpleNamespace(
         verifications=desk, refuse_when_stale=True, calibrations=SimpleNamespace(active=None)
@@ -41,7 +42,7 @@ def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
     app.dependency_overrides[_of_request] = lambda: service
     with TestClient(app) as found:
         yield found
-    store.close()
+    store.database.close()
     folder.release()
 
 

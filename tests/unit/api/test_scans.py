@@ -142,7 +142,7 @@ def test_key_of_a_deleted_scan_is_told_as_such(client: TestClient) -> None:
     scan = ended(client, client.post("/scan", headers=headers).json()["id"])
     client.delete(scan["links"]["self"])
     again = client.post("/scan", headers=headers)
-    assert (again.status_code, again.json()["type"]) == (404, "/problems/scan-not-found")
+    assert (again.status_code, again.json()["type"]) == (404, "/problems/job-not-found")
     assert "404" in client.get("/openapi.json").json()["paths"]["/scan"]["post"]["responses"]
 
 
@@ -303,7 +303,7 @@ def test_unknown_scan_is_not_found_anywhere(client: TestClient) -> None:
     unknown = uuid4()
     for path in ("", "/events", "/mesh.ply", "/bundle.zip"):
         response = client.get(f"/scan/{unknown}{path}")
-        assert (response.status_code, response.json()["type"]) == (404, "/problems/scan-not-found"), path
+        assert (response.status_code, response.json()["type"]) == (404, "/problems/job-not-found"), path
     assert client.post(f"/scan/{unknown}/cancel").status_code == 404
 
 

@@ -238,5 +238,5 @@ class CalibrationBench(Bench):
         self.tame.solving.set()
         self.runner.close()
         self.calibrations.close()
-        self.store.close()
+        self.store.database.close()
         self.folder.release()

@@ -27,8 +27,8 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
+from slrig.jobs.records import JobState
 from slrig.model import Size
-from slrig.scan.records import ScanState
 from slrig.scan.sweep import sweep
 from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
 from tests.unit.scan.fakes import WAIT_S
@@ -107,7 +107,7 @@ def test_bad_pose_is_refused_with_its_cause_and_its_picture(bench: CalibrationBe
     for pose, words in ((judged, "hold it still."), (unseen, "no camera sees the board. Move it into view.")):
         assert pose.state is PoseState.REFUSED
         assert pose.fault is not None
-        assert pose.fault.kind == "PoseRefusedError"
+        assert pose.fault.code == "pose-refused"
         assert pose.fault.message.endswith(words)
         assert "pose '" not in pose.fault.message
         place = bench.calibrations.store.pose(session_id, pose.number)
@@ -131,7 +131,7 @@ def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
     queued = bench.scan(wait=True)
     bench.gate.set()
     assert bench.until_pose(session_id, pose.number).state is PoseState.ACCEPTED
-    assert bench.until(queued.id).state is ScanState.SUCCEEDED
+    assert bench.until(queued.id).state is JobState.SUCCEEDED
 
     scan = bench.held()
     with pytest.raises(RigBusyError) as busy:
@@ -160,7 +160,7 @@ def test_device_that_vanishes_fails_the_pose_and_is_opened_again(bench: Calibrat
     session_id = bench.session()
     bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
     pose = bench.shot(session_id)
-    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "DeviceGoneError")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "device-gone")
     assert bench.opened_again.wait(WAIT_S)
     assert bench.shot(session_id).state is PoseState.ACCEPTED
 
@@ -169,7 +169,7 @@ def test_full_disk_during_a_pose_fails_it_and_leaves_nothing(bench: CalibrationB
     session_id = bench.session()
     bench.error = StorageError("000.png: the disk refused: No space left on device")
     pose = bench.shot(session_id)
-    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "StorageError")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "storage")
     assert list(bench.folder.incoming.iterdir()) == []
     assert not bench.calibrations.store.pose(session_id, 1).exists()
     assert not bench.opened[0][1].closed
@@ -189,7 +189,7 @@ def test_full_disk_while_a_pose_is_read_fails_it(bench: CalibrationBench, monkey
     monkeypatch.setattr(CalibrationStore, "commit_pose", commit)
     pose = bench.shot(session_id)
     monkeypatch.undo()
-    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "StorageError")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "storage")
     assert list(bench.folder.incoming.iterdir()) == []
     assert bench.shot(session_id).state is PoseState.ACCEPTED
 
@@ -214,7 +214,7 @@ def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypa
 def test_defect_in_the_reading_is_told_without_its_traceback(bench: CalibrationBench) -> None:
     bench.tame.read_error = ZeroDivisionError("secret")
     pose = bench.shot(bench.session())
-    assert (pose.state, None if pose.fault is None else pose.fault.kind) == (PoseState.FAILED, "UnexpectedError")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "unexpected")
     assert pose.fault is not None
     assert "secret" not in pose.fault.message
 
@@ -320,7 +320,7 @@ def test_failed_solve_tells_why_and_another_pose_opens_the_session_again(bench: 
     bench.calibrations.solves.solve(session_id)
     failed = bench.until_session(session_id, lambda found: found.state is SessionState.FAILED)
     assert failed.fault is not None
-    assert (failed.fault.kind, failed.solve) == ("SolveRefusedError", 0)
+    assert (failed.fault.code, failed.solve) == ("solve-refused", 0)
     with pytest.raises(CalibrationStateError, match="was not solved yet"):
         bench.calibrations.activate(session_id)
     bench.tame.solve_error = None
@@ -434,7 +434,7 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     assert [pose.state for pose in record.poses] == [PoseState.ACCEPTED, PoseState.FAILED]
     fault = record.poses[1].fault
     assert fault is not None
-    assert (fault.kind, "Shoot it again" in fault.message) == ("ScanInterruptedError", True)
+    assert (fault.code, "Shoot it again" in fault.message) == ("scan-interrupted", True)
     assert [each.id for each in again.latest()] == [session_id, active]
     assert [each.observation.name for each in again.answers.readings(record)] == ["pose 1"]
 

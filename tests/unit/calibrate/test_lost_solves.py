@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from slrig.calibrate.records import SessionState
-from slrig.scan.records import ScanState
+from slrig.jobs.records import JobState
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.scan.bench import PIPELINE
 
@@ -15,8 +15,8 @@ from tests.unit.scan.bench import PIPELINE
 @pytest.mark.parametrize(
     ("how", "kind", "words"),
     [
-        ("crash", "WorkerLostError", "ended in the middle of the solve (signal SIGSEGV)"),
-        ("exhaust", "OutOfMemoryError", "Unable to allocate 64.0 GiB"),
+        ("crash", "worker-lost", "ended in the middle of the solve (signal SIGSEGV)"),
+        ("exhaust", "out-of-memory", "Unable to allocate 64.0 GiB"),
     ],
 )
 def test_a_solve_that_is_lost_costs_the_solve_only(tmp_path: Path, how: str, kind: str, words: str) -> None:
@@ -29,9 +29,9 @@ def test_a_solve_that_is_lost_costs_the_solve_only(tmp_path: Path, how: str, kin
     lost = bench.until_session(session_id, lambda found: found.state is not SessionState.SOLVING)
     assert (lost.state, lost.solve) == (SessionState.FAILED, 0)
     assert lost.fault is not None
-    assert lost.fault.kind == kind
+    assert lost.fault.code == kind
     assert words in lost.fault.message
-    assert bench.until(waiting.id).state is ScanState.SUCCEEDED
-    assert bench.until(bench.scan(wait=True).id).state is ScanState.SUCCEEDED
+    assert bench.until(waiting.id).state is JobState.SUCCEEDED
+    assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
     assert len(bench.opened) == 1, "the rig stayed open"
     bench.close()

@@ -18,9 +18,11 @@ import pytest
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.store import JobStore
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import KeptRecord, ScanState, write_record
-from slrig.scan.store import ScanStore
+from slrig.scan.records import KeptRecord, plan_from_json, plan_json, write_record
 from slrig.scan.sweep import sweep
 
 
@@ -32,14 +34,14 @@ def folder(tmp_path: Path) -> Iterator[DataFolder]:
 
 
 @pytest.fixture
-def store(folder: DataFolder) -> Iterator[ScanStore]:
-    store = ScanStore(folder.database)
+def store(folder: DataFolder) -> Iterator[JobStore]:
+    store = JobStore(Database(folder.database), JobKind.SCAN)
     yield store
-    store.close()
+    store.database.close()
 
 
-def running(store: ScanStore, state: ScanState) -> UUID:
-    scan = store.create(ScanPlan(), rig="bench", label=None)
+def running(store: JobStore, state: JobState) -> UUID:
+    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None)
     store.advance(scan.id, state)
     return scan.id
 
@@ -135,24 +137,24 @@ def test_other_errors_pass_through(tmp_path: Path) -> None:
 
 
 def test_sweep_records_a_cut_off_capture_as_interrupted_and_clears_its_files(
-    store: ScanStore, folder: DataFolder
+    store: JobStore, folder: DataFolder
 ) -> None:
-    scan_id = running(store, ScanState.CAPTURING)
+    scan_id = running(store, JobState.CAPTURING)
     staged_bundle(folder, scan_id)
     swept = sweep(store, folder)
     assert swept.interrupted == (scan_id,)
     record = store.get(scan_id)
-    assert record.state is ScanState.INTERRUPTED
+    assert record.state is JobState.INTERRUPTED
     assert record.fault is not None
-    assert record.fault.kind == "ScanInterruptedError"
+    assert record.fault.code == "scan-interrupted"
     assert not folder.scan(scan_id).exists()
     assert list(folder.incoming.iterdir()) == []
 
 
-def test_sweep_leaves_what_the_runner_takes_up_again(store: ScanStore, folder: DataFolder) -> None:
-    cut_off = running(store, ScanState.RECONSTRUCTING)
+def test_sweep_leaves_what_the_runner_takes_up_again(store: JobStore, folder: DataFolder) -> None:
+    cut_off = running(store, JobState.COMPUTING)
     staged_bundle(folder, cut_off)
-    queued = store.create(ScanPlan(), rig="bench", label=None).id
+    queued = store.create(plan_json(ScanPlan()), rig="bench", label=None).id
     swept = sweep(store, folder)
     assert (swept.resumed, swept.interrupted) == ((cut_off, queued), ())
     assert [record.id for record in store.unfinished()] == [cut_off, queued]
@@ -160,29 +162,29 @@ def test_sweep_leaves_what_the_runner_takes_up_again(store: ScanStore, folder: D
 
 
 def test_sweep_keeps_the_whole_bundle_of_a_reconstruction_that_was_cut_off_twice(
-    store: ScanStore, folder: DataFolder
+    store: JobStore, folder: DataFolder
 ) -> None:
-    scan_id = running(store, ScanState.RECONSTRUCTING)
-    store.advance(scan_id, ScanState.RECONSTRUCTING)
+    scan_id = running(store, JobState.COMPUTING)
+    store.advance(scan_id, JobState.COMPUTING)
     staged_bundle(folder, scan_id)
     (folder.staging(scan_id) / "result.part").mkdir()
     sweep(store, folder)
-    assert store.get(scan_id).state is ScanState.INTERRUPTED
+    assert store.get(scan_id).state is JobState.INTERRUPTED
     assert [path.name for path in folder.scan(scan_id).iterdir()] == ["bundle"]
 
 
-def test_sweep_recognises_a_scan_that_lacked_only_its_last_record(store: ScanStore, folder: DataFolder) -> None:
-    scan_id = running(store, ScanState.RECONSTRUCTING)
+def test_sweep_recognises_a_scan_that_lacked_only_its_last_record(store: JobStore, folder: DataFolder) -> None:
+    scan_id = running(store, JobState.COMPUTING)
     finished(folder, scan_id)
     assert sweep(store, folder).recovered == (scan_id,)
-    assert store.get(scan_id).state is ScanState.SUCCEEDED
+    assert store.get(scan_id).state is JobState.SUCCEEDED
     assert store.get(scan_id).summary == {"truth": {"rms_mm": 0.01}}
 
 
-def test_sweep_completes_a_deletion_that_was_cut_off(store: ScanStore, folder: DataFolder) -> None:
-    scan_id = running(store, ScanState.RECONSTRUCTING)
+def test_sweep_completes_a_deletion_that_was_cut_off(store: JobStore, folder: DataFolder) -> None:
+    scan_id = running(store, JobState.COMPUTING)
     finished(folder, scan_id)
-    store.finish(scan_id, ScanState.SUCCEEDED)
+    store.finish(scan_id, JobState.SUCCEEDED)
     folder.withdraw(scan_id)
     sweep(store, folder)
     assert scan_id not in store.states()
@@ -191,29 +193,29 @@ def test_sweep_completes_a_deletion_that_was_cut_off(store: ScanStore, folder: D
 
 @pytest.mark.parametrize("gone", [("mesh.ply",), ("report.json",), ("mesh.ply", "report.json")])
 def test_sweep_says_when_the_files_of_a_scan_are_gone(
-    store: ScanStore, folder: DataFolder, gone: tuple[str, ...]
+    store: JobStore, folder: DataFolder, gone: tuple[str, ...]
 ) -> None:
-    scan_id = running(store, ScanState.RECONSTRUCTING)
-    store.finish(scan_id, ScanState.SUCCEEDED)
+    scan_id = running(store, JobState.COMPUTING)
+    store.finish(scan_id, JobState.SUCCEEDED)
     finished(folder, scan_id)
     for name in gone:
         (folder.scan(scan_id) / name).unlink()
     assert sweep(store, folder).lost == (scan_id,)
     record = store.get(scan_id)
-    assert record.state is ScanState.FAILED
+    assert record.state is JobState.FAILED
     assert record.fault is not None
     assert record.fault.message.startswith(f"{' and '.join(gone)} of this scan is gone")
 
 
-def test_sweep_takes_no_scan_without_a_mesh_for_a_finished_one(store: ScanStore, folder: DataFolder) -> None:
-    scan_id = running(store, ScanState.RECONSTRUCTING)
+def test_sweep_takes_no_scan_without_a_mesh_for_a_finished_one(store: JobStore, folder: DataFolder) -> None:
+    scan_id = running(store, JobState.COMPUTING)
     finished(folder, scan_id)
     (folder.scan(scan_id) / "mesh.ply").unlink()
     assert sweep(store, folder).interrupted == (scan_id,)
 
 
 def test_sweep_puts_finished_scans_on_record_again_beside_a_database_that_was_lost(
-    store: ScanStore, folder: DataFolder
+    store: JobStore, folder: DataFolder
 ) -> None:
     plan = ScanPlan(exposure_s=0.02)
     made = datetime(2026, 11, 23, 12, 0, tzinfo=UTC)
@@ -227,13 +229,18 @@ def test_sweep_puts_finished_scans_on_record_again_beside_a_database_that_was_lo
     assert swept.put_aside == (str(records[1].id),)
     newest, oldest = store.page(before=None, limit=10)
     assert (newest.id, oldest.id) == (records[0].id, records[2].id)
-    assert (newest.state, newest.label, newest.plan, newest.created_at) == (ScanState.SUCCEEDED, "part 0", plan, made)
+    assert (newest.state, newest.label, plan_from_json(newest.plan), newest.created_at) == (
+        JobState.SUCCEEDED,
+        "part 0",
+        plan,
+        made,
+    )
     assert newest.summary == {"truth": {"rms_mm": 0.01}}
     assert [event.kind for event in store.events(newest.id, after=0)] == ["state"]
     assert sweep(store, folder).recovered == ()
 
 
-def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: ScanStore, folder: DataFolder) -> None:
+def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: JobStore, folder: DataFolder) -> None:
     stray = folder.scans / "somebody"
     stray.mkdir()
     (stray / "mesh.ply").write_bytes(b"work")
@@ -241,10 +248,10 @@ def test_sweep_puts_files_without_a_record_aside_and_deletes_none(store: ScanSto
     assert (folder.orphans / "somebody" / "mesh.ply").read_bytes() == b"work"
 
 
-def test_sweep_of_a_sound_folder_changes_nothing(store: ScanStore, folder: DataFolder) -> None:
-    scan_id = running(store, ScanState.RECONSTRUCTING)
+def test_sweep_of_a_sound_folder_changes_nothing(store: JobStore, folder: DataFolder) -> None:
+    scan_id = running(store, JobState.COMPUTING)
     finished(folder, scan_id)
-    store.finish(scan_id, ScanState.SUCCEEDED)
+    store.finish(scan_id, JobState.SUCCEEDED)
     before = store.get(scan_id)
     swept = sweep(store, folder)
     assert (swept.interrupted, swept.recovered, swept.lost, swept.put_aside) == ((), (), (), ())

@@ -15,11 +15,11 @@ import pytest
 from slrig.errors import ScanCancelledError
 from slrig.jobs import worker_wait
 from slrig.jobs.frame_feed import Abandon, Begin, End, FrameFeed, Take
+from slrig.jobs.records import JobState
 from slrig.jobs.worker import Worker
 from slrig.model import Shot
 from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
-from slrig.scan.records import ScanState
 from tests.unit.scan.bench import PIPELINE, Bench
 from tests.unit.scan.fakes import CALIBRATION, EVIDENCE, OUTLINE, SHOTS, WAIT_S
 
@@ -268,7 +268,7 @@ def test_frames_that_wait_for_the_kernels_arrive_and_the_wait_is_told(
 
 def test_scan_hands_its_frames_on_while_it_captures(bench: Bench) -> None:
     record = bench.until(bench.scan().id)
-    assert record.state is ScanState.SUCCEEDED
+    assert record.state is JobState.SUCCEEDED
     report = (bench.folder.scan(record.id) / "report.json").read_text()
     assert '"live": [2, 2, true]' in report
 
@@ -280,14 +280,14 @@ def test_scan_survives_the_death_of_the_reconstruction_during_its_capture(bench:
     os.waitid(os.P_PID, bench.worker.process_id, os.WEXITED | os.WNOWAIT)
     bench.gate.set()
     record = bench.until(scan.id)
-    assert record.state is ScanState.SUCCEEDED
+    assert record.state is JobState.SUCCEEDED
     assert '"live"' not in (bench.folder.scan(record.id) / "report.json").read_text()
 
 
 def test_scan_after_one_that_was_cancelled_sees_its_own_frames_only(bench: Bench) -> None:
     scan = bench.held()
     bench.runner.cancel(scan.id)
-    assert bench.until(scan.id).state is ScanState.CANCELLED
+    assert bench.until(scan.id).state is JobState.CANCELLED
     bench.gate.set()
     record = bench.until(bench.scan().id)
     assert '"live": [2, 2, true]' in (bench.folder.scan(record.id) / "report.json").read_text()

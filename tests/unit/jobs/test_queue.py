@@ -19,13 +19,13 @@ from slrig.errors import (
     QueueFullError,
     RigBusyError,
     ScanCancelledError,
+    ScanInterruptedError,
 )
-from slrig.failure import ScanInterruptedError
 from slrig.jobs.job import Holder
+from slrig.jobs.records import JobState
 from slrig.rig.positioner import MOVE_LIMIT_S, GuardedPositioner
 from slrig.rig.session import ActiveCalibration
 from slrig.rig.watchdog import Calls
-from slrig.scan.records import ScanState
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S
@@ -96,7 +96,7 @@ def test_rig_is_lent_on_its_owner_thread_and_dark_afterwards(bench: Bench, works
     assert (lit, projector.dark, work.told, work.threads) == (True, True, [None], ["slrig-rig"])
     # Whoever was told that it is over may begin at once.
     assert bench.runner.status().holder is None
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     assert len(bench.opened) == 1
 
 
@@ -118,14 +118,14 @@ def test_work_and_scans_wait_in_one_line(bench: Bench, works: Callable[..., Work
         submitted(bench, second, wait=True)
     assert second.told == []
     work.gate.set()
-    assert bench.until(scan.id).state is ScanState.SUCCEEDED
+    assert bench.until(scan.id).state is JobState.SUCCEEDED
     running = bench.held()
     submitted(bench, second, wait=True)
     second.gate.set()
     assert not second.began.is_set()
     bench.gate.set()
     assert second.over.wait(WAIT_S)
-    assert bench.store.get(running.id).state is ScanState.SUCCEEDED
+    assert bench.store.get(running.id).state is JobState.SUCCEEDED
 
 
 def test_recalled_work_ends_early_and_waiting_work_at_once(bench: Bench, works: Callable[..., Work]) -> None:
@@ -207,7 +207,7 @@ def test_teller_that_fails_does_not_end_the_owner_thread(bench: Bench, works: Ca
     with capture_logs() as logs:
         bench.runner.submit_work(work, holder=HOLDER, wait=False, ended=fail)
         assert work.over.wait(WAIT_S)
-        assert bench.until(bench.scan(wait=True).id).state is ScanState.SUCCEEDED
+        assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
     assert "the end of work with the rig went wrong" in [each["event"] for each in logs]
 
 
@@ -252,7 +252,7 @@ def test_calibration_that_turns_out_to_be_for_others_leaves_the_rig_to_be_calibr
     bench.runner.start()
     record = bench.until(queued.id)
     assert record.fault is not None
-    assert record.fault.kind == "CalibrationError"
+    assert record.fault.code == "calibration"
     assert "calibration spring: the calibration is for other devices" in record.fault.message
     assert "POST /calibration/ID/activate" in record.fault.message
     assert bench.runner.status().misfit is not None

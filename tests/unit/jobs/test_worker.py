@@ -14,8 +14,15 @@ from pathlib import Path
 
 import pytest
 
-from slrig.errors import NothingToReconstructError, ScanCancelledError, StorageError
-from slrig.failure import OutOfMemoryError, ScanInterruptedError, WorkerLostError, failure_of, interruption
+from slrig.errors import (
+    NothingToReconstructError,
+    OutOfMemoryError,
+    ScanCancelledError,
+    ScanInterruptedError,
+    StorageError,
+    WorkerLostError,
+)
+from slrig.failure import failure_of, interruption
 from slrig.jobs import worker as worker_module
 from slrig.jobs import worker_wait
 from slrig.jobs.channel import Call, Done, Failed, Progressed

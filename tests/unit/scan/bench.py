@@ -8,12 +8,13 @@ from uuid import UUID
 
 from slrig.errors import InvalidInputError
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import ScanRecord, ScanState
 from slrig.scan.runner import Runner
-from slrig.scan.store import ScanStore
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
 PIPELINE = "tests.unit.scan.fake_pipeline"
@@ -27,7 +28,7 @@ class Bench(TameBench):
         self.free_bytes = 10**9
         self.given_up: list[InvalidInputError] = []
         self.folder = DataFolder(tmp_path / "data", free=lambda _: self.free_bytes)
-        self.store = ScanStore(self.folder.database)
+        self.store = JobStore(Database(self.folder.database), JobKind.SCAN)
         self.worker = Worker(PIPELINE)
         self.runner = Runner(
             self.store,
@@ -39,10 +40,10 @@ class Bench(TameBench):
             give_up=self.given_up.append,
         )
 
-    def scan(self, *, wait: bool = False) -> ScanRecord:
+    def scan(self, *, wait: bool = False) -> JobRecord:
         return self.runner.submit(ScanPlan(), label=None, wait=wait)
 
-    def held(self) -> ScanRecord:
+    def held(self) -> JobRecord:
         """A scan that has begun to capture and goes on until `gate` is set."""
         self.began.clear()
         self.gate.clear()
@@ -50,10 +51,10 @@ class Bench(TameBench):
         assert self.began.wait(WAIT_S)
         return scan
 
-    def until(self, scan_id: UUID, state: ScanState | None = None) -> ScanRecord:
+    def until(self, scan_id: UUID, state: JobState | None = None) -> JobRecord:
         """The scan once it has reached `state`, or any final state."""
         reached = threading.Event()
-        states = {state} if state is not None else {state for state in ScanState if state.final}
+        states = {state} if state is not None else {state for state in JobState if state.final}
 
         def look() -> None:
             if self.store.get(scan_id).state in states:
@@ -68,9 +69,9 @@ class Bench(TameBench):
     def close(self) -> None:
         self.gate.set()
         self.runner.close()
-        self.store.close()
+        self.store.database.close()
         self.folder.release()
 
 
-def fault_kind(record: ScanRecord) -> str | None:
-    return None if record.fault is None else record.fault.kind
+def failure_code(record: JobRecord) -> str | None:
+    return None if record.fault is None else record.fault.code

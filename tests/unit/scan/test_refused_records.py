@@ -14,8 +14,8 @@ from sqlalchemy.orm import Session
 
 from slrig.errors import StorageError
 from slrig.jobs import database
+from slrig.jobs.records import JobRecord, JobState
 from slrig.scan import endings
-from slrig.scan.records import ScanRecord, ScanState
 from tests.unit.scan.bench import Bench
 
 MOST_WRITES = 12
@@ -53,7 +53,7 @@ def read_only(_: Bench, real: Changing, **options: Any) -> Iterator[Session]:
             cursor.execute("PRAGMA query_only=OFF")
 
 
-def assert_own(bench: Bench, record: ScanRecord) -> None:
+def assert_own(bench: Bench, record: JobRecord) -> None:
     """The scan has its own files, and its own report."""
     report = json.loads((bench.folder.scan(record.id) / "report.json").read_bytes())
     assert (bench.folder.scan(record.id) / "mesh.ply").is_file()
@@ -71,7 +71,7 @@ def test_a_refused_record_poisons_no_later_scan(
     monkeypatch.setattr(endings, "RETRY_S", 0.01)
     bench = Bench(tmp_path)
     bench.runner.start()
-    real, writes = bench.store._database.changing, 0
+    real, writes = bench.store.database.changing, 0
     at: range = range(0)
 
     def changing(**options: Any) -> AbstractContextManager[Session]:
@@ -79,7 +79,7 @@ def test_a_refused_record_poisons_no_later_scan(
         writes += 1
         return refused(bench, real, **options) if writes in at else real(**options)
 
-    monkeypatch.setattr(bench.store._database, "changing", changing)
+    monkeypatch.setattr(bench.store.database, "changing", changing)
     seen = set()
     for first in range(1, MOST_WRITES + 1):
         writes, at = 0, range(first, first + lasting)
@@ -92,14 +92,14 @@ def test_a_refused_record_poisons_no_later_scan(
         if hurt is not None:
             record = bench.until(hurt.id)
             seen.add(record.state)
-            assert record.state in {ScanState.SUCCEEDED, ScanState.FAILED}
-            if record.state is ScanState.SUCCEEDED:
+            assert record.state in {JobState.SUCCEEDED, JobState.FAILED}
+            if record.state is JobState.SUCCEEDED:
                 assert_own(bench, record)
         at = range(0)
         for _ in range(2):
             record = bench.until(bench.scan(wait=True).id)
-            assert record.state is ScanState.SUCCEEDED, record.fault
+            assert record.state is JobState.SUCCEEDED, record.fault
             assert_own(bench, record)
-    assert seen == {ScanState.SUCCEEDED, ScanState.FAILED}
+    assert seen == {JobState.SUCCEEDED, JobState.FAILED}
     assert list(bench.folder.incoming.iterdir()) == []
     bench.close()

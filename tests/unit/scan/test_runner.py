@@ -14,42 +14,43 @@ from slrig.errors import (
     PatternError,
     QueueFullError,
     RigBusyError,
+    ScanInterruptedError,
     ScanStateError,
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.failure import ScanInterruptedError
+from slrig.jobs.records import JobState
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import PatternPlan, ScanPlan
-from slrig.scan.records import ScanState, read_record
+from slrig.scan.records import plan_json, read_record
 from slrig.scan.sweep import sweep
 from tests.unit.calibrate.calibration_bench import tame_calibration
-from tests.unit.scan.bench import Bench, fault_kind
+from tests.unit.scan.bench import Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S
 
 
 def test_scans_that_a_kill_left_are_taken_up_again(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    cut_off = bench.store.create(ScanPlan(), rig="bench", label="cut off").id
-    bench.store.advance(cut_off, ScanState.RECONSTRUCTING)
+    cut_off = bench.store.create(plan_json(ScanPlan()), rig="bench", label="cut off").id
+    bench.store.advance(cut_off, JobState.COMPUTING)
     bundle = bench.folder.stage(cut_off) / "bundle"
     bundle.mkdir()
     (bundle / "order").write_text("finish")
     (bundle.parent / "result.part").mkdir()
     # More than may wait: whoever asked was answered long ago.
-    queued = [bench.store.create(ScanPlan(), rig="bench", label=None).id for _ in range(3)]
+    queued = [bench.store.create(plan_json(ScanPlan()), rig="bench", label=None).id for _ in range(3)]
     resumed = sweep(bench.store, bench.folder).resumed
     assert resumed == (cut_off, *queued)
     bench.runner.take_up(resumed)
     bench.runner.start()
     for scan_id in (cut_off, *queued):
         record = bench.until(scan_id)
-        assert record.state is ScanState.SUCCEEDED, record.fault
+        assert record.state is JobState.SUCCEEDED, record.fault
         assert record.summary is not None
         assert record.summary["bundle"] == str(scan_id)
     states = [event.data["state"] for event in bench.store.events(cut_off, after=0) if event.kind == "state"]
-    assert states == ["queued", "reconstructing", "reconstructing", "succeeded"]
+    assert states == ["queued", "computing", "computing", "succeeded"]
     kept = read_record(bench.folder.scan(cut_off))
     assert kept is not None
     assert (kept.id, kept.label) == (cut_off, "cut off")
@@ -59,7 +60,7 @@ def test_scans_that_a_kill_left_are_taken_up_again(tmp_path: Path) -> None:
 
 def test_scan_walks_to_its_mesh(bench: Bench) -> None:
     record = bench.until(bench.scan().id)
-    assert record.state is ScanState.SUCCEEDED
+    assert record.state is JobState.SUCCEEDED
     assert record.progress.fraction == 1.0
     assert record.summary == {"bundle": str(record.id), "seconds": 1.5, "truth": {"rms_mm": 0.01}}
     files = {path.name for path in bench.folder.scan(record.id).iterdir()}
@@ -69,7 +70,7 @@ def test_scan_walks_to_its_mesh(bench: Bench) -> None:
     assert [event.data["state"] for event in events if event.kind == "state"] == [
         "queued",
         "capturing",
-        "reconstructing",
+        "computing",
         "succeeded",
     ]
     fractions = [event.data["fraction"] for event in events if event.kind == "progress"]
@@ -88,7 +89,7 @@ def test_held_rig_is_refused_by_the_name_of_its_holder(bench: Bench) -> None:
     assert bench.runner.status().holder == str(holder.id)
     bench.gate.set()
     bench.until(holder.id)
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
 
 
 def test_queue_is_short_and_served_in_order(bench: Bench) -> None:
@@ -96,11 +97,11 @@ def test_queue_is_short_and_served_in_order(bench: Bench) -> None:
     second = bench.scan(wait=True)
     with pytest.raises(QueueFullError):
         bench.scan(wait=True)
-    assert bench.store.get(second.id).state is ScanState.QUEUED
+    assert bench.store.get(second.id).state is JobState.QUEUED
     bench.gate.set()
     later = bench.until(second.id)
     earlier = bench.store.get(first.id)
-    assert later.state is earlier.state is ScanState.SUCCEEDED
+    assert later.state is earlier.state is JobState.SUCCEEDED
     assert earlier.finished_at is not None
     assert later.started_at is not None
     assert earlier.finished_at <= later.started_at
@@ -109,61 +110,61 @@ def test_queue_is_short_and_served_in_order(bench: Bench) -> None:
 def test_cancel_stops_a_capture_and_darkens_the_projector(bench: Bench) -> None:
     scan = bench.held()
     bench.runner.cancel(scan.id)
-    assert bench.until(scan.id).state is ScanState.CANCELLED
+    assert bench.until(scan.id).state is JobState.CANCELLED
     assert bench.opened[0][1].dark
     assert not bench.opened[0][1].closed
     assert list(bench.folder.incoming.iterdir()) == []
-    assert bench.runner.cancel(scan.id).state is ScanState.CANCELLED
+    assert bench.runner.cancel(scan.id).state is JobState.CANCELLED
 
 
 def test_cancel_takes_a_waiting_scan_out_of_the_line(bench: Bench) -> None:
     first = bench.held()
     second = bench.scan(wait=True)
-    assert bench.runner.cancel(second.id).state is ScanState.CANCELLED
+    assert bench.runner.cancel(second.id).state is JobState.CANCELLED
     bench.gate.set()
-    assert bench.until(first.id).state is ScanState.SUCCEEDED
+    assert bench.until(first.id).state is JobState.SUCCEEDED
 
 
 def test_cancel_reaches_the_reconstruction(bench: Bench) -> None:
     bench.order = "hang"
     scan = bench.scan()
-    bench.until(scan.id, ScanState.RECONSTRUCTING)
+    bench.until(scan.id, JobState.COMPUTING)
     bench.runner.cancel(scan.id)
-    assert bench.until(scan.id).state is ScanState.CANCELLED
+    assert bench.until(scan.id).state is JobState.CANCELLED
     assert not bench.folder.scan(scan.id).exists()
 
 
 def test_failed_reconstruction_keeps_the_bundle_for_a_second_look(bench: Bench) -> None:
     bench.order = "fail"
     record = bench.until(bench.scan().id)
-    assert (record.state, fault_kind(record)) == (ScanState.FAILED, "NothingToReconstructError")
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "nothing-to-reconstruct")
     assert [path.name for path in bench.folder.scan(record.id).iterdir()] == ["bundle"]
 
 
 def test_lost_worker_fails_its_scan_and_no_other(bench: Bench) -> None:
     bench.order = "die"
     record = bench.until(bench.scan().id)
-    assert (record.state, fault_kind(record)) == (ScanState.FAILED, "WorkerLostError")
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "worker-lost")
     bench.order = "finish"
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
 
 
 def test_defect_is_told_without_its_traceback(bench: Bench) -> None:
     bench.order = "break"
     record = bench.until(bench.scan().id)
     assert record.fault is not None
-    assert record.fault.kind == "UnexpectedError"
+    assert record.fault.code == "unexpected"
     assert "Traceback" not in record.fault.message
 
 
 def test_vanished_device_is_opened_again_for_the_next_scan(bench: Bench) -> None:
     bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
     record = bench.until(bench.scan().id)
-    assert (record.state, fault_kind(record)) == (ScanState.FAILED, "DeviceGoneError")
+    assert (record.state, failure_code(record)) == (JobState.FAILED, "device-gone")
     assert bench.opened[0][1].closed
     # Nobody has to scan first to learn whether the rig is well again.
     assert bench.opened_again.wait(WAIT_S)
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     assert len(bench.opened) == 2
     assert bench.runner.status().fault is None
 
@@ -180,9 +181,9 @@ def test_rig_that_cannot_be_opened_fails_the_scan_with_its_cause(tmp_path: Path)
     bench.open_error = DeviceGoneError("No camera on usb-3.")
     bench.runner.start()
     record = bench.until(bench.scan().id)
-    assert fault_kind(record) == "DeviceGoneError"
+    assert failure_code(record) == "device-gone"
     bench.open_error = None
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     bench.close()
 
 
@@ -203,7 +204,7 @@ def test_columns_alone_are_refused_for_a_camera_above_the_projector(bench: Bench
     bench.runner.use_calibration(ActiveCalibration("spring", Calibration({"cam0": above}, level)))
     with pytest.raises(PatternError, match="above or below the projector"):
         bench.runner.submit(ScanPlan(patterns=PatternPlan(rows=False)), label=None, wait=False)
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
 
 
 def test_small_disk_is_noticed_before_the_scan(bench: Bench) -> None:
@@ -218,7 +219,7 @@ def test_full_disk_in_the_middle_is_a_storage_error(bench: Bench) -> None:
     # As BundleWriter tells it: an OSError that comes out of a capture is a driver's.
     bench.error = StorageError("000.png: the disk refused: No space left on device")
     record = bench.until(bench.scan().id)
-    assert fault_kind(record) == "StorageError"
+    assert failure_code(record) == "storage"
     assert list(bench.folder.incoming.iterdir()) == []
     assert not bench.opened[0][1].closed
 
@@ -241,7 +242,7 @@ def test_closing_interrupts_what_runs_and_what_waits(bench: Bench) -> None:
     bench.runner.close()
     for scan in (active, waiting):
         record = bench.store.get(scan.id)
-        assert (record.state, fault_kind(record)) == (ScanState.INTERRUPTED, "ScanInterruptedError")
+        assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
     _, projector = bench.opened[0]
     assert projector.dark
     assert projector.closed
@@ -252,7 +253,7 @@ def test_closing_interrupts_what_runs_and_what_waits(bench: Bench) -> None:
 def test_closing_ends_a_reconstruction_and_keeps_its_bundle(bench: Bench) -> None:
     bench.order = "hang-deaf"
     scan = bench.scan()
-    bench.until(scan.id, ScanState.RECONSTRUCTING)
+    bench.until(scan.id, JobState.COMPUTING)
     bench.runner.close()
-    assert bench.store.get(scan.id).state is ScanState.INTERRUPTED
+    assert bench.store.get(scan.id).state is JobState.INTERRUPTED
     assert (bench.folder.scan(scan.id) / "bundle" / "bundle.json").is_file()

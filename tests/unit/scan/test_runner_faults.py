@@ -22,10 +22,11 @@ from slrig.errors import (
     StorageError,
     UnsupportedByDeviceError,
 )
+from slrig.jobs.records import JobState
 from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
-from slrig.scan.records import ScanState
-from tests.unit.scan.bench import Bench, fault_kind
+from slrig.scan.records import plan_json
+from tests.unit.scan.bench import Bench, failure_code
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
 
@@ -61,8 +62,8 @@ def test_driver_that_cannot_blank_or_close_stops_nothing(bench: Bench, error: Ex
     camera, projector = bench.opened[0]
     projector.blank_error = camera.close_error = error
     bench.gate.set()
-    assert bench.until(scan.id).state is ScanState.SUCCEEDED
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(scan.id).state is JobState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     # Its last chance to go dark was its closing.
     assert projector.dark
     assert (camera.closed, projector.closed) == (True, True)
@@ -76,7 +77,7 @@ def test_projector_that_stays_lit_is_told(bench: Bench) -> None:
     bench.open_error = DeviceGoneError("No projector on ttyUSB0.")
     with capture_logs() as logs:
         bench.runner.cancel(scan.id)
-        assert bench.until(scan.id).state is ScanState.CANCELLED
+        assert bench.until(scan.id).state is JobState.CANCELLED
     told = [each for each in logs if "does not go dark" in each["event"]]
     assert [(each["log_level"], each["rig"]) for each in told] == [("error", "bench")]
     assert (camera.closed, projector.closed) == (True, True)
@@ -91,7 +92,7 @@ def test_driver_that_never_returns_is_darkened_past(bench: Bench) -> None:
     lit_before = not projector.dark
     bench.runner.close(timeout_s=0.01)
     assert (lit_before, projector.dark) == (True, True)
-    assert bench.store.get(scan.id).state is ScanState.INTERRUPTED
+    assert bench.store.get(scan.id).state is JobState.INTERRUPTED
 
 
 def test_closing_again_does_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +114,7 @@ def test_closing_again_does_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatc
 def test_error_of_the_system_in_a_driver_is_no_fault_of_the_disk(bench: Bench) -> None:
     bench.error = input_output_error()
     record = bench.until(bench.scan().id)
-    assert fault_kind(record) == "DeviceError"
+    assert failure_code(record) == "device"
     assert record.fault is not None
     assert "a driver of rig 'bench' failed: [Errno 5] Input/output error; check cable" in record.fault.message
     assert bench.opened[0][0].closed
@@ -127,14 +128,14 @@ def test_error_of_the_system_at_opening_is_no_fault_of_the_disk() -> None:
     with pytest.raises(DeviceError, match=r"rig 'bench' failed: .*'/dev/video0'; check cable, power and permissions"):
         rig.open()
     assert rig.fault is not None
-    assert rig.fault.kind == "DeviceError"
+    assert rig.fault.code == "device"
 
 
 def test_request_that_the_devices_cannot_do_leaves_the_rig_open(bench: Bench) -> None:
     bench.error = UnsupportedByDeviceError("asked for gain 9, it uses gain 8")
-    assert fault_kind(bench.until(bench.scan().id)) == "UnsupportedByDeviceError"
+    assert failure_code(bench.until(bench.scan().id)) == "unsupported-by-device"
     assert bench.runner.status().fault is None
-    assert bench.until(bench.scan().id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
     assert len(bench.opened) == 1
 
 
@@ -163,7 +164,7 @@ def test_rig_file_that_is_wrong_is_given_up(tmp_path: Path, error: InvalidInputE
     bench = Bench(tmp_path)
     bench.open_error = error
     bench.runner.start()
-    assert fault_kind(bench.until(bench.scan().id)) == type(error).__name__
+    assert failure_code(bench.until(bench.scan().id)) == error.code
     # Once: at the first opening, not at the scan's own.
     assert bench.given_up == [error]
     bench.close()
@@ -182,15 +183,15 @@ def test_ending_that_the_disk_refused_is_recorded_before_the_next_scan(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scan_id = stranded(bench, monkeypatch)
-    assert bench.store.get(scan_id).state is ScanState.RECONSTRUCTING
-    assert bench.until(bench.scan(wait=True).id).state is ScanState.SUCCEEDED
-    assert bench.store.get(scan_id).state is ScanState.SUCCEEDED
+    assert bench.store.get(scan_id).state is JobState.COMPUTING
+    assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
+    assert bench.store.get(scan_id).state is JobState.SUCCEEDED
 
 
 def test_ending_that_the_disk_refused_is_recorded_at_the_close(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     scan_id = stranded(bench, monkeypatch)
     bench.runner.close()
-    assert bench.store.get(scan_id).state is ScanState.SUCCEEDED
+    assert bench.store.get(scan_id).state is JobState.SUCCEEDED
 
 
 @pytest.mark.parametrize("how", ["cancel", "delete"])
@@ -199,16 +200,16 @@ def test_ending_that_the_disk_refused_is_recorded_when_somebody_asks(
 ) -> None:
     scan_id = stranded(bench, monkeypatch)
     if how == "cancel":
-        assert bench.runner.cancel(scan_id).state is ScanState.SUCCEEDED
+        assert bench.runner.cancel(scan_id).state is JobState.SUCCEEDED
     else:
         bench.runner.delete(scan_id)
         assert bench.store.page(before=None, limit=10) == []
 
 
 def test_scan_that_nobody_works_on_can_be_cancelled(bench: Bench) -> None:
-    lost = bench.store.create(ScanPlan(), rig="bench", label=None)
+    lost = bench.store.create(plan_json(ScanPlan()), rig="bench", label=None)
     record = bench.runner.cancel(lost.id)
-    assert (record.state, fault_kind(record)) == (ScanState.INTERRUPTED, "ScanInterruptedError")
+    assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
     bench.runner.delete(lost.id)
 
 
@@ -223,6 +224,6 @@ def test_worker_that_cannot_be_started_again_strands_no_scan(bench: Bench, monke
 
     monkeypatch.setattr(bench.worker, "start", start)
     bench.runner.cancel(scan.id)
-    assert bench.until(scan.id).state is ScanState.CANCELLED
+    assert bench.until(scan.id).state is JobState.CANCELLED
     bench.gate.set()
-    assert bench.until(waiting.id).state is ScanState.SUCCEEDED
+    assert bench.until(waiting.id).state is JobState.SUCCEEDED

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from slrig.errors import RigBusyError
+from slrig.jobs.database import Database
 from slrig.schedule.cron import Cron
 from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.scheduler import Scheduler
@@ -27,7 +28,7 @@ class Desk:
         self.done: list[tuple[Schedule, Run]] = []
         self.told: list[tuple[datetime, RunState]] = []
         self.during: Callable[[], None] = lambda: None
-        self.store = ScheduleStore(database)
+        self.store = ScheduleStore(Database(database))
         self.scheduler = Scheduler(
             self.store,
             self._work,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from slrig.jobs.database import Database
 from slrig.schedule.cron import Cron
 from slrig.schedule.records import Order, RunState, TaskKind
 from slrig.schedule.store import ScheduleStore
@@ -21,7 +22,7 @@ KILLS = 60
 
 @pytest.mark.slow
 def test_kill_at_sixty_random_instants_leaves_every_due_time_with_one_row(tmp_path: Path) -> None:
-    store = ScheduleStore(tmp_path / "slrig.sqlite")
+    store = ScheduleStore(Database(tmp_path / "slrig.sqlite"))
     cron = Cron("*/5 * * * *", "Europe/Berlin")
     begun = victim.moment()
     order = Order(cron, TaskKind.VERIFICATION, grace_s=600.0, retry_s=30.0)
@@ -58,4 +59,4 @@ def test_kill_at_sixty_random_instants_leaves_every_due_time_with_one_row(tmp_pa
             assert ended == 1
         elif run.state not in {RunState.INTERRUPTED, RunState.FAILED}:
             assert started == 0, run
-    store.close()
+    store.database.close()

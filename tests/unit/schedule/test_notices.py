@@ -17,6 +17,7 @@ import structlog
 
 from slrig.config import ServiceSettings, read_settings
 from slrig.errors import ConfigError
+from slrig.jobs.database import Database
 from slrig.schedule.cron import Cron
 from slrig.schedule.notices import TOLD, NoticedHealth, Notices
 from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
@@ -91,13 +92,13 @@ def test_runs_that_a_person_has_to_know_of_are_sent_and_no_others(hook: Hook) ->
 
 def test_health_is_told_when_it_changes(hook: Hook, tmp_path: Path) -> None:
     notices = Notices(hook.url, rig="bench")
-    health = NoticedHealth(tmp_path / "slrig.sqlite", notices)
+    health = NoticedHealth(Database(tmp_path / "slrig.sqlite"), notices)
     for hour, look in enumerate([a_look(), a_look(), a_look(6.0, evidence=400.0), a_look(6.0, evidence=400.0)]):
         health.add(look, calibration="one", at=hours(hour))
     health.add(a_look(), calibration="two", at=hours(9))
     first, second = (hook.came.get(timeout=WAIT_S) for _ in range(2))
     notices.close()
-    health.close()
+    health.database.close()
     assert hook.came.empty()
     assert (first["kind"], first["health"]["before"], first["health"]["state"]) == ("health.changed", "good", "stale")
     assert "turned by 0.050" in first["words"]

@@ -16,8 +16,8 @@ from slrig.errors import (
     ScheduleNotFoundError,
     SlrigError,
     UnsupportedByDeviceError,
+    WorkerLostError,
 )
-from slrig.failure import WorkerLostError
 from slrig.schedule.cron import Cron
 from slrig.schedule.records import Order, RunState, TaskKind
 from tests.unit.schedule.desk import START, Desk
@@ -35,7 +35,7 @@ def new_desk(tmp_path: Path) -> Iterator[NewDesk]:
 
     yield made
     for desk in desks:
-        desk.store.close()
+        desk.store.database.close()
 
 
 @pytest.fixture

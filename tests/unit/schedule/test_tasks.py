@@ -30,8 +30,9 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.failure import JobFailure
+from slrig.jobs.database import Database
 from slrig.jobs.job import Holder
-from slrig.scan.records import ScanState
+from slrig.jobs.records import JobState
 from slrig.schedule.acceptance_task import AcceptanceTask
 from slrig.schedule.cron import Cron
 from slrig.schedule.holder import NamedHolder
@@ -59,7 +60,7 @@ class TaskBench(CalibrationBench):
         super().__init__(tmp_path, positioner=positioner)
         self.queue = NamedHolder(self.runner)
         self.calibrations = Calibrations(self.folder, self.queue, rig_name="bench", tools=self.tame.tools())
-        self.health = HealthStore(self.folder.database)
+        self.health = HealthStore(Database(self.folder.database))
         tools = self.tame.tools()
         verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_look())
         self.verifications = VerificationDesk(self.folder, self.queue, self.health, tools=verifying)
@@ -70,7 +71,7 @@ class TaskBench(CalibrationBench):
             tidy=lambda: self.tidied.append(len(self.calibrations.latest())),
         )  # fmt: skip
         self.clock = SetClock()
-        self.schedules = ScheduleStore(self.folder.database)
+        self.schedules = ScheduleStore(Database(self.folder.database))
         self.scheduler = Scheduler(self.schedules, self.tasks, clock=self.clock, execute=lambda call: call())
 
     def do(self, task: TaskKind, *, cancelled: Callable[[], bool] = lambda: False, **options: Any) -> Mapping[str, Any]:
@@ -89,8 +90,8 @@ class TaskBench(CalibrationBench):
 
     def close(self) -> None:
         super().close()
-        self.health.close()
-        self.schedules.close()
+        self.health.database.close()
+        self.schedules.database.close()
 
 
 def scheduled(task: TaskKind, options: Mapping[str, Any]) -> tuple[Schedule, Run]:
@@ -312,7 +313,7 @@ def test_run_that_is_cancelled_lets_the_rig_go(bench: TaskBench, task: TaskKind)
     run.join(WAIT_S)
     assert len(errors) == 1
     bench.gate.set()
-    assert bench.until(bench.scan(wait=True).id).state is ScanState.SUCCEEDED
+    assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
 
 
 def test_schedule_that_finds_a_scan_tries_again_within_its_grace(bench: TaskBench) -> None:
@@ -370,6 +371,6 @@ def test_acceptance_is_measured_by_script_and_tells_its_decision(
 
 
 def test_fault_of_a_busy_rig_is_not_told_as_one() -> None:
-    assert type(error_of(JobFailure("RigBusyError", "held"))) is DeviceError
-    assert type(error_of(JobFailure("UnexpectedError", "odd"))) is SlrigError
-    assert type(error_of(JobFailure("PoseRefusedError", "dark"))) is PoseRefusedError
+    assert type(error_of(JobFailure("rig-busy", "held"))) is DeviceError
+    assert type(error_of(JobFailure("unexpected", "odd"))) is SlrigError
+    assert type(error_of(JobFailure("pose-refused", "dark"))) is PoseRefusedError

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from slrig.errors import PoseRefusedError, RigBusyError
+from slrig.jobs.database import Database
 from slrig.schedule.records import Run, Schedule
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
@@ -48,7 +49,7 @@ def keep(folder: Path, seed: int, ready: Connection) -> None:
         return {}
 
     scheduler = Scheduler(
-        ScheduleStore(folder / "slrig.sqlite"), work, clock=moment, alone=True, execute=lambda call: call()
+        ScheduleStore(Database(folder / "slrig.sqlite")), work, clock=moment, alone=True, execute=lambda call: call()
     )
     scheduler.start()
     ready.send(None)

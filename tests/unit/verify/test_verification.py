@@ -27,6 +27,7 @@ from slrig.errors import (
     ScanCancelledError,
 )
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
 from slrig.jobs.job import Holder
 from slrig.model import Calibration
 from slrig.scan.runner import RunnerStatus
@@ -119,9 +120,9 @@ def folder(tmp_path: Path) -> Iterator[DataFolder]:
 
 @pytest.fixture
 def store(folder: DataFolder) -> Iterator[HealthStore]:
-    found = HealthStore(folder.database)
+    found = HealthStore(Database(folder.database))
     yield found
-    found.close()
+    found.database.close()
 
 
 def done(desk: VerificationDesk, **options: Any) -> VerificationJob:
@@ -166,7 +167,7 @@ def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, stor
     job = done(desk)
     assert job.state is JobState.FAILED
     assert job.fault is not None
-    assert job.fault.kind == "CalibrationStateError"
+    assert job.fault.code == "calibration-state"
     assert "Calibrate it" in job.fault.message
     assert desk.health()[0].state is HealthState.UNKNOWN
 

@@ -120,7 +120,7 @@ def test_a_refusal_keeps_its_code_and_words() -> None:
     asked = link(lambda data, _count: answer(data, "ERR 4 26 of 26"))
     with pytest.raises(RefusedError, match=r"refused SHOW: error 4 \(range\) 26 of 26") as refusal:
         asked.ask("SHOW", 26)
-    assert (refusal.value.code, refusal.value.words) == (4, ("26", "of", "26"))
+    assert (refusal.value.number, refusal.value.words) == (4, ("26", "of", "26"))
     with pytest.raises(RefusedError, match=r"error 77 \(unknown\)"):
         link(lambda data, _count: answer(data, "ERR 77 new")).ask("SHOW", 1)
 

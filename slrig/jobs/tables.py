@@ -1,0 +1,135 @@
+"""Every table of the service's database. The migrations in `slrig.jobs.migrations` make them; a test holds them equal.
+
+Times are ISO 8601 text in UTC, which sorts as it reads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import JSON, Boolean, Float, ForeignKey, Index, Integer, String, UniqueConstraint
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+
+class Base(DeclarativeBase):
+    """Holds the metadata."""
+
+
+class JobRow(Base):
+    """One job of any kind. pinned : no retention removes it."""
+
+    __tablename__ = "job"
+
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(36), unique=True)
+    kind: Mapped[str] = mapped_column(String(16))
+    state: Mapped[str] = mapped_column(String(16))
+    label: Mapped[str | None] = mapped_column(String(200))
+    rig: Mapped[str] = mapped_column(String(200))
+    plan: Mapped[dict[str, Any]] = mapped_column(JSON)
+    created_at: Mapped[str] = mapped_column(String(32))
+    started_at: Mapped[str | None] = mapped_column(String(32))
+    finished_at: Mapped[str | None] = mapped_column(String(32))
+    stage: Mapped[str] = mapped_column(String(64))
+    fraction: Mapped[float] = mapped_column(Float)
+    detail: Mapped[str] = mapped_column(String)
+    failure_code: Mapped[str | None] = mapped_column(String(64))
+    failure_message: Mapped[str | None] = mapped_column(String)
+    summary: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+    last_event: Mapped[int] = mapped_column(Integer)
+    pinned: Mapped[bool] = mapped_column(Boolean)
+
+    __table_args__ = (Index("ix_job_kind_state", "kind", "state"), {"sqlite_autoincrement": True})
+
+
+class EventRow(Base):
+    """One event of one job; `number` counts from 1 within the job."""
+
+    __tablename__ = "event"
+
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), primary_key=True)
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    kind: Mapped[str] = mapped_column(String(16))
+    data: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+
+class KeyRow(Base):
+    """One idempotency key. `job_id` is empty while the first request is being answered.
+
+    No foreign key: a job may be deleted before its key expires, and a late repeat must not start it again.
+    """
+
+    __tablename__ = "idempotency_key"
+
+    key: Mapped[str] = mapped_column(String(255), primary_key=True)
+    fingerprint: Mapped[str] = mapped_column(String(64))
+    job_id: Mapped[str | None] = mapped_column(String(36))
+    created_at: Mapped[str] = mapped_column(String(32))
+
+
+class ScheduleRow(Base):
+    """One schedule."""
+
+    __tablename__ = "schedule"
+
+    id: Mapped[str] = mapped_column(String(36), primary_key=True)
+    label: Mapped[str | None] = mapped_column(String(200))
+    cron: Mapped[str] = mapped_column(String(200))
+    time_zone: Mapped[str] = mapped_column(String(64))
+    task: Mapped[str] = mapped_column(String(16))
+    options: Mapped[dict[str, Any]] = mapped_column(JSON)
+    grace_s: Mapped[float] = mapped_column(Float)
+    retry_s: Mapped[float] = mapped_column(Float)
+    catch_up: Mapped[bool] = mapped_column(Boolean)
+    enabled: Mapped[bool] = mapped_column(Boolean)
+    created_at: Mapped[str] = mapped_column(String(32))
+    next_due: Mapped[str] = mapped_column(String(32))
+
+
+class RunRow(Base):
+    """One due time of a schedule. `owner` is the process that runs it or waits with it."""
+
+    __tablename__ = "run"
+
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    schedule_id: Mapped[str] = mapped_column(ForeignKey("schedule.id", ondelete="CASCADE"))
+    due: Mapped[str] = mapped_column(String(32))
+    state: Mapped[str] = mapped_column(String(16))
+    reason: Mapped[str | None] = mapped_column(String)
+    count: Mapped[int] = mapped_column(Integer)
+    attempts: Mapped[int] = mapped_column(Integer)
+    deadline: Mapped[str] = mapped_column(String(32))
+    next_attempt: Mapped[str | None] = mapped_column(String(32))
+    started_at: Mapped[str | None] = mapped_column(String(32))
+    finished_at: Mapped[str | None] = mapped_column(String(32))
+    owner: Mapped[str | None] = mapped_column(String(36))
+    alive_until: Mapped[str | None] = mapped_column(String(32))
+    result: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
+
+    __table_args__ = (
+        UniqueConstraint("schedule_id", "due", name="uq_run_due"),
+        Index("ix_run_state", "state"),
+        {"sqlite_autoincrement": True},
+    )
+
+
+class VerificationRow(Base):
+    """What one verification, or one scan's redundancy, said of a calibration. `look` is `Look.document`."""
+
+    __tablename__ = "verification"
+
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(36), unique=True)
+    at: Mapped[str] = mapped_column(String(32))
+    calibration: Mapped[str] = mapped_column(String(80))
+    kind: Mapped[str] = mapped_column(String(16))
+    state: Mapped[str] = mapped_column(String(16))
+    reasons: Mapped[list[str]] = mapped_column(JSON)
+    remedy: Mapped[str | None] = mapped_column(String)
+    look: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+    __table_args__ = (
+        Index("ix_verification_calibration", "calibration", "number"),
+        Index("ix_verification_at", "at"),
+        {"sqlite_autoincrement": True},
+    )

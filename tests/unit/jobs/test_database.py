@@ -1,0 +1,49 @@
+"""The service's database: its tables, and the files that it refuses."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import create_engine, text
+
+from slrig.errors import StorageError
+from slrig.jobs.database import Database
+from slrig.jobs.tables import Base
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "slrig.sqlite"
+
+
+def test_migrations_give_the_tables_that_the_code_uses(path: Path) -> None:
+    for _ in range(2):
+        Database(path).close()
+    engine = create_engine(f"sqlite:///{path}")
+    with engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+        assert connection.execute(text("PRAGMA journal_mode")).scalar() == "wal"
+    engine.dispose()
+
+
+def test_file_that_is_no_database_is_refused(path: Path) -> None:
+    path.write_bytes(b"not a database, for certain" * 100)
+    with pytest.raises(StorageError, match=r"slrig\.sqlite"):
+        Database(path)
+
+
+@pytest.mark.parametrize("version", ["0001", "records99"])
+def test_records_of_another_version_are_refused_and_left_as_they_are(path: Path, version: str) -> None:
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL)")
+        file.execute("INSERT INTO alembic_version VALUES (?)", [version])
+    file.close()
+    with pytest.raises(StorageError, match=rf"of version {version}.*Move that file out of the data folder.*--data"):
+        Database(path)
+    with sqlite3.connect(path) as file:
+        assert file.execute("SELECT name FROM sqlite_master").fetchall() == [("alembic_version",)]
+    file.close()
