@@ -10,6 +10,7 @@ from fastapi import APIRouter, Body, Query, Response
 from pydantic import BaseModel, Field
 
 from slrig.api.calibration_schemas import BoardRequest, IfBusy, board_of
+from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
@@ -17,10 +18,9 @@ from slrig.bundle.faults import Strict
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import HealthState
 from slrig.errors import CalibrationError
-from slrig.jobs.records import utc_now
+from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.verify.plot import health_svg
 from slrig.verify.store import VerificationRecord
-from slrig.verify.verification import JobState, VerificationJob
 
 router = APIRouter(prefix="/rig", tags=["health"])
 
@@ -159,12 +159,17 @@ def verify_rig(
     service: Serving,
     response: Response,
     request: Annotated[VerificationRequest, Body(default_factory=VerificationRequest)],
+    idempotency_key: IdempotencyKey = None,
 ) -> VerificationBody:
     """Shoot the board and judge the calibration in use by it. The answer comes at once; look again later."""
     board = _board_in_use(service) if request.board is None else board_of(request.board)
-    job = service.verifications.shoot(
-        board, position=request.position, exposure_s=request.exposure_s, wait=request.if_busy == "queue"
-    )
+
+    def start(key: str | None) -> JobRecord:
+        return service.verifications.shoot(
+            board, position=request.position, exposure_s=request.exposure_s, wait=request.if_busy == "queue", key=key
+        )
+
+    job = started_once(service.verifications.jobs, idempotency_key, request, start)
     body = _body(job)
     response.headers["Location"] = body.links["self"]
     return body
@@ -173,7 +178,7 @@ def verify_rig(
 @router.get("/verification/{verification_id}", responses=problems(404, 422))
 def look_at_verification(service: Serving, verification_id: UUID) -> VerificationBody:
     """Return a verification: its state, and what was found, or why nothing was."""
-    return _body(service.verifications.job(verification_id))
+    return _body(service.verifications.jobs.get(verification_id))
 
 
 @router.post("/verification/{verification_id}/cancel", status_code=202, responses=problems(404, 422))
@@ -199,8 +204,8 @@ def _figures(record: VerificationRecord) -> VerificationFigures:
     return VerificationFigures.model_validate(record.document())
 
 
-def _body(job: VerificationJob) -> VerificationBody:
+def _body(job: JobRecord) -> VerificationBody:
     here = f"/rig/verification/{job.id}"
-    found = None if job.record is None else _figures(job.record)
-    links = {"self": here, "cancel": f"{here}/cancel", "health": "/rig/health"}
+    found = None if job.summary is None else VerificationFigures.model_validate(job.summary)
+    links = {"self": here, "events": f"{here}/events", "cancel": f"{here}/cancel", "health": "/rig/health"}
     return filled(VerificationBody, job, found=found, error=job.fault, links=links)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Body, Header, Query, Response
+from fastapi import APIRouter, Body, Query, Response
 
 from slrig.api.artefacts import ready_files
+from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
-from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, fingerprint, scan_body, scan_plan
-from slrig.api.service import Service, Serving
-from slrig.jobs.records import JobProgress, JobRecord, JobState
+from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, scan_body, scan_plan
+from slrig.api.service import Serving
+from slrig.jobs.records import JobRecord
 from slrig.verify.verification import require_healthy
 
 USUAL_PAGE = 50
@@ -25,55 +25,19 @@ def start_scan(
     service: Serving,
     response: Response,
     request: Annotated[ScanRequest, Body(default_factory=ScanRequest)],
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            min_length=1,
-            max_length=255,
-            description="makes a repeat of this request return the first one's scan instead of starting another; "
-            "kept for a day",
-        ),
-    ] = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> ScanBody:
     """Start a scan. The answer comes at once; follow `links.events` for the rest."""
-    record = _first_answer(_started(service, request, idempotency_key))
+    plan = scan_plan(request, service.scan_defaults)
+
+    def start(key: str | None) -> JobRecord:
+        health, _, _ = service.verifications.health()
+        require_healthy(health, refuse_when_stale=service.refuse_when_stale)
+        return service.runner.submit(plan, label=request.label, wait=request.if_busy == "queue", key=key)
+
+    record = started_once(service.store, idempotency_key, request, start)
     response.headers["Location"] = f"/scan/{record.id}"
     return scan_body(record, {})
-
-
-def _started(service: Service, request: ScanRequest, key: str | None) -> JobRecord:
-    plan = scan_plan(request, service.scan_defaults)
-    wait = request.if_busy == "queue"
-    if key is None:
-        _require_healthy(service)
-        return service.runner.submit(plan, label=request.label, wait=wait)
-    earlier = service.store.reserve_key(key, fingerprint(request))
-    if earlier is not None:
-        return service.store.get(earlier)
-    try:
-        _require_healthy(service)
-        return service.runner.submit(plan, label=request.label, wait=wait, key=key)
-    finally:
-        # Does nothing when the key has its scan; a refused request may be tried again with the same key.
-        service.store.release_key(key)
-
-
-def _require_healthy(service: Service) -> None:
-    health, _, _ = service.verifications.health()
-    require_healthy(health, refuse_when_stale=service.refuse_when_stale)
-
-
-def _first_answer(record: JobRecord) -> JobRecord:
-    """The record as it was when the scan was made, so that a repeated request gets the same answer."""
-    return replace(
-        record,
-        state=JobState.QUEUED,
-        started_at=None,
-        finished_at=None,
-        progress=JobProgress("waiting", 0.0, ""),
-        fault=None,
-        summary=None,
-    )
 
 
 @router.get("", responses=problems(422))

@@ -15,6 +15,7 @@ from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.runner import Runner
@@ -23,7 +24,8 @@ from slrig.schedule.notices import NoticedHealth, Notices
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
-from slrig.verify.verification import VerificationDesk, verification_tools
+from slrig.verify.job import VerificationDesk
+from slrig.verify.verification import verification_tools
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
@@ -64,6 +66,7 @@ class Service:
         self.runner.close(timeout_s=self.settings.shutdown_s)
         # A run that held a deaf driver has its answer now.
         self.scheduler.close(timeout_s=_SCHEDULE_END_S)
+        self.verifications.close()
         self.calibrations.close()
 
     def close(self) -> None:
@@ -107,8 +110,16 @@ def assembled_service(
     schedules = ScheduleStore(store.database)
     notices = Notices(settings.webhook_url, rig=rig_name)
     health = NoticedHealth(store.database, notices)
-    verifications = VerificationDesk(folder, queue, health, tools=verification_tools(worker), spare_bytes=spare_bytes)
+    verifications = VerificationDesk(
+        folder,
+        queue,
+        health,
+        JobStore(store.database, JobKind.VERIFICATION),
+        tools=verification_tools(worker),
+        spare_bytes=spare_bytes,
+    )
     runner.watch_health(verifications)
+    verifications.take_up()
     acceptance = AcceptanceDesk(
         folder,
         queue,

@@ -54,10 +54,18 @@ class JobStore:
         with self.database.reading() as session:
             session.execute(text("SELECT 1"))
 
-    def create(self, plan: Mapping[str, Any], *, rig: str, label: str | None, key: str | None = None) -> JobRecord:
+    def create(
+        self,
+        plan: Mapping[str, Any],
+        *,
+        rig: str,
+        label: str | None,
+        key: str | None = None,
+        job_id: UUID | None = None,
+    ) -> JobRecord:
         """Record a new job as queued and, in the same transaction, tie its idempotency key to it."""
         row = JobRow(
-            id=str(uuid4()),
+            id=str(job_id or uuid4()),
             kind=self.kind,
             state=JobState.QUEUED,
             label=label,
@@ -183,6 +191,14 @@ class JobStore:
             session.delete(self._find(session, job_id))
         # Whoever waits for its next event would wait for ever.
         self._wake(job_id)
+
+    def prune(self, keep: int) -> None:
+        """Forget the oldest finished jobs, so that `keep` are left."""
+        query = select(JobRow).where(JobRow.kind == self.kind).order_by(JobRow.number.desc()).offset(keep)
+        with self.database.changing() as session:
+            for row in session.scalars(query):
+                if JobState(row.state).final:
+                    session.delete(row)
 
     def events(self, job_id: UUID, *, after: int) -> Sequence[JobEvent]:
         """Return a job's events whose number is above `after`, in order."""

@@ -16,13 +16,13 @@ from slrig.errors import ScanCancelledError, ScanInterruptedError, SlrigError, S
 from slrig.failure import UNEXPECTED, JobFailure, disk_errors, failure_of, interruption
 from slrig.jobs.channel import Call
 from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
+from slrig.jobs.endings import Ending, Endings
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
 from slrig.jobs.job import Holder
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore, ProgressRecorder
 from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession, driver_errors
-from slrig.scan.endings import Ending, Endings
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import check_plan
 from slrig.scan.records import KeptRecord, plan_from_json, report_summary, write_record

@@ -14,6 +14,7 @@ from slrig.devices import Rig
 from slrig.errors import InvalidInputError, ScanInterruptedError, ScanStateError
 from slrig.failure import failure_of
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.endings import Endings
 from slrig.jobs.job import Holder, RigWork
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobRecord, JobState, utc_now
@@ -21,7 +22,6 @@ from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.preview import Light, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
-from slrig.scan.endings import Endings
 from slrig.scan.job import CaptureBundle, ScanJob, ScanTools, WatchesHealth
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan

@@ -17,7 +17,7 @@ from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import until
 from slrig.schedule.records import Order, Run, Schedule, TaskKind
 from slrig.schedule.verification_task import VerificationTask
-from slrig.verify.verification import VerificationDesk
+from slrig.verify.job import VerificationDesk
 
 
 class Task(Protocol):

@@ -13,7 +13,7 @@ from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import error_of, until
 from slrig.schedule.positions import require_positions
 from slrig.schedule.task_options import VerificationOptions, checked
-from slrig.verify.verification import VerificationDesk
+from slrig.verify.job import VerificationDesk
 
 _TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
 
@@ -44,14 +44,14 @@ class VerificationTask:
         board = self._board_in_use() if asked.board is None else asked.board.board()
         with self._queue.named(holder):
             job = self._desk.shoot(board, position=asked.position, exposure_s=asked.exposure_s, wait=False)
-        until(lambda: self._desk.job(job.id).state.final, cancelled, cancel=lambda: self._desk.cancel(job.id))
-        over = self._desk.job(job.id)
+        jobs = self._desk.jobs
+        until(lambda: jobs.get(job.id).state.final, cancelled, cancel=lambda: self._desk.cancel(job.id))
+        over = jobs.get(job.id)
         if over.fault is not None:
             raise error_of(over.fault)
-        if over.record is None:
+        if over.summary is None:
             raise TypeError(over)
-        found = over.record.document()
-        return {"verification": str(over.record.id), **{name: found.get(name) for name in _TOLD}}
+        return {"verification": over.summary["id"], **{name: over.summary.get(name) for name in _TOLD}}
 
     def _board_in_use(self) -> Board:
         active = self._calibrations.active

@@ -10,7 +10,7 @@ from uuid import UUID
 import pytest
 from sse_starlette import ServerSentEvent
 
-from slrig.api.events import followed_scan
+from slrig.api.events import followed_job
 from slrig.api.streams import OpenStreams
 from slrig.api.streams import told as stream_of
 from slrig.jobs.database import Database
@@ -58,7 +58,7 @@ def test_stream_ahead_of_its_scan_is_told_what_comes_next(store: ActingStore) ->
         store.finish(scan.id, JobState.SUCCEEDED)
 
     store.act = go_on
-    assert asyncio.run(told(stream_of(followed_scan(store, scan.id), 1000, OpenStreams(1)))) == ["2", "3"]
+    assert asyncio.run(told(stream_of(followed_job(store, scan.id), 1000, OpenStreams(1)))) == ["2", "3"]
 
 
 @pytest.mark.parametrize("final", [True, False])
@@ -66,7 +66,7 @@ def test_stream_of_a_scan_that_is_deleted_ends(store: ActingStore, final: bool) 
     scan = made(store)
 
     async def follow() -> list[str | None]:
-        stream = stream_of(followed_scan(store, scan.id), 0, OpenStreams(1))
+        stream = stream_of(followed_job(store, scan.id), 0, OpenStreams(1))
         assert (await anext(stream)).id == "1"
         if final:
             # It is woken by the last event, and finds it gone.

@@ -16,8 +16,10 @@ from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.records import JobKind
+from slrig.jobs.store import JobStore
+from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
-from slrig.verify.verification import VerificationDesk
 from tests.unit.verify.test_verification import TAME, JobQueue
 
 BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
@@ -32,7 +34,7 @@ def queue() -> JobQueue:
 def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
     store = HealthStore(Database(folder.database))
-    desk = VerificationDesk(folder, queue, store, tools=TAME)
+    desk = VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), tools=TAME)
     service = SimpleNamespace(
         verifications=desk, refuse_when_stale=True, calibrations=SimpleNamespace(active=None)
     )  # fmt: skip
@@ -51,14 +53,16 @@ def test_a_verification_changes_the_health(client: TestClient) -> None:
     assert before["state"] == "unknown"
     assert before["calibration"] == "0123456789ab"
     assert before["refuses_scans_when_stale"] is True
-    answer = client.post("/rig/verification", json={"board": BOARD})
+    answer = client.post("/rig/verification", json={"board": BOARD}, headers={"Idempotency-Key": "k"})
     assert answer.status_code == 202
+    again = client.post("/rig/verification", json={"board": BOARD}, headers={"Idempotency-Key": "k"})
+    assert again.json() == answer.json()
     place = answer.headers["Location"]
     deadline = time.monotonic() + 20
-    while client.get(place).json()["state"] not in ("done", "failed"):
+    while client.get(place).json()["state"] not in ("succeeded", "failed"):
         assert time.monotonic() < deadline
     found = client.get(place).json()
-    assert found["state"] == "done"
+    assert found["state"] == "succeeded"
     after = client.get("/rig/health").json()
     assert after["state"] == "good"
     assert after["latest"] == found["found"]

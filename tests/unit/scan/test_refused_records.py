@@ -13,9 +13,8 @@ import pytest
 from sqlalchemy.orm import Session
 
 from slrig.errors import StorageError
-from slrig.jobs import database
+from slrig.jobs import database, endings
 from slrig.jobs.records import JobRecord, JobState
-from slrig.scan import endings
 from tests.unit.scan.bench import Bench
 
 MOST_WRITES = 12

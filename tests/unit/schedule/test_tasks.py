@@ -32,7 +32,8 @@ from slrig.errors import (
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.job import Holder
-from slrig.jobs.records import JobState
+from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.store import JobStore
 from slrig.schedule.acceptance_task import AcceptanceTask
 from slrig.schedule.cron import Cron
 from slrig.schedule.holder import NamedHolder
@@ -41,8 +42,9 @@ from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks, holder_of
+from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
-from slrig.verify.verification import VerificationDesk, VerificationTools
+from slrig.verify.verification import VerificationTools
 from tests.unit.accept.test_desk import PLAN, TameLender, desk, desks, queue
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.scan.fakes import WAIT_S, SetClock
@@ -63,7 +65,9 @@ class TaskBench(CalibrationBench):
         self.health = HealthStore(Database(self.folder.database))
         tools = self.tame.tools()
         verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_look())
-        self.verifications = VerificationDesk(self.folder, self.queue, self.health, tools=verifying)
+        self.verifications = VerificationDesk(
+            self.folder, self.queue, self.health, JobStore(self.health.database, JobKind.VERIFICATION), tools=verifying
+        )
         self.acceptance = AcceptanceDesk(self.folder, self.queue, evaluate=evaluated, report=write_reports)
         self.tidied: list[int] = []
         self.tasks = Tasks(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,22 +21,23 @@ from slrig.calibration.observations import PoseObservation
 from slrig.calibration.poses.figures import ViewFigures
 from slrig.devices import Rig
 from slrig.errors import (
-    CalibrationNotFoundError,
     CalibrationStateError,
+    JobNotFoundError,
     PoseRefusedError,
     RigBusyError,
     ScanCancelledError,
 )
+from slrig.failure import interruption
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.job import Holder
+from slrig.jobs.records import JobKind, JobRecord, JobState
+from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.scan.runner import RunnerStatus
+from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
 from slrig.verify.verification import (
-    JobState,
-    VerificationDesk,
-    VerificationJob,
     VerificationTools,
     health_stamp,
     require_healthy,
@@ -86,7 +88,7 @@ class JobQueue:
 
     def status(self) -> RunnerStatus:
         active = None if self.calibration is None else SimpleNamespace(calibration=self.calibration)
-        return cast("RunnerStatus", SimpleNamespace(active=active, facts=None))
+        return cast("RunnerStatus", SimpleNamespace(active=active, facts=None, rig="bench"))
 
 
 def capture(_rig: Rig, _plan: object, folder: Path, /, **_options: object) -> None:
@@ -125,45 +127,57 @@ def store(folder: DataFolder) -> Iterator[HealthStore]:
     found.database.close()
 
 
-def done(desk: VerificationDesk, **options: Any) -> VerificationJob:
+def desk_of(folder: DataFolder, store: HealthStore, queue: JobQueue, **options: Any) -> VerificationDesk:
+    options.setdefault("tools", TAME)
+    return VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), **options)
+
+
+def over(desk: VerificationDesk, job_id: UUID) -> JobRecord:
+    """A verification when it is over."""
+    changed = threading.Event()
+    unwatch = desk.jobs.watch(job_id, changed.set)
+    while not (record := desk.jobs.get(job_id)).state.final:
+        assert changed.wait(30)
+        changed.clear()
+    unwatch()
+    return record
+
+
+def done(desk: VerificationDesk, **options: Any) -> JobRecord:
     """A verification from beginning to end."""
-    over = threading.Event()
-    last: list[VerificationJob] = []
-
-    def ended(job: VerificationJob) -> None:
-        last.append(job)
-        over.set()
-
-    desk.shoot(BOARD, ended=ended, **options)
-    assert over.wait(30)
-    return last[0]
+    return over(desk, desk.shoot(BOARD, **options).id)
 
 
 def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, store: HealthStore) -> None:
-    desk = VerificationDesk(folder, JobQueue(), store, tools=TAME, clock=lambda: hours(1))
+    desk = desk_of(folder, store, JobQueue(), clock=lambda: hours(1))
     assert desk.health()[0].state is HealthState.UNKNOWN
     job = done(desk)
-    assert job.state is JobState.DONE
-    assert job.record is not None
-    assert job.record.at == hours(1)
-    assert job.record.calibration == "0123456789ab"
-    assert store.latest() == job.record
-    health, latest, calibration = desk.health()
+    assert job.state is JobState.SUCCEEDED
+    latest = store.latest()
+    assert latest is not None
+    assert job.summary == json.loads(json.dumps(latest.document()))
+    assert (latest.at, latest.calibration) == (hours(1), "0123456789ab")
+    states = [event.data["state"] for event in desk.jobs.events(job.id, after=0)]
+    assert states == ["queued", "capturing", "computing", "succeeded"]
+    health, found, calibration = desk.health()
     assert health.state is HealthState.GOOD
-    assert latest == job.record
+    assert found == latest
     assert calibration is CALIBRATION
     assert list(folder.incoming.iterdir()) == []
+    # It outlives the service.
+    assert desk_of(folder, store, JobQueue()).jobs.get(job.id) == job
 
 
 def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthStore) -> None:
-    desk = VerificationDesk(folder, JobQueue(held="scan 7"), store, tools=TAME)
+    desk = desk_of(folder, store, JobQueue(held="scan 7"))
     with pytest.raises(RigBusyError, match="scan 7"):
         desk.shoot(BOARD)
-    assert done(desk, wait=True).state is JobState.DONE
+    assert desk.jobs.page(before=None, limit=5) == []
+    assert done(desk, wait=True).state is JobState.SUCCEEDED
 
 
 def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, store: HealthStore) -> None:
-    desk = VerificationDesk(folder, JobQueue(calibration=None), store, tools=TAME)
+    desk = desk_of(folder, store, JobQueue(calibration=None))
     job = done(desk)
     assert job.state is JobState.FAILED
     assert job.fault is not None
@@ -174,7 +188,7 @@ def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, stor
 
 def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, store: HealthStore) -> None:
     tools = VerificationTools(capture=cast("Any", capture), read=moving, look=look)
-    job = done(VerificationDesk(folder, JobQueue(), store, tools=tools))
+    job = done(desk_of(folder, store, JobQueue(), tools=tools))
     assert job.state is JobState.FAILED
     assert job.fault is not None
     assert "camera 'left': the board moved by 0.90 px while it was shot" in job.fault.message
@@ -183,12 +197,46 @@ def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, st
 
 
 def test_a_cancelled_one_is_cancelled(folder: DataFolder, store: HealthStore) -> None:
-    desk = VerificationDesk(folder, JobQueue(error=ScanCancelledError("asked to")), store, tools=TAME)
+    desk = desk_of(folder, store, JobQueue(error=ScanCancelledError("asked to")))
     job = done(desk)
     assert job.state is JobState.CANCELLED
     assert desk.cancel(job.id).state is JobState.CANCELLED
-    with pytest.raises(CalibrationNotFoundError, match="GET /rig/health/history"):
-        desk.job(uuid4())
+    with pytest.raises(JobNotFoundError, match="GET /rig/health/history"):
+        desk.jobs.get(uuid4())
+
+
+def test_one_that_the_end_of_the_service_cuts_off_is_interrupted(folder: DataFolder, store: HealthStore) -> None:
+    job = done(desk_of(folder, store, JobQueue(error=interruption())))
+    assert job.state is JobState.INTERRUPTED
+
+
+def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
+    folder: DataFolder, store: HealthStore
+) -> None:
+    class Held(JobQueue):
+        """Never begins what is submitted."""
+
+        def submit_work(self, *_: Any, begun: Callable[[UUID], None], **__: Any) -> UUID:
+            begun(work_id := uuid4())
+            return work_id
+
+    before = desk_of(folder, store, Held())
+    waiting, shot = before.shoot(BOARD, wait=True), before.shoot(BOARD, wait=True)
+    before.jobs.advance(shot.id, JobState.CAPTURING)
+    after = desk_of(folder, store, JobQueue())
+    after.take_up()
+    assert over(after, waiting.id).state is JobState.SUCCEEDED
+    cut_off = after.jobs.get(shot.id)
+    assert cut_off.state is JobState.INTERRUPTED
+    assert cut_off.fault is not None
+    assert cut_off.fault.code == "scan-interrupted"
+
+
+def test_only_so_many_finished_ones_stay_on_record(folder: DataFolder, store: HealthStore) -> None:
+    desk = desk_of(folder, store, JobQueue())
+    made = [done(desk).id for _ in range(4)]
+    desk.jobs.prune(2)
+    assert [job.id for job in desk.jobs.page(before=None, limit=9)] == made[:1:-1]
 
 
 def test_a_recorded_pose_is_judged(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""How scans ended, kept until the records have taken it: a disk that refuses now may take it later."""
+"""How jobs ended, kept until the records have taken it: a disk that refuses now may take it later."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
 
 RETRY_S = 2.0
-"""How long after a refusal the records are tried again: soon enough for whoever waits for the end of a scan."""
+"""How long after a refusal the records are tried again: soon enough for whoever waits for the end of a job."""
 
 _log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ending:
-    """The final state of a scan, why where that is not success, and the summary of its report where it is."""
+    """The final state of a job, why where that is not success, and the summary of its report where it is."""
 
     id: UUID
     state: JobState
@@ -67,8 +67,8 @@ class Endings:
                 made = self._store.finish(ending.id, ending.state, fault=ending.fault, summary=ending.summary)
             except Exception as error:  # noqa: BLE001 - whatever refuses the record, the ending is not lost
                 _log.error(
-                    "the end of a scan could not be recorded",
-                    scan=str(ending.id), state=str(ending.state), exc_info=not isinstance(error, StorageError),
+                    "the end of a job could not be recorded",
+                    job=str(ending.id), state=str(ending.state), exc_info=not isinstance(error, StorageError),
                     cause=str(error),
                 )  # fmt: skip
                 self._try_again()
@@ -76,7 +76,7 @@ class Endings:
             with self._lock:
                 self._unrecorded = [each for each in self._unrecorded if each is not ending]
             if made:
-                _log.info("scan finished", scan=str(ending.id), state=str(ending.state))
+                _log.info("job finished", kind=str(self._store.kind), job=str(ending.id), state=str(ending.state))
 
     def _try_again(self) -> None:
         with self._lock:
