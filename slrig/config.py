@@ -219,7 +219,9 @@ class ServiceSettings(BaseSettings):
     `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
     environment they are separated by commas. `webhook_url` is told when a scheduled run was missed or failed, and when
     the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
-    are removed with their poses, but for the one in use and those that a scan or an acceptance test names. `log_format`
+    are removed with their poses, but for the one in use and those that a scan or an acceptance test names. Scans are
+    kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes` sets a limit: beyond it the oldest are
+    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `log_format`
     auto is text on a terminal, and JSON lines elsewhere.
     """
 
@@ -242,6 +244,9 @@ class ServiceSettings(BaseSettings):
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
     keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] = 100
+    keep_scans: Annotated[int, Field(ge=1)] | None = None
+    keep_scans_days: Annotated[float, Field(gt=0)] | None = None
+    keep_scans_bytes: Annotated[int, Field(ge=1)] | None = None
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["auto", "text", "json"] = "auto"
     webhook_url: Annotated[str, Field(max_length=2000)] | None = None

@@ -62,6 +62,7 @@ def _refuse_absent(record: JobRecord, name: str) -> None:
 
 def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: str | None) -> Response:
     record = service.store.get(scan_id)
+    service.scan_retention.reading(scan_id)
     place = service.folder.scan(scan_id)
     path = place / name
     if record.state.final and name in ON_REQUEST and (place / MESH).is_file():
@@ -141,6 +142,7 @@ def fetch_bundle(request: Request, service: Serving, scan_id: UUID, known: Known
     A scan whose reconstruction failed has its bundle, too.
     """
     record = service.store.get(scan_id)
+    service.scan_retention.reading(scan_id)
     bundle = service.folder.scan(scan_id) / "bundle"
     if not record.state.final or not bundle.is_dir():
         _refuse_absent(record, BUNDLE_ZIP)

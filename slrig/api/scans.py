@@ -11,7 +11,7 @@ from slrig.api.artefacts import ready_files
 from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
 from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, scan_body, scan_plan
-from slrig.api.service import Serving
+from slrig.api.service import Service, Serving
 from slrig.jobs.records import JobRecord
 from slrig.verify.verification import require_healthy
 
@@ -69,6 +69,23 @@ def look_at_scan(service: Serving, scan_id: UUID) -> ScanBody:
 def cancel_scan(service: Serving, scan_id: UUID) -> ScanBody:
     """Ask a scan to stop between two frames. May be repeated; a scan that has finished stays as it is."""
     record = service.runner.cancel(scan_id)
+    return scan_body(record, ready_files(service.folder, record))
+
+
+@router.put("/{scan_id}/pin", responses=problems(404, 422))
+def pin_scan(service: Serving, scan_id: UUID) -> ScanBody:
+    """Keep a scan, whatever the settings say of old ones. DELETE lets it go the way of the others again."""
+    return _pinned(service, scan_id, pinned=True)
+
+
+@router.delete("/{scan_id}/pin", responses=problems(404, 422))
+def unpin_scan(service: Serving, scan_id: UUID) -> ScanBody:
+    """Let a scan be removed when it is old, where the settings ask for that."""
+    return _pinned(service, scan_id, pinned=False)
+
+
+def _pinned(service: Service, scan_id: UUID, *, pinned: bool) -> ScanBody:
+    record = service.store.pin(scan_id, pinned=pinned)
     return scan_body(record, ready_files(service.folder, record))
 
 

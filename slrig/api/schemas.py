@@ -197,6 +197,7 @@ class ScanBody(BaseModel):
     progress: ProgressBody
     error: FaultBody
     summary: dict[str, Any] | None = Field(description="the plain figures and the notes of report.json")
+    pinned: bool = Field(description="kept, whatever the settings say of old scans")
     links: ScanLinks
 
 

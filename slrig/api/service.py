@@ -18,6 +18,7 @@ from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
+from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
 from slrig.schedule.holder import NamedHolder
 from slrig.schedule.notices import NoticedHealth, Notices
@@ -51,6 +52,7 @@ class Service:
     scheduler: Scheduler
     notices: Notices
     retention: Retention
+    scan_retention: ScanRetention
     refuse_when_stale: bool = False
 
     def start(self) -> None:
@@ -58,10 +60,12 @@ class Service:
         self.runner.start()
         self.scheduler.start()
         # It reads the report of every scan, and nobody waits for it.
+        self.scan_retention.start()
         threading.Thread(target=self.retention, name="slrig-retention", daemon=True).start()
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""
+        self.scan_retention.close()
         self.scheduler.close(timeout_s=min(_SCHEDULE_END_S, self.settings.shutdown_s))
         self.runner.close(timeout_s=self.settings.shutdown_s)
         # A run that held a deaf driver has its answer now.
@@ -132,6 +136,9 @@ def assembled_service(
         keep=settings.keep_calibrations,
         named=lambda: {test.calibration for test in acceptance.latest()},
     )
+    limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
+    scan_retention = ScanRetention(store, folder, limits, runner.delete)
+    runner.after_scan = scan_retention.look
     tasks = Tasks(queue, calibrations, verifications, acceptance, tidy=retention)
     # The folder's lock keeps every other process out.
     scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)
@@ -149,6 +156,7 @@ def assembled_service(
         scheduler=scheduler,
         notices=notices,
         retention=retention,
+        scan_retention=scan_retention,
         refuse_when_stale=refuse_when_stale,
     )
 

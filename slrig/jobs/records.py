@@ -66,7 +66,8 @@ class JobProgress:
 class JobRecord:
     """One job. `number` rises with every job and orders lists; times are UTC. plan : what was asked, as JSON values.
 
-    summary : what came of it, as far as a list shows it; None until the job has succeeded.
+    summary : what came of it, as far as a list shows it; None until the job has succeeded. pinned : no retention
+    removes it.
     """
 
     number: int
@@ -81,6 +82,7 @@ class JobRecord:
     progress: JobProgress
     fault: JobFailure | None
     summary: Mapping[str, Any] | None
+    pinned: bool = False
 
 
 @dataclass(frozen=True, slots=True)

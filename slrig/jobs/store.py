@@ -97,7 +97,9 @@ class JobStore:
         created_at: datetime,
         started_at: datetime,
     ) -> None:
-        """Put a job that succeeded on record again. How it went is not known any more; its end is taken for now."""
+        """Put a job that succeeded on record again. How it went is not known any more; its end is taken for now.
+        Whether it was pinned is not known either: it is pinned.
+        """
         row = JobRow(
             id=str(job_id),
             kind=self.kind,
@@ -111,7 +113,7 @@ class JobStore:
             fraction=0.0,
             detail="",
             last_event=0,
-            pinned=False,
+            pinned=True,
         )
         with self.database.changing() as session:
             session.add(row)
@@ -137,6 +139,20 @@ class JobStore:
         query = select(JobRow).where(JobRow.kind == self.kind, JobRow.state.in_(running)).order_by(JobRow.number)
         with self.database.reading() as session:
             return [_record(row) for row in session.scalars(query)]
+
+    def finished(self) -> Sequence[JobRecord]:
+        """Return the jobs that are in a final state, newest first."""
+        running = [state for state in JobState if not state.final]
+        query = select(JobRow).where(JobRow.kind == self.kind, JobRow.state.not_in(running))
+        with self.database.reading() as session:
+            return [_record(row) for row in session.scalars(query.order_by(JobRow.number.desc()))]
+
+    def pin(self, job_id: UUID, *, pinned: bool) -> JobRecord:
+        """Have a job kept by every retention, or not any more. Raises JobNotFoundError."""
+        with self.database.changing() as session:
+            row = self._find(session, job_id)
+            row.pinned = pinned
+            return _record(row)
 
     def states(self) -> dict[UUID, JobState]:
         """Return the state of every job on record."""
@@ -349,6 +365,7 @@ def _record(row: JobRow) -> JobRecord:
         progress=JobProgress(row.stage, row.fraction, row.detail),
         fault=None if row.failure_code is None else JobFailure(row.failure_code, row.failure_message or ""),
         summary=row.summary,
+        pinned=row.pinned,
     )
 
 

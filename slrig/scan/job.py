@@ -68,7 +68,7 @@ class ScanTools:
     """What every scan is made with.
 
     spare_bytes : left free on the disk. ending : tells that the service ends. health : who knows whether the
-    calibration still holds, if anybody does.
+    calibration still holds, if anybody does. after : called when a scan is over.
     """
 
     store: JobStore
@@ -79,6 +79,7 @@ class ScanTools:
     spare_bytes: int
     ending: Callable[[], bool]
     health: Callable[[], WatchesHealth | None] = lambda: None
+    after: Callable[[], None] = lambda: None
 
 
 class ScanJob:
@@ -121,6 +122,7 @@ class ScanJob:
     def settle(self) -> None:
         """See `Job`."""
         self._tools.endings.settle()
+        self._tools.after()
 
     def _ended(self, held: RigSession) -> Ending:
         log = _log.bind(scan=str(self.id))

@@ -82,6 +82,8 @@ class Runner:
         self._queue = JobQueue(rig, queue_length=queue_length, give_up=give_up)
         self._endings = Endings(store)
         self._health: WatchesHealth | None = None
+        self.after_scan: Callable[[], None] = lambda: None
+        """Called, on the rig's thread, after each scan."""
         self._tools = ScanTools(
             store,
             folder,
@@ -91,6 +93,7 @@ class Runner:
             spare_bytes,
             ending=lambda: self._queue.ending,
             health=lambda: self._health,
+            after=lambda: self.after_scan(),
         )
 
     def start(self) -> None:

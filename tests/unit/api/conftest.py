@@ -30,12 +30,10 @@ KEY = "the key of the tests"
 class ServedBench(TameBench):
     """A service over a tame bench."""
 
-    def __init__(self, root: Path, *, keep_calibrations: int = 100) -> None:
+    def __init__(self, root: Path, **settings: Any) -> None:
         super().__init__()
         self.free_bytes = 10**12
-        settings = ServiceSettings(
-            data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, keep_calibrations=keep_calibrations
-        )
+        chosen = ServiceSettings(data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, **settings)
         folder = DataFolder(root, free=lambda _: self.free_bytes)
         store = JobStore(Database(folder.database), JobKind.SCAN)
         self.worker = Worker("tests.unit.scan.fake_pipeline")
@@ -44,7 +42,7 @@ class ServedBench(TameBench):
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
         self.tame = TameCalibrating(self)
         self.service = assembled_service(
-            settings,
+            chosen,
             defaults,
             folder,
             store,

@@ -1,0 +1,118 @@
+"""Old scans: removed by count, age and size; pinned ones, those being read and those under way are kept."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+
+from slrig.errors import StorageError
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.database import Database
+from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.store import JobStore
+from slrig.scan.plan import ScanPlan
+from slrig.scan.records import plan_json
+from slrig.scan.retention import READ_S, ScanLimits, ScanRetention
+
+NOON = datetime(2026, 11, 23, 12, tzinfo=UTC)
+
+
+class Archive:
+    """Scans of a data folder, each an hour younger than the one before, of 1000 bytes."""
+
+    def __init__(self, root: Path) -> None:
+        self.now, self.now_s = NOON, 0.0
+        self.folder = DataFolder(root)
+        self.store = JobStore(Database(self.folder.database), JobKind.SCAN, clock=lambda: self.now)
+        self.deleted: list[UUID] = []
+        self.refuses: set[UUID] = set()
+
+    def scan(self, state: JobState = JobState.SUCCEEDED) -> UUID:
+        self.now += timedelta(hours=1)
+        made = self.store.create(plan_json(ScanPlan()), rig="bench", label=None).id
+        if state.final:
+            self.store.finish(made, state)
+            self.folder.scan(made).mkdir()
+            (self.folder.scan(made) / "mesh.ply").write_bytes(bytes(1000))
+        return made
+
+    def delete(self, scan: UUID) -> None:
+        if scan in self.refuses:
+            message = "read-only"
+            raise StorageError(message)
+        self.store.delete(scan)
+        self.deleted.append(scan)
+
+    def retention(self, limits: ScanLimits, delete: Callable[[UUID], None] | None = None) -> ScanRetention:
+        return ScanRetention(
+            self.store, self.folder, limits, delete or self.delete, clock=lambda: self.now, now_s=lambda: self.now_s
+        )
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Iterator[Archive]:
+    found = Archive(tmp_path / "data")
+    yield found
+    found.store.database.close()
+    found.folder.release()
+
+
+@pytest.mark.parametrize(
+    ("limits", "kept"),
+    [
+        (ScanLimits(), 5),
+        (ScanLimits(count=2), 2),
+        (ScanLimits(days=2.5 / 24), 3),
+        (ScanLimits(size_bytes=3999), 3),
+        (ScanLimits(count=4, days=1.0, size_bytes=1000), 1),
+    ],
+)
+def test_the_oldest_beyond_a_limit_are_removed(archive: Archive, limits: ScanLimits, kept: int) -> None:
+    made = [archive.scan() for _ in range(5)]
+    assert list(archive.retention(limits).apply()) == made[: 5 - kept]
+    assert archive.retention(limits).apply() == []
+
+
+def test_a_scan_that_is_pinned_under_way_or_being_read_is_kept(archive: Archive) -> None:
+    pinned, under_way, read, old, new = (
+        archive.scan(), archive.scan(JobState.CAPTURING), archive.scan(), archive.scan(), archive.scan(),
+    )  # fmt: skip
+    archive.store.pin(pinned, pinned=True)
+    retention = archive.retention(ScanLimits(count=1))
+    retention.reading(read)
+    assert retention.apply() == [old]
+    archive.now_s = READ_S
+    assert retention.apply() == [read]
+    archive.store.pin(pinned, pinned=False)
+    assert retention.apply() == [pinned]
+    assert {job.id for job in archive.store.page(before=None, limit=9)} == {under_way, new}
+
+
+def test_a_disk_that_refuses_one_keeps_that_one_only(archive: Archive) -> None:
+    first, second, _ = archive.scan(), archive.scan(), archive.scan()
+    archive.refuses = {first}
+    assert archive.retention(ScanLimits(count=1)).apply() == [second]
+
+
+def test_it_looks_at_its_start_and_when_it_is_told_to(archive: Archive) -> None:
+    removed = threading.Event()
+
+    def delete(scan: UUID) -> None:
+        archive.delete(scan)
+        removed.set()
+
+    first, second = archive.scan(), archive.scan()
+    retention = archive.retention(ScanLimits(count=1), delete)
+    retention.start()
+    assert removed.wait(30)
+    removed.clear()
+    archive.scan()
+    retention.look()
+    assert removed.wait(30)
+    retention.close()
+    assert archive.deleted == [first, second]
