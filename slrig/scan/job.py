@@ -93,26 +93,32 @@ class ScanJob:
         self.stop = threading.Event()
         self._plan = plan_from_json(record.plan)
         self._tools = tools
-        self._ending = Ending(record.id, JobState.FAILED, failure_of(RuntimeError()))
+        self._begun = False
+        self._captured = False
+        self._ending: Ending | None = Ending(record.id, JobState.FAILED, failure_of(RuntimeError()))
 
     def run(self, held: RigSession) -> None:
         """See `Job`."""
+        self._begun = True
         self._tools.endings.settle()
         self._ending = self._ended(held)
 
     def clear_up(self) -> None:
         """See `Job`."""
-        if self._ending.state is not JobState.SUCCEEDED:
+        if self._ending is not None and self._ending.state is not JobState.SUCCEEDED:
             self._keep_evidence(self._ending.state)
         self._tools.worker.start()
 
     def conclude(self) -> None:
         """See `Job`."""
-        self._tools.endings.add(self._ending)
+        if self._ending is not None:
+            self._tools.endings.add(self._ending)
 
     def cut_off(self, error: SlrigError) -> None:
         """See `Job`."""
         state = JobState.FAILED
+        if isinstance(error, ScanInterruptedError) and self._goes_on:
+            return
         if isinstance(error, ScanInterruptedError):
             state = JobState.INTERRUPTED
         elif isinstance(error, ScanCancelledError) or self.stop.is_set():
@@ -124,7 +130,13 @@ class ScanJob:
         self._tools.endings.settle()
         self._tools.after()
 
-    def _ended(self, held: RigSession) -> Ending:
+    @property
+    def _goes_on(self) -> bool:
+        """Whether the next start of the service takes the scan up, as `slrig.scan.sweep` does."""
+        return not self._begun or self._captured
+
+    def _ended(self, held: RigSession) -> Ending | None:
+        """How it ended; None where the service ends first and the next one goes on with it."""
         log = _log.bind(scan=str(self.id))
         state, summary, fault = JobState.FAILED, None, None
         try:
@@ -132,6 +144,9 @@ class ScanJob:
             state = JobState.SUCCEEDED
         except Exception as error:
             fault = self._told(error)
+            if self._tools.ending() and self._captured:
+                log.info("a scan is left to the next start of the service")
+                return None
             if self._tools.ending():
                 state, fault = JobState.INTERRUPTED, failure_of(interruption())
             elif isinstance(error, ScanCancelledError):
@@ -185,7 +200,7 @@ class ScanJob:
     def _reconstructed(self, staged: Path, progress: ProgressRecorder, feed: FrameFeed | None) -> Mapping[str, Any]:
         """Make the mesh of the bundle in staging, put the scan in its place, and return the summary of its report."""
         tools, bundle = self._tools, staged / "bundle"
-        self._reconstructing()
+        self._captured = self._reconstructing()
         progress.span(CAPTURE_SHARE, 1.0)
         call = reconstruction(tools.worker.module, bundle, staged / "result", self._plan.reconstruction)
         report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=self.stop.is_set, feed=feed)
@@ -197,12 +212,14 @@ class ScanJob:
             _noted(health, report)
         return report_summary(report)
 
-    def _reconstructing(self) -> None:
-        """Record that the bundle is whole. That record is for whoever looks on; the scan goes on without."""
+    def _reconstructing(self) -> bool:
+        """Record that the bundle is whole, and return whether that is on record; the scan goes on without."""
         try:
             self._tools.store.advance(self.id, JobState.COMPUTING)
         except StorageError as error:
             _log.warning("that a scan is reconstructed could not be recorded", scan=str(self.id), cause=str(error))
+            return False
+        return True
 
     def _keep_evidence(self, state: JobState) -> None:
         """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""

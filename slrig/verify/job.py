@@ -253,6 +253,9 @@ class VerificationDesk:
         if isinstance(error, ScanCancelledError):
             state = JobState.CANCELLED
         elif isinstance(error, ScanInterruptedError):
+            if self.jobs.get(job_id).state is JobState.QUEUED:
+                # The next start of the service takes it up.
+                return
             state = JobState.INTERRUPTED
         else:
             _log.warning("a verification failed", job=str(job_id), cause=str(error))

@@ -88,10 +88,12 @@ def scanned(client: ServiceClient) -> dict[str, Any]:
 def half_written(data: Path) -> list[str]:
     """What lies in the data folder and should not: leftovers of writing, and scans that no record knows whole."""
     with sqlite3.connect(data / "slrig.sqlite") as database:
-        states = dict(database.execute("select id, state from scan").fetchall())
+        states = dict(database.execute("select id, state from job").fetchall())
     database.close()
-    found = [path for path in data.rglob("*") if path.name.endswith(".part")]
-    found += (data / ".incoming").iterdir()
+    # A scan whose frames are all there is completed at the next start, which clears its folder first.
+    computing = [data / ".incoming" / scan for scan, state in states.items() if state == "computing"]
+    found = [path for path in data.rglob("*.part") if not any(path.is_relative_to(folder) for folder in computing)]
+    found += (path for path in (data / ".incoming").iterdir() if path not in computing)
     found += (data / ".orphans").glob("*")
     for folder in (data / "scans").iterdir():
         state = states.get(folder.name)

@@ -236,13 +236,13 @@ def test_delete_removes_record_and_files_once_a_scan_is_over(bench: Bench) -> No
     assert bench.store.page(before=None, limit=10) == []
 
 
-def test_closing_interrupts_what_runs_and_what_waits(bench: Bench) -> None:
+def test_closing_interrupts_what_captures_and_leaves_what_waits(bench: Bench) -> None:
     active = bench.held()
     waiting = bench.scan(wait=True)
     bench.runner.close()
-    for scan in (active, waiting):
-        record = bench.store.get(scan.id)
-        assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
+    record = bench.store.get(active.id)
+    assert (record.state, failure_code(record)) == (JobState.INTERRUPTED, "scan-interrupted")
+    assert bench.store.get(waiting.id).state is JobState.QUEUED
     _, projector = bench.opened[0]
     assert projector.dark
     assert projector.closed
@@ -250,10 +250,11 @@ def test_closing_interrupts_what_runs_and_what_waits(bench: Bench) -> None:
         bench.scan()
 
 
-def test_closing_ends_a_reconstruction_and_keeps_its_bundle(bench: Bench) -> None:
+def test_closing_leaves_a_reconstruction_to_the_next_start(bench: Bench) -> None:
     bench.order = "hang-deaf"
     scan = bench.scan()
     bench.until(scan.id, JobState.COMPUTING)
     bench.runner.close()
-    assert bench.store.get(scan.id).state is JobState.INTERRUPTED
-    assert (bench.folder.scan(scan.id) / "bundle" / "bundle.json").is_file()
+    assert bench.store.get(scan.id).state is JobState.COMPUTING
+    assert sweep(bench.store, bench.folder).resumed == (scan.id,)
+    assert (bench.folder.staging(scan.id) / "bundle" / "bundle.json").is_file()

@@ -206,8 +206,19 @@ def test_a_cancelled_one_is_cancelled(folder: DataFolder, store: HealthStore) ->
 
 
 def test_one_that_the_end_of_the_service_cuts_off_is_interrupted(folder: DataFolder, store: HealthStore) -> None:
-    job = done(desk_of(folder, store, JobQueue(error=interruption())))
-    assert job.state is JobState.INTERRUPTED
+    def cut_off(*_: Any, **__: Any) -> None:
+        raise interruption()
+
+    tools = VerificationTools(capture=cut_off, read=read, look=look)
+    assert done(desk_of(folder, store, JobQueue(), tools=tools)).state is JobState.INTERRUPTED
+
+
+def test_one_that_waits_at_the_end_of_the_service_waits_on(folder: DataFolder, store: HealthStore) -> None:
+    job = desk_of(folder, store, JobQueue(error=interruption())).shoot(BOARD)
+    assert job.state is JobState.QUEUED
+    after = desk_of(folder, store, JobQueue())
+    after.take_up()
+    assert over(after, job.id).state is JobState.SUCCEEDED
 
 
 def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
