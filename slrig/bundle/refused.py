@@ -23,9 +23,10 @@ _MOST_BYTES = 16 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """One exposure that did not count: which pattern and camera, the how-manieth of that pattern, and why.
+    """One exposure that did not count: which pattern and camera, which attempt at that pattern, and why.
 
-    shot : its frame; None where no frame came, and where it had been accepted and `delivered` before.
+    shot : its frame; None where no frame came, and where it had been accepted and `delivered` before. left_out : the
+    whole exposure is of no use to the camera, and is not shot again.
     """
 
     pattern: int
@@ -34,6 +35,7 @@ class Refused:
     cause: str
     shot: Shot | None = None
     delivered: bool = False
+    left_out: bool = False
 
 
 class RefusedEntry(Strict):
@@ -46,6 +48,7 @@ class RefusedEntry(Strict):
     file: str | None = None
     exposure_s: Annotated[float, Field(gt=0)] | None = None
     time_s: float | None = None
+    left_out: Literal[True] | None = None
 
 
 class RefusedList(Strict):
@@ -75,4 +78,7 @@ def read_refused(folder: Path) -> tuple[Refused, ...]:
     except ValidationError as cause:
         message = f"{path} is not a valid list of refused frames:\n{explain(cause, data, keys_of(RefusedList))}"
         raise BundleError(message) from cause
-    return tuple(Refused(entry.pattern, entry.camera, entry.attempt, entry.cause) for entry in listed.frames)
+    return tuple(
+        Refused(entry.pattern, entry.camera, entry.attempt, entry.cause, left_out=bool(entry.left_out))
+        for entry in listed.frames
+    )

@@ -141,7 +141,8 @@ class BundleWriter:
             place = _Place({"pattern": refused.pattern, "camera": refused.camera})
             self._places.append(place)
         place.vacant = True
-        self._refused.append(RefusedEntry.model_validate({**entry, "cause": refused.cause}))
+        entry |= {"cause": refused.cause, "left_out": refused.left_out or None}
+        self._refused.append(RefusedEntry.model_validate(entry))
 
     def keep(self, ended: str) -> None:
         """Have what was written stay although the block will end with an error; `ended` says which."""

@@ -9,7 +9,8 @@ A pattern that is constant over the visible part of the projector is no contradi
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypedDict
 
 from slrig.bundle.refused import Refused
 from slrig.capture.identity import Contradiction, place
@@ -25,7 +26,8 @@ class EvidenceSummary:
     patterns : how many were seen. verified : how many of them passed, in every camera, a test that another pattern
     would fail. lit, light_drift, noise_dn : per camera, share of the image that the projector lights, largest change
     of the light as a share of white, noise of a frame in DN; missing where nothing tells. faults : contradictions that
-    stand. shot_again : how many exposures were refused and made again; causes : why, each once.
+    stand. shot_again : how many exposures were refused and made again; causes : why, each once. left_out : why
+    whole exposures of a bracket were left out, each once.
     """
 
     patterns: int
@@ -36,10 +38,29 @@ class EvidenceSummary:
     faults: tuple[str, ...]
     shot_again: int = 0
     causes: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         again = f", {self.shot_again} frame{'s' * (self.shot_again != 1)} shot again" if self.shot_again else ""
         return f"{self.verified}/{self.patterns} patterns verified{again}"
+
+
+class Again(TypedDict):
+    """The members of `EvidenceSummary` that tell of refused exposures."""
+
+    shot_again: int
+    causes: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def again(refused: Sequence[Refused], patterns: Sequence[Pattern]) -> Again:
+    """What refused exposures come to."""
+    shot = [each for each in refused if not each.left_out]
+    return {
+        "shot_again": len(shot),
+        "causes": tuple(dict.fromkeys(f"{place(r.camera, r.pattern, patterns[r.pattern])}: {r.cause}" for r in shot)),
+        "left_out": tuple(dict.fromkeys(each.cause for each in refused if each.left_out)),
+    }
 
 
 class Evidence:
@@ -90,7 +111,7 @@ class Evidence:
 
     def note(self, refused: Refused) -> None:
         """Put on record that an exposure was refused."""
-        self._refused.append(Refused(refused.pattern, refused.camera, refused.attempt, refused.cause))
+        self._refused.append(replace(refused, shot=None))
 
     @property
     def refused_count(self) -> int:
@@ -103,7 +124,6 @@ class Evidence:
         seen = {index for witness in witnesses for index in witness.seen}
         unproven = {index for witness in witnesses for index in witness.seen - witness.verified}
         noises = {w.name: w.measured_noise_dn for w in witnesses}
-        causes = (f"{place(r.camera, r.pattern, self._patterns[r.pattern])}: {r.cause}" for r in self._refused)
         return EvidenceSummary(
             patterns=len(seen),
             verified=len(seen - unproven),
@@ -111,8 +131,7 @@ class Evidence:
             light_drift={w.name: w.light_drift for w in witnesses if w.light_drift is not None},
             noise_dn={name: noise for name, noise in noises.items() if noise is not None},
             faults=tuple(str(told) for w in witnesses for told in w.told),
-            shot_again=len(self._refused),
-            causes=tuple(dict.fromkeys(causes)),
+            **again(self._refused, self._patterns),
         )
 
 

@@ -18,13 +18,10 @@ import numpy as np
 
 from slrig.bundle.refused import Refused
 from slrig.capture.checks import NOISE_FLOOR_DN, Samples
-from slrig.capture.evidence import EvidenceSummary, check_capture
-from slrig.capture.identity import named, place
+from slrig.capture.evidence import EvidenceSummary, again, check_capture
+from slrig.capture.identity import named
 from slrig.capture.sampling import Sampler
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
-
-LEFT_OUT = "left out: "
-"""What the cause of a refusal begins with that leaves out a whole exposure."""
 
 _NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
 _MOST_SATURATED = 0.9
@@ -161,14 +158,8 @@ def bracket_summary(
         light_drift=drift,
         noise_dn=best.noise_dn,
         faults=(*(f"at {time_s:g} s, {fault}" for time_s, part in parts for fault in part.faults), *faults),
-        shot_again=sum(not each.cause.startswith(LEFT_OUT) for each in refused),
-        causes=tuple(dict.fromkeys(f"{place(r.camera, r.pattern, patterns[r.pattern])}: {r.cause}" for r in refused)),
+        **again(refused, patterns),
     )
-
-
-def left_out(causes: Sequence[str]) -> list[str]:
-    """What the causes of a summary say about exposures that were left out, each once."""
-    return list(dict.fromkeys(cause[cause.index(LEFT_OUT) :] for cause in causes if LEFT_OUT in cause))
 
 
 def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:

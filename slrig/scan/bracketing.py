@@ -15,7 +15,6 @@ from slrig.bundle.refused import Refused
 from slrig.capture.checks import NOISE_FLOOR_DN, Samples
 from slrig.capture.evidence import Evidence, EvidenceSummary
 from slrig.capture.exposure import (
-    LEFT_OUT,
     ExposedSamples,
     Unfit,
     Verdict,
@@ -230,10 +229,11 @@ class Exposing:
             cause = f"{run.exposure_s:g} s is {told.unfit} for camera '{name}': {told.words}{longer}"
             self._causes[name] = cause
             white = self._sequence.patterns.index(White())
-            self._note(Refused(white, name, run.refused[white, name] + 1, LEFT_OUT + cause))
+            self._note(Refused(white, name, run.refused[white, name] + 1, cause, left_out=True))
         for pattern, name in sorted(run.standing):
-            cause = LEFT_OUT + self._causes[name] if name in unfit else again
-            self._note(Refused(pattern, name, run.refused[pattern, name] + 1, cause, delivered=True))
+            cause = self._causes[name] if name in unfit else again
+            attempt = run.refused[pattern, name] + 1
+            self._note(Refused(pattern, name, attempt, cause, delivered=True, left_out=name in unfit))
         self._skip(run.exposure_s, set(unfit))
 
     def _skip(self, exposure_s: float | None, cameras: set[str]) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
-from slrig.capture.exposure import LEFT_OUT, left_out
 from slrig.meshing.optimisation import Optimised
 from slrig.meshing.surface import FinishedMesh, Stage
 from slrig.model import Axis, Capture, LineShift, Mesh, PointCurves, Refusal, Source
@@ -191,7 +190,7 @@ def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> d
         "evidence": {
             "patterns_verified": f"{evidence.verified}/{evidence.patterns}",
             "shot_again": evidence.shot_again,
-            "shot_again_because": [cause for cause in evidence.causes if LEFT_OUT not in cause],
+            "shot_again_because": list(evidence.causes),
             "light_drift": dict(evidence.light_drift),
             "contradictions": list(evidence.faults),
         },
@@ -216,6 +215,6 @@ def capture_notes(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> li
         for name, form in capture.cameras.items()
         if form.compression_dn
     ]
-    notes += [f"an exposure was {words}" for words in left_out(evidence.causes)]
+    notes += [f"an exposure was left out: {cause}" for cause in evidence.left_out]
     notes += [f"the frames contradict their patterns: {fault}" for fault in evidence.faults]
     return notes

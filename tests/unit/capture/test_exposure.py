@@ -11,12 +11,10 @@ import pytest
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.capture.exposure import (
-    LEFT_OUT,
     ExposedSamples,
     Unfit,
     bracket_summary,
     check_exposures,
-    left_out,
     movement_between,
     verdict,
 )
@@ -140,14 +138,14 @@ def test_a_bracket_has_verified_what_its_best_exposure_has() -> None:
     parts = [(0.01, summary(12, drift=0.01)), (0.04, summary(20, drift=-0.03, lit=0.7)), (0.16, summary(18))]
     refused = [
         Refused(0, "left", 1, "at 0.04 s, it is dark"),
-        Refused(0, "left", 1, f"{LEFT_OUT}0.64 s is too bright"),
-        Refused(1, "left", 1, f"{LEFT_OUT}0.64 s is too bright"),
+        Refused(0, "left", 1, "0.64 s is too bright", left_out=True),
+        Refused(1, "left", 1, "0.64 s is too bright", left_out=True),
     ]
     found = bracket_summary(parts, refused, ["something moved"], PATTERNS)
     assert str(found) == "20/20 patterns verified, 1 frame shot again"
     assert (found.lit["left"], found.light_drift["left"]) == (0.7, -0.03)
     assert found.faults == ("something moved",)
-    assert left_out(found.causes) == [f"{LEFT_OUT}0.64 s is too bright"]
+    assert found.left_out == ("0.64 s is too bright",)
     worse = bracket_summary([(0.01, summary(20, faults=("bit 3 is stale",)))], [], [], PATTERNS)
     assert worse.faults == ("at 0.01 s, bit 3 is stale",)
 
