@@ -31,6 +31,7 @@ from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_bundle
+from slrig.scan.job import PIPELINE
 from slrig.scan.runner import Runner
 from slrig.scan.sweep import sweep
 
@@ -72,7 +73,7 @@ def open_service(
     ):
         for name in found:
             _log.warning("left by the last run", scan=str(name), found=what)
-    worker = Worker()
+    worker = Worker(PIPELINE)
     runner = Runner(
         store,
         folder,

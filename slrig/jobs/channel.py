@@ -15,7 +15,7 @@ from slrig.failure import JobFailure
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class Task:
     """A task of the worker: a function that is named rather than passed, so that the service need not load it.
 
     function : "module:function". It is given `progress` and `cancelled` if it takes arguments of these names, and
@@ -35,7 +35,7 @@ class Run:
     """Parent to child: do this, with the frames that were sent under the same number if `fed`."""
 
     number: int
-    call: Call
+    task: Task
     fed: bool
 
 

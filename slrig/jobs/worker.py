@@ -26,12 +26,12 @@ import structlog
 from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.failure import errors_by_code, interruption
 from slrig.jobs.channel import (
-    Call,
     Failed,
     Fed,
     Preparing,
     Ready,
     Run,
+    Task,
     Unloadable,
     received,
     sent,
@@ -39,9 +39,6 @@ from slrig.jobs.channel import (
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.worker_process import serve
 from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Told
-
-PIPELINE = "slrig.scan.reconstruct"
-"""What the process prepares for: the reconstruction of scans, whose kernels are compiled once on each machine."""
 
 SILENCE_TOLD_S = 5.0
 """From when on `condition` tells that the process shows no sign of life."""
@@ -70,7 +67,7 @@ def _never() -> bool:
 class Worker:
     """Runs one task at a time in a child process, in the order in which they come. Any thread may call."""
 
-    def __init__(self, module: str = PIPELINE) -> None:
+    def __init__(self, module: str) -> None:
         """`module` : see `slrig.jobs.worker_process.serve`."""
         self.module = module
         self._spawning = multiprocessing.get_context("spawn")
@@ -177,7 +174,7 @@ class Worker:
 
     def run(
         self,
-        call: Call,
+        task: Task,
         *,
         progress: Told = _silent,
         cancelled: Callable[[], bool] = _never,
@@ -200,7 +197,7 @@ class Worker:
         UnexpectedWorkerError
             The task has a defect.
         """
-        with self._its_turn(call, progress, cancelled):
+        with self._its_turn(task, progress, cancelled):
             self.start()
             with self._guard:
                 process, pipe, stops = self._process, self._pipe, self._stops
@@ -211,12 +208,12 @@ class Worker:
             # A process that was started since the capture has not seen its frames.
             if feed is not None and self._fed is not None and self._fed[:2] == (feed, pipe):
                 number, fed = self._fed[2], True
-            job = JobWait(call, number, process, pipe, stops, self._heartbeat, progress, cancelled, self._noted)
+            job = JobWait(task, number, process, pipe, stops, self._heartbeat, progress, cancelled, self._noted)
             try:
                 if fed and feed is not None:
                     fed = job.settled(feed)
                 with self._sending:
-                    begun = sent(pipe, Run(number, call, fed))
+                    begun = sent(pipe, Run(number, task, fed))
                 if not begun:
                     # What it last said may lie in the pipe still: why it could not be loaded.
                     self._noted(received(pipe))
@@ -226,7 +223,7 @@ class Worker:
                 if self._closed:
                     raise interruption() from error
                 if not self._loading and self._condition != READY:
-                    message = f"The {call.what} did not begin: {self._condition}. {call.remedy}"
+                    message = f"The {task.what} did not begin: {self._condition}. {task.remedy}"
                     raise WorkerLostError(message) from error
                 raise
             finally:
@@ -247,12 +244,12 @@ class Worker:
         """A function of the mathematics, "module:function", done by the worker; see `run` for the two callables."""
 
         def call(*given: Any, progress: Told = _silent, cancelled: Callable[[], bool] = _never, **options: Any) -> Any:
-            return self.run(Call(function, given, options, what=what), progress=progress, cancelled=cancelled)
+            return self.run(Task(function, given, options, what=what), progress=progress, cancelled=cancelled)
 
         return call
 
     @contextmanager
-    def _its_turn(self, call: Call, progress: Told, cancelled: Callable[[], bool]) -> Iterator[None]:
+    def _its_turn(self, task: Task, progress: Told, cancelled: Callable[[], bool]) -> Iterator[None]:
         """Wait until the jobs that came before are over."""
         turn, told = next(self._numbers), False
         with self._turn:
@@ -266,7 +263,7 @@ class Worker:
                     progress(WAITING, 0.0, "another job is computed first")
                     told = True
                 if cancelled():
-                    message = f"The {call.what} was cancelled."
+                    message = f"The {task.what} was cancelled."
                     raise ScanCancelledError(message)
             yield
         finally:

@@ -16,7 +16,6 @@ from typing import Any
 
 from slrig.failure import failure_of
 from slrig.jobs.channel import (
-    Call,
     Done,
     Failed,
     Fed,
@@ -24,6 +23,7 @@ from slrig.jobs.channel import (
     Progressed,
     Ready,
     Run,
+    Task,
     Unloadable,
     received,
     sent,
@@ -102,7 +102,7 @@ def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | 
         given = {"progress": progress, "cancelled": cancelled}
         if live is not None:
             given["live"] = live
-        return Done(run.number, _called(run.call, given))
+        return Done(run.number, _called(run.task, given))
     except (ConnectionError, EOFError):
         # The parent is gone: nobody waits for an answer.
         raise
@@ -110,8 +110,8 @@ def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | 
         return Failed(run.number, failure_of(error), traceback.format_exc())
 
 
-def _called(call: Call, given: dict[str, Any]) -> Any:
-    module, _, name = call.function.partition(":")
+def _called(task: Task, given: dict[str, Any]) -> Any:
+    module, _, name = task.function.partition(":")
     function = getattr(importlib.import_module(module), name)
     taken = inspect.signature(function).parameters
-    return function(*call.given, **call.options, **{name: each for name, each in given.items() if name in taken})
+    return function(*task.given, **task.options, **{name: each for name, each in given.items() if name in taken})

@@ -13,7 +13,7 @@ from multiprocessing.process import BaseProcess
 import structlog
 
 from slrig.errors import ScanCancelledError, WorkerLostError
-from slrig.jobs.channel import Call, Done, Failed, Preparing, Progressed, Unloadable, received, sent
+from slrig.jobs.channel import Done, Failed, Preparing, Progressed, Task, Unloadable, received, sent
 from slrig.jobs.frame_feed import FrameFeed
 
 CANCEL_LIMIT_S = 10.0
@@ -44,7 +44,7 @@ class JobWait:
     process says of itself.
     """
 
-    call: Call
+    task: Task
     number: int
     process: BaseProcess
     pipe: Connection
@@ -118,8 +118,8 @@ class JobWait:
         if self._standstill_s > STANDSTILL_LIMIT_S:
             raise self._replaced(f"told no progress for {self._standstill_s / 60:.0f} minutes")
         if self._stop_after is not None and now_s > self._stop_after:
-            _log.warning("a job did not stop when asked, its process is ended", job=self.call.what)
-            message = f"The {self.call.what} was cancelled."
+            _log.warning("a job did not stop when asked, its process is ended", job=self.task.what)
+            message = f"The {self.task.what} was cancelled."
             raise ScanCancelledError(message)
         if self._stop_after is None and self.cancelled():
             self._stop_after = now_s + CANCEL_LIMIT_S
@@ -127,10 +127,10 @@ class JobWait:
         return self._stop_after is not None
 
     def _replaced(self, why: str) -> WorkerLostError:
-        _log.error("the worker is replaced", job=self.call.what, why=why)
+        _log.error("the worker is replaced", job=self.task.what, why=why)
         message = (
-            f"The worker {why} in the middle of the {self.call.what}, and has been replaced. Look for what stops or "
-            f"overloads this machine. {self.call.remedy}"
+            f"The worker {why} in the middle of the {self.task.what}, and has been replaced. Look for what stops or "
+            f"overloads this machine. {self.task.remedy}"
         )
         return WorkerLostError(message)
 
@@ -140,7 +140,7 @@ class JobWait:
         code = self.process.exitcode
         how = f"signal {signal.Signals(-code).name}" if code is not None and code < 0 else f"exit code {code}"
         message = (
-            f"The worker's process ended in the middle of the {self.call.what} ({how}), and has been replaced. If the "
-            f"machine ran out of memory, free some or use a camera of fewer pixels. {self.call.remedy}"
+            f"The worker's process ended in the middle of the {self.task.what} ({how}), and has been replaced. If the "
+            f"machine ran out of memory, free some or use a camera of fewer pixels. {self.task.remedy}"
         )
         return WorkerLostError(message)

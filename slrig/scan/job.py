@@ -14,7 +14,7 @@ from slrig.bundle.health import write_health
 from slrig.devices import Rig
 from slrig.errors import ScanCancelledError, ScanInterruptedError, SlrigError, StorageError
 from slrig.failure import UNEXPECTED, JobFailure, disk_errors, failure_of, interruption
-from slrig.jobs.channel import Call
+from slrig.jobs.channel import Task
 from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
 from slrig.jobs.endings import Ending, Endings
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
@@ -26,6 +26,9 @@ from slrig.rig.session import RigSession, driver_errors
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import check_plan
 from slrig.scan.records import KeptRecord, plan_from_json, report_summary, write_record
+
+PIPELINE = "slrig.scan.reconstruct"
+"""What the worker prepares for: the reconstruction of scans, whose kernels are compiled once on each machine."""
 
 CAPTURE_SHARE = 0.5
 """The part of a scan's progress that is capture."""
@@ -233,9 +236,9 @@ class ScanJob:
         folder.discard(self.id)
 
 
-def reconstruction(pipeline: str, bundle: Path, output: Path, plan: ReconstructionPlan) -> Call:
+def reconstruction(pipeline: str, bundle: Path, output: Path, plan: ReconstructionPlan) -> Task:
     """The worker's job of reconstructing a bundle. pipeline : `Worker.module`."""
-    return Call(
+    return Task(
         f"{pipeline}:reconstruct_bundle",
         (bundle, output),
         {"plan": plan},

@@ -25,7 +25,7 @@ from slrig.errors import (
 from slrig.failure import failure_of, interruption
 from slrig.jobs import worker as worker_module
 from slrig.jobs import worker_wait
-from slrig.jobs.channel import Call, Done, Failed, Progressed
+from slrig.jobs.channel import Done, Failed, Progressed, Task
 from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
 from slrig.jobs.worker_process import serve
 from slrig.jobs.worker_wait import JobWait
@@ -54,7 +54,7 @@ class Told:
         self.stages.append((stage, fraction))
 
 
-def job(tmp_path: Path, order: str) -> Call:
+def job(tmp_path: Path, order: str) -> Task:
     bundle = tmp_path / "bundle"
     bundle.mkdir(exist_ok=True, parents=True)
     (bundle / "order").write_text(order)
@@ -117,8 +117,8 @@ def test_deaf_job_loses_its_process(worker: Worker, tmp_path: Path, monkeypatch:
     assert worker.process_id != before
 
 
-def task(name: str, *given: object) -> Call:
-    return Call(f"{PIPELINE}:{name}", given, what="examination")
+def task(name: str, *given: object) -> Task:
+    return Task(f"{PIPELINE}:{name}", given, what="examination")
 
 
 def test_any_named_task_is_done_with_what_it_takes(worker: Worker) -> None:

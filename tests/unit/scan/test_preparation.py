@@ -11,11 +11,10 @@ import pytest
 from numba import config
 
 from slrig.errors import StorageError
-from slrig.jobs.worker import PIPELINE
 from slrig.kernels import Prepared, compilations_told, prepared
 from slrig.scan import preparation
 from slrig.scan import reconstruct as pipeline
-from slrig.scan.job import reconstruction
+from slrig.scan.job import PIPELINE, reconstruction
 from slrig.scan.plan import ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels, sample_scan
 
