@@ -7,13 +7,14 @@ from datetime import datetime
 from typing import Annotated, Any, Literal
 from uuid import UUID
 
-from fastapi import APIRouter, Body, Header, Query, Response
+from fastapi import APIRouter, Body, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
 from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, RequestKey
 from slrig.accept.store import HTML, JSON
+from slrig.api.idempotency import IdempotencyKey
 from slrig.api.openapi import problems
 from slrig.api.schemas import AnyFault, filled, fingerprint
 from slrig.api.service import Serving
@@ -21,16 +22,6 @@ from slrig.bundle.faults import Strict
 from slrig.calibration.artefacts import Decision
 
 router = APIRouter(prefix="/acceptance", tags=["acceptance"])
-
-Key = Annotated[
-    str | None,
-    Header(
-        alias="Idempotency-Key",
-        min_length=1,
-        max_length=255,
-        description="makes a repeat of this request change nothing, and return the test; kept as long as the test",
-    ),
-]
 
 
 class PositionRequest(Strict):
@@ -96,7 +87,7 @@ def open_acceptance(
     service: Serving,
     response: Response,
     request: Annotated[AcceptanceRequest, Body(default_factory=AcceptanceRequest)],
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> AcceptanceBody:
     """Open an acceptance test of the rig as it is calibrated now. Touches no device."""
     record = service.acceptance.open(request.plan, key=_key(idempotency_key, request))
@@ -123,7 +114,7 @@ def measure_position(
     service: Serving,
     test_id: UUID,
     request: Annotated[PositionRequest, Body(default_factory=PositionRequest)],
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> AcceptanceBody:
     """Measure the next position, with its repeats; by script, all that are left. The answer comes at once."""
     wait = request.if_busy == "queue"

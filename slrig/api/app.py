@@ -14,7 +14,6 @@ from slrig.api import (
     acceptance,
     artefacts,
     calibration,
-    calibration_events,
     calibration_files,
     events,
     health,
@@ -50,7 +49,7 @@ def bare_app() -> FastAPI:
         lifespan=_life,
     )
     scanning = (scans, events, artefacts, rig, preview)
-    calibrating = (calibration, calibration_events, calibration_files, health)
+    calibrating = (calibration, calibration_files, health)
     for part in (*scanning, *calibrating, acceptance, schedules, metrics, system):
         app.include_router(part.router)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Body, Header, Query, Request, Response
+from fastapi import APIRouter, Body, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
@@ -25,6 +25,7 @@ from slrig.api.calibration_schemas import (
     comparison_body,
     pose_body,
 )
+from slrig.api.idempotency import IdempotencyKey
 from slrig.api.openapi import problems
 from slrig.api.schemas import fingerprint, pattern_plan
 from slrig.api.service import Service, Serving
@@ -51,16 +52,6 @@ _ENDINGS = {
 router = APIRouter(prefix="/calibration", tags=["calibration"])
 
 PoseNumber = int
-Key = Annotated[
-    str | None,
-    Header(
-        alias="Idempotency-Key",
-        min_length=1,
-        max_length=255,
-        description="makes a repeat of this request return the first one's pose instead of shooting another; kept as "
-        "long as the calibration",
-    ),
-]
 Label = Annotated[str | None, Query(min_length=1, max_length=200, description="free text, to find it again")]
 
 
@@ -162,7 +153,7 @@ def shoot_pose(
     response: Response,
     calibration_id: UUID,
     request: Annotated[PoseRequestBody, Body(default_factory=PoseRequestBody)],
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> PoseBody:
     """Shoot a pose of the board. The answer comes at once; look at the pose for what was found."""
     asked = PoseRequest(request.position, request.exposure_s, idempotency_key, fingerprint(request))
@@ -176,7 +167,7 @@ def shoot_script(
     response: Response,
     calibration_id: UUID,
     request: Annotated[ScriptRequest, Body(default_factory=ScriptRequest)],
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKey = None,
 ) -> PoseBody:
     """Have the positioner take its poses one after the other, and shoot each; return the first. Other work may come
     between two of them. To stop, cancel the pose that is under way.

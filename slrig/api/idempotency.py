@@ -1,4 +1,4 @@
-"""A request that is sent twice makes one job: the Idempotency-Key of whatever is put in the queue."""
+"""A request that is sent twice does its work once."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ IdempotencyKey = Annotated[
     Header(
         min_length=1,
         max_length=255,
-        description="makes a repeat of this request return the first one's job instead of starting another; "
-        "kept for a day",
+        description="makes a repeat of this request return what the first one made instead of making another; kept "
+        "for a day, or as long as the calibration or the acceptance test that it belongs to",
     ),
 ]
 
@@ -38,7 +38,7 @@ def started_once(
     """
     if key is None:
         return _at_first(start(None))
-    earlier = store.reserve_key(key, f"{store.kind} {fingerprint(request)}")
+    earlier = store.reserve_key(key, fingerprint(request))
     if earlier is not None:
         return _at_first(store.get(earlier))
     try:

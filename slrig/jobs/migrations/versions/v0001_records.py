@@ -45,7 +45,7 @@ def upgrade() -> None:
     op.create_table(
         "idempotency_key",
         sa.Column("key", sa.String(255), primary_key=True),
-        sa.Column("fingerprint", sa.String(80), nullable=False),
+        sa.Column("fingerprint", sa.String(64), nullable=False),
         sa.Column("job_id", sa.String(36)),
         sa.Column("created_at", sa.String(32), nullable=False),
     )
