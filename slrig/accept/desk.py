@@ -16,7 +16,7 @@ from slrig.accept.records import AcceptanceRecord, AcceptanceState, RequestKey
 from slrig.accept.running import Evaluate, by_positioner, measured, required_calibration
 from slrig.accept.store import AcceptanceStore, interruption_fault
 from slrig.accept.verdicts import AcceptanceResult, verdicts
-from slrig.calibrate.pose_shooting import RigLender
+from slrig.calibrate.pose_shooting import RigQueue
 from slrig.devices import Rig
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -59,7 +59,7 @@ class AcceptanceDesk:
     def __init__(
         self,
         folder: DataFolder,
-        queue: RigLender,
+        queue: RigQueue,
         *,
         evaluate: Evaluate,
         report: Callable[[AcceptanceResult, Path], None],
@@ -123,11 +123,19 @@ class AcceptanceDesk:
         with self._lock:
             return tuple(held.record for held in reversed(self._tests.values()))
 
-    def measure(self, test_id: UUID, *, wait: bool, scripted: bool, key: RequestKey | None = None) -> AcceptanceRecord:
+    def measure(
+        self,
+        test_id: UUID,
+        *,
+        wait: bool,
+        scripted: bool,
+        key: RequestKey | None = None,
+        holder: Holder | None = None,
+    ) -> AcceptanceRecord:
         """Have the next position measured, or, scripted, all that are left; return at once.
 
         By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. A request with
-        a key that came before changes nothing.
+        a key that came before changes nothing. holder : whom a refusal names meanwhile; None the test.
 
         Raises
         ------
@@ -160,7 +168,7 @@ class AcceptanceDesk:
 
             self._queue.submit_work(
                 lambda rig, cancelled: self._measure(held, rig, cancelled, scripted=scripted),
-                holder=Holder(words, words, f"/acceptance/{test_id}"),
+                holder=holder or Holder(words, words, f"/acceptance/{test_id}"),
                 wait=wait,
                 ended=lambda error: self._ended(held, error),
                 begun=begun,

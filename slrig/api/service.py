@@ -20,7 +20,6 @@ from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
-from slrig.schedule.holder import NamedHolder
 from slrig.schedule.notices import NoticedHealth, Notices
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
@@ -103,10 +102,9 @@ def assembled_service(
         The disk refused. What was given is still the caller's to close.
     """
     spare_bytes = settings.min_free_bytes
-    queue = NamedHolder(runner)
     calibrations = Calibrations(
         folder,
-        queue,
+        runner,
         rig_name=rig_name,
         tools=calibration_tools or usual_calibration_tools(worker),
         spare_bytes=spare_bytes,
@@ -116,7 +114,7 @@ def assembled_service(
     health = NoticedHealth(store.database, notices)
     verifications = VerificationDesk(
         folder,
-        queue,
+        runner,
         health,
         JobStore(store.database, JobKind.VERIFICATION),
         tools=verification_tools(worker),
@@ -126,7 +124,7 @@ def assembled_service(
     verifications.take_up()
     acceptance = AcceptanceDesk(
         folder,
-        queue,
+        runner,
         evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
         report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
     )
@@ -139,7 +137,7 @@ def assembled_service(
     limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
     scan_retention = ScanRetention(store, folder, limits, runner.delete)
     runner.after_scan = scan_retention.look
-    tasks = Tasks(queue, calibrations, verifications, acceptance, tidy=retention)
+    tasks = Tasks(runner, calibrations, verifications, acceptance, tidy=retention)
     # The folder's lock keeps every other process out.
     scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)
     return Service(

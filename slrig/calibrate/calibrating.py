@@ -14,7 +14,7 @@ from slrig.bundle.calibration_file import write_calibration
 from slrig.bundle.opencv_calibration import write_opencv_calibration
 from slrig.bundle.storage import write_durably
 from slrig.calibrate.pose_answering import PoseAnswers, setting_of
-from slrig.calibrate.pose_shooting import PoseDesk, RigLender
+from slrig.calibrate.pose_shooting import PoseDesk, RigQueue
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solves import SolveDesk
@@ -36,7 +36,7 @@ EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 _log = structlog.get_logger(__name__)
 
 
-class CalibratedRig(RigLender, Protocol):
+class CalibratedRig(RigQueue, Protocol):
     """`slrig.scan.runner.Runner`: does work with the rig, and takes a calibration for what is begun from now on."""
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:

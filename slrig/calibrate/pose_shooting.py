@@ -35,7 +35,7 @@ from slrig.scan.runner import RunnerStatus
 _log = structlog.get_logger(__name__)
 
 
-class RigLender(Protocol):
+class RigQueue(Protocol):
     """`slrig.scan.runner.Runner`, as far as a session needs it."""
 
     def submit_work(
@@ -78,7 +78,7 @@ class PoseDesk:
         self,
         register: CalibrationRegister,
         folder: DataFolder,
-        queue: RigLender,
+        queue: RigQueue,
         tools: CalibrationTools,
         answers: PoseAnswers,
         *,
@@ -95,8 +95,10 @@ class PoseDesk:
         self._answers = answers
         self._work_ids: dict[tuple[UUID, int], UUID] = {}
 
-    def shoot(self, session_id: UUID, request: PoseRequest, *, wait: bool) -> PoseRecord:
+    def shoot(self, session_id: UUID, request: PoseRequest, *, wait: bool, holder: Holder | None = None) -> PoseRecord:
         """Have a pose shot; `wait` lets it stand in line. Returns at once.
+
+        holder : whom a refusal names meanwhile; None the pose.
 
         Raises
         ------
@@ -132,14 +134,14 @@ class PoseDesk:
                 self._work_ids[session_id, number] = work_id
                 self._register.change(session_id, lambda found: _with_new(found, pose, request))
 
-            holder = Holder(
+            own = Holder(
                 f"calibration {session_id}, pose {number}",
                 f"calibration {session_id}, pose {number}",
                 f"/calibration/{session_id}/pose/{number}",
             )
             self._queue.submit_work(
                 lambda rig, cancelled: self._shoot(session_id, pose, plan, rig, cancelled),
-                holder=holder,
+                holder=holder or own,
                 wait=wait,
                 ended=lambda error: self._shot(session_id, number, error),
                 begun=begun,

@@ -8,7 +8,7 @@ from typing import Any
 from uuid import UUID
 
 from slrig.calibrate.calibrating import Calibrations
-from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.pose_shooting import PoseRequest, RigQueue
 from slrig.calibrate.records import PoseState, SessionRecord, SessionState
 from slrig.calibration.judging.verdict import Grade
 from slrig.errors import (
@@ -19,7 +19,6 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.job import Holder
-from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import error_of, until
 from slrig.schedule.positions import require_positions
 from slrig.schedule.task_options import CalibrationOptions, checked
@@ -31,7 +30,7 @@ class CalibrationTask:
     tidy : called after each, however it ended, so that they do not pile up.
     """
 
-    def __init__(self, queue: NamedHolder, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+    def __init__(self, queue: RigQueue, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._tidy = tidy
@@ -79,8 +78,8 @@ class CalibrationTask:
     def _shoot(
         self, session: UUID, holder: Holder, asked: CalibrationOptions, position: int | str, *, wait: bool
     ) -> None:
-        with self._queue.named(holder):
-            self._calibrations.poses.shoot(session, PoseRequest(position, asked.exposure_s), wait=wait)
+        request = PoseRequest(position, asked.exposure_s)
+        self._calibrations.poses.shoot(session, request, wait=wait, holder=holder)
 
     def _await_rig(self, session: UUID, cancelled: Callable[[], bool]) -> None:
         """Until the last pose was shot: it may still be read while the next one is."""

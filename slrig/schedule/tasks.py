@@ -9,11 +9,11 @@ from uuid import UUID
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.pose_shooting import RigQueue
 from slrig.errors import ScanStateError
 from slrig.jobs.job import Holder
 from slrig.schedule.acceptance_task import AcceptanceTask
 from slrig.schedule.calibration_task import CalibrationTask
-from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import until
 from slrig.schedule.records import Order, Run, Schedule, TaskKind
 from slrig.schedule.verification_task import VerificationTask
@@ -43,13 +43,12 @@ class Task(Protocol):
 class Tasks:
     """Every kind of work: a `slrig.schedule.scheduler.Work`. Any thread may call.
 
-    The desks have to submit their work to `queue`: it is by it that a refusal names the schedule. tidy : called after
-    each calibration, see `slrig.calibrate.retention`.
+    tidy : called after each calibration, see `slrig.calibrate.retention`.
     """
 
     def __init__(
         self,
-        queue: NamedHolder,
+        queue: RigQueue,
         calibrations: Calibrations,
         verifications: VerificationDesk,
         acceptance: AcceptanceDesk,
@@ -99,8 +98,9 @@ class Tasks:
         if self._queue.status().facts is not None:
             return
         errors: list[Exception | None] = []
-        with self._queue.named(holder):
-            work_id = self._queue.submit_work(lambda *_: None, holder=holder, wait=False, ended=errors.append)
+        work_id = self._queue.submit_work(
+            lambda *_: None, holder=holder, wait=False, ended=errors.append, begun=lambda _: None
+        )
         until(lambda: bool(errors), cancelled, cancel=lambda: self._queue.cancel_work(work_id))
         if errors[0] is not None:
             raise errors[0]

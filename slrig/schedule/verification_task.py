@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.pose_shooting import RigQueue
 from slrig.calibration.board import Board
 from slrig.errors import CalibrationError, ScheduleError
 from slrig.jobs.job import Holder
-from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import error_of, until
 from slrig.schedule.positions import require_positions
 from slrig.schedule.task_options import VerificationOptions, checked
@@ -21,7 +21,7 @@ _TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent
 class VerificationTask:
     """Implements `slrig.schedule.tasks.Task`."""
 
-    def __init__(self, queue: NamedHolder, calibrations: Calibrations, desk: VerificationDesk) -> None:
+    def __init__(self, queue: RigQueue, calibrations: Calibrations, desk: VerificationDesk) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._desk = desk
@@ -42,8 +42,7 @@ class VerificationTask:
         """See `Task`. A rig that is found stale is a verification that succeeded."""
         asked = _options(options)
         board = self._board_in_use() if asked.board is None else asked.board.board()
-        with self._queue.named(holder):
-            job = self._desk.shoot(board, position=asked.position, exposure_s=asked.exposure_s, wait=False)
+        job = self._desk.shoot(board, position=asked.position, exposure_s=asked.exposure_s, holder=holder)
         jobs = self._desk.jobs
         until(lambda: jobs.get(job.id).state.final, cancelled, cancel=lambda: self._desk.cancel(job.id))
         over = jobs.get(job.id)

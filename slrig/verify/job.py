@@ -14,7 +14,7 @@ from uuid import UUID, uuid4
 import structlog
 from pydantic import TypeAdapter
 
-from slrig.calibrate.pose_shooting import RigLender
+from slrig.calibrate.pose_shooting import RigQueue
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
 from slrig.calibration.health.look import Look, health_of_scan
@@ -78,7 +78,7 @@ class VerificationDesk:
     def __init__(
         self,
         folder: DataFolder,
-        queue: RigLender,
+        queue: RigQueue,
         store: HealthStore,
         jobs: JobStore,
         *,
@@ -115,10 +115,12 @@ class VerificationDesk:
         exposure_s: float | None = None,
         wait: bool = False,
         key: str | None = None,
+        holder: Holder | None = None,
     ) -> JobRecord:
         """Have the board shot, where the positioner takes it if asked, and the calibration judged. Returns at once.
 
         wait : stand in line while the rig is held. key : the idempotency key of the request, reserved.
+        holder : whom a refusal names meanwhile; None the verification.
 
         Raises
         ------
@@ -141,14 +143,21 @@ class VerificationDesk:
         job_id = uuid4()
         document = _plan_adapter.dump_python(plan, mode="json")
         record = partial(self.jobs.create, document, rig=status.rig, label=None, key=key, job_id=job_id)
-        self._submit(job_id, plan, wait=wait, record=record)
+        self._submit(job_id, plan, wait=wait, record=record, holder=holder)
         self.jobs.prune(_KEPT)
         return self.jobs.get(job_id)
 
     def _submit(
-        self, job_id: UUID, plan: VerificationPlan, *, wait: bool, record: Callable[[], object] = lambda: None
+        self,
+        job_id: UUID,
+        plan: VerificationPlan,
+        *,
+        wait: bool,
+        record: Callable[[], object] = lambda: None,
+        holder: Holder | None = None,
     ) -> None:
         calibrations: list[Calibration] = []
+        words = f"verification {job_id}"
 
         def begun(work_id: UUID) -> None:
             record()
@@ -156,7 +165,7 @@ class VerificationDesk:
 
         self._queue.submit_work(
             lambda rig, cancelled: self._shoot(job_id, plan, rig, cancelled, calibrations),
-            holder=Holder(f"verification {job_id}", f"verification {job_id}", f"/rig/verification/{job_id}"),
+            holder=holder or Holder(words, words, f"/rig/verification/{job_id}"),
             wait=wait,
             ended=lambda error: self._shot(job_id, plan, calibrations, error),
             begun=begun,

@@ -46,7 +46,7 @@ from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, scan_of
 PLAN = replace(SHORT, rendered=False)
 
 
-class TameLender:
+class TameQueue:
     """Does work with a rig on the caller's own thread; `holder` is who holds it meanwhile."""
 
     def __init__(self, rig: Rig) -> None:
@@ -87,16 +87,16 @@ class TameLender:
 
 
 @pytest.fixture
-def queue() -> TameLender:
+def queue() -> TameQueue:
     positioner = TamePositioner(tuple(step.name for step in PLAN.steps))
-    return TameLender(Rig("tame", {}, None, {}, RIG, positioner=positioner))  # type: ignore[arg-type]
+    return TameQueue(Rig("tame", {}, None, {}, RIG, positioner=positioner))  # type: ignore[arg-type]
 
 
 Desks = Callable[[], AcceptanceDesk]
 
 
 @pytest.fixture
-def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameLender) -> Desks:
+def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> Desks:
     """Makes the desk of a service, and of one after it over the same folder."""
     folder = DataFolder(tmp_path)
     monkeypatch.setattr(acceptance, "capture_bundle", lambda _rig, _plan, folder, **_: folder.mkdir())
@@ -127,7 +127,7 @@ def the_plan(_: Calibration) -> AcceptancePlan:
     return PLAN
 
 
-def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: AcceptanceDesk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
     done = []
     while (record := desk.get(test.id)).state is AcceptanceState.OPEN:
@@ -146,7 +146,7 @@ def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Accep
         desk.measure(test.id, wait=False, scripted=False)
 
 
-def test_a_script_measures_all_that_are_left_in_one_loan(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_a_script_measures_all_that_are_left_in_one_loan(desk: AcceptanceDesk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=True)
     assert desk.get(test.id).state is AcceptanceState.FINISHED
@@ -177,7 +177,7 @@ def test_a_position_that_went_wrong_may_be_measured_again(
     assert len(desk.get(test.id).readings) == PLAN.repeats
 
 
-def test_a_cancelled_test_is_over(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_a_cancelled_test_is_over(desk: AcceptanceDesk, queue: TameQueue) -> None:
     waiting, running = desk.open(the_plan), desk.open(the_plan)
     assert desk.cancel(waiting.id).state is AcceptanceState.CANCELLED
     queue.cancelled = lambda: True
@@ -189,7 +189,7 @@ def test_a_cancelled_test_is_over(desk: AcceptanceDesk, queue: TameLender) -> No
         desk.file(running.id, "report.json")
 
 
-def test_a_held_rig_is_refused_and_the_test_stays_open(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_a_held_rig_is_refused_and_the_test_stays_open(desk: AcceptanceDesk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
     queue.busy = True
     with pytest.raises(RigBusyError):
@@ -197,7 +197,7 @@ def test_a_held_rig_is_refused_and_the_test_stays_open(desk: AcceptanceDesk, que
     assert desk.get(test.id).state is AcceptanceState.OPEN
 
 
-def test_what_cannot_be_tested_is_refused(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_what_cannot_be_tested_is_refused(desk: AcceptanceDesk, queue: TameQueue) -> None:
     with pytest.raises(JobNotFoundError, match="No acceptance test"):
         desk.get(uuid4())
     exact = desk.open(lambda _: replace(PLAN, rendered=True))
@@ -236,7 +236,7 @@ def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks) -> Non
     assert [each.id for each in desks().latest()] == [third.id, waiting.id]
 
 
-def cut_off(desk: AcceptanceDesk, test_id: UUID, queue: TameLender, *, after_captures: int) -> None:
+def cut_off(desk: AcceptanceDesk, test_id: UUID, queue: TameQueue, *, after_captures: int) -> None:
     """Have the service end, as it were, in the middle of a capture: nothing is told of how it ended."""
 
     class PowerCut(BaseException):
@@ -253,7 +253,7 @@ def cut_off(desk: AcceptanceDesk, test_id: UUID, queue: TameLender, *, after_cap
     queue.cancelled = lambda: False
 
 
-def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks, queue: TameLender) -> None:
+def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks, queue: TameQueue) -> None:
     before = desks()
     test = before.open(the_plan)
     cut_off(before, test.id, queue, after_captures=1)
@@ -275,7 +275,7 @@ def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks
     assert [each.take for each in after.get(test.id).readings if each.step == "sphere-1"] == [0, 1]
 
 
-def test_a_service_that_ends_in_good_order_interrupts_a_test_too(desks: Desks, queue: TameLender) -> None:
+def test_a_service_that_ends_in_good_order_interrupts_a_test_too(desks: Desks, queue: TameQueue) -> None:
     before = desks()
     test = before.open(the_plan)
 
@@ -310,7 +310,7 @@ def test_what_cannot_be_read_is_put_aside(desks: Desks, tmp_path: Path) -> None:
     assert (tmp_path / ".orphans" / f"acceptance-{test.id}" / "test.json").is_file()
 
 
-def test_a_request_with_a_key_that_came_before_changes_nothing(desks: Desks, queue: TameLender) -> None:
+def test_a_request_with_a_key_that_came_before_changes_nothing(desks: Desks, queue: TameQueue) -> None:
     before, key = desks(), RequestKey("a", "body")
     test = before.open(the_plan, key=key)
     before.measure(test.id, wait=False, scripted=False, key=key)
@@ -332,7 +332,7 @@ def test_a_request_with_a_key_that_came_before_changes_nothing(desks: Desks, que
     assert len(queue.holders) == 2
 
 
-def test_positions_of_one_test_are_measured_with_one_calibration(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_positions_of_one_test_are_measured_with_one_calibration(desk: AcceptanceDesk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=False)
     camera = RIG.cameras["left"]
@@ -344,7 +344,7 @@ def test_positions_of_one_test_are_measured_with_one_calibration(desk: Acceptanc
     assert desk.cancel(test.id).state is AcceptanceState.CANCELLED
 
 
-def test_a_test_under_way_is_not_deleted(desk: AcceptanceDesk, queue: TameLender) -> None:
+def test_a_test_under_way_is_not_deleted(desk: AcceptanceDesk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
     refused: list[str] = []
 

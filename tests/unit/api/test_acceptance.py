@@ -14,7 +14,7 @@ from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
-from tests.unit.accept.test_desk import PLAN, TameLender, desk, desks, queue
+from tests.unit.accept.test_desk import PLAN, TameQueue, desk, desks, queue
 from tests.unit.accept.test_running import RIG
 
 __all__ = ["desk", "desks", "queue"]
@@ -84,7 +84,7 @@ def test_what_cannot_be_tested_is_refused(client: TestClient, body: dict[str, ob
 
 
 def test_a_held_rig_answers_409_and_an_unknown_test_404(
-    client: TestClient, desk: AcceptanceDesk, queue: TameLender
+    client: TestClient, desk: AcceptanceDesk, queue: TameQueue
 ) -> None:
     test = desk.open(lambda _: PLAN)
     queue.busy = True
@@ -104,7 +104,7 @@ def test_exact_artefacts_are_refused_on_metal(client: TestClient) -> None:
 
 
 def test_a_repeated_request_opens_and_measures_nothing_anew(
-    client: TestClient, desk: AcceptanceDesk, queue: TameLender, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, desk: AcceptanceDesk, queue: TameQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     key = {"Idempotency-Key": "once"}

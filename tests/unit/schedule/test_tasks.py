@@ -16,7 +16,7 @@ from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.report import write_reports
 from slrig.accept.running import evaluated
-from slrig.calibrate.calibrating import CalibratedRig, Calibrations
+from slrig.calibrate.calibrating import Calibrations
 from slrig.errors import (
     CalibrationError,
     DeviceError,
@@ -36,7 +36,6 @@ from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
 from slrig.schedule.acceptance_task import AcceptanceTask
 from slrig.schedule.cron import Cron
-from slrig.schedule.holder import NamedHolder
 from slrig.schedule.polling import error_of
 from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.scheduler import Scheduler
@@ -45,7 +44,7 @@ from slrig.schedule.tasks import Tasks, holder_of
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
 from slrig.verify.verification import VerificationTools
-from tests.unit.accept.test_desk import PLAN, TameLender, desk, desks, queue
+from tests.unit.accept.test_desk import PLAN, TameQueue, desk, desks, queue
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.scan.fakes import WAIT_S, SetClock
 from tests.unit.verify.health_bench import a_look
@@ -60,7 +59,7 @@ class TaskBench(CalibrationBench):
 
     def __init__(self, tmp_path: Path, *, positioner: bool = True) -> None:
         super().__init__(tmp_path, positioner=positioner)
-        self.queue = NamedHolder(self.runner)
+        self.queue = self.runner
         self.calibrations = Calibrations(self.folder, self.queue, rig_name="bench", tools=self.tame.tools())
         self.health = HealthStore(Database(self.folder.database))
         tools = self.tame.tools()
@@ -357,13 +356,11 @@ def test_schedule_that_is_removed_during_its_run_is_forgotten(bench: TaskBench) 
 
 
 def test_acceptance_is_measured_by_script_and_tells_its_decision(
-    desk: AcceptanceDesk, queue: TameLender, monkeypatch: pytest.MonkeyPatch
+    desk: AcceptanceDesk, queue: TameQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
-    named = NamedHolder(cast("CalibratedRig", queue))
-    desk._queue = named
-    tasks = Tasks(named, cast("Any", None), cast("Any", None), desk)
+    tasks = Tasks(cast("Any", queue), cast("Any", None), cast("Any", None), desk)
     told = tasks(schedule, run, cancelled=lambda: False)
     assert queue.holders == [HOLDER.format("acceptance")]
     assert told["decision"] == "passes"
@@ -371,7 +368,7 @@ def test_acceptance_is_measured_by_script_and_tells_its_decision(
     assert desk.file(UUID(told["acceptance"]), "report.html").is_file()
     queue.busy = True
     with pytest.raises(RigBusyError):
-        AcceptanceTask(named, desk).do(holder_of(schedule, run), {}, cancelled=lambda: False)
+        AcceptanceTask(cast("Any", queue), desk).do(holder_of(schedule, run), {}, cancelled=lambda: False)
 
 
 def test_fault_of_a_busy_rig_is_not_told_as_one() -> None:
