@@ -6,6 +6,7 @@ frames were accepted; each is then compared with what the camera should have see
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -29,6 +30,10 @@ _DAMAGED = 0.15
 
 Expected = Callable[[str, int], Pixels]
 """What a camera sees of a pattern of the sequence: (H, W), in its own units, with little noise or none."""
+
+FRAMES = int(os.environ.get("SLRIG_PAIRING_FRAMES", "500"))
+"""How many frames a slow test of pairing counts. 500 find a fault of one frame in a hundred with 99 %; campaigns, run
+when a driver or the evidence changes, ask for 2000 or more."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,12 +11,12 @@ import pytest
 from slrig.devices import CameraSettings, Trigger
 from slrig.model import PatternSequence, Size
 from tests.contract.depthai_bench import oak_head, sequence
+from tests.contract.pairing import FRAMES
 from tests.unit.drivers.depthai.conftest import small_stage
 from tests.unit.drivers.depthai.fake_oak import Fault
 
 EXPOSURE_S = 0.003
 FPS = 200.0
-FRAMES = 2_000
 
 
 @dataclass

@@ -16,7 +16,7 @@ from slrig.devices import Camera, CameraSettings, Rig, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
 from tests.contract.opencv_bench import DeviceHost, OpenCvHead
-from tests.contract.pairing import wrong_pairings
+from tests.contract.pairing import FRAMES, wrong_pairings
 from tests.contract.stage import StagedProjector
 from tests.contract.suite import rig_of
 from tests.contract.v4l2_bench import Faked, FakeDevice, sequence, staged, why_not
@@ -199,6 +199,6 @@ def test_no_wrong_pairing_in_many_frames_by_stamps(plugged: Plug, stamp: str) ->
     def expected(_: str, index: int) -> Pixels:
         return light.expected(shown.profiles[index], exposure_s=exposure_s)
 
-    result = wrong_pairings(open_rig, shown, expected, frames=700, seed=4, longest_idle_s=0.05, proven=False)
-    assert result.frames >= 700
+    result = wrong_pairings(open_rig, shown, expected, frames=FRAMES, seed=4, longest_idle_s=0.05, proven=False)
+    assert result.frames >= FRAMES
     assert (result.wrong, result.examples) == (0, ())

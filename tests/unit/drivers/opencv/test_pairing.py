@@ -13,7 +13,7 @@ from drivers.opencv import open_camera
 from slrig.devices import Camera
 from slrig.model import Pixels
 from tests.contract.opencv_bench import NetworkCamera, OpenCvHead, Piped, Served
-from tests.contract.pairing import PairingResult, wrong_pairings
+from tests.contract.pairing import FRAMES, PairingResult, wrong_pairings
 from tests.contract.stage import StagedProjector
 from tests.contract.v4l2_bench import sequence, staged
 
@@ -63,10 +63,10 @@ def test_disturbed_cameras_give_no_wrong_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_no_wrong_pairing_in_two_times_a_thousand_frames(tmp_path: Path, seed: int) -> None:
-    result = counted(tmp_path, frames=1000, seed=seed)
-    assert result.frames >= 1000
+@pytest.mark.parametrize("seed", [1])
+def test_no_wrong_pairing_in_many_frames(tmp_path: Path, seed: int) -> None:
+    result = counted(tmp_path, frames=FRAMES, seed=seed)
+    assert result.frames >= FRAMES
     assert (result.wrong, result.examples) == (0, ())
     assert result.refused_scans < result.scans / 4
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from slrig.devices import CameraSettings, Trigger
+from tests.contract.pairing import FRAMES
 from tests.contract.stage import StagedProjector
 from tests.contract.v4l2_bench import Faked, FakeDevice, sequence, staged
 from tests.contract.v4l2_sensor import GAIN_UNITS
@@ -17,7 +18,6 @@ from tests.contract.v4l2_sensor import GAIN_UNITS
 pytestmark = pytest.mark.slow
 
 EXPOSURE_S, GAIN = 0.0008, 8.0
-FRAMES = 700  # with each of three stamps
 SOME_FRAMES = 150
 
 
