@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import TypedDict
 
 from slrig.bundle.refused import Refused
+from slrig.capture.frame_verifier import FrameVerifier
 from slrig.capture.identity import Contradiction, place
-from slrig.capture.witness import Witness
 from slrig.errors import ScanEvidenceError
 from slrig.model import Black, CameraFormat, Capture, Pattern, Shot, White
 
@@ -78,7 +78,7 @@ class Evidence:
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
         self._refused: list[Refused] = []
-        self._witnesses: dict[str, Witness] = {}
+        self._verifiers: dict[str, FrameVerifier] = {}
         self.forget()
 
     def add(self, shot: Shot) -> None:
@@ -95,7 +95,7 @@ class Evidence:
 
     def contradictions(self, shot: Shot) -> tuple[Contradiction, ...]:
         """Take a frame in; return the contradictions that it brings to light."""
-        return tuple(self._witnesses[shot.camera].judge(shot))
+        return tuple(self._verifiers[shot.camera].judge(shot))
 
     def retract(self, camera: str, patterns: Collection[int]) -> tuple[int, ...]:
         """Forget frames and what was concluded from them, as if they had never come; those left are judged again.
@@ -103,11 +103,11 @@ class Evidence:
         Returns the patterns whose frames are forgotten: these, and all of that camera if one tells what is lit. What
         the others now contradict is returned with the next frame.
         """
-        return self._witnesses[camera].retract(patterns)
+        return self._verifiers[camera].retract(patterns)
 
     def forget(self) -> None:
         """Forget every frame. What was refused stays on record."""
-        self._witnesses = {name: Witness(name, form, self._patterns) for name, form in self._cameras.items()}
+        self._verifiers = {name: FrameVerifier(name, form, self._patterns) for name, form in self._cameras.items()}
 
     def note(self, refused: Refused) -> None:
         """Put on record that an exposure was refused."""
@@ -120,17 +120,17 @@ class Evidence:
 
     def summary(self) -> EvidenceSummary:
         """Sum up what was found so far."""
-        witnesses = self._witnesses.values()
-        seen = {index for witness in witnesses for index in witness.seen}
-        unproven = {index for witness in witnesses for index in witness.seen - witness.verified}
-        noises = {w.name: w.measured_noise_dn for w in witnesses}
+        verifiers = self._verifiers.values()
+        seen = {index for verifier in verifiers for index in verifier.seen}
+        unproven = {index for verifier in verifiers for index in verifier.seen - verifier.verified}
+        noises = {w.name: w.measured_noise_dn for w in verifiers}
         return EvidenceSummary(
             patterns=len(seen),
             verified=len(seen - unproven),
-            lit={w.name: w.lighting.lit for w in witnesses if w.lighting is not None},
-            light_drift={w.name: w.light_drift for w in witnesses if w.light_drift is not None},
+            lit={w.name: w.lighting.lit for w in verifiers if w.lighting is not None},
+            light_drift={w.name: w.light_drift for w in verifiers if w.light_drift is not None},
             noise_dn={name: noise for name, noise in noises.items() if noise is not None},
-            faults=tuple(str(told) for w in witnesses for told in w.told),
+            faults=tuple(str(told) for w in verifiers for told in w.told),
             **again(self._refused, self._patterns),
         )
 

@@ -7,10 +7,10 @@ from contextlib import ExitStack, suppress
 
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence
-from slrig.capture.judging import Judge
-from slrig.capture.playing import played
+from slrig.capture.hardware_trigger import hardware_triggered
+from slrig.capture.retry_policy import RetryPolicy
 from slrig.capture.session import Session, differ
-from slrig.capture.stepping import stepped
+from slrig.capture.software_trigger import software_triggered
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Shot
@@ -82,12 +82,12 @@ def capture(
             leaving.callback(_whatever_happens, camera.disarm)
         leaving.callback(_whatever_happens, rig.projector.blank)
         session = Session(rig, sequence, _configure(rig), triggers, timeout_s, cancelled)
-        judge = Judge(sequence, evidence, refused, since_ns=since_ns)
+        retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns)
         if Trigger.HARDWARE in triggers.values():
             leaving.callback(_whatever_happens, rig.projector.stop)
-            yield from played(session, judge, refused)
+            yield from hardware_triggered(session, retries, refused)
         else:
-            yield from stepped(session, judge)
+            yield from software_triggered(session, retries)
         # Here a projector that will not go dark is an error of its own, not a footnote to another one.
         rig.projector.blank()
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from slrig.capture.identity import named
-from slrig.capture.synchronisation import stable_from_ns
+from slrig.capture.latency import stable_from_ns
 from slrig.devices import AppliedSettings, Rig, Shown, Trigger
 from slrig.errors import ScanCancelledError
 from slrig.model import Frame, PatternSequence

@@ -10,8 +10,8 @@ from pathlib import Path
 import typer
 
 from slrig.api.logs import set_up_logs_for_a_person
-from slrig.capture.flashes import CameraLatency
-from slrig.capture.synchronisation import LatencyMeasurement, measure_latency
+from slrig.capture.latency import LatencyMeasurement, measure_latency
+from slrig.capture.latency_fit import CameraLatency
 from slrig.cli.display import progress_shown
 from slrig.config import read_rig
 from slrig.devices import Synchronisation, Trigger

@@ -4,7 +4,8 @@
 """
 
 from slrig.conformance.catalogue import CHECKS
-from slrig.conformance.check import Check, Failure
+from slrig.conformance.check import Check
+from slrig.conformance.expectation import Failure
 from slrig.conformance.report import Outcome, Report, Result
 from slrig.conformance.running import Examination, Progress, run
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from slrig.conformance import declared, frames, freshness, sequences, settings, states, ways_out
+from slrig.conformance import declared, frames, freshness, sequences, settings, shutdown, states
 from slrig.conformance.check import Check
 
 CHECKS: tuple[Check, ...] = (
@@ -12,5 +12,5 @@ CHECKS: tuple[Check, ...] = (
     *frames.CHECKS,
     *freshness.CHECKS,
     *sequences.CHECKS,
-    *ways_out.CHECKS,
+    *shutdown.CHECKS,
 )

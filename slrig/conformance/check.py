@@ -1,107 +1,15 @@
-"""What a check of the driver contract is, and how it says what it expected, what it found, and what to do."""
+"""What a check of the driver contract is: what it asks, what a rig must have for it, and the function that does it."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
 
+from slrig.conformance.bench import RigBench
+from slrig.conformance.expectation import STEPPED
 from slrig.devices import Rig, Trigger
-from slrig.errors import SlrigError
 from slrig.model import Black, PatternSequence, White
-
-if TYPE_CHECKING:
-    from slrig.conformance.stand import Stand
-
-TOLERANCE = 0.01
-"""How far an exposure or a gain may be from what was asked, as a fraction."""
-
-STEPPED = (Trigger.SOFTWARE, Trigger.FREE)
-"""The triggers with which a camera can follow a projector that steps; the better one first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """One broken expectation: which device, what was asked of it, what was found, and what its driver's author does."""
-
-    asked: str
-    found: str
-    do: str
-    where: str = ""
-
-    def __str__(self) -> str:
-        device = f"{self.where}: " if self.where else ""
-        return f"{device}{self.asked}; found {self.found}; {self.do}"
-
-
-class ExpectationError(Exception):
-    """A device does not do what the contract asks of it. Raised by checks only, and kept in their result."""
-
-    def __init__(self, failure: Failure) -> None:
-        super().__init__(str(failure))
-        self.failure = failure
-
-
-class NotApplicableError(Exception):
-    """A check found out, once at work, that it has nothing to ask of these devices. The message says why."""
-
-
-def expect(condition: object, *, asked: str, found: object, do: str) -> None:
-    """Go on if the condition holds. Raises ExpectationError."""
-    if not condition:
-        raise ExpectationError(Failure(asked, str(found), do))
-
-
-@contextmanager
-def refused(error: type[SlrigError], *, asked: str, do: str) -> Iterator[None]:
-    """Expect that the block raises `error`. Raises ExpectationError if it raises another, or none."""
-    asked = f"{asked} is refused with {error.__name__}"
-    try:
-        yield
-    except error:
-        return
-    except Exception as other:
-        raise ExpectationError(Failure(asked, _named(other), do)) from other
-    raise ExpectationError(Failure(asked, "no error", do))
-
-
-@contextmanager
-def at(where: str) -> Iterator[None]:
-    """Name the device in whatever goes wrong within the block; errors of a driver become failures of the check."""
-    try:
-        yield
-    except ExpectationError as error:
-        if error.failure.where:
-            raise
-        raise ExpectationError(replace(error.failure, where=where)) from error
-    except NotApplicableError:
-        raise
-    except Exception as error:
-        raise ExpectationError(replace(failure_of(error), where=where)) from error
-
-
-def failure_of(error: Exception) -> Failure:
-    """What an error means that came out of a device where none was due."""
-    if isinstance(error, ExpectationError):
-        return error.failure
-    do = (
-        "correct the rig as the message says, or the driver if it is wrong"
-        if isinstance(error, SlrigError)
-        else "a driver raises the errors of slrig.errors, and no others"
-    )
-    return Failure("no error comes from a call that the contract allows", _named(error), do)
-
-
-def near(got: float, asked: float) -> bool:
-    """Whether a setting is what was asked, within the tolerance. What a device cannot tell (NaN) is no contradiction.
-
-    >>> near(0.01001, 0.01), near(0.02, 0.01), near(math.nan, 0.01)
-    (True, False, True)
-    """
-    return math.isnan(got) or abs(got - asked) <= TOLERANCE * abs(asked) + 1e-12
 
 
 class Need(Enum):
@@ -148,22 +56,18 @@ class Check:
     asks: tuple[str, ...]
     needs: tuple[Need, ...]
     fresh: bool
-    function: Callable[[Stand], None]
+    function: Callable[[RigBench], None]
 
 
 def check(
     *, asks: tuple[str, ...], needs: tuple[Need, ...] = (), fresh: bool = False
-) -> Callable[[Callable[[Stand], None]], Check]:
+) -> Callable[[Callable[[RigBench], None]], Check]:
     """Make a check of the function below: its name is the check's, its docstring's first line the title."""
 
-    def made(function: Callable[[Stand], None]) -> Check:
+    def made(function: Callable[[RigBench], None]) -> Check:
         name = function.__name__
         # Python may be told to leave docstrings out.
         title = (function.__doc__ or name.replace("_", " ")).splitlines()[0].removesuffix(".")
         return Check(name, title, asks, needs, fresh, function)
 
     return made
-
-
-def _named(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

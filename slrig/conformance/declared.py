@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 
-from slrig.conformance.check import Check, at, check, expect, refused
-from slrig.conformance.stand import Stand
+from slrig.conformance.bench import RigBench
+from slrig.conformance.check import Check, check
+from slrig.conformance.expectation import at, expect, refused
 from slrig.devices import Camera, Head, Projector, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
@@ -18,9 +19,9 @@ _INFO = "keep what info declares in the driver's own memory, and ask the device 
 @check(
     asks=("Head.cameras", "Head.projector", "Camera.info"),
 )
-def devices_implement_the_protocols(stand: Stand) -> None:
+def devices_implement_the_protocols(bench: RigBench) -> None:
     """The devices have every method of their protocol, and the cameras their names."""
-    rig = stand.rig
+    rig = bench.rig
     expect(
         rig.cameras,
         asked="a rig has a camera",
@@ -65,9 +66,9 @@ def devices_implement_the_protocols(stand: Stand) -> None:
     asks=("Camera.info", "Projector.info"),
     fresh=True,
 )
-def info_is_readable_in_every_state(stand: Stand) -> None:
+def info_is_readable_in_every_state(bench: RigBench) -> None:
     """What is declared can be read in every state, and does not change."""
-    rig = stand.rig
+    rig = bench.rig
     devices: dict[str, Camera | Projector] = {"projector": rig.projector}
     devices |= {f"camera '{name}'": camera for name, camera in rig.cameras.items()}
     before = {what: device.info for what, device in devices.items()}
@@ -83,22 +84,22 @@ def info_is_readable_in_every_state(stand: Stand) -> None:
                     do=_INFO,
                 )
 
-    rig.projector.load(stand.opening)
+    rig.projector.load(bench.opening)
     for name, camera in rig.cameras.items():
-        camera.configure(stand.settings(name))
+        camera.configure(bench.settings(name))
         camera.arm(1, min(camera.info.triggers))
     rig.projector.show(0)
     unchanged("of an armed camera and a projector that shows")
-    stand.rest()
+    bench.rest()
     unchanged("after disarm and blank")
-    stand.close()
+    bench.close()
     unchanged("after close")
 
 
 @check(asks=("Camera.info", "Projector.info"))
-def declared_ranges_are_sound(stand: Stand) -> None:
+def declared_ranges_are_sound(bench: RigBench) -> None:
     """The ranges that are declared make sense."""
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         with at(f"camera '{name}'"):
             info = camera.info
             low_s, high_s = info.exposure_range_s
@@ -121,7 +122,7 @@ def declared_ranges_are_sound(stand: Stand) -> None:
                 found=info.triggers,
                 do="declare slrig.devices.Trigger members",
             )
-    projector = stand.rig.projector.info
+    projector = bench.rig.projector.info
     expect(
         0 <= projector.latency_s < math.inf,
         asked="the projector's latency_s is 0 s or more, and finite",
@@ -133,9 +134,9 @@ def declared_ranges_are_sound(stand: Stand) -> None:
 @check(
     asks=("Head.calibration", "Head.truth"),
 )
-def calibration_and_truth_fit_the_devices(stand: Stand) -> None:
+def calibration_and_truth_fit_the_devices(bench: RigBench) -> None:
     """A calibration or truth that the rig carries fits its devices."""
-    rig = stand.rig
+    rig = bench.rig
     sizes = {name: camera.info.format.size for name, camera in rig.cameras.items()}
     carried = {"rig": rig.calibration, "head": None if rig.head is None else rig.head.calibration}
     for what, calibration in carried.items():
@@ -169,11 +170,11 @@ def calibration_and_truth_fit_the_devices(stand: Stand) -> None:
 @check(
     asks=("Camera.arm",),
 )
-def triggers_that_are_not_declared_are_refused(stand: Stand) -> None:
+def triggers_that_are_not_declared_are_refused(bench: RigBench) -> None:
     """Triggers that a camera does not declare are refused, and no frames as well."""
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         with at(f"camera '{name}'"):
-            camera.configure(stand.settings(name))
+            camera.configure(bench.settings(name))
             for trigger in sorted(set(Trigger) - camera.info.triggers):
                 with _arm_refused(camera, 1, trigger):
                     camera.arm(1, trigger)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slrig.conformance.check import Check, Need, check, expect, near
-from slrig.conformance.stand import Stand
+from slrig.conformance.bench import RigBench
+from slrig.conformance.check import Check, Need, check
+from slrig.conformance.expectation import expect, near
 from slrig.devices import AppliedSettings, CameraInfo
 from slrig.model import Frame
 
@@ -19,11 +20,11 @@ _SEEN = (Need.STEPPED, Need.WHITE_AND_BLACK)
     asks=("Camera.info", "Camera.read", "Projector.show"),
     needs=_STEPPED,
 )
-def frames_are_as_declared(stand: Stand) -> None:
+def frames_are_as_declared(bench: RigBench) -> None:
     """Frames have the name, extent, type and range that the camera declares."""
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
-            for index in range(len(stand.opening)):
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
+            for index in range(len(bench.opening)):
                 expect_declared(view.expose(index), view.camera.info)
 
 
@@ -31,22 +32,22 @@ def frames_are_as_declared(stand: Stand) -> None:
     asks=("Camera.configure", "Camera.read"),
     needs=_STEPPED,
 )
-def frames_tell_their_exposure(stand: Stand) -> None:
+def frames_tell_their_exposure(bench: RigBench) -> None:
     """Frames tell the exposure and gain that were set, and lasted as long."""
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
-            for index in range(len(stand.opening)):
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
+            for index in range(len(bench.opening)):
                 expect_exposed(view.expose(index), view.applied)
 
 
 @check(asks=("Camera.read",), needs=_STEPPED)
-def frame_numbers_and_times_rise(stand: Stand) -> None:
+def frame_numbers_and_times_rise(bench: RigBench) -> None:
     """Frame numbers and times only rise."""
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             last = view.expose(0)
             for index in range(6):
-                frame = view.expose(index % len(stand.sequence))
+                frame = view.expose(index % len(bench.sequence))
                 expect(
                     frame.sequence_number > last.sequence_number,
                     asked=f"a frame number is above {last.sequence_number}, that of the frame before",
@@ -72,17 +73,17 @@ def frame_numbers_and_times_rise(stand: Stand) -> None:
     asks=("Camera.read", "Projector.show"),
     needs=_STEPPED,
 )
-def frame_times_lie_on_the_projectors_clock(stand: Stand) -> None:
+def frame_times_lie_on_the_projectors_clock(bench: RigBench) -> None:
     """Times of frames lie on the projector's clock."""
     do = "convert the device's clock to CLOCK_MONOTONIC (time.monotonic_ns), and state the error in t_err_ns"
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             before = view.show(0)
             for index in (1, 0, 1):
                 view.start()
                 frame = view.read(view.stable_ns(before))
                 expect(frame.t_err_ns >= 0, asked="t_err_ns is 0 or more", found=frame.t_err_ns, do=do)
-                after = view.show(index % len(stand.sequence))
+                after = view.show(index % len(bench.sequence))
                 expect(
                     frame.t_start_ns >= view.stable_ns(before),
                     asked=f"a frame read after {view.stable_ns(before)} ns begins after that",
@@ -102,10 +103,10 @@ def frame_times_lie_on_the_projectors_clock(stand: Stand) -> None:
     asks=("Camera.read", "Camera.trigger", "Projector.show"),
     needs=_SEEN,
 )
-def a_frame_lies_wholly_in_its_pattern(stand: Stand) -> None:
+def a_frame_lies_wholly_in_its_pattern(bench: RigBench) -> None:
     """Every frame shows its pattern and no other's light, at once and after a pause."""
-    for name, trigger in stand.ways(every=True):
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways(every=True):
+        with bench.view(name, trigger) as view:
             view.learn()
             for turn in range(_ALTERNATIONS):
                 index = turn % 2
@@ -122,10 +123,10 @@ def a_frame_lies_wholly_in_its_pattern(stand: Stand) -> None:
 
 
 @check(asks=("Camera.read",), needs=_SEEN)
-def a_frame_keeps_its_pixels(stand: Stand) -> None:
+def a_frame_keeps_its_pixels(bench: RigBench) -> None:
     """A frame keeps its pixels when the next ones come."""
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             frame = view.expose(0)
             kept = frame.image.copy()
             for index in (1, 1, 1, 1, 1, 1, 1, 1):

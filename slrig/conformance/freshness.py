@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 
-from slrig.conformance.check import Check, ExpectationError, Failure, Need, at, check, expect, refused
-from slrig.conformance.stand import FRAMES, SHORT_S, Stand, View
+from slrig.conformance.bench import FRAMES, SHORT_S, RigBench, View
+from slrig.conformance.check import Check, Need, check
+from slrig.conformance.expectation import ExpectationError, Failure, at, expect, refused
 from slrig.devices import Camera, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError
 
@@ -18,10 +19,10 @@ _DROP_STALE = "compare each frame's t_start_ns with after_ns, and drop those tha
     asks=("Camera.read", "Camera.trigger"),
     needs=(Need.STEPPED, Need.WHITE_AND_BLACK),
 )
-def read_passes_over_stale_frames(stand: Stand) -> None:
+def read_passes_over_stale_frames(bench: RigBench) -> None:
     """A frame of an earlier pattern is passed over."""
-    for name, trigger in stand.ways(every=True):
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways(every=True):
+        with bench.view(name, trigger) as view:
             view.learn()
             for index in (1, 0):
                 earlier = view.show(1 - index)
@@ -44,10 +45,10 @@ def read_passes_over_stale_frames(stand: Stand) -> None:
 
 
 @check(asks=("Camera.read",), needs=(Need.STEPPED,))
-def stale_frames_never_come_back(stand: Stand) -> None:
+def stale_frames_never_come_back(bench: RigBench) -> None:
     """A frame that was passed over never comes back."""
-    for name, trigger in stand.ways(every=True):
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways(every=True):
+        with bench.view(name, trigger) as view:
             first = view.expose(0)
             view.start()
             # Long enough for a triggered frame to be on the host's side, on a busy host as well.
@@ -75,10 +76,10 @@ def stale_frames_never_come_back(stand: Stand) -> None:
 
 
 @check(asks=("Camera.read",), needs=(Need.STEPPED,))
-def read_times_out_in_time(stand: Stand) -> None:
+def read_times_out_in_time(bench: RigBench) -> None:
     """A frame that does not come is given up in time."""
-    for name, trigger in stand.ways(every=True):
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways(every=True):
+        with bench.view(name, trigger) as view:
             shown = view.show(0)
             after_ns = 0 if trigger is Trigger.SOFTWARE else view.stable_ns(shown) + _FAR_NS
             _given_up(view.camera, after_ns, asked="a read of a frame that cannot come")
@@ -88,12 +89,12 @@ def read_times_out_in_time(stand: Stand) -> None:
     asks=("Camera.arm", "Camera.trigger", "Camera.read"),
     needs=(Need.FREE,),
 )
-def a_free_running_camera_needs_no_trigger(stand: Stand) -> None:
+def a_free_running_camera_needs_no_trigger(bench: RigBench) -> None:
     """A free-running camera gives frames without a trigger, and refuses one."""
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         if Trigger.FREE not in camera.info.triggers:
             continue
-        with stand.view(name, Trigger.FREE) as view:
+        with bench.view(name, Trigger.FREE) as view:
             _trigger_refused(view.camera, "a software trigger of a camera that is armed to run freely")
             first, second = view.expose(0), view.expose(0)
             expect(
@@ -108,13 +109,13 @@ def a_free_running_camera_needs_no_trigger(stand: Stand) -> None:
     asks=("Camera.arm", "Camera.trigger", "Camera.read"),
     needs=(Need.HARDWARE,),
 )
-def a_wire_without_pulses_gives_no_frame(stand: Stand) -> None:
+def a_wire_without_pulses_gives_no_frame(bench: RigBench) -> None:
     """A camera armed for wire triggers makes no frame without a pulse."""
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         if Trigger.HARDWARE not in camera.info.triggers:
             continue
         with at(f"camera '{name}', {Trigger.HARDWARE} trigger"):
-            camera.configure(stand.settings(name))
+            camera.configure(bench.settings(name))
             camera.arm(4, Trigger.HARDWARE)
             _trigger_refused(camera, "a software trigger of a camera that is armed for wire triggers")
             _given_up(camera, 0, asked="a read while the projector does not play")
@@ -125,10 +126,10 @@ def a_wire_without_pulses_gives_no_frame(stand: Stand) -> None:
     asks=("Camera.arm", "Camera.disarm", "Camera.read"),
     needs=(Need.STEPPED, Need.WHITE_AND_BLACK),
 )
-def arming_again_starts_afresh(stand: Stand) -> None:
+def arming_again_starts_afresh(bench: RigBench) -> None:
     """Arming again forgets what was before."""
-    for name, trigger in stand.ways(every=True):
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways(every=True):
+        with bench.view(name, trigger) as view:
             view.learn()
             shown = view.show(0)
             view.start()

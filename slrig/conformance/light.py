@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.conformance.check import ExpectationError, Failure, expect
+from slrig.conformance.expectation import ExpectationError, Failure, expect
 from slrig.model import Pixels
 
 LIT = 0.8

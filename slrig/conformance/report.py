@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any
 
-from slrig.conformance.check import Failure
+from slrig.conformance.expectation import Failure
 
 
 class Outcome(StrEnum):

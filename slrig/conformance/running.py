@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from slrig.conformance.bench import RigBench
 from slrig.conformance.catalogue import CHECKS
-from slrig.conformance.check import Check, Failure, NotApplicableError, failure_of
+from slrig.conformance.check import Check
+from slrig.conformance.expectation import Failure, NotApplicableError, failure_of
 from slrig.conformance.report import Outcome, Report, Result
-from slrig.conformance.stand import Stand
 from slrig.devices import Rig
 from slrig.errors import DeviceError
 from slrig.model import PatternSequence
@@ -87,7 +88,7 @@ class Examination:
     """
 
     def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence, *, limit_s: float | None = None) -> None:
-        self._stand = Stand(open_rig, sequence)
+        self._stand = RigBench(open_rig, sequence)
         self._limit_s = limit_s
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         # A device that never answers must not keep the program from ending.
@@ -182,25 +183,25 @@ class Examination:
             self._stand.close()
 
     def _judged(self, check: Check) -> tuple[Outcome, Failure | None, str | None]:
-        stand = self._stand
+        bench = self._stand
         try:
             if check.fresh:
-                stand.close()
+                bench.close()
             if (failure := self._opened_again()) is not None:
                 return Outcome.FAILED, failure, None
-            unmet = [why for need in check.needs if (why := need.unmet(stand.rig, stand.sequence)) is not None]
+            unmet = [why for need in check.needs if (why := need.unmet(bench.rig, bench.sequence)) is not None]
             if unmet:
                 return Outcome.NOT_APPLICABLE, None, "; ".join(unmet)
-            check.function(stand)
+            check.function(bench)
             if check.fresh:
-                stand.close()
+                bench.close()
             else:
-                stand.rest()
+                bench.rest()
         except NotApplicableError as reason:
-            stand.rest()
+            bench.rest()
             return Outcome.NOT_APPLICABLE, None, str(reason)
         except Exception as error:  # noqa: BLE001 - whatever a driver raises is what the report is about
             # What comes next must not suffer from what is left behind.
-            stand.close()
+            bench.close()
             return Outcome.FAILED, failure_of(error), None
         return Outcome.PASSED, None, None

@@ -10,10 +10,11 @@ import numpy as np
 
 from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture, choose_triggers
-from slrig.conformance.check import STEPPED, Check, ExpectationError, Failure, Need, at, check, expect, refused
+from slrig.conformance.bench import LONG_S, SHORT_S, RigBench
+from slrig.conformance.check import Check, Need, check
+from slrig.conformance.expectation import STEPPED, ExpectationError, Failure, at, expect, refused
 from slrig.conformance.frames import expect_declared, expect_exposed
 from slrig.conformance.light import DARK
-from slrig.conformance.stand import LONG_S, SHORT_S, Stand
 from slrig.devices import Camera, Projector, Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError
 from slrig.model import Frame, PatternSequence
@@ -26,28 +27,28 @@ _ROUND = "make one pulse per pattern, and one frame per pulse; check the trigger
     asks=("Projector.blank", "Camera.disarm", "Camera.arm", "Projector.load"),
     needs=(Need.STEPPED, Need.WHITE_AND_BLACK),
 )
-def every_end_of_a_capture_is_dark_and_leaves_the_rig_usable(stand: Stand) -> None:
+def every_end_of_a_capture_is_dark_and_leaves_the_rig_usable(bench: RigBench) -> None:
     """However a capture ends, the projector is dark and the rig can be used again."""
-    rig = _set(stand)
+    rig = _set(bench)
     with at("rig"):
-        with stand.view(*next(stand.ways())) as view:
+        with bench.view(*next(bench.ways())) as view:
             view.learn()
-        frames = capture(rig, stand.opening)
+        frames = capture(rig, bench.opening)
         next(frames)
         del frames
-        _expect_left_dark(stand, "a capture that nobody reads on")
+        _expect_left_dark(bench, "a capture that nobody reads on")
         taken: list[object] = []
         with suppress(ScanCancelledError):
-            for shot in capture(rig, stand.opening, cancelled=lambda: bool(taken)):
+            for shot in capture(rig, bench.opening, cancelled=lambda: bool(taken)):
                 taken.append(shot)  # noqa: PERF402 - `cancelled` looks at what was taken so far
-        _expect_left_dark(stand, "a capture that is cancelled after its first frame")
+        _expect_left_dark(bench, "a capture that is cancelled after its first frame")
         expect(
-            list(capture(rig, stand.opening)),
+            list(capture(rig, bench.opening)),
             asked="a capture after a cancelled one gives its frames",
             found="none",
             do="let disarm and blank leave the devices as they were after opening",
         )
-        _expect_left_dark(stand, "a capture that is complete")
+        _expect_left_dark(bench, "a capture that is complete")
 
 
 @check(
@@ -63,28 +64,28 @@ def every_end_of_a_capture_is_dark_and_leaves_the_rig_usable(stand: Stand) -> No
     ),
     needs=(Need.WHITE_AND_BLACK,),
 )
-def a_whole_sequence_is_proven(stand: Stand) -> None:
+def a_whole_sequence_is_proven(bench: RigBench) -> None:
     """A whole sequence is captured, and every frame proven to show its pattern."""
-    rig = _set(stand)
+    rig = _set(bench)
     with at("rig"):
-        _expect_proven(stand, rig)
+        _expect_proven(bench, rig)
     steps = all(camera.info.triggers.intersection(STEPPED) for camera in rig.cameras.values())
     if Trigger.HARDWARE in choose_triggers(rig).values() and steps:
         with at("rig, without its trigger wire"):
-            _expect_proven(stand, replace(rig, projector=_Stepping(rig.projector)))
+            _expect_proven(bench, replace(rig, projector=_Stepping(rig.projector)))
 
 
 @check(
     asks=("Projector.play", "Projector.stop", "Camera.arm", "Camera.read"),
     needs=_PLAYS,
 )
-def a_played_sequence_gives_every_frame_in_order(stand: Stand) -> None:
+def a_played_sequence_gives_every_frame_in_order(bench: RigBench) -> None:
     """A sequence that the projector plays gives one frame per pattern, in order, and no more."""
-    rig = _set(stand)
+    rig = _set(bench)
     cameras = _wired(rig)
     with at("projector and cameras by wire"):
-        applied = {name: camera.configure(stand.settings(name)) for name, camera in cameras.items()}
-        frames = _played(stand, rig, cameras, stand.sequence)
+        applied = {name: camera.configure(bench.settings(name)) for name, camera in cameras.items()}
+        frames = _played(bench, rig, cameras, bench.sequence)
         for name, taken in frames.items():
             for frame in taken:
                 expect_declared(frame, cameras[name].info)
@@ -92,7 +93,7 @@ def a_played_sequence_gives_every_frame_in_order(stand: Stand) -> None:
             numbers = [frame.sequence_number for frame in taken]
             expect(
                 bool(np.all(np.diff(numbers) == 1)) and taken[-1].dropped_count == 0,
-                asked=f"camera '{name}': {len(stand.sequence)} frames with numbers in one run, none lost",
+                asked=f"camera '{name}': {len(bench.sequence)} frames with numbers in one run, none lost",
                 found=f"{numbers}, {taken[-1].dropped_count} lost",
                 do=_ROUND,
             )
@@ -102,7 +103,7 @@ def a_played_sequence_gives_every_frame_in_order(stand: Stand) -> None:
                 found=[(frame.t_start_ns, frame.t_end_ns) for frame in taken],
                 do="take time stamps from the device",
             )
-            if Need.WHITE_AND_BLACK.unmet(rig, stand.sequence) is None and len(taken) > 1:
+            if Need.WHITE_AND_BLACK.unmet(rig, bench.sequence) is None and len(taken) > 1:
                 white, black = (float(taken[index].image.mean()) for index in (0, 1))
                 expect(
                     white > black,
@@ -121,15 +122,15 @@ def a_played_sequence_gives_every_frame_in_order(stand: Stand) -> None:
     asks=("Projector.play", "Projector.stop"),
     needs=_PLAYS,
 )
-def a_play_can_be_stopped(stand: Stand) -> None:
+def a_play_can_be_stopped(bench: RigBench) -> None:
     """A play that is stopped ends at once, dark, and another one begins with the first pattern."""
-    rig = _set(stand)
+    rig = _set(bench)
     cameras = _wired(rig)
     with at("projector and cameras by wire"):
-        exposure_s = max(stand.settings(name).exposure_s for name in cameras)
-        rig.projector.load(stand.sequence)
+        exposure_s = max(bench.settings(name).exposure_s for name in cameras)
+        rig.projector.load(bench.sequence)
         for camera in cameras.values():
-            camera.arm(len(stand.sequence), Trigger.HARDWARE)
+            camera.arm(len(bench.sequence), Trigger.HARDWARE)
         # Slow enough that most of it is still to come.
         rig.projector.play(exposure_s, 20 * exposure_s)
         for camera in cameras.values():
@@ -143,15 +144,15 @@ def a_play_can_be_stopped(stand: Stand) -> None:
                     camera.read(0, 25 * exposure_s)
                     count += 1
             expect(
-                count <= most or len(stand.sequence) <= most,
-                asked=f"camera '{name}': frames end with stop, after the first of {len(stand.sequence)} patterns",
+                count <= most or len(bench.sequence) <= most,
+                asked=f"camera '{name}': frames end with stop, after the first of {len(bench.sequence)} patterns",
                 found=f"{count} frames",
                 do="end the sequence in stop, and make no more pulses",
             )
             camera.disarm()
-        for name, taken in _played(stand, rig, cameras, stand.opening).items():
+        for name, taken in _played(bench, rig, cameras, bench.opening).items():
             expect(
-                len(taken) == len(stand.opening),
+                len(taken) == len(bench.opening),
                 asked=f"camera '{name}': the next play gives its frames",
                 found=f"{len(taken)}",
                 do="begin with the first pattern at every play",
@@ -167,14 +168,14 @@ class _Stepping:
         self.stop, self.blank, self.close = projector.stop, projector.blank, projector.close
 
 
-def _expect_proven(stand: Stand, rig: Rig) -> None:
+def _expect_proven(bench: RigBench, rig: Rig) -> None:
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-    evidence = Evidence(stand.sequence.patterns, formats)
-    shots = list(capture(rig, stand.sequence, evidence=evidence))
+    evidence = Evidence(bench.sequence.patterns, formats)
+    shots = list(capture(rig, bench.sequence, evidence=evidence))
     got = {(shot.pattern, shot.camera) for shot in shots}
     lacking = [
         f"pattern {index} of '{name}'"
-        for index in range(len(stand.sequence))
+        for index in range(len(bench.sequence))
         for name in rig.cameras
         if (index, name) not in got
     ]
@@ -200,16 +201,16 @@ def _expect_proven(stand: Stand, rig: Rig) -> None:
             do="take time stamps from the device",
         )
     expect(
-        summary.verified == len(stand.sequence),
-        asked=f"{len(stand.sequence)} of {len(stand.sequence)} patterns are proven by what the frames show",
+        summary.verified == len(bench.sequence),
+        asked=f"{len(bench.sequence)} of {len(bench.sequence)} patterns are proven by what the frames show",
         found=f"{summary.verified}",
         do="put a light, matt surface before the rig that fills the view of every camera, in focus, not saturated",
     )
 
 
-def _played(stand: Stand, rig: Rig, cameras: dict[str, Camera], sequence: PatternSequence) -> dict[str, list[Frame]]:
+def _played(bench: RigBench, rig: Rig, cameras: dict[str, Camera], sequence: PatternSequence) -> dict[str, list[Frame]]:
     """Play a sequence once; return each camera's frames. The cameras stay armed."""
-    exposure_s = max(stand.settings(name).exposure_s for name in cameras)
+    exposure_s = max(bench.settings(name).exposure_s for name in cameras)
     # As long again for the sensors to be read out.
     period_s = 2 * exposure_s
     rig.projector.load(sequence)
@@ -234,18 +235,18 @@ def _wired(rig: Rig) -> dict[str, Camera]:
     return {name: camera for name, camera in rig.cameras.items() if Trigger.HARDWARE in camera.info.triggers}
 
 
-def _set(stand: Stand) -> Rig:
+def _set(bench: RigBench) -> Rig:
     """The rig at rest, with every camera set, and settings for a capture."""
-    rig = stand.rig
-    settings = {name: stand.settings(name) for name in rig.cameras}
+    rig = bench.rig
+    settings = {name: bench.settings(name) for name in rig.cameras}
     for name, camera in rig.cameras.items():
         camera.disarm()
         camera.configure(settings[name])
     return replace(rig, settings=settings)
 
 
-def _expect_left_dark(stand: Stand, after: str) -> None:
-    with stand.view(*next(stand.ways()), load=False) as view:
+def _expect_left_dark(bench: RigBench, after: str) -> None:
+    with bench.view(*next(bench.ways()), load=False) as view:
         level = view.darkest()
         expect(
             level <= DARK,

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from slrig.conformance.check import Check, Need, NotApplicableError, at, check, expect, near, refused
-from slrig.conformance.stand import FRAMES, Stand, View
+from slrig.conformance.bench import FRAMES, RigBench, View
+from slrig.conformance.check import Check, Need, check
+from slrig.conformance.expectation import NotApplicableError, at, expect, near, refused
 from slrig.devices import Camera, CameraSettings
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Pixels
@@ -23,12 +24,12 @@ _LEAST_PIXELS = 16
 @check(
     asks=("Camera.configure", "Camera.info"),
 )
-def settings_are_read_back(stand: Stand) -> None:
+def settings_are_read_back(bench: RigBench) -> None:
     """Both ends of the declared ranges can be set, and are read back."""
     # Set, never exposed: the longest exposure may be a minute.
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         with at(f"camera '{name}'"):
-            usual = stand.settings(name)
+            usual = bench.settings(name)
             wanted = [CameraSettings(exposure_s, usual.gain) for exposure_s in camera.info.exposure_range_s]
             wanted += [CameraSettings(usual.exposure_s, gain) for gain in camera.info.gain_range]
             for asked in (*wanted, usual):
@@ -44,11 +45,11 @@ def settings_are_read_back(stand: Stand) -> None:
 @check(
     asks=("Camera.configure",),
 )
-def settings_out_of_range_are_refused(stand: Stand) -> None:
+def settings_out_of_range_are_refused(bench: RigBench) -> None:
     """Settings out of range are refused, and change nothing."""
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         with at(f"camera '{name}'"):
-            usual = stand.settings(name)
+            usual = bench.settings(name)
             camera.configure(usual)
             for asked in _impossible(camera, usual):
                 with refused(
@@ -58,10 +59,10 @@ def settings_out_of_range_are_refused(stand: Stand) -> None:
                     do=_REFUSE,
                 ):
                     camera.configure(asked)
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             view.camera.disarm()
-            for asked in _impossible(view.camera, stand.settings(name)):
+            for asked in _impossible(view.camera, bench.settings(name)):
                 with refused(UnsupportedByDeviceError, asked="a setting out of range", do=_REFUSE):
                     view.camera.configure(asked)
             view.camera.arm(FRAMES, trigger)
@@ -79,12 +80,12 @@ def settings_out_of_range_are_refused(stand: Stand) -> None:
     asks=("Camera.configure", "Camera.read"),
     needs=(Need.STEPPED, Need.WHITE_AND_BLACK),
 )
-def a_longer_exposure_is_brighter(stand: Stand) -> None:
+def a_longer_exposure_is_brighter(bench: RigBench) -> None:
     """A longer exposure makes a brighter frame."""
     reasons: list[str] = []
     judged = False
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             try:
                 _expect_brighter(view)
                 judged = True
@@ -97,7 +98,7 @@ def a_longer_exposure_is_brighter(stand: Stand) -> None:
 
 def _expect_brighter(view: View) -> None:
     lit = view.learn().lit
-    usual = view.stand.settings(view.name)
+    usual = view.bench.settings(view.name)
     other_s = _another_exposure(view.camera, usual.exposure_s)
     if other_s is None:
         message = "has one exposure, or none that it can set"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from slrig.conformance.check import STEPPED, Check, Need, at, check, expect, refused
-from slrig.conformance.stand import SHORT_S, Stand
+from slrig.conformance.bench import SHORT_S, RigBench
+from slrig.conformance.check import Check, Need, check
+from slrig.conformance.expectation import STEPPED, at, expect, refused
 from slrig.devices import Trigger
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Size, White
@@ -19,12 +20,12 @@ _STATE = "keep the state in the driver, and check it before the device is touche
     asks=("Camera.configure", "Camera.arm", "Camera.read"),
     needs=(Need.STEPPED,),
 )
-def an_armed_camera_refuses_to_be_set_or_armed(stand: Stand) -> None:
+def an_armed_camera_refuses_to_be_set_or_armed(bench: RigBench) -> None:
     """An armed camera refuses to be set or armed, and goes on."""
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             with refused(DeviceStateError, asked="configure of an armed camera", do=_STATE):
-                view.camera.configure(stand.settings(name))
+                view.camera.configure(bench.settings(name))
             with refused(DeviceStateError, asked="arm of an armed camera", do=_STATE):
                 view.camera.arm(1, trigger)
             view.expose(0)
@@ -33,11 +34,11 @@ def an_armed_camera_refuses_to_be_set_or_armed(stand: Stand) -> None:
 @check(
     asks=("Camera.trigger", "Camera.read", "Camera.disarm"),
 )
-def trigger_and_read_need_an_armed_camera(stand: Stand) -> None:
+def trigger_and_read_need_an_armed_camera(bench: RigBench) -> None:
     """Trigger and read need an armed camera."""
-    for name, camera in stand.rig.cameras.items():
+    for name, camera in bench.rig.cameras.items():
         with at(f"camera '{name}'"):
-            camera.configure(stand.settings(name))
+            camera.configure(bench.settings(name))
             for state in ("that was not armed", "that was disarmed"):
                 with refused(DeviceStateError, asked=f"trigger of a camera {state}", do=_STATE):
                     camera.trigger()
@@ -53,9 +54,9 @@ def trigger_and_read_need_an_armed_camera(stand: Stand) -> None:
     asks=("Projector.load", "Projector.show"),
     fresh=True,
 )
-def show_needs_a_loaded_sequence(stand: Stand) -> None:
+def show_needs_a_loaded_sequence(bench: RigBench) -> None:
     """Show needs a loaded sequence, and one of its patterns."""
-    projector, sequence = stand.rig.projector, stand.sequence
+    projector, sequence = bench.rig.projector, bench.sequence
     with at("projector"):
         with refused(DeviceStateError, asked="show before load", do=_STATE):
             projector.show(0)
@@ -73,15 +74,15 @@ def show_needs_a_loaded_sequence(stand: Stand) -> None:
 @check(
     asks=("Projector.show",),
 )
-def show_tells_which_pattern_is_lit_since_when(stand: Stand) -> None:
+def show_tells_which_pattern_is_lit_since_when(bench: RigBench) -> None:
     """Show tells which pattern is lit since when, once it is."""
-    projector = stand.rig.projector
+    projector = bench.rig.projector
     with at("projector"):
-        projector.load(stand.sequence)
+        projector.load(bench.sequence)
         last = None
-        for index in (0, len(stand.sequence) - 1, 0):
+        for index in (0, len(bench.sequence) - 1, 0):
             shown = projector.show(index)
-            returned_ns = stand.rig.clock.now_ns()
+            returned_ns = bench.rig.clock.now_ns()
             expect(
                 shown.index == index and shown.t_err_ns >= 0,
                 asked=f"show({index}) tells of pattern {index}, with an error of 0 ns or more",
@@ -102,10 +103,10 @@ def show_tells_which_pattern_is_lit_since_when(stand: Stand) -> None:
                 do="wait in show until t_visible_ns + t_err_ns has passed",
             )
             last = shown
-    for name, trigger in stand.ways():
+    for name, trigger in bench.ways():
         if trigger is not Trigger.SOFTWARE:
             continue
-        with stand.view(name, trigger) as view:
+        with bench.view(name, trigger) as view:
             shown = view.show(0)
             frame = view.look()
             expect(
@@ -120,9 +121,9 @@ def show_tells_which_pattern_is_lit_since_when(stand: Stand) -> None:
     asks=("Projector.load", "Projector.info"),
     fresh=True,
 )
-def a_sequence_of_another_size_is_refused(stand: Stand) -> None:
+def a_sequence_of_another_size_is_refused(bench: RigBench) -> None:
     """A sequence for a projector of another size is refused."""
-    projector = stand.rig.projector
+    projector = bench.rig.projector
     size = projector.info.size
     with at("projector"):
         for other in (Size(size.width_px + 8, size.height_px), Size(size.width_px, size.height_px + 8)):
@@ -140,18 +141,18 @@ def a_sequence_of_another_size_is_refused(stand: Stand) -> None:
     asks=("Projector.play", "Projector.stop", "Projector.info"),
     fresh=True,
 )
-def a_projector_plays_only_if_it_says_so(stand: Stand) -> None:
+def a_projector_plays_only_if_it_says_so(bench: RigBench) -> None:
     """A projector plays if it says so, and else refuses."""
-    projector = stand.rig.projector
-    exposure_s = max((stand.settings(name).exposure_s for name in stand.rig.cameras), default=0.01)
+    projector = bench.rig.projector
+    exposure_s = max((bench.settings(name).exposure_s for name in bench.rig.cameras), default=0.01)
     with at("projector"):
         if projector.info.plays:
             with refused(DeviceStateError, asked="play before load", do=_STATE):
                 projector.play(exposure_s, 2 * exposure_s)
-            projector.load(stand.opening)
+            projector.load(bench.opening)
             projector.play(exposure_s, 2 * exposure_s)
         else:
-            projector.load(stand.opening)
+            projector.load(bench.opening)
             with refused(
                 UnsupportedByDeviceError,
                 asked="play of a projector that declares plays=False",

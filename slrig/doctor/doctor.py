@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from slrig.capture.latency import USUAL_SEARCH_S, LatencyMeasurement
 from slrig.capture.response import ResponseCurve
-from slrig.capture.synchronisation import USUAL_SEARCH_S, LatencyMeasurement
 from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation
 from slrig.doctor import timing
 from slrig.doctor.advice import ExposureAdvice, exposure_advice, is_whole, unsnapped

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from slrig.capture.flashes import CameraLatency
+from slrig.capture.latency import LatencyMeasurement, measure_latency
+from slrig.capture.latency_fit import CameraLatency
 from slrig.capture.refresh import refresh_hz
-from slrig.capture.synchronisation import LatencyMeasurement, measure_latency
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
 from slrig.doctor.light import Seen

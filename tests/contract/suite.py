@@ -9,7 +9,7 @@ from functools import partial
 
 from slrig.conformance import CHECKS as CONTRACT
 from slrig.conformance import Check, Examination, Outcome
-from slrig.conformance.stand import usual_settings
+from slrig.conformance.bench import usual_settings
 from slrig.devices import Camera, CameraSettings, Head, KeepsTime, Rig, SystemClock
 from slrig.model import PatternSequence
 

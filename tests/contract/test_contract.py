@@ -37,7 +37,7 @@ def members(protocol: type) -> set[str]:
 
 
 def recording(target: object, protocol: type, asked: set[str]) -> Any:
-    """Stand in for `target`, noting which members of the protocol are asked for."""
+    """RigBench in for `target`, noting which members of the protocol are asked for."""
 
     def property_of(name: str) -> property:
         def get(_: object) -> object:

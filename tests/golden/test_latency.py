@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slrig.capture.flashes import CameraLatency
+from slrig.capture.latency import measure_latency
+from slrig.capture.latency_fit import CameraLatency
 from slrig.capture.sequencer import capture
-from slrig.capture.synchronisation import measure_latency
 from slrig.cli.commands import app
 from slrig.config import read_rig
 from slrig.devices import Synchronisation, Trigger

@@ -23,7 +23,7 @@ import pytest
 from drivers import v4l2
 from slrig.capture.sequencer import capture
 from slrig.conformance import run
-from slrig.conformance.stand import usual_settings
+from slrig.conformance.bench import usual_settings
 from slrig.devices import Camera, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from tests.contract import vivid_bench

@@ -10,7 +10,7 @@ import pytest
 
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence, EvidenceSummary
-from slrig.capture.judging import MOST_FAILURES
+from slrig.capture.retry_policy import MOST_FAILURES
 from slrig.capture.sequencer import capture
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.model import Black, Gray, LineShift, Shot, White

@@ -145,7 +145,7 @@ BROKEN: list[tuple[Maker, str, str]] = [
     (Maker(projector=projectors.StaysLitWhileLoading), "the_projector_is_dark_unless_it_shows", "after load"),
     (Maker(projector=projectors.StaysLitAfterClose), "the_projector_is_dark_after_opening_and_close", "after close"),
     (Maker(projector=projectors.ShinesFromTheStart), "the_projector_is_dark_after_opening_and_close", "after opening"),
-    (Maker(cameras.ClosesOnce), "the_way_out_may_be_taken_twice", "DeviceStateError"),
+    (Maker(cameras.ClosesOnce), "close_may_be_called_twice", "DeviceStateError"),
     (Maker(cameras.IgnoresClose), "nothing_works_after_close", "no error"),
     (Hoarder(), "a_closed_rig_opens_again", "process 4711"),
 ]

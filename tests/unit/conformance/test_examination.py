@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from slrig.conformance import CHECKS, Examination, Failure, Outcome, Report, Result, run
-from slrig.conformance.check import ExpectationError, NotApplicableError, check
+from slrig.conformance.bench import RigBench
+from slrig.conformance.check import check
+from slrig.conformance.expectation import ExpectationError, NotApplicableError
 from slrig.conformance.light import learn_light
-from slrig.conformance.stand import Stand
 from slrig.devices import Camera, Projector, Rig
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import Pixels
@@ -113,9 +114,9 @@ def test_one_thread_owns_the_devices() -> None:
     owners: set[int] = set()
 
     @check(asks=())
-    def remember_the_thread(stand: Stand) -> None:
+    def remember_the_thread(bench: RigBench) -> None:
         """Nothing."""
-        assert stand.rig.cameras
+        assert bench.rig.cameras
         owners.add(threading.get_ident())
 
     maker = Maker()
@@ -149,9 +150,9 @@ def test_checks_share_a_rig_unless_they_want_a_fresh_one_or_the_last_one_failed(
 
 def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
     @check(asks=())
-    def raises(stand: Stand) -> None:
+    def raises(bench: RigBench) -> None:
         """A driver fails."""
-        with stand.view(*next(stand.ways())):
+        with bench.view(*next(bench.ways())):
             fault = "select failed"
             raise OSError(fault)
 
@@ -167,7 +168,7 @@ def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
 
 def test_a_check_may_find_out_that_it_has_nothing_to_ask() -> None:
     @check(asks=())
-    def has_nothing_to_ask(_stand: Stand) -> None:
+    def has_nothing_to_ask(_stand: RigBench) -> None:
         """Nothing to ask."""
         message = "it has one exposure"
         raise NotApplicableError(message)

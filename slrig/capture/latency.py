@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.capture.flashes import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels, rows_of
+from slrig.capture.latency_fit import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels, rows_of
 from slrig.devices import Camera, CameraSettings, Rig, Shown, Synchronisation, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError, UnsupportedByDeviceError
 from slrig.model import Black, Frame, PatternSequence, Pixels, Size, White

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.capture.flashes import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels
+from slrig.capture.latency_fit import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels
 from slrig.devices import Shown
 from slrig.errors import ScanEvidenceError
 from slrig.model import FloatArray, Pixels

@@ -36,7 +36,7 @@ class _Findings:
     lined: set[Axis] = field(default_factory=set)
 
 
-class Witness:
+class FrameVerifier:
     """One camera's frames so far: whole until white and black tell what is lit, then at sampled lit pixels."""
 
     def __init__(self, name: str, form: CameraFormat, patterns: Sequence[Pattern]) -> None:

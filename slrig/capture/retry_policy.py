@@ -22,7 +22,7 @@ MOST_FAILURES = 3
 _ORDINALS = ("first", "second", "third")
 
 
-class Judge:
+class RetryPolicy:
     """Takes every frame of a capture once, and knows which patterns have to be shown again to which cameras.
 
     refused : is told of every exposure that does not count. since_ns : when times count from; None stands for the start
@@ -137,15 +137,15 @@ class Judge:
                 raise ScanEvidenceError(self._failed(camera, index, causes))
 
     def _failed(self, camera: str, index: int, causes: list[str]) -> str:
-        return f"{place(camera, index, self._sequence.patterns[index])}: {told(causes)}"
+        return f"{place(camera, index, self._sequence.patterns[index])}: {in_words(causes)}"
 
 
-def told(causes: list[str]) -> str:
+def in_words(causes: list[str]) -> str:
     """Words for several failures of one thing; those that differ in numbers only are told once.
 
-    >>> told(["frame 7 is dark", "frame 9 is dark"])
+    >>> in_words(["frame 7 is dark", "frame 9 is dark"])
     'it failed 2 times, each time alike: frame 9 is dark'
-    >>> told(["it is dark", "it came twice"])
+    >>> in_words(["it is dark", "it came twice"])
     'it failed 2 times. The first time: it is dark. The second time: it came twice'
     """
     if len({re.sub(r"\d+", "", cause) for cause in causes}) == 1:

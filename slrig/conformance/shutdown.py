@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from slrig.conformance.check import Check, Failure, Need, at, check, expect, refused
-from slrig.conformance.check import ExpectationError as Broken
+from slrig.conformance.bench import SHORT_S, RigBench, View
+from slrig.conformance.check import Check, Need, check
+from slrig.conformance.expectation import ExpectationError as Broken
+from slrig.conformance.expectation import Failure, at, expect, refused
 from slrig.conformance.light import DARK
-from slrig.conformance.stand import SHORT_S, Stand, View
 from slrig.devices import Camera, Projector, Rig, Trigger
 from slrig.errors import DeviceStateError
 
@@ -18,15 +19,15 @@ _SEEN = (Need.STEPPED, Need.WHITE_AND_BLACK)
     asks=("Projector.blank", "Projector.stop", "Projector.load", "Projector.show"),
     needs=_SEEN,
 )
-def the_projector_is_dark_unless_it_shows(stand: Stand) -> None:
+def the_projector_is_dark_unless_it_shows(bench: RigBench) -> None:
     """The projector is dark unless it shows: after blank, stop and load."""
-    name, trigger = next(stand.ways())
-    with stand.view(name, trigger) as view:
+    name, trigger = next(bench.ways())
+    with bench.view(name, trigger) as view:
         view.learn()
         dark: dict[str, Callable[[], None]] = {
             "blank": view.projector.blank,
             "stop": view.projector.stop,
-            "load": lambda: view.projector.load(stand.sequence),
+            "load": lambda: view.projector.load(bench.sequence),
         }
         for call, darken in dark.items():
             view.expect_level(
@@ -41,17 +42,17 @@ def the_projector_is_dark_unless_it_shows(stand: Stand) -> None:
     needs=_SEEN,
     fresh=True,
 )
-def the_projector_is_dark_after_opening_and_close(stand: Stand) -> None:
+def the_projector_is_dark_after_opening_and_close(bench: RigBench) -> None:
     """The projector is dark when it was opened, and when it is closed."""
-    name, trigger = next(stand.ways())
-    with stand.view(name, trigger) as view:
+    name, trigger = next(bench.ways())
+    with bench.view(name, trigger) as view:
         view.learn()
     # Left shining: whatever closes a rig after an error closes it so.
-    stand.rig.projector.show(0)
-    stand.close()
-    with stand.view(name, trigger, load=False) as view:
+    bench.rig.projector.show(0)
+    bench.close()
+    with bench.view(name, trigger, load=False) as view:
         _expect_dark(view, "after opening")
-        view.projector.load(stand.sequence)
+        view.projector.load(bench.sequence)
         view.show(0)
         view.projector.close()
         _expect_dark(view, "after close")
@@ -61,9 +62,9 @@ def the_projector_is_dark_after_opening_and_close(stand: Stand) -> None:
     asks=("Camera.disarm", "Camera.close", "Projector.stop", "Projector.blank", "Projector.close"),
     fresh=True,
 )
-def the_way_out_may_be_taken_twice(stand: Stand) -> None:
+def close_may_be_called_twice(bench: RigBench) -> None:
     """The way out may be taken twice."""
-    rig = _in_use(stand)
+    rig = _in_use(bench)
     for _ in range(2):
         for what, leave in _leaving(rig, closing=False):
             _without_error(what, leave)
@@ -78,19 +79,19 @@ def the_way_out_may_be_taken_twice(stand: Stand) -> None:
     asks=("Camera.close", "Projector.close"),
     fresh=True,
 )
-def nothing_works_after_close(stand: Stand) -> None:
+def nothing_works_after_close(bench: RigBench) -> None:
     """Nothing works after close."""
-    rig = _in_use(stand)
+    rig = _in_use(bench)
     for what, leave in _leaving(rig, closing=True):
         _without_error(what, leave)
     for name, camera in rig.cameras.items():
         with at(f"camera '{name}'"):
-            for what, call in _uses(camera, stand, name):
+            for what, call in _uses(camera, bench, name):
                 with refused(DeviceStateError, asked=f"{what} after close", do="refuse every use of a closed device"):
                     call()
     projector = rig.projector
     calls: dict[str, Callable[[], object]] = {
-        "load": lambda: projector.load(stand.opening),
+        "load": lambda: projector.load(bench.opening),
         "show": lambda: projector.show(0),
         "play": lambda: projector.play(0.01, 0.02),
     }
@@ -104,14 +105,14 @@ def nothing_works_after_close(stand: Stand) -> None:
     asks=("Camera.close", "Projector.close"),
     fresh=True,
 )
-def a_closed_rig_opens_again(stand: Stand) -> None:
+def a_closed_rig_opens_again(bench: RigBench) -> None:
     """A rig that was closed can be opened again at once, and gives frames."""
     for _ in range(2):
-        _in_use(stand)
-        stand.close()
+        _in_use(bench)
+        bench.close()
         with at("rig"):
             try:
-                rig = stand.rig
+                rig = bench.rig
             except Exception as error:
                 failure = Failure(
                     "a rig opens again after it was closed",
@@ -120,8 +121,8 @@ def a_closed_rig_opens_again(stand: Stand) -> None:
                 )
                 raise Broken(failure) from error
             expect(rig.cameras, asked="the rig has its cameras again", found="none", do="open every device afresh")
-    for name, trigger in stand.ways():
-        with stand.view(name, trigger) as view:
+    for name, trigger in bench.ways():
+        with bench.view(name, trigger) as view:
             view.expose(0)
 
 
@@ -135,13 +136,13 @@ def _expect_dark(view: View, when: str) -> None:
     )
 
 
-def _in_use(stand: Stand) -> Rig:
+def _in_use(bench: RigBench) -> Rig:
     """The rig with every camera armed, a frame under way where one can be, and the projector shining."""
-    rig = stand.rig
-    rig.projector.load(stand.sequence)
-    best = dict(stand.ways())
+    rig = bench.rig
+    rig.projector.load(bench.sequence)
+    best = dict(bench.ways())
     for name, camera in rig.cameras.items():
-        camera.configure(stand.settings(name))
+        camera.configure(bench.settings(name))
         camera.arm(2, best.get(name, Trigger.HARDWARE))
     rig.projector.show(0)
     for name, trigger in best.items():
@@ -174,8 +175,8 @@ def _without_error(what: str, leave: Callable[[], None]) -> None:
         raise Broken(failure) from error
 
 
-def _uses(camera: Camera, stand: Stand, name: str) -> list[tuple[str, Callable[[], object]]]:
-    settings = stand.settings(name)
+def _uses(camera: Camera, bench: RigBench, name: str) -> list[tuple[str, Callable[[], object]]]:
+    settings = bench.settings(name)
     return [
         ("configure", lambda: camera.configure(settings)),
         ("arm", lambda: camera.arm(1, min(camera.info.triggers))),
@@ -187,7 +188,7 @@ def _uses(camera: Camera, stand: Stand, name: str) -> list[tuple[str, Callable[[
 CHECKS: tuple[Check, ...] = (
     the_projector_is_dark_unless_it_shows,
     the_projector_is_dark_after_opening_and_close,
-    the_way_out_may_be_taken_twice,
+    close_may_be_called_twice,
     nothing_works_after_close,
     a_closed_rig_opens_again,
 )

@@ -9,7 +9,7 @@ import pytest
 
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence
-from slrig.capture.playing import frame_shift
+from slrig.capture.hardware_trigger import frame_shift
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Synchronisation, Trigger
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from slrig.capture.judging import Judge
+from slrig.capture.retry_policy import RetryPolicy
 from slrig.capture.session import Session
 from slrig.devices import Shown, Trigger
 from slrig.errors import FrameTimeoutError
@@ -31,21 +31,21 @@ class _Taken:
     fault: str | None
 
 
-def stepped(session: Session, judge: Judge) -> Iterator[Shot]:
-    """Show each pattern, and again where frames failed, until every frame counts. Raises as `Judge` does."""
+def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
+    """Show each pattern, and again where frames failed, until every frame counts. Raises as `RetryPolicy` does."""
     rig = session.rig
     rig.projector.load(session.sequence)
     for name, camera in rig.cameras.items():
-        camera.arm(judge.most_shots, session.triggers[name])
+        camera.arm(retries.most_shots, session.triggers[name])
     ahead = iter(range(len(session.sequence)))
     last: dict[str, Frame] = {}
     waiting: list[_Taken] = []
     while True:
-        turn = _next_turn(judge, ahead, list(rig.cameras))
+        turn = _next_turn(retries, ahead, list(rig.cameras))
         if turn is None:
             if not waiting:
                 return
-            yield from _judged(judge, waiting)
+            yield from _judged(retries, waiting)
             waiting = []
             continue
         index, names = turn
@@ -53,29 +53,29 @@ def stepped(session: Session, judge: Judge) -> Iterator[Shot]:
         shown = rig.projector.show(index)
         stable_ns = session.settled_ns(shown)
         for name in names:
-            judge.begin(name, index)
+            retries.begin(name, index)
             if session.triggers[name] is Trigger.SOFTWARE:
                 rig.cameras[name].trigger()
         # The sensors are at work now: there is time for the frames before.
-        yield from _judged(judge, waiting)
+        yield from _judged(retries, waiting)
         waiting = [_taken(session, name, shown, stable_ns, last) for name in names]
 
 
-def _next_turn(judge: Judge, ahead: Iterator[int], cameras: list[str]) -> tuple[int, list[str]] | None:
+def _next_turn(retries: RetryPolicy, ahead: Iterator[int], cameras: list[str]) -> tuple[int, list[str]] | None:
     """What is to be shot next: first what failed, in order."""
-    if judge.again:
-        index = min(judge.again)
-        return index, judge.again.pop(index)
+    if retries.again:
+        index = min(retries.again)
+        return index, retries.again.pop(index)
     ahead_index = next(ahead, None)
     return None if ahead_index is None else (ahead_index, cameras)
 
 
-def _judged(judge: Judge, taken: list[_Taken]) -> Iterator[Shot]:
+def _judged(retries: RetryPolicy, taken: list[_Taken]) -> Iterator[Shot]:
     for each in taken:
         if each.frame is None:
-            judge.missed(each.camera, each.index, each.fault or "no frame came")
+            retries.missed(each.camera, each.index, each.fault or "no frame came")
             continue
-        shot = judge.took(each.index, each.frame, each.fault)
+        shot = retries.took(each.index, each.frame, each.fault)
         if shot is not None:
             yield shot
 

@@ -14,9 +14,9 @@ import numpy as np
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence
 from slrig.capture.identity import place
-from slrig.capture.judging import Judge, told
+from slrig.capture.latency import shutter_skew_s
+from slrig.capture.retry_policy import RetryPolicy, in_words
 from slrig.capture.session import Session
-from slrig.capture.synchronisation import shutter_skew_s
 from slrig.devices import Trigger
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
 from slrig.model import Frame, Gray, PatternSequence, Shot
@@ -39,7 +39,7 @@ class _Play:
     missing: int = 0
 
 
-def played(session: Session, judge: Judge, refused: Callable[[Refused], None]) -> Iterator[Shot]:
+def hardware_triggered(session: Session, retries: RetryPolicy, refused: Callable[[Refused], None]) -> Iterator[Shot]:
     """Play the sequence until every frame counts, three times at most.
 
     Frames are delivered as they come. Those of a play that failed are refused, and all come again.
@@ -68,7 +68,7 @@ def played(session: Session, judge: Judge, refused: Callable[[Refused], None]) -
             # Room for one more than there should be: it would tell.
             camera.arm(count + 1, Trigger.HARDWARE)
         play = _Play(number, levels={name: [] for name in rig.cameras})
-        yield from _frames(session, judge, play, last)
+        yield from _frames(session, retries, play, last)
         rig.projector.stop()
         if not play.faults:
             return
@@ -76,12 +76,12 @@ def played(session: Session, judge: Judge, refused: Callable[[Refused], None]) -
             camera.disarm()
         causes.append(_cause(play, session.sequence))
         timed_out += play.missing == len(play.faults)
-        _refuse(play, judge.evidence, causes[-1], refused)
-    message = f"the sequence was played {MOST_PLAYS} times by wire: {told(causes)}"
+        _refuse(play, retries.evidence, causes[-1], refused)
+    message = f"the sequence was played {MOST_PLAYS} times by wire: {in_words(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
 
 
-def _frames(session: Session, judge: Judge, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
+def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
     rig, count = session.rig, len(session.sequence)
     exposure_s = max(applied.exposure_s for applied in session.applied.values())
     skew_s = max(shutter_skew_s(camera, name, rig.synchronisation) for name, camera in rig.cameras.items())
@@ -112,7 +112,7 @@ def _frames(session: Session, judge: Judge, play: _Play, last: dict[str, Frame])
             where = place(name, index, session.sequence.patterns[index])
             own = session.own_fault(frame, after_ns, before.get(name)) or _gap(frame, before.get(name))
             last[name] = before[name] = frame
-            shot = judge.shot(index, frame)
+            shot = retries.shot(index, frame)
             if own is not None:
                 if name not in spoilt:
                     # One is enough: what is lost stays lost.
@@ -120,7 +120,7 @@ def _frames(session: Session, judge: Judge, play: _Play, last: dict[str, Frame])
                 spoilt.add(name)
             elif not play.faults:
                 # After the first fault there is nothing left to prove, only to understand.
-                play.faults += map(str, judge.evidence.contradictions(shot))
+                play.faults += map(str, retries.evidence.contradictions(shot))
             if play.faults:
                 play.withheld.append(shot)
             else:

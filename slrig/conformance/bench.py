@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slrig.capture.synchronisation import stable_from_ns
-from slrig.conformance.check import STEPPED, at, expect
+from slrig.capture.latency import stable_from_ns
+from slrig.conformance.expectation import STEPPED, at, expect
 from slrig.conformance.light import DARK, LIT, Light, learn_light
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Shown, Trigger
 from slrig.model import Frame, PatternSequence
@@ -31,7 +31,7 @@ _MOST_LOOKS = 64
 _LEARNT_FROM = 3
 
 
-class Stand:
+class RigBench:
     """A rig under examination. One thread uses it.
 
     Parameters
@@ -125,7 +125,7 @@ class Stand:
 class View:
     """One armed camera before the projector."""
 
-    stand: Stand
+    bench: RigBench
     name: str
     trigger: Trigger
     projector: Projector
@@ -146,15 +146,15 @@ class View:
         """Show a pattern; the instant from which its light is certain is remembered."""
         shown = self.projector.show(index)
         stable_ns = self.stable_ns(shown)
-        if self.stand.rig.synchronisation is not None:
+        if self.bench.rig.synchronisation is not None:
             # A display that is known to be slower than its driver says: its light is waited for before a trigger.
-            self.stand.rig.clock.wait_until(stable_ns, threading.Event())
-        self.stand.noted(stable_ns)
+            self.bench.rig.clock.wait_until(stable_ns, threading.Event())
+        self.bench.noted(stable_ns)
         return shown
 
     def stable_ns(self, shown: Shown) -> int:
         """The instant from which a pattern's light is the only one, as far as the rig's latency is known."""
-        return stable_from_ns(shown, self.stand.rig.synchronisation)
+        return stable_from_ns(shown, self.bench.rig.synchronisation)
 
     def start(self) -> None:
         """Start one exposure, if somebody has to."""
@@ -164,7 +164,7 @@ class View:
     def read(self, after_ns: int) -> Frame:
         """Return the next frame that was exposed wholly after an instant."""
         frame = self.camera.read(after_ns, self.patience_s)
-        self.stand.noted(frame.t_end_ns)
+        self.bench.noted(frame.t_end_ns)
         return frame
 
     def expose(self, index: int) -> Frame:
@@ -177,15 +177,15 @@ class View:
         """Return a frame of whatever is shown now."""
         self.start()
         # A camera that runs by itself may still hold frames from before; one that was triggered just now cannot.
-        return self.read(self.stand.now_ns if self.trigger is Trigger.FREE else 0)
+        return self.read(self.bench.now_ns if self.trigger is Trigger.FREE else 0)
 
     def learn(self) -> Light:
         """Find out how white and black look, if nobody has yet: shows both. Raises ExpectationError."""
-        return self.stand.light(self)
+        return self.bench.light(self)
 
     def level(self, frame: Frame) -> float:
         """How much of the projector's white is in a frame. Call `learn` first, before what is to be looked at."""
-        return self.stand.light(self).level(frame.image)
+        return self.bench.light(self).level(frame.image)
 
     def expect_level(self, frame: Frame, index: int, *, asked: str, do: str) -> None:
         """Expect a frame of pattern 0 to be white, one of pattern 1 to be black. Raises ExpectationError."""
@@ -200,7 +200,7 @@ class View:
 
     def darkest(self) -> float:
         """The level of what is shown now, looked at until it is dark or the projector has had its time to go dark."""
-        measured = self.stand.rig.synchronisation
+        measured = self.bench.rig.synchronisation
         late_s = 0.0 if measured is None else measured.latency_s + measured.latency_error_s
         allowed_s = min(self.projector.info.latency_s + max(late_s, 0.0), 1.0) + _SETTLE_S
         first = last = self.look()
@@ -214,7 +214,7 @@ class View:
 
     def let_frames_pile_up(self) -> None:
         """Let time pass in which nobody reads, so that a camera that runs by itself fills its driver's buffers."""
-        clock = self.stand.rig.clock
+        clock = self.bench.rig.clock
         waited_s = min(max(6 * self.exposure_s, 0.1), 0.5)
         clock.wait_until(clock.now_ns() + round(waited_s * 1e9), threading.Event())
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.capture.synchronisation import LatencyMeasurement, measure_latency, shutter_skew_s, stable_from_ns
+from slrig.capture.latency import LatencyMeasurement, measure_latency, shutter_skew_s, stable_from_ns
 from slrig.config import read_rig
 from slrig.devices import CameraSettings, Rig, Shown, Synchronisation, SystemClock, Trigger
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ScanCancelledError, ScanEvidenceError, UnsupportedByDeviceError
-from tests.unit.capture.test_flashes import STATED_NS, World, both_ways, step
+from tests.unit.capture.test_latency_fit import STATED_NS, World, both_ways, step
 from tests.unit.simulated_rig.building import small_head
 
 
