@@ -95,11 +95,6 @@ def watch_visibility(connection: Connection, window: int) -> None:
     connection.do(2, struct.pack("<III", window, _EVENT_MASK, VISIBILITY_CHANGE))
 
 
-def destroy_window(connection: Connection, window: int) -> None:
-    """Destroy a window."""
-    connection.do(4, struct.pack("<I", window))
-
-
 def pixmap(connection: Connection, size: Size) -> int:
     """Make room for a picture of the screen's depth."""
     return _pixmap(connection, size, connection.screen.depth)

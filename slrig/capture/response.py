@@ -13,8 +13,6 @@ import numpy as np
 
 from slrig.model import FloatArray
 
-_MOST_VALUE = 255.0
-
 
 @dataclass(frozen=True, slots=True)
 class ResponseCurve:

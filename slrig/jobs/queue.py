@@ -122,11 +122,6 @@ class JobQueue:
             queued.settle()
         return False
 
-    def knows(self, job_id: UUID) -> bool:
-        """Whether a job waits or is under way."""
-        with self._changed:
-            return any(job.id == job_id for job in (*self._waiting, self._active) if job is not None)
-
     def watch(self, camera: str, light: Light) -> Watch:
         """Look through a camera; pictures come while the rig is idle.
 
