@@ -17,7 +17,7 @@ _SAME_EXPOSURE = 0.01
 
 @dataclass(slots=True)
 class Stage:
-    """What lies before the cameras: the pattern shown, and the how-manieth showing of it in the sequence."""
+    """What lies before the cameras: the pattern shown, and how often it was shown before in the sequence."""
 
     shown: tuple[Pattern, int] | None = None
 

@@ -166,7 +166,7 @@ def measured(
         with refusals_of(work):
             work.mkdir(parents=True)
         scan = ScanPlan(exposure_s=plan.exposure_s)
-        # What a rendered rig knows of its scene is no business of the test's; and the noise of a point, by which form
+        # The test must not use what a rendered rig knows of its scene; and the noise of a point, by which form
         # is judged, is to hold nothing of the calibration's own error, which is what form is to show.
         blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
         capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)

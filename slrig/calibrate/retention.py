@@ -1,4 +1,4 @@
-"""Old calibrations removed, lest one a night fill the disk: never the one in use, nor one that a scan names.
+"""Old calibrations removed, because one a night fills the disk: never the one in use, nor one that a scan names.
 
 A scan names the calibration that it was measured by in its report and in its bundle: by the solve's id, or by a digest
 of the numbers where the calibration says nothing of its own error.

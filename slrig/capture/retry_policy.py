@@ -91,7 +91,7 @@ class RetryPolicy:
         return shot if not found or index not in self._answer(shot, found) else None
 
     def missed(self, camera: str, index: int, cause: str) -> None:
-        """Hear that no frame came. Raises FrameTimeoutError when none came three times running."""
+        """Take note that no frame came. Raises FrameTimeoutError when none came three times running."""
         missing = self._missing[camera, index]
         missing.append(cause)
         self._refuse(Refused(index, camera, self._shots[camera, index], cause))

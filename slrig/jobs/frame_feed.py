@@ -56,7 +56,7 @@ class FrameSink(Protocol):
     """Is shown the frames of a capture as they are taken."""
 
     def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
-        """Hear what will come."""
+        """Take note of what will come."""
         ...
 
     def take(self, shot: Shot) -> None:
@@ -64,7 +64,7 @@ class FrameSink(Protocol):
         ...
 
     def end(self, evidence: EvidenceSummary) -> None:
-        """Hear that all frames have come."""
+        """Take note that all frames have come."""
         ...
 
 

@@ -1,7 +1,7 @@
 """Gray-code decoding with a reason for every refused pixel.
 
 A bit is read by comparing it with its inverse (or with the middle of white and black) against a margin that the
-noise sets. A bit inside the margin has two minds; the pixel is then known to an interval of cells. One such bit at
+noise sets. A bit inside the margin is ambiguous; the pixel is then known to an interval of cells. One such bit at
 its own code edge gives two neighbouring cells and does no harm; a finest bit lost in blur costs resolution only;
 anywhere else the interval is wide and the pixel is refused.
 """

@@ -1,8 +1,8 @@
 """Devices as the service calls them: what they raise says which device and which call, and no call hangs unnoticed.
 
 Drivers raise what the operating system gives them, in its words; a scan is on record with words that a person can act
-on. And a call that does not return, because a driver or the kernel hangs, must not leave a scan under way for ever with
-the projector's light on.
+on. And a call that does not return, because a driver or the kernel hangs, must not leave a scan under way, with the
+projector's light on, until somebody comes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a scan is asked to do: frozen data, made once from a request and a rig file; and whom it tells how far it is."""
+"""What a scan is asked to do: frozen data, made once from a request and a rig file; and who is told how far it is."""
 
 from __future__ import annotations
 

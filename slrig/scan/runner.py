@@ -255,8 +255,8 @@ class Runner:
     def close(self, *, timeout_s: float = 3.0) -> None:
         """Stop scanning, darken and close the rig, and record what was cut off as interrupted. Idempotent.
 
-        A driver that does not return in `timeout_s` is left behind: the projector is darkened past it, as far as it
-        lets, and its scan is recorded all the same.
+        A driver that does not return in `timeout_s` is left behind: the projector is made dark from another thread, as
+        far as the driver lets, and its scan is recorded all the same.
         """
         with self._closing:
             if not self._closed:

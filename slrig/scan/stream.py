@@ -193,7 +193,7 @@ class LiveScan:
         self.watch.enter(WAITING)
 
     def end(self, evidence: EvidenceSummary) -> None:
-        """Hear that all frames have come, and what they have proven."""
+        """Take note that all frames have come, and what they have proven."""
         self.evidence = evidence
 
     def finish(self, entered: Entered) -> list[Seen]:

@@ -226,7 +226,7 @@ class VerificationDesk:
         if plan.position is not None and rig.positioner is not None:
             rig.positioner.move(plan.position)
         staged = self._folder.stage(job_id)
-        # What a rendered rig knows of its scene is no business of a verification's.
+        # A verification must not use what a rendered rig knows of its scene.
         bare = replace(rig, calibration=None, head=None)
         with disk_errors(staged):
             self._tools.capture(bare, plan.scan, staged / "bundle", progress=lambda *_: None, cancelled=cancelled)

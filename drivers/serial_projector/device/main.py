@@ -181,7 +181,7 @@ class UsbPort:
 
 
 def serve(device: Device, port: UsbPort, alive, tidy) -> None:
-    """Run a box for ever. alive : feeds the watchdog timer. tidy : collects garbage, where that disturbs least."""
+    """Run a box without end. alive : feeds the watchdog timer. tidy : collects garbage, where that disturbs least."""
     sent = 0
     while True:
         alive()

@@ -107,7 +107,7 @@ def within(points_px: FloatArray, size: Size) -> NDArray[np.bool_]:
 
 def _sample(light: Correspondences) -> Correspondences:
     step = max(1, len(light.axis) // _MOST_SAMPLES)
-    # An odd step, lest columns and rows that come by turns leave one axis out.
+    # An odd step: with an even one, columns and rows that come by turns would leave one axis out.
     every = slice(None, None, step + (1 - step % 2))
     return Correspondences(light.pixels_px[every], light.axis[every], light.position_px[every], light.sigma_px[every])
 
