@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from slrig.capture.latency import USUAL_SEARCH_S, LatencyMeasurement
-from slrig.capture.response import ResponseCurve
 from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation
 from slrig.doctor import timing
 from slrig.doctor.advice import ExposureAdvice, exposure_advice, is_whole, unsnapped
@@ -20,6 +19,7 @@ from slrig.doctor.flicker import Flicker, flicker
 from slrig.doctor.focus import focus
 from slrig.doctor.geometry import picture
 from slrig.doctor.light import Seen, at_exposure, look
+from slrig.doctor.measures.response import ResponseCurve
 from slrig.doctor.response import response
 from slrig.doctor.viewing import Viewer
 from slrig.errors import DeviceError, DeviceGoneError, UnsupportedByDeviceError

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slrig.capture.flicker import Swing, passed, swings
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
 from slrig.doctor.light import Seen
+from slrig.doctor.measures.flicker import Swing, passed, swings
 from slrig.doctor.timing import white_and_black
 from slrig.doctor.viewing import Viewer
 from slrig.model import FloatArray, Frame, PatternSequence

@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.capture.sharpness import BarContrast, EdgeBlur, bar_blur_px, bar_contrast, edge_blur
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.geometry import Picture
 from slrig.doctor.light import Seen
+from slrig.doctor.measures.sharpness import BarContrast, EdgeBlur, bar_blur_px, bar_contrast, edge_blur
 from slrig.model import Axis, PatternSequence
 from slrig.patterns.gray import edge_indices
 

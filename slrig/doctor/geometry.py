@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.evidence import Evidence
-from slrig.capture.orientation import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.light import Seen
+from slrig.doctor.measures.orientation import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.viewing import Viewer
 from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
 from slrig.model.gray_code import gray_index

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from slrig.capture.light_levels import USUAL_SNR, LightLevels, light_levels
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
+from slrig.doctor.measures.light_levels import USUAL_SNR, LightLevels, light_levels
 from slrig.doctor.viewing import Viewer
 from slrig.model import Black, FloatArray, Gray, PatternSequence, White
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from slrig.capture.response import ResponseCurve, camera_exponent, response_curve
 from slrig.doctor.findings import Finding, camera_named, note, ok
 from slrig.doctor.light import Seen
+from slrig.doctor.measures.response import ResponseCurve, camera_exponent, response_curve
 from slrig.doctor.viewing import Viewer
 from slrig.errors import DeviceError, DeviceGoneError
 from slrig.model import Black, FloatArray, Pattern, PatternSequence, Size, White

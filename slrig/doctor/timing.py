@@ -11,10 +11,10 @@ import numpy as np
 
 from slrig.capture.latency import LatencyMeasurement, measure_latency
 from slrig.capture.latency_fit import CameraLatency
-from slrig.capture.refresh import refresh_hz
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
 from slrig.doctor.light import Seen
+from slrig.doctor.measures.refresh import refresh_hz
 from slrig.doctor.viewing import Viewer
 from slrig.errors import ScanEvidenceError
 from slrig.model import Black, PatternSequence, Size, White

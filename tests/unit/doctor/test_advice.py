@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.capture.light_levels import LightLevels, light_levels
 from slrig.doctor.advice import exposure_advice, unsnapped
 from slrig.doctor.findings import Finding, Severity, fault, ok
 from slrig.doctor.flicker import Flicker
 from slrig.doctor.light import Seen
+from slrig.doctor.measures.light_levels import LightLevels, light_levels
 
 
 def levels() -> LightLevels:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slrig.capture.orientation import apart_deg, expected_orientation, orientation
-from slrig.capture.sharpness import bar_blur_px, bar_contrast, edge_blur
+from slrig.doctor.measures.orientation import apart_deg, expected_orientation, orientation
+from slrig.doctor.measures.sharpness import bar_blur_px, bar_contrast, edge_blur
 from slrig.model import FloatArray, Pinhole, Size
 
 SHAPE = (120, 160)

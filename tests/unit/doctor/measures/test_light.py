@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.capture.flicker import passed, swings
-from slrig.capture.light_levels import light_levels
-from slrig.capture.refresh import refresh_hz
-from slrig.capture.response import camera_exponent, response_curve
+from slrig.doctor.measures.flicker import passed, swings
+from slrig.doctor.measures.light_levels import light_levels
+from slrig.doctor.measures.refresh import refresh_hz
+from slrig.doctor.measures.response import camera_exponent, response_curve
 from slrig.model import FloatArray, Pixels
 
 SHAPE = (60, 80)

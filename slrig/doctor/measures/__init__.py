@@ -1,0 +1,1 @@
+"""What the doctor measures of frames: pure, on arrays."""
