@@ -168,8 +168,8 @@ def pose_figures(result: CalibrationResult, board: Board, names: Sequence[str]) 
             seen = BoardPose(
                 first.rotation @ pose.rotation, first.rotation @ pose.translation_mm + first.translation_mm
             )
-            stood = attitude(seen, middle_mm)
-            tilt, distance = stood.steep_deg, stood.distance_mm
+            board_pose = attitude(seen, middle_mm)
+            tilt, distance = board_pose.steep_deg, board_pose.distance_mm
         found.append(PoseFigures(name, rms, tilt, distance, solution.outliers.get(name, "")))
     return tuple(found)
 

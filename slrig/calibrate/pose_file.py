@@ -59,7 +59,7 @@ def _view(light_first: Any = False, **values: Any) -> BoardView:
 def _parts(pose: ReadPose) -> Iterator[tuple[str, str, Any]]:
     for camera, view in pose.observation.views.items():
         yield "view", camera, view
-    for camera, light in pose.observation.light.items():
+    for camera, light in pose.observation.correspondences.items():
         yield "light", camera, light
     for camera, figures in pose.figures.items():
         yield "figures", camera, figures

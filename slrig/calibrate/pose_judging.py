@@ -10,7 +10,7 @@ from typing import Any
 from slrig.bundle.storage import write_file
 from slrig.calibrate.figures import baselines, device_figures
 from slrig.calibrate.pose_pictures import white_frame
-from slrig.calibrate.records import PoseState, SessionRecord, plain
+from slrig.calibrate.records import SessionRecord, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import Judgement, Setting, Standing, sizes_of
@@ -107,7 +107,7 @@ def write_report(
     pictures: dict[str, dict[str, Pixels]] = {
         name: {camera: white_frame(bundle, camera) for camera in record.cameras} for name, bundle in bundles.items()
     }
-    refused = {pose.name: pose.fault.message for pose in record.poses if pose.state is PoseState.REFUSED and pose.fault}
+    refused = {pose.name: pose.fault.message for pose in record.poses if pose.refused and pose.fault}
     remarks = {pose.name: list((pose.answer or {}).get("warnings", ())) for pose in record.accepted}
     text = report_html(
         result,

@@ -62,7 +62,7 @@ def report_html(
     remarks : by pose, what could be better about it. refused : by pose, why it could not be read at all.
     machine : where it was solved, in words.
     """
-    expected, stood = result.expected, list(result.solution.poses.values())
+    expected, board_pose = result.expected, list(result.solution.poses.values())
     devices = device_figures(result)
     shown = pose_figures(result, board, [pose.observation.name for pose in poses])
     least_mm, most_mm = error_range_mm(expected)
@@ -96,7 +96,7 @@ def report_html(
         legend=legend,
         longest_arrow_px=longest_arrow_px,
         residual_map=residual_map,
-        rig_view=partial(rig_view, result.calibration, stood, board, expected.volume_mm),
+        rig_view=partial(rig_view, result.calibration, board_pose, board, expected.volume_mm),
         rounded=rounded,
     )
 
@@ -117,7 +117,7 @@ def _pictures(
 
 
 def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board, figures: DeviceFigures) -> Markup:
-    stood, left_out = result.solution.poses, result.solution.outliers
+    board_pose, left_out = result.solution.poses, result.solution.outliers
     used = [pose.observation for pose in poses if pose.observation.name not in left_out]
     if figures.is_projector:
         parts = [lit_board(pose, figures.size).positions_px for pose in used]
@@ -126,4 +126,4 @@ def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board
     points = np.concatenate([np.zeros((0, 2)), *parts])
     chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_DOTS)).astype(int))
     device = named_devices(result.calibration)[figures.name]
-    return coverage_map(device, board, list(stood.values()), points[chosen], name=figures.name)
+    return coverage_map(device, board, list(board_pose.values()), points[chosen], name=figures.name)

@@ -61,11 +61,11 @@ class Correspondences:
 
 @dataclass(frozen=True, slots=True)
 class PoseObservation:
-    """One pose of the board. `views` and `light` are by camera; `light` is empty where no projector was used."""
+    """One pose of the board. `views` and `correspondences` are by camera; the latter are none without a projector."""
 
     name: str
     views: Mapping[str, BoardView]
-    light: Mapping[str, Correspondences] = field(default_factory=dict)
+    correspondences: Mapping[str, Correspondences] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,11 +124,11 @@ class _Panel:
 
 
 def _errors(records: Records, at: Thresholds, top: float) -> list[Markup]:
-    errors = [record.look.expected_mm for record in records]
+    errors = [record.found.expected_mm for record in records]
     known = [error for error in errors if error is not None]
     if not known:
         return [shape("text", "No verification tells an expected error: they are all of scans.", x=_LEFT, y=top + 20)]
-    stated = next((record.look.stated_mm for record in reversed(records) if record.look.stated_mm), 0.0)
+    stated = next((record.found.stated_mm for record in reversed(records) if record.found.stated_mm), 0.0)
     panel = _Panel(records, top, max(*known, 1.2 * at.watch_error_ratio * stated), "Expected error of a scan, mm")
     if stated:
         panel.limit(stated, "stated", _COLOURS[HealthState.UNKNOWN])
@@ -144,15 +144,15 @@ def _errors(records: Records, at: Thresholds, top: float) -> list[Markup]:
 
 
 def _residuals(records: Records, at: Thresholds, top: float) -> list[Markup]:
-    looks = [{(pair.first, pair.second): pair for pair in record.look.pairs} for record in records]
-    known = [max(pair.rms_px, abs(pair.mean_px)) for look in looks for pair in look.values()]
+    all_pairs = [{(pair.first, pair.second): pair for pair in record.found.pairs} for record in records]
+    known = [max(pair.rms_px, abs(pair.mean_px)) for pairs in all_pairs for pair in pairs.values()]
     panel = _Panel(records, top, max([*known, 1.2 * at.watch_mean_px]), "Disagreement of two devices, px")
     panel.limit(at.watch_mean_px, "watch (mean)", _COLOURS[HealthState.WATCH])
     panel.limit(at.stale_mean_px, "stale (mean)", _COLOURS[HealthState.STALE])
-    for number, name in enumerate(dict.fromkeys(name for look in looks for name in look)):
+    for number, name in enumerate(dict.fromkeys(name for pairs in all_pairs for name in pairs)):
         colour, x = _LINES[number % len(_LINES)], _LEFT + 256 + 130 * number
-        panel.line([abs(look[name].mean_px) if name in look else None for look in looks], colour)
-        panel.line([look[name].rms_px if name in look else None for look in looks], colour, wide=0.7)
+        panel.line([abs(pairs[name].mean_px) if name in pairs else None for pairs in all_pairs], colour)
+        panel.line([pairs[name].rms_px if name in pairs else None for pairs in all_pairs], colour, wide=0.7)
         panel.parts.append(shape("path", d=f"M{x:.1f} {top - 16:.1f}h14", stroke=colour, stroke_width=2))
         panel.parts.append(shape("text", " - ".join(name), x=x + 18, y=top - 12))
     note = shape("text", "thick: mean, thin: rms", x=_END, y=top + _PANEL + 36, class_="faint end")

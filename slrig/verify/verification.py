@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from slrig.calibrate.tools import CapturePose
 from slrig.calibration.board import Board
-from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import Health, HealthState
+from slrig.calibration.health.verification import Verification
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.worker import Worker
 from slrig.model import Calibration
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _STILL_PX = 0.3
 
 
-_READ, _LOOK = "slrig.calibrate.pose_reading:read_pose", "slrig.calibration.health.looking:look_at_board"
+_READ, _JUDGE = "slrig.calibrate.pose_reading:read_pose", "slrig.calibration.health.verifying:verify_by_board"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +33,17 @@ class VerificationTools:
 
     capture: CapturePose = capture_bundle
     read: Callable[[Path, Board, str], ReadPose] = field(default_factory=lambda: _later(_READ))
-    look: Callable[[Sequence[Any], Board, Calibration], Look] = field(default_factory=lambda: _later(_LOOK))
+    judge: Callable[[Sequence[Any], Board, Calibration], Verification] = field(default_factory=lambda: _later(_JUDGE))
 
 
 def verification_tools(worker: Worker) -> VerificationTools:
     """Those of a service: the shot is taken here, the mathematics is the worker's."""
-    return VerificationTools(read=worker.task(_READ, "reading of the board"), look=worker.task(_LOOK, "verification"))
+    return VerificationTools(read=worker.task(_READ, "reading of the board"), judge=worker.task(_JUDGE, "verification"))
 
 
 def verify_bundle(
     folder: Path, board: Board, calibration: Calibration, /, *, tools: VerificationTools | None = None
-) -> Look:
+) -> Verification:
     """Judge a calibration by a recorded pose of the board.
 
     Raises
@@ -64,7 +64,7 @@ def verify_bundle(
                 f"{_STILL_PX} px would be taken for a change of the rig; put it on a stand, and shoot it again"
             )
             raise PoseRefusedError(message)
-    return used.look([pose.observation], board, calibration)
+    return used.judge([pose.observation], board, calibration)
 
 
 def require_healthy(health: Health, *, refuse_when_stale: bool) -> None:
@@ -91,7 +91,7 @@ def health_stamp(health: Health, latest: VerificationRecord | None) -> dict[str,
         "reasons": list(health.reasons),
         "verified_at": None if latest is None else latest.at.isoformat(timespec="seconds"),
         "verification": None if latest is None else str(latest.id),
-        "expected_error_mm": None if latest is None else latest.look.expected_mm,
+        "expected_error_mm": None if latest is None else latest.found.expected_mm,
     }
 
 

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.calibration.health.look import Look
-from slrig.calibration.health.looking import look_at_board
 from slrig.calibration.health.verdict import HealthState, judged
+from slrig.calibration.health.verification import Verification
+from slrig.calibration.health.verifying import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.model import Pinhole
 from tests.unit.calibration.health.drifting import (
@@ -59,7 +59,7 @@ def planted(devices: Mapping[str, Pinhole], change: str, rng: np.random.Generato
     return {**devices, name: turned(devices[name], (float(x), float(y), float(z)))}, name
 
 
-def told(found: Look, device: str) -> str:
+def told(found: Verification, device: str) -> str:
     """Whether the right device was named: "named", "open" (it is among those that cannot be told apart), "wrong"."""
     if not found.drifts:
         return "nothing"
@@ -88,7 +88,7 @@ def test_planted_changes_are_stale_named_and_foretold(cameras: int) -> None:
             rng = np.random.default_rng((seed, CHANGES.index(change)))
             rig = bench(seed, cameras=cameras)
             now, device = planted(rig.devices, change, rng)
-            found = look_at_board([look_of(now, seed + 50_000)], BOARD, rig.calibration)
+            found = verify_by_board([look_of(now, seed + 50_000)], BOARD, rig.calibration)
             true_mm = true_error_mm(now, rig.calibration)
             rows.append(
                 {
@@ -137,15 +137,15 @@ def test_no_alarm_on_clean_captures() -> None:
     rows: list[dict[str, Any]] = []
     for number in range(CLEAN_RIGS):
         rig = bench(SEED + 100 + number, cameras=1 + number % 2)
-        looks: list[Look] = []
+        verifications: list[Verification] = []
         for capture in range(CLEAN_CAPTURES):
             seed = 100 * SEED + CLEAN_CAPTURES * number + capture
-            looks.append(look_at_board([look_of(rig.devices, seed)], BOARD, rig.calibration))
-            health = judged(looks)
+            verifications.append(verify_by_board([look_of(rig.devices, seed)], BOARD, rig.calibration))
+            health = judged(verifications)
             rows.append({"rig": number, "capture": capture, "state": str(health.state), "reasons": health.reasons})
             if health.state is not HealthState.GOOD:
                 print(rows[-1], flush=True)  # noqa: T201
-        print(f"clean rig {number}: {len(looks)} captures", flush=True)  # noqa: T201
+        print(f"clean rig {number}: {len(verifications)} captures", flush=True)  # noqa: T201
     alarms = [each for each in rows if each["state"] != HealthState.GOOD]
     written("clean", alarms, {"captures": len(rows), "alarms": len(alarms)})
     assert not alarms
@@ -155,16 +155,16 @@ def test_a_warm_up_is_watched_before_the_error_doubles() -> None:
     rows: list[dict[str, Any]] = []
     for number in range(WARM_RIGS):
         rig = bench(SEED + 200 + number, known_px=0.05)
-        looks: list[Look] = []
+        verifications: list[Verification] = []
         alarm, doubled, before_mm, late = None, None, 0.0, 0
         for capture in range(WARM_CAPTURES):
             share = 1.6 * (1 - np.exp(-capture / 60))
             lamp = zoomed(turned(rig.devices[PROJECTOR], (0.001 * share, 0.006 * share, 0)), 1e-4 * share)
             now = {**rig.devices, PROJECTOR: lamp}
             seed = 200 * SEED + WARM_CAPTURES * number + capture
-            looks.append(look_at_board([look_of(now, seed)], BOARD, rig.calibration))
-            state, error_mm = judged(looks).state, true_error_mm(now, rig.calibration)
-            before_mm = before_mm or max(error_mm, float(looks[0].stated_mm or 0))
+            verifications.append(verify_by_board([look_of(now, seed)], BOARD, rig.calibration))
+            state, error_mm = judged(verifications).state, true_error_mm(now, rig.calibration)
+            before_mm = before_mm or max(error_mm, float(verifications[0].stated_mm or 0))
             if state is not HealthState.GOOD and alarm is None:
                 alarm = capture
             if error_mm > 2 * before_mm and doubled is None:

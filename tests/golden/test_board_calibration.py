@@ -54,7 +54,7 @@ def off_sheet_px(light: Correspondences, axis: int) -> FloatArray:
 
 @pytest.mark.parametrize("number", range(len(POSES)))
 def test_light_of_the_real_boards_lies_on_smooth_sheets(poses: list[ReadPose], number: int) -> None:
-    light = poses[number].observation.light["cam0"]
+    light = poses[number].observation.correspondences["cam0"]
     for axis in (COLUMN, ROW):
         off = off_sheet_px(light, axis)
         assert len(off) > 2000
@@ -68,8 +68,8 @@ def every_corner_off_px(result: CalibrationResult, poses: list[ReadPose]) -> Flo
     assert shape_mm is not None
     off = []
     for pose in poses:
-        stood, view = result.solution.poses[pose.observation.name], pose.observation.views["cam0"]
-        world = (BOARD.points_mm + shape_mm)[view.corner] @ stood.rotation.T + stood.translation_mm
+        board_pose, view = result.solution.poses[pose.observation.name], pose.observation.views["cam0"]
+        world = (BOARD.points_mm + shape_mm)[view.corner] @ board_pose.rotation.T + board_pose.translation_mm
         seen, _ = cv2.projectPoints(world, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
         off.append(np.linalg.norm(seen.reshape(-1, 2) - view.points_px, axis=1))
     return np.concatenate(off)

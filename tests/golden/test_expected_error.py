@@ -41,7 +41,7 @@ from slrig.model import Calibration, FloatArray, Pinhole, Solved
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
-from tests.unit.calibration.perturbed import aligned, met_with_light, pixels
+from tests.unit.calibration.perturbed import aligned, met_with_projector, pixels
 from tests.unit.calibration.solving.against_truth import in_first_camera
 
 pytestmark = pytest.mark.slow
@@ -273,7 +273,7 @@ def test_the_calibration_has_its_share_of_it(measured: Measured) -> None:
     assert exact.projector is not None
     places = measured.stated.grid_mm
     at, lit = pixels(exact.cameras["left"], places), pixels(exact.projector, places)[:, 0]
-    moved = aligned(met_with_light(solved.cameras["left"], solved.projector, at, lit, places, 0), places)
+    moved = aligned(met_with_projector(solved.cameras["left"], solved.projector, at, lit, places, 0), places)
     rays = places / np.linalg.norm(places, axis=1, keepdims=True)
     found_mm = rms([np.einsum("ni,ni->n", moved - places, rays)])
     # The square of one draw is a weighted sum of a few squares of normal numbers, about two that count: one draw may be

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.solving.adjustment import corner_terms, light_terms
+from slrig.calibration.solving.adjustment import corner_terms, match_terms
 from slrig.calibration.solving.measurements import spread
 from slrig.calibration.solving.solve import solve
 from tests.unit.calibration.solving.test_adjustment import aside, true_geometry
@@ -36,14 +36,14 @@ def test_a_step_changes_residuals_by_its_derivative(seed: int, bend: list[float]
     by_number = (corner_terms(ahead, seen, jacobian=False)[0] - corner_terms(behind, seen, jacobian=False)[0]) / 2
     good = np.isfinite(residual)
     np.testing.assert_allclose(change[good], by_number[good], atol=1e-7)
-    residual, rows = light_terms(geometry, seen, jacobian=True)
+    residual, rows = match_terms(geometry, seen, jacobian=True)
     place = np.hstack([
-        15 * seen.light_where[:, :1] + np.arange(15),
+        15 * seen.match_where[:, :1] + np.arange(15),
         np.tile(15 * (layout.devices - 1) + np.arange(15), (len(residual), 1)),
-        layout.first_pose + 6 * seen.light_where[:, 1:2] + np.arange(6),
+        layout.first_pose + 6 * seen.match_where[:, 1:2] + np.arange(6),
     ])  # fmt: skip
     change = np.einsum("ni,ni->n", rows[:, :36], step[place])
-    by_number = (light_terms(ahead, seen, jacobian=False)[0] - light_terms(behind, seen, jacobian=False)[0]) / 2
+    by_number = (match_terms(ahead, seen, jacobian=False)[0] - match_terms(behind, seen, jacobian=False)[0]) / 2
     good = np.isfinite(residual)
     assert good.any()
     np.testing.assert_allclose(change[good], by_number[good], atol=1e-6)

@@ -1,1 +1,1 @@
-"""Does a calibration still hold? What a look at the board says of a rig that may have changed."""
+"""Does a calibration still hold? What a verification by the board says of a rig that may have changed."""

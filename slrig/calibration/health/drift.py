@@ -1,9 +1,10 @@
 """Which device changed since the calibration, by how much, and which others the geometry cannot tell from it.
 
 A hypothesis is a change δ of one device: it turned about its own centre (3), moved (3), did both (6), or its focal
-length changed (1). Each is fitted to the equations of one look at the board (`slrig.calibration.health.equations`) by
-generalised least squares, everything else held by the calibration's covariance. With the columns J of the change and
-what is left r, both made orthogonal to all that is not a change, and S the size that such a change may have,
+length changed (1). Each is fitted to the equations of one verification by the board
+(`slrig.calibration.health.equations`) by generalised least squares, everything else held by the calibration's
+covariance. With the columns J of the change and what is left r, both made orthogonal to all that is not a change, and S
+the size that such a change may have,
 
     2 ln(evidence / evidence of no change) = rᵀ J' (J'ᵀJ' + 1)⁻¹ J'ᵀ r - ln det(J'ᵀJ' + 1),    J' = J S
 
@@ -160,7 +161,7 @@ def _fitted(
 def _posterior(
     found: Equations, base: FloatArray, left: FloatArray, columns: FloatArray, by_change: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (15 d,) and modes (15 d, k) of the parameters' deviation, after the look."""
+    """Mean (15 d,) and modes (15 d, k) of the parameters' deviation, after the verification."""
     count, poses = columns.shape[1], found.by_pose.shape[1]
     prior = np.hstack([np.zeros((count, base.shape[1])), np.eye(count)])
     full = np.vstack([np.hstack([base, by_change]), prior])

@@ -1,4 +1,4 @@
-"""What one look at the board says of the devices, as linear equations about a calibration.
+"""What one verification by the board says of the devices, as linear equations about a calibration.
 
 Observed are the corners in each camera and the projector's light, averaged over cells of the image. With the board's
 pose p, the calibration's own error e with covariance C = M Mᵀ, and a change δ of the devices since then,
@@ -26,7 +26,7 @@ from slrig.calibration.observations import Observations, PoseObservation
 from slrig.calibration.solution import BoardPose
 from slrig.calibration.solving.measurements import Measurements, groups, measured
 from slrig.calibration.solving.parameters import device_row, pose_row, to_board_pose, turned
-from slrig.calibration.solving.projection import BEND, POSE, corner_rows, light_rows
+from slrig.calibration.solving.projection import BEND, POSE, corner_rows, match_rows
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, IntArray
 
@@ -69,8 +69,8 @@ def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calib
     """
     names = list(calibration.cameras)
     sizes = {name: camera.size for name, camera in calibration.cameras.items()}
-    light_size = None if calibration.projector is None else calibration.projector.size
-    everything = measured(Observations(board, sizes, light_size, tuple(poses)), {}, light_per_view=_LIGHT)
+    projector_size = None if calibration.projector is None else calibration.projector.size
+    everything = measured(Observations(board, sizes, projector_size, tuple(poses)), {}, matches_per_view=_LIGHT)
     if not len(everything.corner_px):
         seen = sorted({name for pose in poses for name in pose.views})
         message = (
@@ -134,7 +134,7 @@ class _Bench:
 
     def linear(self, modes: FloatArray) -> Equations:
         corners = self._corners()
-        light = self._light() if len(self._all.light_px) else []
+        light = self._light() if len(self._all.match_px) else []
         parts = corners + light
         blocks = np.zeros((sum(len(part[0]) for part in parts), 6 * len(parts)))
         start = 0
@@ -171,18 +171,18 @@ class _Bench:
 
     def _light(self) -> list[tuple[FloatArray, ...]]:
         m, lamp = self._all, len(self._devices) - 1
-        left = -light_rows(
-            self._devices, self.poses, self._bend, self._frame, m.light_where, m.light_pixel, m.light_px, jacobian=False
+        left = -match_rows(
+            self._devices, self.poses, self._bend, self._frame, m.match_where, m.match_pixel, m.match_px, jacobian=False
         )[0]
         parts: list[tuple[FloatArray, ...]] = []
-        for run in groups(m.light_where):
+        for run in groups(m.match_where):
             good = np.flatnonzero(np.isfinite(left[run])) + run.start
             if len(good) < _CELLS:
                 continue
-            pixels, value, sigma = _cells(m.light_pixel[good], left[good], m.light_sigma[good])
-            where = np.repeat(m.light_where[good[:1]], len(value), axis=0)
+            pixels, value, sigma = _cells(m.match_pixel[good], left[good], m.match_sigma[good])
+            where = np.repeat(m.match_where[good[:1]], len(value), axis=0)
             camera, pose = where[0, :2]
-            _, rows = light_rows(
+            _, rows = match_rows(
                 self._devices, self.poses, self._bend, self._frame, where, pixels, np.zeros(len(value))
             )
             surface = self._surface((pixels - pixels.mean(axis=0)) / np.ptp(pixels) * 2 * self._half + self._middle)

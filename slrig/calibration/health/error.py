@@ -3,10 +3,11 @@
 Each hypothesis h of what changed (`slrig.calibration.health.drift`) gives the parameters' deviation from the
 calibration a mean m_h and modes P_h. With F what they do to a point along the first camera's ray, the rigid motion
 nearest to it taken out, the expected square of the error is Σ_h w_h mean((F m_h)² + Σ_k (F P_h)_k²) over places in the
-volume. A calibration that nothing changed gives what it stated of itself, less what the look at the board has taught.
+volume. A calibration that nothing changed gives what it stated of itself, less what the verification by the board has
+taught.
 
-Only hypotheses that what was seen makes likelier than no change count. Of a device that the look did not see each is as
-likely as before, and would bring in all that may ever happen to it.
+Only hypotheses that what was seen makes likelier than no change count. Of a device that the verification did not see
+each is as likely as before, and would bring in all that may ever happen to it.
 """
 
 from __future__ import annotations

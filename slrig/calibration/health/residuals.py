@@ -141,7 +141,7 @@ def _matches(
     if second != PROJECTOR:
         corners = _corner_matches(pose, board, stands, first, second)
         return None if corners is None else corners[1]
-    light = pose.light.get(first)
+    light = pose.correspondences.get(first)
     if light is None:
         return None
     pixels, position, sigma = both_axes(light)
@@ -172,7 +172,7 @@ def _corner_matches(
     if view is None:
         return None
     if second == PROJECTOR:
-        light = pose.light.get(first)
+        light = pose.correspondences.get(first)
         if light is None:
             return None
         at, sigma = _light_at(view.points_px, light, _reach_px(view.points_px, view.corner, board))

@@ -1,8 +1,8 @@
-"""Good, watch or stale: what several looks at a rig since its calibration say together.
+"""Good, watch or stale: what several verifications of a rig since its calibration say together.
 
-One look may be bad luck: a lamp was switched on, someone leaned on the table. So the trend is judged, the median of the
-last three looks; but a look that is far beyond chance counts at once (`Thresholds.jump_evidence`): a device that was
-knocked stays knocked.
+One verification may be bad luck: a lamp was switched on, someone leaned on the table. So the trend is judged, the
+median of the last three verifications; but a verification that is far beyond chance counts at once
+(`Thresholds.jump_evidence`): a device that was knocked stays knocked.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from slrig.calibration.health.devices import device_words
-from slrig.calibration.health.look import Look, PairFigures
+from slrig.calibration.health.verification import PairFigures, Verification
 
 
 class HealthState(StrEnum):
@@ -35,8 +35,8 @@ class Thresholds:
     expected error over the stated one, of a change with watch_evidence. sure_error_ratio : from which it is stale if
     the change is certain too, by sure_sigmas. watch_evidence : of a change that is too small to matter yet (6 is 20
     times likelier than none). trend_chance : below which the measured size of the board, or a pair's mean, has not
-    crept by chance since the first looks. jump_evidence : of one look that counts at once (100 is 10 σ),
-    jump_mean_sigmas the same of a pair's mean.
+    crept by chance since the first verifications. jump_evidence : of one verification that counts at once (100 is 10
+    σ), jump_mean_sigmas the same of a pair's mean.
     """
 
     watch_mean_px: float = 0.1
@@ -56,7 +56,7 @@ class Thresholds:
 THRESHOLDS = Thresholds()
 _TREND = 3
 _CHANCE = 4.0
-_AVERAGED = 8  # looks at the beginning, and at the end, that a trend is judged by
+_AVERAGED = 8  # verifications at the beginning, and at the end, that a trend is judged by
 _FEWEST_AVERAGED = 4
 _CREPT_PX = 0.02
 
@@ -70,26 +70,26 @@ class Health:
     remedy: str | None = None
 
 
-def judged(looks: Sequence[Look], /, *, thresholds: Thresholds = THRESHOLDS) -> Health:
-    """Judge a rig by every look since its calibration, oldest first."""
-    if not looks:
+def judged(verifications: Sequence[Verification], /, *, thresholds: Thresholds = THRESHOLDS) -> Health:
+    """Judge a rig by every verification since its calibration, oldest first."""
+    if not verifications:
         return Health(
             HealthState.UNKNOWN, ("nothing was verified since the calibration",), "shoot a verification of the board"
         )
-    latest = looks[-1]
+    latest = verifications[-1]
     told: list[tuple[HealthState, str]] = []
-    told += _of_error(looks, thresholds)
-    told += _of_means(looks, thresholds)
-    told += _of_rms(looks, thresholds)
-    told += _of_change(looks, thresholds)
-    told += _of_trend(looks, thresholds)
+    told += _of_error(verifications, thresholds)
+    told += _of_means(verifications, thresholds)
+    told += _of_rms(verifications, thresholds)
+    told += _of_change(verifications, thresholds)
+    told += _of_trend(verifications, thresholds)
     state = HealthState.GOOD
     for found, _ in told:
         state = found if found is HealthState.STALE or state is HealthState.GOOD else state
     reasons = tuple(words for found, words in sorted(told, key=lambda each: each[0] is not HealthState.STALE))
     if state is HealthState.GOOD:
         return Health(state, (_good_words(latest),))
-    measured = [look for look in looks if look.kind == "board"]
+    measured = [verification for verification in verifications if verification.kind == "board"]
     named = measured[-1] if measured else latest
     if named.drifts:
         reasons = (*reasons, named.drifts[0].words, *([named.open] if named.open else []))
@@ -101,13 +101,23 @@ def judged(looks: Sequence[Look], /, *, thresholds: Thresholds = THRESHOLDS) -> 
     return Health(state, reasons, remedy)
 
 
-def _of_error(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, str]]:
-    known = [look for look in looks if look.expected_mm is not None and look.stated_mm]
+def _of_error(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
+    known = [
+        verification
+        for verification in verifications
+        if verification.expected_mm is not None and verification.stated_mm
+    ]
     if not known:
         return []
-    ratio, jumped = _trend(known, _error_ratio, lambda look: look.evidence > at.jump_evidence)
-    evidence = known[-1].evidence if jumped else float(np.median([look.evidence for look in known[-_TREND:]]))
-    sigmas = known[-1].significance if jumped else float(np.median([look.significance for look in known[-_TREND:]]))
+    ratio, jumped = _trend(known, _error_ratio, lambda verification: verification.evidence > at.jump_evidence)
+    evidence = (
+        known[-1].evidence if jumped else float(np.median([verification.evidence for verification in known[-_TREND:]]))
+    )
+    sigmas = (
+        known[-1].significance
+        if jumped
+        else float(np.median([verification.significance for verification in known[-_TREND:]]))
+    )
     now, stated = known[-1].expected_mm, known[-1].stated_mm
     words = f"scans are now expected to be wrong by {now:.3g} mm, {ratio:.1f} times the {stated:.3g} mm that is stated"
     sure = sigmas > at.sure_sigmas
@@ -119,17 +129,17 @@ def _of_error(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, 
     return [(HealthState.WATCH, words)] if ratio > at.watch_error_ratio and changed else []
 
 
-def _of_means(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, str]]:
+def _of_means(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
     told = []
-    for first, second in _pairs(looks):
-        known = [look for look in looks if _pair(look, first, second) is not None]
+    for first, second in _pairs(verifications):
+        known = [verification for verification in verifications if _pair(verification, first, second) is not None]
 
-        def mean(look: Look, first: str = first, second: str = second) -> float:
-            found = _pair(look, first, second)
+        def mean(verification: Verification, first: str = first, second: str = second) -> float:
+            found = _pair(verification, first, second)
             return abs(found.mean_px) if found is not None else 0.0
 
-        def jump(look: Look, first: str = first, second: str = second) -> bool:
-            found = _pair(look, first, second)
+        def jump(verification: Verification, first: str = first, second: str = second) -> bool:
+            found = _pair(verification, first, second)
             return found is not None and abs(found.mean_px) > at.jump_mean_sigmas * found.mean_sigma_px
 
         value, _ = _trend(known, mean, jump)
@@ -141,10 +151,10 @@ def _of_means(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, 
     return told
 
 
-def _of_rms(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, str]]:
+def _of_rms(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
     told = []
-    for first, second in _pairs(looks):
-        found = [pair for look in looks if (pair := _pair(look, first, second)) is not None]
+    for first, second in _pairs(verifications):
+        found = [pair for verification in verifications if (pair := _pair(verification, first, second)) is not None]
         after = max(found[0].predicted_px, min(pair.rms_px for pair in found[:_TREND]))
         value = float(np.median([pair.rms_px for pair in found[-_TREND:]]))
         if value > at.watch_rms_ratio * after:
@@ -154,36 +164,41 @@ def _of_rms(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, st
     return told
 
 
-def _of_change(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, str]]:
-    board = [look for look in looks if look.kind == "board"][-_TREND:]
-    if len(board) < _TREND or float(np.median([look.evidence for look in board])) < at.watch_evidence:
+def _of_change(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
+    board = [verification for verification in verifications if verification.kind == "board"][-_TREND:]
+    if len(board) < _TREND or float(np.median([verification.evidence for verification in board])) < at.watch_evidence:
         return []
-    return [(HealthState.WATCH, "the last looks agree that a device changed")]
+    return [(HealthState.WATCH, "the last verifications agree that a device changed")]
 
 
-def _of_trend(looks: Sequence[Look], at: Thresholds) -> list[tuple[HealthState, str]]:
+def _of_trend(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
     told = []
-    sizes = [look.scale_percent for look in looks if look.scale_percent is not None]
+    sizes = [verification.scale_percent for verification in verifications if verification.scale_percent is not None]
     crept, chance = _crept(sizes)
     if chance < at.trend_chance:
-        words = f"the board's measured size has crept by {crept:+.3f} % since the first looks, and not by chance"
+        words = (
+            f"the board's measured size has crept by {crept:+.3f} % since the first verifications, and not by chance"
+        )
         told.append((HealthState.WATCH, words))
-    for first, second in _pairs(looks):
-        means = [pair.mean_px for look in looks if (pair := _pair(look, first, second)) is not None]
+    for first, second in _pairs(verifications):
+        means = [
+            pair.mean_px for verification in verifications if (pair := _pair(verification, first, second)) is not None
+        ]
         crept, chance = _crept(means)
         if chance < at.trend_chance and abs(crept) > _CREPT_PX:
             words = (
-                f"'{first}' and '{second}' have crept apart by {crept:+.3f} px since the first looks, and not by chance"
+                f"'{first}' and '{second}' have crept apart by {crept:+.3f} px since the first verifications, and not "
+                "by chance"
             )
             told.append((HealthState.WATCH, words))
     return told
 
 
 def _crept(values: Sequence[float]) -> tuple[float, float]:
-    """The mean of the last looks less that of the first ones, and the probability of as much by chance.
+    """The mean of the last verifications less that of the first ones, and the probability of as much by chance.
 
-    The deviation is that of the looks' own scatter, from the differences of neighbours (von Neumann 1941): a slow trend
-    is not in it. Its square has about two thirds as many degrees of freedom as there are differences.
+    The deviation is that of the verifications' own scatter, from the differences of neighbours (von Neumann 1941): a
+    slow trend is not in it. Its square has about two thirds as many degrees of freedom as there are differences.
     """
     count = min(len(values) // 2, _AVERAGED)
     if count < _FEWEST_AVERAGED:
@@ -195,34 +210,45 @@ def _crept(values: Sequence[float]) -> tuple[float, float]:
     return crept, float(2 * stdtr(2 * (len(values) - 1) / 3, -size))
 
 
-def _trend(looks: Sequence[Look], value: Callable[[Look], float], jumps: Callable[[Look], bool]) -> tuple[float, bool]:
+def _trend(
+    verifications: Sequence[Verification], value: Callable[[Verification], float], jumps: Callable[[Verification], bool]
+) -> tuple[float, bool]:
     """The median of the last three, or the last alone where it is beyond chance; and whether it was that."""
-    last = value(looks[-1])
-    middle = float(np.median([value(look) for look in looks[-_TREND:]]))
-    return (last, True) if last > middle and jumps(looks[-1]) else (middle, False)
+    last = value(verifications[-1])
+    middle = float(np.median([value(verification) for verification in verifications[-_TREND:]]))
+    return (last, True) if last > middle and jumps(verifications[-1]) else (middle, False)
 
 
-def _error_ratio(look: Look) -> float:
-    return look.expected_mm / look.stated_mm if look.expected_mm is not None and look.stated_mm else 0.0
+def _error_ratio(verification: Verification) -> float:
+    return (
+        verification.expected_mm / verification.stated_mm
+        if verification.expected_mm is not None and verification.stated_mm
+        else 0.0
+    )
 
 
-def _pair(look: Look, first: str, second: str) -> PairFigures | None:
-    return next((pair for pair in look.pairs if (pair.first, pair.second) == (first, second)), None)
+def _pair(verification: Verification, first: str, second: str) -> PairFigures | None:
+    return next((pair for pair in verification.pairs if (pair.first, pair.second) == (first, second)), None)
 
 
-def _pairs(looks: Sequence[Look]) -> list[tuple[str, str]]:
-    return list(dict.fromkeys((pair.first, pair.second) for look in looks[-_TREND:] for pair in look.pairs))
+def _pairs(verifications: Sequence[Verification]) -> list[tuple[str, str]]:
+    return list(
+        dict.fromkeys(
+            (pair.first, pair.second) for verification in verifications[-_TREND:] for pair in verification.pairs
+        )
+    )
 
 
-def _good_words(look: Look) -> str:
-    worst = max((abs(pair.mean_px) for pair in look.pairs), default=float("nan"))
+def _good_words(verification: Verification) -> str:
+    worst = max((abs(pair.mean_px) for pair in verification.pairs), default=float("nan"))
     words = f"devices agree within {worst:.2f} px in the mean"
-    if look.expected_mm is not None and look.stated_mm:
-        words = f"expected error {look.expected_mm:.3g} mm, stated {look.stated_mm:.3g} mm"
-    return f"the calibration holds: {words}{''.join(f'; {each}' for each in _unseen_words(look))}"
+    if verification.expected_mm is not None and verification.stated_mm:
+        words = f"expected error {verification.expected_mm:.3g} mm, stated {verification.stated_mm:.3g} mm"
+    return f"the calibration holds: {words}{''.join(f'; {each}' for each in _unseen_words(verification))}"
 
 
-def _unseen_words(look: Look) -> list[str]:
+def _unseen_words(verification: Verification) -> list[str]:
     return [
-        f"{device_words(name)} did not take part in the last look, which says nothing of it" for name in look.unseen
+        f"{device_words(name)} did not take part in the last verification, which says nothing of it"
+        for name in verification.unseen
     ]

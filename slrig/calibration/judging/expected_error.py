@@ -148,7 +148,9 @@ def _light_sigma_px(observations: Observations, calibration: Calibration) -> flo
         return float("nan")
     axis = triangulated_axis(list(calibration.cameras.values()), calibration.projector)
     wanted = COLUMN if axis is Axis.COLUMN else ROW
-    found = [light.sigma_px[light.axis == wanted] for pose in observations.poses for light in pose.light.values()]
+    found = [
+        light.sigma_px[light.axis == wanted] for pose in observations.poses for light in pose.correspondences.values()
+    ]
     sigma = np.concatenate([np.zeros(0), *found])
     return _FITTED * float(np.quantile(sigma, _PAPER)) if len(sigma) else float("nan")
 

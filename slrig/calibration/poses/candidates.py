@@ -35,7 +35,7 @@ class Candidate:
     """A pose to hold the board in, as one camera would see it.
 
     place : (-1, 0 or 1 across, the same down): left or top, middle, right or bottom. tilt_deg, turn_deg, distance_mm :
-    as in `Attitude`; nominal. stood : in the camera's frame. outline_px : (4, 2) float64, the outer corners in its
+    as in `Attitude`; nominal. board_pose : in the camera's frame. outline_px : (4, 2) float64, the outer corners in its
     picture.
     """
 
@@ -43,7 +43,7 @@ class Candidate:
     tilt_deg: tuple[float, float]
     turn_deg: float
     distance_mm: float
-    stood: BoardPose
+    board_pose: BoardPose
     outline_px: FloatArray
 
 

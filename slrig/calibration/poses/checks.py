@@ -107,7 +107,7 @@ def judge_pose(
             judging.figures(camera, figures[camera], view)
     if not any(len(view.corner) for view in pose.views.values()):
         judging.refusals.append("no camera sees the board: move it into the picture, and shoot again")
-    if PROJECTOR in sizes and not pose.light:
+    if PROJECTOR in sizes and not pose.correspondences:
         judging.refusals.append(
             "no light of the projector was decoded on the board: let the projector's picture fall on it, dim the "
             "room's light, and shoot again"
@@ -300,9 +300,9 @@ def _steep(known: RigGuess, camera: str, pose: PoseObservation, board: Board) ->
     """
     device, view = known.devices[camera], pose.views.get(camera)
     if pose.name in device.poses and device.focal_sigma <= _FOCAL_KNOWN:
-        stood = device.poses[pose.name]
-        centre = stood.rotation @ board.points_mm.mean(axis=0) + stood.translation_mm
-        sight = abs(float(stood.rotation[:, 2] @ centre)) / float(np.linalg.norm(centre))
+        board_pose = device.poses[pose.name]
+        centre = board_pose.rotation @ board.points_mm.mean(axis=0) + board_pose.translation_mm
+        sight = abs(float(board_pose.rotation[:, 2] @ centre)) / float(np.linalg.norm(centre))
         return float(np.degrees(np.arccos(min(1.0, sight))))
     if view is None or len(view.corner) < 4:
         return float("nan")
@@ -320,5 +320,5 @@ def _distance(known: RigGuess, camera: str, pose: PoseObservation, board: Board)
     device = known.devices[camera]
     if pose.name not in device.poses or device.focal_sigma > _FOCAL_KNOWN:
         return float("nan")
-    stood = device.poses[pose.name]
-    return float((stood.rotation @ board.points_mm.mean(axis=0) + stood.translation_mm)[2])
+    board_pose = device.poses[pose.name]
+    return float((board_pose.rotation @ board.points_mm.mean(axis=0) + board_pose.translation_mm)[2])

@@ -111,7 +111,7 @@ def coverage(
         for pose in poses:
             cells += _cells_of(pose, name, size, known)
         reachable = _reachable(known, name) | (cells > 0)
-        attitudes = {each: attitude(stood, middle_mm) for each, stood in device.poses.items()}
+        attitudes = {each: attitude(board_pose, middle_mm) for each, board_pose in device.poses.items()}
         distances = [each.distance_mm for each in attitudes.values()]
         turns = [each.turn_deg for each in attitudes.values()]
         told = bool(distances) and device.focal_sigma <= _FOCAL_KNOWN
@@ -139,10 +139,10 @@ def cells_of(points_px: FloatArray, size: Size) -> IntArray:
     return counts
 
 
-def attitude(stood: BoardPose, middle_mm: FloatArray) -> Attitude:
+def attitude(board_pose: BoardPose, middle_mm: FloatArray) -> Attitude:
     """Return how a board stood, from its pose in the device's frame."""
-    normal, along = stood.rotation[:, 2], stood.rotation[:, 0]
-    centre = stood.rotation @ middle_mm + stood.translation_mm
+    normal, along = board_pose.rotation[:, 2], board_pose.rotation[:, 0]
+    centre = board_pose.rotation @ middle_mm + board_pose.translation_mm
     sight = float(abs(normal @ centre) / np.linalg.norm(centre))
     return Attitude(
         (float(np.degrees(np.arctan2(-normal[1], normal[2]))), float(np.degrees(np.arctan2(normal[0], normal[2])))),

@@ -40,7 +40,7 @@ def lit_board(pose: PoseObservation, size: Size) -> LitBoard:
     """Return one pose as a projector of this size would see it. Corners that lie outside its image are left out."""
     best: BoardView | None = None
     positions = [np.zeros((0, 2))]
-    for camera, light in pose.light.items():
+    for camera, light in pose.correspondences.items():
         to_projector = plane_map(light)
         if to_projector is None:
             continue

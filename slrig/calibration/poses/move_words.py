@@ -66,11 +66,11 @@ class Gain:
         if name == PROJECTOR:
             return met
         way = self.ways[name]
-        stood = BoardPose(
-            way.rotation @ self.option.stood.rotation,
-            way.rotation @ self.option.stood.translation_mm + way.translation_mm,
+        board_pose = BoardPose(
+            way.rotation @ self.option.board_pose.rotation,
+            way.rotation @ self.option.board_pose.translation_mm + way.translation_mm,
         )
-        then = attitude(stood, self.guess.board.points_mm.mean(axis=0))
+        then = attitude(board_pose, self.guess.board.points_mm.mean(axis=0))
         now = list(one.attitudes.values())
         leaning = tilted([then], self.goals)
         if any(one.tilted[axis] < self.goals.tilted and leaning[axis] for axis in (0, 1)):

@@ -78,9 +78,9 @@ def next_move(
         return _enough(found, worst, goals)
     camera = _least_sure(seeing, known, found, worst)
     device = known.devices[camera]
-    stood = found.devices[camera].attitudes
-    distance_mm = float(np.median([each.distance_mm for each in stood.values()]))
-    upright_deg = 90.0 * round(next(iter(stood.values())).turn_deg / 90.0)
+    board_pose = found.devices[camera].attitudes
+    distance_mm = float(np.median([each.distance_mm for each in board_pose.values()]))
+    upright_deg = 90.0 * round(next(iter(board_pose.values())).turn_deg / 90.0)
     options = candidates(device, board, distance_mm=distance_mm, upright_deg=upright_deg)
     if not options:
         options = candidates(device, board, distance_mm=first_distance_mm(device, board), upright_deg=upright_deg)
@@ -98,7 +98,7 @@ def next_move(
     if not found.missing and float(np.sqrt(total[chosen] / now)) > 1 - _LEAST_GAIN:
         return _enough(found, worst, goals)
     expected = {name: float(after[name][chosen]) for name in reaches}
-    last = list(stood.values())[-1]
+    last = list(board_pose.values())[-1]
     why = reasons(gains[chosen], worst, expected, _worst_place(known.devices, reaches, worst))
     words = f"{move_words(options[chosen], camera, last, upright_deg, round_deg=full_turn_deg(board))}: {why}"
     return Advice(words, False, camera, options[chosen].outline_px, options[chosen], worst, expected)
@@ -156,8 +156,8 @@ def _worst(information: FloatArray, reach: FloatArray) -> FloatArray:
 
 def _informed(options: Sequence[Candidate], camera: str, known: RigGuess, board: Board) -> _Informed:
     points_mm = sample_corners(board, _CORNERS)
-    rotation = np.stack([option.stood.rotation for option in options])
-    shift = np.stack([option.stood.translation_mm for option in options])
+    rotation = np.stack([option.board_pose.rotation for option in options])
+    shift = np.stack([option.board_pose.translation_mm for option in options])
     information, ways, seen = {}, {}, {}
     shown: dict[str, NDArray[np.bool_]] = {}
     seeing = np.zeros(len(options), dtype=np.int64)
@@ -178,8 +178,8 @@ def _informed(options: Sequence[Candidate], camera: str, known: RigGuess, board:
         sigma_px = _sigma(device) * float(np.sqrt(len(points_mm) / board.corner_count))
         held = np.repeat(device.information[None], len(options), axis=0)
         for index in np.flatnonzero(visible.sum(axis=1) >= FEWEST_CORNERS):
-            stood = BoardPose(turned[index], moved[index])
-            _, lens, pose = lens_rows(device, points_mm[visible[index]], stood)
+            board_pose = BoardPose(turned[index], moved[index])
+            _, lens, pose = lens_rows(device, points_mm[visible[index]], board_pose)
             held[index] += gained(lens, pose, sigma_px)
             seeing[index] += 1
         information[name], ways[name], seen[name], shown[name] = held, way, points_px, visible

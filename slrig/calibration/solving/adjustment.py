@@ -23,7 +23,7 @@ from slrig.calibration.solving.projection import (
     LIGHT_TERMS,
     POSE,
     corner_rows,
-    light_rows,
+    match_rows,
     weighed_blocks,
 )
 from slrig.model import FloatArray, IntArray
@@ -39,29 +39,29 @@ _MOST_DAMPING = 1e8
 _LEAST_DAMPING = 1e-12
 
 Weights = tuple[FloatArray, FloatArray]
-"""Of corners (n,) and of light (k,)."""
+"""Of corners (n,) and of matches (k,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Residuals:
-    """What is left: corners (n, 2), px, and light (k,), projector px; projected minus measured."""
+    """What is left: corners (n, 2), px, and matches (k,), projector px; projected minus measured."""
 
     corners: FloatArray
-    light: FloatArray
+    matches: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """The deviations that observations are weighed with: corners (n,) and light (k,), px.
+    """The deviations that observations are weighed with: corners (n,) and matches (k,), px.
 
-    corner_worth, light_worth : (n,) and (k,), how much of an observation each tells; less than 1 where neighbours err
+    corner_weight, match_weight : (n,) and (k,), how much of an observation each tells; less than 1 where neighbours err
     alike. It takes weight from all, and makes none of them more or less of an outlier.
     """
 
     corners: FloatArray
-    light: FloatArray
-    corner_worth: FloatArray
-    light_worth: FloatArray
+    matches: FloatArray
+    corner_weight: FloatArray
+    match_weight: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,28 +102,28 @@ class Adjustment:
 def residuals_of(geometry: Geometry, measurements: Measurements) -> Residuals:
     """The residuals alone."""
     return Residuals(
-        corner_terms(geometry, measurements, jacobian=False)[0], light_terms(geometry, measurements, jacobian=False)[0]
+        corner_terms(geometry, measurements, jacobian=False)[0], match_terms(geometry, measurements, jacobian=False)[0]
     )
 
 
 def sizes_of(residuals: Residuals, deviations: Deviations) -> tuple[FloatArray, FloatArray]:
-    """Residuals over their deviations, of corners (n,) and light (k,), positive; a corner's is its distance over √2."""
+    """Residuals over their deviations, of corners (n,) and matches (k,); a corner's is its distance over √2."""
     corner = np.hypot(residuals.corners[:, 0], residuals.corners[:, 1]) / deviations.corners / np.sqrt(2)
-    return corner, np.abs(residuals.light) / deviations.light
+    return corner, np.abs(residuals.matches) / deviations.matches
 
 
 def kept_of(residuals: Residuals, deviations: Deviations) -> Weights:
     """1 for what is not outlying, 0 for what is, or has no residual."""
-    corner, light = sizes_of(residuals, deviations)
-    return (corner <= OUTLYING).astype(np.float64), (light <= OUTLYING).astype(np.float64)
+    corner, matches = sizes_of(residuals, deviations)
+    return (corner <= OUTLYING).astype(np.float64), (matches <= OUTLYING).astype(np.float64)
 
 
 def weights_of(residuals: Residuals, deviations: Deviations, kept: Weights) -> Weights:
     """The robust weight over the variance, 0 where nothing is kept. Both coordinates of a corner have one weight."""
-    corner, light = sizes_of(residuals, deviations)
+    corner, matches = sizes_of(residuals, deviations)
     return (
-        _robust(corner, kept[0]) / deviations.corners**2 * deviations.corner_worth,
-        _robust(light, kept[1]) / deviations.light**2 * deviations.light_worth,
+        _robust(corner, kept[0]) / deviations.corners**2 * deviations.corner_weight,
+        _robust(matches, kept[1]) / deviations.matches**2 * deviations.match_weight,
     )
 
 
@@ -155,7 +155,7 @@ def adjusted(
 
 
 def _kept_at_start(left: Residuals, deviations: Deviations) -> Weights:
-    """As `kept_of`, but where half of the corners or of the light is off, as from a start, that half counts."""
+    """As `kept_of`, but where half of the corners or of the matches is off, as from a start, that half counts."""
     kept = []
     for size in sizes_of(left, deviations):
         middle = float(np.nanmedian(size)) if np.isfinite(size).any() else 0.0
@@ -212,12 +212,12 @@ def normal_equations(
     layout = geometry.layout
     matrix, gradient = np.zeros((layout.count, layout.count)), np.zeros(layout.count)
     corners, corner_jacobian = corner_terms(geometry, measurements, jacobian=True)
-    light, light_jacobian = light_terms(geometry, measurements, jacobian=True)
+    matches, match_jacobian = match_terms(geometry, measurements, jacobian=True)
     _add_corners(
         layout, measurements.corner_where, corners, corner_jacobian, weights[0],
         prior is not None and prior.offsets, matrix, gradient,
     )  # fmt: skip
-    _add_light(layout, measurements.light_where, light, light_jacobian, weights[1], matrix, gradient)
+    _add_matches(layout, measurements.match_where, matches, match_jacobian, weights[1], matrix, gradient)
     if prior is not None:
         _add_prior(geometry, prior, matrix, gradient)
     return NormalEquations(matrix, gradient)
@@ -251,7 +251,7 @@ def _add_corners(
         gradient[own] += np.einsum("nki,nk,n->ni", offset, residual[used], weight[used])
 
 
-def _add_light(
+def _add_matches(
     layout: Layout, where: IntArray, residual: FloatArray, jacobian: FloatArray, weight: FloatArray,
     matrix: FloatArray, gradient: FloatArray,
 ) -> None:  # fmt: skip
@@ -294,17 +294,17 @@ def _prior_cost(geometry: Geometry, prior: Prior) -> float:
 
 def _cost(geometry: Geometry, left: Residuals, deviations: Deviations, kept: Weights, prior: Prior | None) -> float:
     """Half of Σ c² log(1 + z²/c²); infinite where an observation that counts has no residual."""
-    corner, light = losses_of(left, deviations)
-    total = float(np.sum(corner[kept[0] > 0]) + np.sum(light[kept[1] > 0]))
+    corner, matches = losses_of(left, deviations)
+    total = float(np.sum(corner[kept[0] > 0]) + np.sum(matches[kept[1] > 0]))
     if not np.isfinite(total):
         return np.inf
     return total / 2 + (0.0 if prior is None else _prior_cost(geometry, prior))
 
 
 def losses_of(left: Residuals, deviations: Deviations) -> tuple[FloatArray, FloatArray]:
-    """Of corners (n,), both coordinates, and light (k,): their worth times c² log(1 + z²/c²), z² where small."""
-    corner, light = (CAUCHY**2 * np.log1p((size / CAUCHY) ** 2) for size in sizes_of(left, deviations))
-    return 2 * corner * deviations.corner_worth, light * deviations.light_worth
+    """Of corners (n,), both coordinates, and matches (k,): their weight times c² log(1 + z²/c²), z² where small."""
+    corner, matches = (CAUCHY**2 * np.log1p((size / CAUCHY) ** 2) for size in sizes_of(left, deviations))
+    return 2 * corner * deviations.corner_weight, matches * deviations.match_weight
 
 
 def _device(number: int) -> IntArray:
@@ -328,11 +328,11 @@ def corner_terms(geometry: Geometry, m: Measurements, /, *, jacobian: bool) -> t
     )  # fmt: skip
 
 
-def light_terms(geometry: Geometry, m: Measurements, /, *, jacobian: bool) -> tuple[FloatArray, FloatArray]:
-    """Residuals (k,) of the light and their derivatives; see `light_rows`."""
-    if not len(m.light_where):
+def match_terms(geometry: Geometry, m: Measurements, /, *, jacobian: bool) -> tuple[FloatArray, FloatArray]:
+    """Residuals (k,) of the matches and their derivatives; see `match_rows`."""
+    if not len(m.match_where):
         return np.zeros(0), np.zeros((0, LIGHT_TERMS))
-    return light_rows(
-        geometry.devices, geometry.poses, geometry.bend, geometry.frame, m.light_where, m.light_pixel, m.light_px,
+    return match_rows(
+        geometry.devices, geometry.poses, geometry.bend, geometry.frame, m.match_where, m.match_pixel, m.match_px,
         jacobian=jacobian,
     )  # fmt: skip

@@ -83,18 +83,18 @@ def found_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> Bump |
     used = np.flatnonzero(problem.used)
     if devices < 2 or len(used) < 2 * _LEAST_AFTER:
         return None
-    sigma = deviations_of(problem.measurements, fit.noise, problem.light)
+    sigma = deviations_of(problem.measurements, fit.noise, problem.with_projector)
     kept = _within_groups(problem, fit)
     size = sizes_of(fit.residuals, sigma)
-    worth = (kept[0] * sigma.corner_worth, kept[1] * sigma.light_worth)
-    total = sum(float(np.sum(k * one[w > 0] ** 2 * w[w > 0])) for k, one, w in zip((2, 1), size, worth, strict=True))
+    weight = (kept[0] * sigma.corner_weight, kept[1] * sigma.match_weight)
+    total = sum(float(np.sum(k * one[w > 0] ** 2 * w[w > 0])) for k, one, w in zip((2, 1), size, weight, strict=True))
     matrices, gradients = [], []
     m = problem.measurements
     for pose in used:
         mask = np.zeros(len(problem.pose_names), dtype=np.bool_)
         mask[pose] = True
-        corners, light = m.corner_where[:, 1] == pose, m.light_where[:, 1] == pose
-        weights = ((worth[0] / sigma.corners**2)[corners], (worth[1] / sigma.light**2)[light])
+        corners, matches = m.corner_where[:, 1] == pose, m.match_where[:, 1] == pose
+        weights = ((weight[0] / sigma.corners**2)[corners], (weight[1] / sigma.matches**2)[matches])
         equations = normal_equations(fit.geometry, m.of_poses(mask), weights)
         matrices.append(equations.matrix)
         gradients.append(equations.gradient)
@@ -105,8 +105,8 @@ def found_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> Bump |
     if share > _BUMP_SHARE:
         return None
     # Which of several devices explains it as well: of two, either.
-    alike = tuple(name for k, name in enumerate(problem.devices) if gains[k, after] >= _ALIKE_GAIN * best)
-    return Bump(alike, int(used[after]), share)
+    correlated = tuple(name for k, name in enumerate(problem.devices) if gains[k, after] >= _ALIKE_GAIN * best)
+    return Bump(correlated, int(used[after]), share)
 
 
 def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_], devices: int) -> FloatArray:
@@ -142,11 +142,11 @@ def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_],
 def _within_groups(problem: Problem, fit: Fit) -> Weights:
     """1 for what is not far off among its own camera and pose, whether or not these are off as a whole; else 0."""
     m = problem.measurements
-    kept = (np.zeros(len(m.corner_px)), np.zeros(len(m.light_px)))
+    kept = (np.zeros(len(m.corner_px)), np.zeros(len(m.match_px)))
     corner = np.hypot(*fit.residuals.corners.T)
     for where, columns, size, into in (
         (m.corner_where, 2, corner, kept[0]),
-        (m.light_where, 3, np.abs(fit.residuals.light), kept[1]),
+        (m.match_where, 3, np.abs(fit.residuals.matches), kept[1]),
     ):
         for rows in groups(where, columns=columns):
             here = size[rows]
@@ -158,14 +158,14 @@ def _within_groups(problem: Problem, fit: Fit) -> Weights:
 def worst_pose(problem: Problem, fit: Fit, /) -> tuple[int, str] | None:
     """The pose that lies farthest from what the others say, and the reason in words; None where all agree."""
     names, m = problem.pose_names, problem.measurements
-    sigma = deviations_of(m, fit.noise, problem.light)
+    sigma = deviations_of(m, fit.noise, problem.with_projector)
     size = sizes_of(fit.residuals, sigma)
-    pixels = (np.hypot(*fit.residuals.corners.T), np.abs(fit.residuals.light))
+    pixels = (np.hypot(*fit.residuals.corners.T), np.abs(fit.residuals.matches))
     worst: tuple[float, int, str] | None = None
     for device, name in enumerate(problem.devices):
-        beam = problem.light and device == len(problem.devices) - 1
+        beam = problem.with_projector and device == len(problem.devices) - 1
         kind = 1 if beam else 0
-        pose = m.light_where[:, 1] if beam else m.corner_where[:, 1]
+        pose = m.match_where[:, 1] if beam else m.corner_where[:, 1]
         mine = np.ones(len(pose), dtype=np.bool_) if beam else m.corner_where[:, 0] == device
         median, median_px = np.full(len(names), np.nan), np.full(len(names), np.nan)
         for number in np.unique(pose[mine]):

@@ -62,7 +62,7 @@ def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, 
     narrow, _ = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
     _refuse_open(problem, fit, narrow)
     all_terms = dict.fromkeys(problem.devices, LENS_TERMS)
-    sigma = deviations_of(problem.measurements, fit.noise, problem.light)
+    sigma = deviations_of(problem.measurements, fit.noise, problem.with_projector)
     open_problem = problem if problem.prior is not None else replace(problem, prior=bend)
     free = free_of(open_problem, fit.geometry, all_terms)
     wide = adjusted(
@@ -88,7 +88,7 @@ def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /
 
 def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Covariance of the devices, (15 d, 15 d), and of the bend, (7, 7), which is 0 where it is held."""
-    sigma = deviations_of(problem.measurements, fit.noise, problem.light)
+    sigma = deviations_of(problem.measurements, fit.noise, problem.with_projector)
     kept = kept_of(fit.residuals, sigma)
     weights = weights_of(fit.residuals, sigma, kept)
     matrix = normal_equations(fit.geometry, problem.measurements, weights, prior=problem.prior).matrix

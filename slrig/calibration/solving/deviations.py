@@ -1,11 +1,11 @@
 """How well observations are really known: what they state, what residuals add to it, and how far neighbours err alike.
 
-A device's deviation is sqrt(scale² stated² + excess²), and each of its observations is worth 1/inflation of one. Where
-residuals are less than stated, `scale` is below 1; where they are more, `excess` fills up: both so that the median of
-|residual|/deviation is that of a normal error, 0.6745. `inflation` is for errors that neighbours share (blur, albedo, a
-print that is off): of n residuals that err independently, the square of a sum is on average the sum of squares, and
-where neighbours err alike it is more, by as much as their number tells less than it seems to. It is taken over cells of
-several sizes, and the worst counts.
+A device's deviation is sqrt(scale² stated² + excess²), and each of its observations weighs 1/design_effect of one.
+Where residuals are less than stated, `scale` is below 1; where they are more, `excess` fills up: both so that the
+median of |residual|/deviation is that of a normal error, 0.6745. The design effect (Kish 1965) is of errors that
+neighbours share (blur, albedo, a print that is off): of n residuals that err independently, the square of a sum is on
+average the sum of squares, and where neighbours err alike it is more, by as much as their number tells less than it
+seems to. It is taken over cells of several sizes, and the worst counts.
 """
 
 from __future__ import annotations
@@ -37,15 +37,17 @@ class DeviceNoise:
 
     scale: float = 1.0
     excess_px: float = 0.0
-    inflation: float = 1.0
+    design_effect: float = 1.0
 
 
-def noise_of(residuals: Residuals, measurements: Measurements, devices: int, light: bool, /) -> list[DeviceNoise]:
-    """Scale and excess of each device, with no inflation. `light` : the last device is the projector."""
+def noise_of(
+    residuals: Residuals, measurements: Measurements, devices: int, with_projector: bool, /
+) -> list[DeviceNoise]:
+    """Scale and excess of each device, with no design effect. `with_projector` : the last device is the projector."""
     noise = []
     for device in range(devices):
-        if light and device == devices - 1:
-            noise.append(_fitted(np.abs(residuals.light), measurements.light_sigma, _MEDIAN, 1.0))
+        if with_projector and device == devices - 1:
+            noise.append(_fitted(np.abs(residuals.matches), measurements.match_sigma, _MEDIAN, 1.0))
             continue
         mine = measurements.corner_where[:, 0] == device
         views = len(np.unique(measurements.corner_where[mine, 1]))
@@ -57,14 +59,14 @@ def noise_of(residuals: Residuals, measurements: Measurements, devices: int, lig
     return noise
 
 
-def _fitted(size: FloatArray, stated: FloatArray, median: float, inflation: float) -> DeviceNoise:
+def _fitted(size: FloatArray, stated: FloatArray, median: float, design_effect: float) -> DeviceNoise:
     good = np.isfinite(size)
     size, stated = size[good], stated[good]
     if not len(size):
-        return DeviceNoise(inflation=inflation)
+        return DeviceNoise(design_effect=design_effect)
     ratio = float(np.median(size / stated)) / median
     if ratio <= 1:
-        return DeviceNoise(max(ratio, _LEAST_SCALE), _LEAST_PX, inflation)
+        return DeviceNoise(max(ratio, _LEAST_SCALE), _LEAST_PX, design_effect)
     low, high = 0.0, float(np.median(size)) / median * 2 + float(np.max(stated))
     for _ in range(25):
         middle = (low + high) / 2
@@ -72,53 +74,58 @@ def _fitted(size: FloatArray, stated: FloatArray, median: float, inflation: floa
             low = middle
         else:
             high = middle
-    return DeviceNoise(1.0, high, inflation)
+    return DeviceNoise(1.0, high, design_effect)
 
 
-def deviations_of(measurements: Measurements, noise: Sequence[DeviceNoise], light: bool, /) -> Deviations:
-    """The deviation of each observation, px, and what it is worth."""
+def deviations_of(measurements: Measurements, noise: Sequence[DeviceNoise], with_projector: bool, /) -> Deviations:
+    """The deviation of each observation, px, and its weight beside others."""
     scale = np.array([one.scale for one in noise])
     excess = np.array([one.excess_px for one in noise])
-    inflation = np.array([one.inflation for one in noise])
+    design_effect = np.array([one.design_effect for one in noise])
     device = measurements.corner_where[:, 0]
     corners = np.hypot(scale[device] * measurements.corner_sigma, excess[device])
-    last = noise[-1] if light else DeviceNoise()
-    lit = np.hypot(last.scale * measurements.light_sigma, last.excess_px)
-    return Deviations(corners, lit, 1 / inflation[device], np.full(len(lit), 1 / last.inflation))
+    last = noise[-1] if with_projector else DeviceNoise()
+    lit = np.hypot(last.scale * measurements.match_sigma, last.excess_px)
+    return Deviations(corners, lit, 1 / design_effect[device], np.full(len(lit), 1 / last.design_effect))
 
 
-def inflated(
-    noise: Sequence[DeviceNoise], geometry: Geometry, residuals: Residuals, measurements: Measurements, light: bool, /
+def with_design_effect(
+    noise: Sequence[DeviceNoise],
+    geometry: Geometry,
+    residuals: Residuals,
+    measurements: Measurements,
+    with_projector: bool,
+    /,
 ) -> list[DeviceNoise]:
     """The same noise, with how much neighbours err alike."""
     plain = [DeviceNoise(one.scale, one.excess_px) for one in noise]
-    sigma = deviations_of(measurements, plain, light)
+    sigma = deviations_of(measurements, plain, with_projector)
     made = []
     for device, one in enumerate(plain):
-        if light and device == len(plain) - 1:
-            inflation = _of_light(residuals.light / sigma.light, measurements)
+        if with_projector and device == len(plain) - 1:
+            design_effect = _of_matches(residuals.matches / sigma.matches, measurements)
         else:
             mine = measurements.corner_where[:, 0] == device
             z = residuals.corners / sigma.corners[:, None]
-            inflation = _of_corners(geometry, z, measurements, mine)
-        made.append(DeviceNoise(one.scale, one.excess_px, inflation))
+            design_effect = _of_corners(geometry, z, measurements, mine)
+        made.append(DeviceNoise(one.scale, one.excess_px, design_effect))
     return made
 
 
-def _of_light(z: FloatArray, measurements: Measurements) -> float:
+def _of_matches(z: FloatArray, measurements: Measurements) -> float:
     good = np.isfinite(z) & (np.abs(z) < OUTLYING)
     worst = 1.0
     for cells in _LIGHT_CELLS:
         key = np.zeros(len(z), dtype=np.int32)
         first = 0
-        for rows in groups(measurements.light_where):
-            key[rows] = first + _cells(measurements.light_pixel[rows], cells)
+        for rows in groups(measurements.match_where):
+            key[rows] = first + _cells(measurements.match_pixel[rows], cells)
             first += cells * cells
-        poses = len(np.unique(measurements.light_where[:, 1])) if len(z) else 0
-        worst = max(worst, _alike(z[good], key[good], 6 * poses))
+        poses = len(np.unique(measurements.match_where[:, 1])) if len(z) else 0
+        worst = max(worst, _design_effect(z[good], key[good], 6 * poses))
     for axis in (0, 1):
-        mine = good & (measurements.light_where[:, 2] == axis)
-        worst = max(worst, _alike(z[mine], _cells(measurements.light_pixel[mine], _MAP_CELLS), 5))
+        mine = good & (measurements.match_where[:, 2] == axis)
+        worst = max(worst, _design_effect(z[mine], _cells(measurements.match_pixel[mine], _MAP_CELLS), 5))
     return worst
 
 
@@ -134,7 +141,7 @@ def _of_corners(geometry: Geometry, z: FloatArray, measurements: Measurements, m
             first += cells * cells
         views = len(np.unique(where[good, 1]))
         both = np.concatenate([z[good, 0], z[good, 1]])
-        worst = max(worst, _alike(both, np.concatenate([key[good], key[good] + first]), 6 * views))
+        worst = max(worst, _design_effect(both, np.concatenate([key[good], key[good] + first]), 6 * views))
     # A print that is off errs alike at one corner in all poses, in the board's own directions.
     across = geometry.poses[where[:, 1]].reshape(-1, 12)
     device = geometry.devices[where[:, 0]]
@@ -143,7 +150,7 @@ def _of_corners(geometry: Geometry, z: FloatArray, measurements: Measurements, m
     corner = where[good, 2].astype(np.int64)
     shifted = np.concatenate([corner, corner + len(geometry.points)])
     if len(np.unique(where[good, 1])) >= _LEAST_IN_GROUPS:
-        worst = max(worst, _alike(along.T.ravel(), shifted, 6))
+        worst = max(worst, _design_effect(along.T.ravel(), shifted, 6))
     return worst
 
 
@@ -157,7 +164,7 @@ def _cells(points_px: FloatArray, cells: int) -> IntArray:
     return np.asarray(cell[:, 1] * cells + cell[:, 0], dtype=np.int32)
 
 
-def _alike(z: FloatArray, key: IntArray, taken: int) -> float:
+def _design_effect(z: FloatArray, key: IntArray, taken: int) -> float:
     """Σ over groups (Σ z)² / Σ z², made up for the `taken` numbers that a fit takes of the groups' sums."""
     if not len(z):
         return 1.0

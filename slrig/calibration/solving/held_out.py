@@ -80,20 +80,20 @@ def held_out(
     """
     trained_on = problem.measurements
     m, judged_kept = judged or (trained_on, kept)
-    total = Residuals(np.full_like(m.corner_px, np.nan), np.full_like(m.light_px, np.nan))
+    total = Residuals(np.full_like(m.corner_px, np.nan), np.full_like(m.match_px, np.nan))
     for fold in folds:
         rest = problem.without(fold)
-        sigma = deviations_of(rest.measurements, noise, problem.light)
-        corners, light = fold[trained_on.corner_where[:, 1]], fold[trained_on.light_where[:, 1]]
+        sigma = deviations_of(rest.measurements, noise, problem.with_projector)
+        corners, matches = fold[trained_on.corner_where[:, 1]], fold[trained_on.match_where[:, 1]]
         trained = adjusted(
             geometry, rest.measurements, free_of(rest, geometry, terms), sigma, prior=problem.prior,
-            kept=(kept[0][~corners], kept[1][~light]),
+            kept=(kept[0][~corners], kept[1][~matches]),
         )  # fmt: skip
-        corners, light = fold[m.corner_where[:, 1]], fold[m.light_where[:, 1]]
-        own = m.of(corners, light)
+        corners, matches = fold[m.corner_where[:, 1]], fold[m.match_where[:, 1]]
+        own = m.of(corners, matches)
         left = residuals_of(_placed(problem, trained.geometry, own, fold, noise, judged_kept[0][corners]), own)
-        total.corners[corners], total.light[light] = left.corners, left.light
-    sigma = deviations_of(m, noise, problem.light)
+        total.corners[corners], total.matches[matches] = left.corners, left.matches
+    sigma = deviations_of(m, noise, problem.with_projector)
     return _summed(problem, m.corner_where[:, 0], total, judged_kept, sigma)
 
 
@@ -102,21 +102,21 @@ def _placed(
     kept: FloatArray,
 ) -> Geometry:  # fmt: skip
     """The fold's board poses, fitted to its corners with the devices held."""
-    corners = own.of(np.ones(len(own.corner_px), dtype=np.bool_), np.zeros(len(own.light_px), dtype=np.bool_))
+    corners = own.of(np.ones(len(own.corner_px), dtype=np.bool_), np.zeros(len(own.match_px), dtype=np.bool_))
     free = np.zeros(geometry.layout.count, dtype=np.bool_)
     free[geometry.layout.first_pose : geometry.layout.first_offset] = np.repeat(fold, 6)
-    sigma = deviations_of(corners, noise, problem.light)
+    sigma = deviations_of(corners, noise, problem.with_projector)
     return adjusted(geometry, corners, free, sigma, kept=(kept, np.zeros(0))).geometry
 
 
 def _summed(problem: Problem, camera: IntArray, left: Residuals, kept: Weights, sigma: Deviations) -> HeldOut:
-    corner_loss, light_loss = losses_of(left, sigma)
+    corner_loss, match_loss = losses_of(left, sigma)
     rms, loss = {}, {}
     for device, name in enumerate(problem.devices):
-        if problem.light and device == len(problem.devices) - 1:
-            mine = (kept[1] > 0) & np.isfinite(light_loss)
-            rms[name] = _rms(left.light[mine])
-            loss[name] = float(np.sum(light_loss[mine]))
+        if problem.with_projector and device == len(problem.devices) - 1:
+            mine = (kept[1] > 0) & np.isfinite(match_loss)
+            rms[name] = _rms(left.matches[mine])
+            loss[name] = float(np.sum(match_loss[mine]))
         else:
             mine = (camera == device) & (kept[0] > 0) & np.isfinite(corner_loss)
             rms[name] = _rms(np.hypot(*left.corners[mine].T))
@@ -143,8 +143,10 @@ def chosen_terms(
         return dict.fromkeys(problem.devices, LADDER[1])
     terms = dict.fromkeys(problem.devices, LADDER[-2])
     for device in problem.devices:
-        richest = fitted(problem, fit.geometry, {**terms, device: LADDER[-1]}, rounds=2, alike=True, noise=fit.noise)
-        sigma = deviations_of(problem.measurements, richest.noise, problem.light)
+        richest = fitted(
+            problem, fit.geometry, {**terms, device: LADDER[-1]}, rounds=2, correlated=True, noise=fit.noise
+        )
+        sigma = deviations_of(problem.measurements, richest.noise, problem.with_projector)
         kept = kept_of(richest.residuals, sigma)
         least = loss_of(richest.residuals, sigma, kept)
         losses: list[float] = []

@@ -22,7 +22,7 @@ _ROUNDS = 12
 _LEAST_EACH = 50
 
 
-def projector_start(devices: FloatArray, poses: FloatArray, light: Measurements, size: Size, /) -> FloatArray:
+def projector_start(devices: FloatArray, poses: FloatArray, matches: Measurements, size: Size, /) -> FloatArray:
     """(21,) float64: the projector as a row, without distortion.
 
     devices : (c, 21), cameras; poses : (m, 12).
@@ -32,7 +32,7 @@ def projector_start(devices: FloatArray, poses: FloatArray, light: Measurements,
     SolveRefusedError
         There is too little light along one axis, or what it shows is a mirror image.
     """
-    axis = light.light_where[:, 2]
+    axis = matches.match_where[:, 2]
     counts = [int((axis == one).sum()) for one in (COLUMN, ROW)]
     if min(counts) < _LEAST_EACH:
         message = (
@@ -40,26 +40,26 @@ def projector_start(devices: FloatArray, poses: FloatArray, light: Measurements,
             "and both are needed: shoot the poses with patterns along both axes, so that the light reaches the board"
         )
         raise SolveRefusedError(message)
-    points = met_points(devices, poses, light)
+    points = met_points(devices, poses, matches)
     good = np.isfinite(points).all(axis=1)
-    points, axis, position = points[good], axis[good], light.light_px[good]
+    points, axis, position = points[good], axis[good], matches.match_px[good]
     matrix = _robust(points, axis, position)
     return _decomposed(matrix, points, size)
 
 
-def met_points(devices: FloatArray, poses: FloatArray, light: Measurements) -> FloatArray:
+def met_points(devices: FloatArray, poses: FloatArray, matches: Measurements) -> FloatArray:
     """(k, 3) float64: where each lit pixel's ray meets the flat board, in the world, mm; NaN behind the camera."""
-    points = np.full((len(light.light_px), 3), np.nan)
+    points = np.full((len(matches.match_px), 3), np.nan)
     for camera, device in enumerate(devices):
-        mine = light.light_where[:, 0] == camera
+        mine = matches.match_where[:, 0] == camera
         if not mine.any():
             continue
         matrix = np.array([[device[0], 0, device[2]], [0, device[1], device[3]], [0, 0, 1.0]])
-        flat = cv2.undistortPoints(light.light_pixel[mine].reshape(-1, 1, 2), matrix, device[4:9]).reshape(-1, 2)
+        flat = cv2.undistortPoints(matches.match_pixel[mine].reshape(-1, 1, 2), matrix, device[4:9]).reshape(-1, 2)
         turn, shift = device[9:18].reshape(3, 3), device[18:]
         rays = np.column_stack([flat, np.ones(len(flat))]) @ turn
         origin = -turn.T @ shift
-        board = poses[light.light_where[mine, 1]]
+        board = poses[matches.match_where[mine, 1]]
         normal = board[:, [2, 5, 8]]
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.einsum("ni,ni->n", normal, board[:, 9:] - origin) / np.einsum("ni,ni->n", normal, rays)

@@ -9,7 +9,7 @@ from slrig.calibration.solution import CELLS, DeviceResiduals
 from slrig.calibration.solving.adjustment import kept_of
 from slrig.calibration.solving.deviations import deviations_of
 from slrig.calibration.solving.problem import Fit, Problem
-from slrig.calibration.solving.projection import light_rows
+from slrig.calibration.solving.projection import match_rows
 from slrig.model import FloatArray, IntArray, Size
 
 
@@ -18,19 +18,19 @@ def residuals_of_devices(
 ) -> dict[str, DeviceResiduals]:
     """By device; see `slrig.calibration.solution.DeviceResiduals`."""
     m = problem.measurements
-    sigma = deviations_of(m, fit.noise, problem.light)
+    sigma = deviations_of(m, fit.noise, problem.with_projector)
     kept = kept_of(fit.residuals, sigma)
     found = {}
     for device, name in enumerate(problem.devices):
         held = held_out_px.get(name, np.nan)
-        if problem.light and device == len(problem.devices) - 1:
+        if problem.with_projector and device == len(problem.devices) - 1:
             good = kept[1] > 0
-            vectors = np.full((len(m.light_px), 2), np.nan)
-            axis = m.light_where[:, 2]
-            vectors[np.arange(len(axis)), axis] = fit.residuals.light
+            vectors = np.full((len(m.match_px), 2), np.nan)
+            axis = m.match_where[:, 2]
+            vectors[np.arange(len(axis)), axis] = fit.residuals.matches
             places = np.column_stack([_shown(problem, fit, 0), _shown(problem, fit, 1)])
             found[name] = _summed(
-                problem, places, vectors, m.light_sigma**2, m.light_where[:, 1], good, sizes[name], held
+                problem, places, vectors, m.match_sigma**2, m.match_where[:, 1], good, sizes[name], held
             )
         else:
             mine = m.corner_where[:, 0] == device
@@ -45,11 +45,11 @@ def residuals_of_devices(
 def _shown(problem: Problem, fit: Fit, axis: int) -> FloatArray:
     """(k,) float64: the projector coordinate that each lit pixel should show."""
     m, geometry = problem.measurements, fit.geometry
-    where = m.light_where.copy()
+    where = m.match_where.copy()
     where[:, 2] = axis
-    return light_rows(
-        geometry.devices, geometry.poses, geometry.bend, geometry.frame, where, m.light_pixel,
-        np.zeros_like(m.light_px), jacobian=False,
+    return match_rows(
+        geometry.devices, geometry.poses, geometry.bend, geometry.frame, where, m.match_pixel,
+        np.zeros_like(m.match_px), jacobian=False,
     )[0]  # fmt: skip
 
 

@@ -21,48 +21,48 @@ class Measurements:
     """All observations of some poses by some cameras.
 
     corner_where : (n, 3) int32, camera, pose and corner; corner_px : (n, 2); corner_sigma : (n,), px, as stated.
-    light_where : (k, 3) int32, camera, pose and axis; light_pixel : (k, 2), in the camera; light_px : (k,), projector
-    coordinates; light_sigma : (k,), as stated.
+    match_where : of the correspondences with the projector, (k, 3) int32, camera, pose and axis; match_pixel : (k, 2),
+    in the camera; match_px : (k,), projector coordinates; match_sigma : (k,), as stated.
     """
 
     corner_where: IntArray
     corner_px: FloatArray
     corner_sigma: FloatArray
-    light_where: IntArray
-    light_pixel: FloatArray
-    light_px: FloatArray
-    light_sigma: FloatArray
+    match_where: IntArray
+    match_pixel: FloatArray
+    match_px: FloatArray
+    match_sigma: FloatArray
 
-    def of(self, corners: NDArray[np.bool_], light: NDArray[np.bool_]) -> Measurements:
+    def of(self, corners: NDArray[np.bool_], matches: NDArray[np.bool_]) -> Measurements:
         """Those that are chosen: (n,) and (k,) bool."""
         return Measurements(
-            self.corner_where[corners], self.corner_px[corners], self.corner_sigma[corners], self.light_where[light],
-            self.light_pixel[light], self.light_px[light], self.light_sigma[light],
+            self.corner_where[corners], self.corner_px[corners], self.corner_sigma[corners], self.match_where[matches],
+            self.match_pixel[matches], self.match_px[matches], self.match_sigma[matches],
         )  # fmt: skip
 
-    def of_poses(self, poses: NDArray[np.bool_], /, *, light: bool = True) -> Measurements:
-        """Those of the chosen poses, (m,) bool; without the light if that is not wanted."""
-        return self.of(poses[self.corner_where[:, 1]], poses[self.light_where[:, 1]] & light)
+    def of_poses(self, poses: NDArray[np.bool_], /, *, matches: bool = True) -> Measurements:
+        """Those of the chosen poses, (m,) bool; without their matches if those are not wanted."""
+        return self.of(poses[self.corner_where[:, 1]], poses[self.match_where[:, 1]] & matches)
 
     def thinned(self, limit: int) -> Measurements:
         """The same with at most `limit` correspondences of each camera, pose and axis, spread over its image."""
-        keep = np.zeros(len(self.light_px), dtype=np.bool_)
-        for rows in groups(self.light_where):
-            keep[rows.start + spread(self.light_pixel[rows], limit)] = True
+        keep = np.zeros(len(self.match_px), dtype=np.bool_)
+        for rows in groups(self.match_where):
+            keep[rows.start + spread(self.match_pixel[rows], limit)] = True
         return self.of(np.ones(len(self.corner_px), dtype=np.bool_), keep)
 
 
 def measured(
-    observations: Observations, flipped: Mapping[tuple[int, int], bool], /, *, light_per_view: int
+    observations: Observations, flipped: Mapping[tuple[int, int], bool], /, *, matches_per_view: int
 ) -> Measurements:
     """Flat arrays of all poses; what is not finite, or has no positive deviation, is left out.
 
     flipped : by (camera, pose), whether that view's corners are counted from the board's other end.
-    light_per_view : at most as many correspondences of each camera, pose and axis are used, spread over its image.
+    matches_per_view : at most as many correspondences of each camera, pose and axis are used, spread over its image.
     """
     last = observations.board.corner_count - 1
     corners: list[tuple[IntArray, FloatArray, FloatArray]] = []
-    light: list[tuple[IntArray, FloatArray, FloatArray, FloatArray]] = []
+    matches: list[tuple[IntArray, FloatArray, FloatArray, FloatArray]] = []
     for number, pose in enumerate(observations.poses):
         for camera, name in enumerate(observations.cameras):
             view = pose.views.get(name)
@@ -71,21 +71,21 @@ def measured(
                 where = np.column_stack([np.full((len(corner), 2), (camera, number)), corner]).astype(np.int32)
                 good = np.isfinite(view.points_px).all(axis=1) & (view.sigma_px > 0) & np.isfinite(view.sigma_px)
                 corners.append((where[good], view.points_px[good], view.sigma_px[good]))
-            seen = pose.light.get(name)
+            seen = pose.correspondences.get(name)
             if seen is not None and len(seen.axis) and observations.projector is not None:
-                light.append(_light_rows(camera, number, seen, light_per_view))
+                matches.append(_match_rows(camera, number, seen, matches_per_view))
     return Measurements(
         np.concatenate([np.zeros((0, 3), np.int32), *(part[0] for part in corners)]),
         np.concatenate([np.zeros((0, 2)), *(part[1] for part in corners)]),
         np.concatenate([np.zeros(0), *(part[2] for part in corners)]),
-        np.concatenate([np.zeros((0, 3), np.int32), *(part[0] for part in light)]),
-        np.concatenate([np.zeros((0, 2)), *(part[1] for part in light)]),
-        np.concatenate([np.zeros(0), *(part[2] for part in light)]),
-        np.concatenate([np.zeros(0), *(part[3] for part in light)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *(part[0] for part in matches)]),
+        np.concatenate([np.zeros((0, 2)), *(part[1] for part in matches)]),
+        np.concatenate([np.zeros(0), *(part[2] for part in matches)]),
+        np.concatenate([np.zeros(0), *(part[3] for part in matches)]),
     )
 
 
-def _light_rows(
+def _match_rows(
     camera: int, pose: int, seen: Correspondences, limit: int
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     finite = np.isfinite(seen.pixels_px).all(axis=1) & np.isfinite(seen.position_px)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import Board
 from slrig.calibration.solving.adjustment import Adjustment, Prior, Residuals, adjusted, residuals_of
-from slrig.calibration.solving.deviations import DeviceNoise, deviations_of, inflated, noise_of
+from slrig.calibration.solving.deviations import DeviceNoise, deviations_of, noise_of, with_design_effect
 from slrig.calibration.solving.measurements import Measurements
 from slrig.calibration.solving.parameters import Geometry
 from slrig.model import FloatArray
@@ -22,19 +22,19 @@ Terms = Mapping[str, tuple[str, ...]]
 class Problem:
     """Measurements of poses by devices. devices : names, cameras first; pose_names : all poses, used or not.
 
-    light : whether the last device is the projector. prior : None for a flat board that is as printed.
+    with_projector : whether the last device is the projector. prior : None for a flat board that is as printed.
     """
 
     devices: tuple[str, ...]
     pose_names: tuple[str, ...]
-    light: bool
+    with_projector: bool
     measurements: Measurements
     prior: Prior | None = None
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The names of the cameras."""
-        return self.devices[:-1] if self.light else self.devices
+        return self.devices[:-1] if self.with_projector else self.devices
 
     @property
     def used(self) -> NDArray[np.bool_]:
@@ -50,7 +50,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A geometry that fits, what is left, and what the observations are worth by it."""
+    """A geometry that fits, what is left, and what the observations weigh by it."""
 
     geometry: Geometry
     residuals: Residuals
@@ -90,12 +90,13 @@ def with_terms(geometry: Geometry, problem: Problem, terms: Terms, /) -> Geometr
 
 
 def fitted(
-    problem: Problem, geometry: Geometry, terms: Terms, /, *, rounds: int = 4, alike: bool = False,
+    problem: Problem, geometry: Geometry, terms: Terms, /, *, rounds: int = 4, correlated: bool = False,
     noise: Sequence[DeviceNoise] | None = None,
 ) -> Fit:  # fmt: skip
     """The geometry that fits, and deviations that fit it: in turns, since the weights need both.
 
-    alike : take into account that neighbours err alike. noise : what to start from; without it, the residuals tell.
+    correlated : take into account that neighbours err alike. noise : what to start from; without it, the residuals
+    tell.
     """
     geometry = with_terms(geometry, problem, terms)
     free = free_of(problem, geometry, terms)
@@ -105,14 +106,14 @@ def fitted(
     made: Adjustment | None = None
     for turn in range(rounds):
         if current is None:
-            current = tuple(noise_of(residuals_of(geometry, measurements), measurements, count, problem.light))
-        sigma = deviations_of(measurements, current, problem.light)
+            current = tuple(noise_of(residuals_of(geometry, measurements), measurements, count, problem.with_projector))
+        sigma = deviations_of(measurements, current, problem.with_projector)
         made = adjusted(geometry, measurements, free, sigma, prior=problem.prior)
         geometry = made.geometry
         before = current
-        current = tuple(noise_of(made.residuals, measurements, count, problem.light))
-        if alike:
-            current = tuple(inflated(current, geometry, made.residuals, measurements, problem.light))
+        current = tuple(noise_of(made.residuals, measurements, count, problem.with_projector))
+        if correlated:
+            current = tuple(with_design_effect(current, geometry, made.residuals, measurements, problem.with_projector))
         if turn and _same(before, current):
             break
     if made is None or current is None:
@@ -124,7 +125,11 @@ def fitted(
 def _same(first: Sequence[DeviceNoise], second: Sequence[DeviceNoise]) -> bool:
     """Whether the weights are all but what they were."""
     for one, other in zip(first, second, strict=True):
-        for a, b in ((one.scale, other.scale), (one.excess_px, other.excess_px), (one.inflation, other.inflation)):
+        for a, b in (
+            (one.scale, other.scale),
+            (one.excess_px, other.excess_px),
+            (one.design_effect, other.design_effect),
+        ):
             if abs(a - b) > 0.02 * max(abs(a), abs(b)) + 1e-4:
                 return False
     return True

@@ -51,7 +51,7 @@ def corner_rows(
     return residual, rows
 
 
-def light_rows(
+def match_rows(
     devices: FloatArray, poses: FloatArray, bend: FloatArray, frame: FloatArray, where: Any, pixels: FloatArray,
     positions: FloatArray, /, *, jacobian: bool = True,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip

@@ -59,8 +59,10 @@ def chosen_shape(
     dealt = folds_of(problem, folds)
     if len(shapes) == 1 or not dealt:
         return shapes[0]
-    richest = fitted(replace(problem, prior=shapes[-1]), fit.geometry, terms, rounds=2, alike=True, noise=fit.noise)
-    sigma = deviations_of(problem.measurements, richest.noise, problem.light)
+    richest = fitted(
+        replace(problem, prior=shapes[-1]), fit.geometry, terms, rounds=2, correlated=True, noise=fit.noise
+    )
+    sigma = deviations_of(problem.measurements, richest.noise, problem.with_projector)
     kept = kept_of(richest.residuals, sigma)
     losses: list[float] = []
     seen: list[float] = []

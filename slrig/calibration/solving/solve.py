@@ -33,15 +33,15 @@ Progress = Callable[[str, float, str], None]
 
 @dataclass(frozen=True, slots=True)
 class SolveOptions:
-    """light_per_view, trial_light_per_view : at most as many correspondences of each camera, pose and axis, spread over
-    its image, go into the result, and into what is tried on the way. folds : of held-out poses. margin : what a
+    """matches_per_view, trial_matches_per_view : at most as many correspondences of each camera, pose and axis, spread
+    over its image, go into the result, and into what is tried on the way. folds : of held-out poses. margin : what a
     lens term must take off the loss at held-out poses, in squared deviations (`slrig.calibration.solving.held_out`).
     board_shape : whether the board may be bent and its corners off their printed places
     (`slrig.calibration.solving.shape`).
     """
 
-    light_per_view: int = 3000
-    trial_light_per_view: int = 300
+    matches_per_view: int = 3000
+    trial_matches_per_view: int = 300
     folds: int = 5
     margin: float = 4.0
     board_shape: BoardShape = BoardShape.AUTO
@@ -70,12 +70,12 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
     _refuse_few(observations)
     progress("cameras", 0.0, f"each of {len(names)} cameras from {len(observations.poses)} poses")
     start = start_of(observations)
-    measurements = measured(observations, start.flipped, light_per_view=options.light_per_view)
+    measurements = measured(observations, start.flipped, matches_per_view=options.matches_per_view)
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(start.poses).all(axis=1))
     poses = tuple(pose.name for pose in observations.poses)
     outliers = {name: _unseen() for name, good in zip(poses, seen, strict=True) if not good}
     everything = Problem((*names,), poses, False, measurements.of_poses(seen))
-    corners_only = replace(everything, measurements=everything.measurements.of_poses(seen, light=False))
+    corners_only = replace(everything, measurements=everything.measurements.of_poses(seen, matches=False))
     # Poses are compared under a lens that can be right: with one that cannot, those at the image's border are off.
     terms = dict.fromkeys([*names, PROJECTOR], LADDER[-2] if int(seen.sum()) >= LEAST_HELD_OUT else LADDER[1])
     geometry = flat_geometry(observations.board, start.devices, start.poses)
@@ -91,9 +91,9 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
     if observations.projector is not None:
         progress("projector", 0.15, "the projector, from the light on the board")
         sizes[PROJECTOR] = observations.projector
-        light = everything.measurements.of_poses(corners_only.used)
-        problem = replace(everything, devices=(*names, PROJECTOR), light=True, measurements=light)
-        trial = replace(problem, measurements=light.thinned(options.trial_light_per_view))
+        matches = everything.measurements.of_poses(corners_only.used)
+        problem = replace(everything, devices=(*names, PROJECTOR), with_projector=True, measurements=matches)
+        trial = replace(problem, measurements=matches.thinned(options.trial_matches_per_view))
         beam = projector_start(fit.geometry.devices, fit.geometry.poses, trial.measurements, observations.projector)
         joined = replace(fit.geometry, devices=np.vstack([fit.geometry.devices, beam]))
         trial, fit = _agreeing_in_shape(trial, joined, terms, outliers, shapes, options)
@@ -113,7 +113,7 @@ def _finished(
     sizes: dict[str, Size], options: SolveOptions, progress: Progress,
 ) -> Solution:  # fmt: skip
     progress("adjustment", 0.7, "devices, poses and light together")
-    fit = fitted(problem, fit.geometry, terms, alike=True)
+    fit = fitted(problem, fit.geometry, terms, correlated=True)
     refuse_bump(problem, fit, free_of(problem, fit.geometry, terms))
     progress("held out", 0.85, "poses that the solve has not seen")
     held = _held_out_px(problem, fit, terms, options)
@@ -139,13 +139,13 @@ def _finished(
 
 
 def _held_out_px(problem: Problem, fit: Fit, terms: Terms, options: SolveOptions) -> dict[str, float]:
-    trial = replace(problem, measurements=problem.measurements.thinned(options.trial_light_per_view))
+    trial = replace(problem, measurements=problem.measurements.thinned(options.trial_matches_per_view))
     dealt = folds_of(trial, options.folds)
     if not dealt:
         return {}
     start = fitted(trial, fit.geometry, terms, rounds=1, noise=fit.noise)
-    kept = kept_of(start.residuals, deviations_of(trial.measurements, fit.noise, trial.light))
-    counted = kept_of(fit.residuals, deviations_of(problem.measurements, fit.noise, problem.light))
+    kept = kept_of(start.residuals, deviations_of(trial.measurements, fit.noise, trial.with_projector))
+    counted = kept_of(fit.residuals, deviations_of(problem.measurements, fit.noise, problem.with_projector))
     judged = (problem.measurements, counted)
     return dict(held_out(trial, start.geometry, terms, fit.noise, dealt, kept, judged=judged).rms_px)
 

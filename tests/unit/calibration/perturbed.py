@@ -79,7 +79,7 @@ def ray_directions(device: Pinhole, pixels_px: FloatArray) -> FloatArray:
     return np.asarray(rays @ device.rotation)
 
 
-def met_with_light(
+def met_with_projector(
     camera: Pinhole, projector: Pinhole, pixels_px: FloatArray, position_px: FloatArray, start_mm: FloatArray, axis: int
 ) -> FloatArray:
     """(n, 3): the points on the pixels' rays that the projector lights with these columns (axis 0) or rows (1)."""

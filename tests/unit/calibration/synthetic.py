@@ -20,7 +20,7 @@ _FIELD = 64
 
 @dataclass(frozen=True)
 class Recipe:
-    """What to make. Noise in px: corner_px white; light_px white; alike_px of an error that neighbours share, over a
+    """What to make. Noise in px: corner_px white; match_px white; alike_px of an error that neighbours share, over a
     twentieth of the board; outlying : the share of light that is off by up to 40 px; stated_share : stated deviations
     over true ones. side : lit places along each side of the board. bumped : a device, and the first pose after its
     bump; moved_pose : one in which the board moves between the cameras. flipped : views counted from the other end.
@@ -32,7 +32,7 @@ class Recipe:
     cameras: int = 1
     projector: bool = True
     corner_px: float = 0.05
-    light_px: float = 0.05
+    match_px: float = 0.05
     alike_px: float = 0.03
     outlying: float = 0.01
     most_tilt_deg: float = 35.0
@@ -174,7 +174,7 @@ def _light(
         cloud *= recipe.alike_px / cloud.std()
         extent = np.array([right - left, bottom - top]) + 1e-9
         cell = np.floor((flat[:, :2] - [left, top]) / extent * _FIELD).astype(int)
-        shown = positions[:, axis] + rng.normal(0, recipe.light_px, len(flat)) + cloud[cell[:, 1], cell[:, 0]]
+        shown = positions[:, axis] + rng.normal(0, recipe.match_px, len(flat)) + cloud[cell[:, 1], cell[:, 0]]
         wrong = rng.random(len(flat)) < recipe.outlying
         shown = np.where(wrong, shown + rng.uniform(-40, 40, len(flat)), shown)
         parts.append((pixels[good], np.full(good.sum(), axis, np.uint8), shown[good]))
@@ -183,5 +183,5 @@ def _light(
         np.concatenate([part[0] for part in parts]),
         np.concatenate([part[1] for part in parts]),
         np.concatenate([part[2] for part in parts]),
-        np.full(count, max(recipe.light_px, 1e-4) * recipe.stated_share),
+        np.full(count, max(recipe.match_px, 1e-4) * recipe.stated_share),
     )

@@ -18,7 +18,7 @@ from tests.unit.calibration.perturbed import (
     covariance_by_known_points,
     left_camera,
     light_source,
-    met_with_light,
+    met_with_projector,
     pixels,
     ray_directions,
     right_camera,
@@ -86,7 +86,9 @@ def by_light(camera: Pinhole, projector: Pinhole, points: FloatArray, change: Fl
     """By how far points move when the camera's and the projector's parameters change: found again, either way."""
     at, lit = pixels(camera, points), pixels(projector, points)[:, axis]
     ends = [
-        met_with_light(changed(camera, s * change[:15]), changed(projector, s * change[-15:]), at, lit, points, axis)
+        met_with_projector(
+            changed(camera, s * change[:15]), changed(projector, s * change[-15:]), at, lit, points, axis
+        )
         for s in (1, -1)
     ]
     return np.asarray((ends[0] - ends[1]) / 2)

@@ -7,11 +7,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import judged
+from slrig.calibration.health.verification import Verification
 from slrig.verify.plot import health_svg
 from slrig.verify.store import VerificationRecord
-from tests.unit.verify.health_bench import a_look, hours
+from tests.unit.verify.health_bench import a_verification, hours
 
 parsed = ElementTree.fromstring
 _SVG = "{http://www.w3.org/2000/svg}"
@@ -21,19 +21,25 @@ def warm_up() -> list[VerificationRecord]:
     """A rig that warms up, is calibrated again, and is then knocked."""
     rng = np.random.default_rng(0)
     records: list[VerificationRecord] = []
-    looks: list[Look] = []
+    verifications: list[Verification] = []
     for number in range(60):
         if number in (0, 36):
-            looks = []
+            verifications = []
         share = 1 - np.exp(-number / 12)
         scatter = rng.normal(0, 0.04)
         if number < 36:
-            look = a_look(1 + 2.4 * share + scatter, mean_px=0.14 * share + scatter / 9, evidence=30 * share)
+            found = a_verification(1 + 2.4 * share + scatter, mean_px=0.14 * share + scatter / 9, evidence=30 * share)
         else:
-            look = a_look(1 + scatter, mean_px=scatter / 9) if number < 54 else a_look(4.4, mean_px=0.42, evidence=900)
-        looks.append(look)
+            found = (
+                a_verification(1 + scatter, mean_px=scatter / 9)
+                if number < 54
+                else a_verification(4.4, mean_px=0.42, evidence=900)
+            )
+        verifications.append(found)
         name = "one" if number < 36 else "two"
-        records.append(VerificationRecord(number, UUID(int=number), hours(number / 4), name, look, judged(looks)))
+        records.append(
+            VerificationRecord(number, UUID(int=number), hours(number / 4), name, found, judged(verifications))
+        )
     return records
 
 
@@ -67,5 +73,5 @@ def test_one_verification_and_none_are_drawn_too() -> None:
 
 def test_words_in_the_picture_are_escaped() -> None:
     record = warm_up()[0]
-    odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", record.look, judged([]))
+    odd = VerificationRecord(1, UUID(int=1), hours(0), "<b>", record.found, judged([]))
     assert "<b>" not in health_svg([odd, record])

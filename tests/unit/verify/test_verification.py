@@ -15,8 +15,8 @@ import pytest
 
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import Health, HealthState
+from slrig.calibration.health.verification import Verification
 from slrig.calibration.observations import PoseObservation
 from slrig.calibration.poses.figures import ViewFigures
 from slrig.devices import Rig
@@ -44,7 +44,7 @@ from slrig.verify.verification import (
     verify_bundle,
 )
 from tests.unit.calibration.health.drifting import bench
-from tests.unit.verify.health_bench import a_look, hours
+from tests.unit.verify.health_bench import a_verification, hours
 
 BOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
 CALIBRATION = bench().calibration
@@ -63,16 +63,16 @@ class JobQueue:
         self,
         work: Callable[[Rig, Callable[[], bool]], None],
         *,
+        work_id: UUID,  # noqa: ARG002 - as the real one
         holder: Holder,  # noqa: ARG002 - as the real one
         wait: bool,
         ended: Callable[[Exception | None], None],
-        begun: Callable[[UUID], None],
-    ) -> UUID:
+        begun: Callable[[], object],
+    ) -> None:
         if self.held and not wait:
             message = f"The rig is held by {self.held} since 06:00."
             raise RigBusyError(message, holder=self.held, since="06:00")
-        work_id = uuid4()
-        begun(work_id)
+        begun()
         rig = Rig("bench", {}, cast("Any", None), {}, self.calibration)
         error: Exception | None = self.error
         if error is None:
@@ -81,7 +81,6 @@ class JobQueue:
             except Exception as found:  # noqa: BLE001 - as the real one
                 error = found
         ended(error)
-        return work_id
 
     def cancel_work(self, work_id: UUID) -> None:
         self.recalled.append(work_id)
@@ -106,11 +105,11 @@ def moving(_folder: Path, _board: Board, name: str) -> ReadPose:
     return ReadPose(PoseObservation(name, {}), {"left": ViewFigures(0.9, 0.0, 0.5, 0.7, 1.0)})
 
 
-def look(_poses: Sequence[Any], _board: Board, _calibration: Calibration) -> Look:
-    return a_look()
+def look(_poses: Sequence[Any], _board: Board, _calibration: Calibration) -> Verification:
+    return a_verification()
 
 
-TAME = VerificationTools(capture=cast("Any", capture), read=read, look=look)
+TAME = VerificationTools(capture=cast("Any", capture), read=read, judge=look)
 
 
 @pytest.fixture
@@ -187,7 +186,7 @@ def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, stor
 
 
 def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, store: HealthStore) -> None:
-    tools = VerificationTools(capture=cast("Any", capture), read=moving, look=look)
+    tools = VerificationTools(capture=cast("Any", capture), read=moving, judge=look)
     job = done(desk_of(folder, store, JobQueue(), tools=tools))
     assert job.state is JobState.FAILED
     assert job.fault is not None
@@ -209,7 +208,7 @@ def test_one_that_the_end_of_the_service_cuts_off_is_interrupted(folder: DataFol
     def cut_off(*_: Any, **__: Any) -> None:
         raise interruption()
 
-    tools = VerificationTools(capture=cut_off, read=read, look=look)
+    tools = VerificationTools(capture=cut_off, read=read, judge=look)
     assert done(desk_of(folder, store, JobQueue(), tools=tools)).state is JobState.INTERRUPTED
 
 
@@ -227,9 +226,8 @@ def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
     class Held(JobQueue):
         """Never begins what is submitted."""
 
-        def submit_work(self, *_: Any, begun: Callable[[UUID], None], **__: Any) -> UUID:
-            begun(work_id := uuid4())
-            return work_id
+        def submit_work(self, *_: Any, begun: Callable[[], object], **__: Any) -> None:
+            begun()
 
     before = desk_of(folder, store, Held())
     waiting, shot = before.shoot(BOARD, wait=True), before.shoot(BOARD, wait=True)
@@ -252,8 +250,8 @@ def test_only_so_many_finished_ones_stay_on_record(folder: DataFolder, store: He
 
 def test_a_recorded_pose_is_judged(tmp_path: Path) -> None:
     capture(cast("Rig", None), None, tmp_path / "pose")
-    assert verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=TAME).document() == a_look().document()
-    tools = VerificationTools(read=moving, look=look)
+    assert verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=TAME).document() == a_verification().document()
+    tools = VerificationTools(read=moving, judge=look)
     with pytest.raises(PoseRefusedError, match="put it on a stand"):
         verify_bundle(tmp_path / "pose", BOARD, CALIBRATION, tools=tools)
 
@@ -268,7 +266,7 @@ def test_a_stale_rig_refuses_scans_if_its_file_says_so() -> None:
 
 
 def test_a_scan_is_stamped_with_the_health_of_its_time(store: HealthStore) -> None:
-    record = store.add(a_look(), calibration=CALIBRATION.solve_id, at=hours(2))
+    record = store.add(a_verification(), calibration=CALIBRATION.solve_id, at=hours(2))
     stamp = health_stamp(record.health, record)
     assert stamp["state"] == "good"
     assert stamp["verification"] == str(record.id)

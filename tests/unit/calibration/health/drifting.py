@@ -23,7 +23,7 @@ from tests.unit.calibration.perturbed import (
     draws,
     left_camera,
     light_source,
-    met_with_light,
+    met_with_projector,
     pixels,
     right_camera,
 )
@@ -113,7 +113,7 @@ def true_error_mm(now: Mapping[str, Pinhole], calibration: Calibration) -> float
     for name, stated in calibration.cameras.items():
         at = pixels(now[name], places)
         weight = ((pixels(now[name], farther) - at) ** 2).sum(axis=1)
-        found += weight[:, None] * met_with_light(stated, calibration.projector, at, lit, places, 0)
+        found += weight[:, None] * met_with_projector(stated, calibration.projector, at, lit, places, 0)
         total += weight
     off = aligned(found / total[:, None], places) - places
     ray = places - now["left"].centre_mm

@@ -8,17 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.health.look import Look, PairFigures
-from slrig.calibration.health.looking import look_at_board
 from slrig.calibration.health.verdict import HealthState, judged
+from slrig.calibration.health.verification import PairFigures, Verification
+from slrig.calibration.health.verifying import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from tests.unit.calibration.health.drifting import BOARD, bench, look_of, true_error_mm, turned, zoomed
 
 
-def figures(error_ratio: float = 1.0, *, mean_px: float = 0.01, rms_px: float = 0.05, evidence: float = 0.0) -> Look:
+def figures(
+    error_ratio: float = 1.0, *, mean_px: float = 0.01, rms_px: float = 0.05, evidence: float = 0.0
+) -> Verification:
     """A look with these figures."""
     pair = PairFigures("left", PROJECTOR, 2000, mean_px, rms_px, 0.04, 0.002)
-    return Look("board", (pair,), expected_mm=0.01 * error_ratio, stated_mm=0.01, significance=evidence**0.5,
+    return Verification("board", (pair,), expected_mm=0.01 * error_ratio, stated_mm=0.01, significance=evidence**0.5,
                 evidence=evidence)  # fmt: skip
 
 
@@ -27,7 +29,7 @@ def test_nothing_verified_is_unknown() -> None:
 
 
 @pytest.mark.parametrize(
-    ("look", "state"),
+    ("found", "state"),
     [
         (figures(), HealthState.GOOD),
         (figures(1.3), HealthState.GOOD),
@@ -42,8 +44,8 @@ def test_nothing_verified_is_unknown() -> None:
         (figures(rms_px=0.06), HealthState.GOOD),
     ],
 )
-def test_thresholds(look: Look, state: HealthState) -> None:
-    assert judged([look]).state is state
+def test_thresholds(found: Verification, state: HealthState) -> None:
+    assert judged([found]).state is state
 
 
 def test_residuals_that_double_are_watched() -> None:
@@ -85,10 +87,10 @@ def test_a_creeping_size_is_watched_and_scatter_is_not() -> None:
 @pytest.mark.slow
 def test_clean_captures_raise_no_alarm() -> None:
     rig = bench(4)
-    looks: list[Look] = []
+    verifications: list[Verification] = []
     for seed in range(8):
-        looks.append(look_at_board([look_of(rig.devices, seed)], BOARD, rig.calibration))
-        assert judged(looks).state is HealthState.GOOD
+        verifications.append(verify_by_board([look_of(rig.devices, seed)], BOARD, rig.calibration))
+        assert judged(verifications).state is HealthState.GOOD
 
 
 @pytest.mark.slow
@@ -97,26 +99,26 @@ def test_no_alarm_on_many_clean_captures() -> None:
     count = int(os.environ.get("SLRIG_CLEAN_CAPTURES", "60"))
     for number in range(2):
         rig = bench(10 + number)
-        looks: list[Look] = []
+        verifications: list[Verification] = []
         for seed in range(count // 2):
-            looks.append(look_at_board([look_of(rig.devices, 1000 * number + seed)], BOARD, rig.calibration))
-            assert judged(looks).state is HealthState.GOOD
+            verifications.append(verify_by_board([look_of(rig.devices, 1000 * number + seed)], BOARD, rig.calibration))
+            assert judged(verifications).state is HealthState.GOOD
 
 
 @pytest.mark.slow
 def test_a_warm_up_over_60_captures_is_watched_before_the_error_doubles() -> None:
     rig = bench(2, known_px=0.05)
-    looks: list[Look] = []
+    verifications: list[Verification] = []
     states, errors_mm = [], []
     for capture in range(60):
         share = 1.6 * (1 - np.exp(-capture / 60))
         lamp = zoomed(turned(rig.devices[PROJECTOR], (0.001 * share, 0.006 * share, 0)), 1e-4 * share)
         now = {**rig.devices, PROJECTOR: lamp}
-        looks.append(look_at_board([look_of(now, capture)], BOARD, rig.calibration))
-        states.append(judged(looks).state)
+        verifications.append(verify_by_board([look_of(now, capture)], BOARD, rig.calibration))
+        states.append(judged(verifications).state)
         errors_mm.append(true_error_mm(now, rig.calibration))
     alarm = next(at for at, state in enumerate(states) if state is not HealthState.GOOD)
-    stated = max(errors_mm[0], float(looks[0].stated_mm or 0))
+    stated = max(errors_mm[0], float(verifications[0].stated_mm or 0))
     doubled = next(at for at, error in enumerate(errors_mm) if error > 2 * stated)
     assert states[alarm] is HealthState.WATCH
     assert alarm < doubled

@@ -24,7 +24,7 @@ from tests.unit.calibration.perturbed import (
     draws,
     left_camera,
     light_source,
-    met_with_light,
+    met_with_projector,
     pixels,
     ray_directions,
     right_camera,
@@ -95,7 +95,7 @@ def test_the_error_is_that_of_calibrations_drawn_from_the_covariance() -> None:
     count = 300
     for change in draws(solution.covariance, count, 2):
         wrong = changed(camera, change[:15]), changed(projector, change[15:])
-        found = met_with_light(*wrong, at, lit, places, 0)
+        found = met_with_projector(*wrong, at, lit, places, 0)
         squares += along_rays(aligned(found, places), places, camera) ** 2 / count
         found_length = np.linalg.norm(found[pairs[:, 1]] - found[pairs[:, 0]], axis=1)
         shares += float(((found_length / length - 1) ** 2).mean()) / count
@@ -112,7 +112,7 @@ def test_noise_is_that_of_the_light_of_one_point() -> None:
     places = stated.grid_mm
     at, lit = pixels(camera, places), pixels(projector, places)[:, 0]
     noise = np.random.default_rng(0).normal(0, 0.02 * FITTED, len(places))
-    found = met_with_light(camera, projector, at, lit + noise, places, 0)
+    found = met_with_projector(camera, projector, at, lit + noise, places, 0)
     assert np.sqrt((along_rays(found, places, camera) ** 2).mean()) == pytest.approx(stated.noise_mm, rel=0.05)
     assert stated.total_mm == pytest.approx(np.hypot(stated.point_mm, stated.noise_mm))
     given = expected_error(solution, observations, noise_px=0.06 * FITTED)

@@ -58,9 +58,9 @@ def test_a_good_pose_is_accepted_and_measured(
     assert answer.refusals == answer.warnings == ()
     assert answer.corners_found == {"left": 88, "right": 88}
     assert answer.corners_expected == 88
-    stood = held(CHESSBOARD, tilt=(-30.0, 10.0), middle_mm=(-60.0, -40.0, 570.0))
+    board_pose = held(CHESSBOARD, tilt=(-30.0, 10.0), middle_mm=(-60.0, -40.0, 570.0))
     sight = np.array([-60.0, -40.0, 570.0]) / np.linalg.norm([-60.0, -40.0, 570.0])
-    steep_deg = np.degrees(np.arccos(abs(stood.rotation[:, 2] @ sight)))
+    steep_deg = np.degrees(np.arccos(abs(board_pose.rotation[:, 2] @ sight)))
     assert answer.tilt_deg["left"] == pytest.approx(steep_deg, abs=1.0)
     assert answer.distance_mm["left"] == pytest.approx(570.0, rel=0.01)
     assert answer.coverage.poses == ("pose_00", "pose_01", "pose_02", "pose_03")
@@ -202,7 +202,7 @@ def test_a_board_in_no_camera_is_refused(
 def test_a_board_without_light_is_refused_where_a_projector_is_calibrated(
     shooting: Shooting, pose: PoseObservation, earlier: list[PoseObservation]
 ) -> None:
-    dark = replace(pose, light={})
+    dark = replace(pose, correspondences={})
     assert any("no light of the projector" in words for words in _answer(shooting, dark, earlier).refusals)
     cameras = {name: size for name, size in shooting.sizes.items() if name != PROJECTOR}
     assert judge_pose(dark, BOTH, earlier, CHESSBOARD, cameras).accepted

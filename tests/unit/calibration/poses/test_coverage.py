@@ -40,9 +40,9 @@ def _followed(shooting: Shooting, advice: Advice) -> BoardPose:
     """The pose in the world of a person who does exactly what the outline in the picture shows."""
     assert advice.camera is not None
     assert advice.candidate is not None
-    camera, stood = shooting.devices[advice.camera], advice.candidate.stood
-    rotation = camera.rotation.T @ stood.rotation
-    return BoardPose(rotation, camera.rotation.T @ (stood.translation_mm - camera.translation_mm))
+    camera, board_pose = shooting.devices[advice.camera], advice.candidate.board_pose
+    rotation = camera.rotation.T @ board_pose.rotation
+    return BoardPose(rotation, camera.rotation.T @ (board_pose.translation_mm - camera.translation_mm))
 
 
 def test_cells_count_points_where_they_lie() -> None:
@@ -58,10 +58,10 @@ def test_cells_count_points_where_they_lie() -> None:
     ("tilt", "near"), [((30.0, 0.0), "top"), ((-30.0, 0.0), "bottom"), ((0.0, 30.0), "right"), ((0.0, -30.0), "left")]
 )
 def test_a_tilt_is_named_by_the_edge_that_comes_nearer(tilt: tuple[float, float], near: str) -> None:
-    stood = held(CHESSBOARD, tilt=tilt)
-    found = attitude(stood, CHESSBOARD.points_mm.mean(axis=0))
+    board_pose = held(CHESSBOARD, tilt=tilt)
+    found = attitude(board_pose, CHESSBOARD.points_mm.mean(axis=0))
     assert found.tilt_deg == pytest.approx(tilt, abs=1e-6)
-    depth = (CHESSBOARD.points_mm @ stood.rotation.T + stood.translation_mm)[:, 2].reshape(8, 11)
+    depth = (CHESSBOARD.points_mm @ board_pose.rotation.T + board_pose.translation_mm)[:, 2].reshape(8, 11)
     edges = {
         "top": depth[0].mean(),
         "bottom": depth[-1].mean(),
@@ -73,10 +73,10 @@ def test_a_tilt_is_named_by_the_edge_that_comes_nearer(tilt: tuple[float, float]
 
 
 def test_a_turn_is_clockwise_in_the_picture() -> None:
-    stood = held(CHESSBOARD, in_plane_deg=30.0)
-    assert attitude(stood, np.zeros(3)).turn_deg == pytest.approx(30.0)
+    board_pose = held(CHESSBOARD, in_plane_deg=30.0)
+    assert attitude(board_pose, np.zeros(3)).turn_deg == pytest.approx(30.0)
     # y runs down: after a clockwise turn, the board's right end lies lower in the picture than its left one.
-    ends = CHESSBOARD.points_mm[[0, 10]] @ stood.rotation.T
+    ends = CHESSBOARD.points_mm[[0, 10]] @ board_pose.rotation.T
     assert ends[1, 1] > ends[0, 1]
 
 
@@ -86,8 +86,8 @@ def test_a_board_that_looks_the_same_after_half_a_turn_is_not_asked_to_be_turned
     assert full_turn_deg(CHESSBOARD) == full_turn_deg(Board(BoardKind.CHARUCO, 9, 7, 12.0)) == 360
     for board, turns in ((alike, 1), (Board(BoardKind.CHARUCO, 9, 7, 12.0), 2)):
         shooting = _shooting(board, only=("left",))
-        stood = [held(board, tilt=(20.0, 0.0)), held(board, tilt=(0.0, 20.0), in_plane_deg=180.0)]
-        poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(stood)]
+        board_pose = [held(board, tilt=(20.0, 0.0)), held(board, tilt=(0.0, 20.0), in_plane_deg=180.0)]
+        poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
         assert coverage(poses, board, shooting.sizes).devices["left"].turns == turns
 
 
@@ -124,14 +124,14 @@ def test_a_guess_holds_with_parallel_poses_and_with_none(count: int) -> None:
 
 def test_coverage_counts_cells_depths_tilts_and_turns() -> None:
     shooting = _shooting()
-    stood = [
+    board_pose = [
         held(CHESSBOARD),
         held(CHESSBOARD, tilt=(30.0, 0.0), middle_mm=(0.0, 0.0, 540.0)),
         held(CHESSBOARD, tilt=(-25.0, 30.0), in_plane_deg=90.0, middle_mm=(60.0, 0.0, 660.0)),
         held(CHESSBOARD, tilt=(0.0, -20.0), in_plane_deg=35.0, middle_mm=(0.0, 20.0, 605.0)),
         held(CHESSBOARD, tilt=(50.0, 5.0)),
     ]
-    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(stood)]
+    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
     left = coverage(poses, CHESSBOARD, shooting.sizes).devices["left"]
     assert left.depths == 3
     assert left.tilted == (2, 2)
@@ -187,7 +187,7 @@ def test_advice_names_place_tilt_and_reason_and_shows_the_outline() -> None:
     assert (advice.outline_px < [1280, 1024]).all()
 
 
-def _errors_px(shooting: Shooting, stood: list[BoardPose], seeds: range) -> FloatArray:
+def _errors_px(shooting: Shooting, board_pose: list[BoardPose], seeds: range) -> FloatArray:
     """(seeds,) the worst cell's error of OpenCV's own calibration, px, after the best rigid motion of the camera.
 
     Straight from solves with other noise each time: nothing of the advice's covariances is in it.
@@ -201,7 +201,7 @@ def _errors_px(shooting: Shooting, stood: list[BoardPose], seeds: range) -> Floa
     worst = []
     for seed in seeds:
         again = Shooting(shooting.board, {"left": truth}, seed=seed)
-        views = [again.shot("pose", pose).views["left"] for pose in stood]
+        views = [again.shot("pose", pose).views["left"] for pose in board_pose]
         flags = cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS
         points = [view.points_px.astype(np.float32) for view in views]
         boards = [board_mm[view.corner] for view in views]
@@ -220,18 +220,18 @@ def _errors_px(shooting: Shooting, stood: list[BoardPose], seeds: range) -> Floa
 
 def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_like_the_last() -> None:
     shooting = _shooting(only=("left",))
-    stood = [
+    board_pose = [
         *first_poses(CHESSBOARD),
         held(CHESSBOARD, tilt=(-20.0, 10.0), middle_mm=(0.0, -20.0, 600.0)),
         held(CHESSBOARD, tilt=(15.0, 15.0), middle_mm=(15.0, 10.0, 605.0)),
     ]
-    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(stood)]
+    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
     advice = next_move(poses, CHESSBOARD, shooting.sizes)
     seeds = range(100, 112)
-    without = np.sqrt((_errors_px(shooting, stood, seeds) ** 2).mean())
+    without = np.sqrt((_errors_px(shooting, board_pose, seeds) ** 2).mean())
     lazy = held(CHESSBOARD, tilt=(15.0, -10.0), middle_mm=(-10.0, 15.0, 600.0))
-    with_another = np.sqrt((_errors_px(shooting, [*stood, lazy], seeds) ** 2).mean())
-    with_advice = np.sqrt((_errors_px(shooting, [*stood, _followed(shooting, advice)], seeds) ** 2).mean())
+    with_another = np.sqrt((_errors_px(shooting, [*board_pose, lazy], seeds) ** 2).mean())
+    with_advice = np.sqrt((_errors_px(shooting, [*board_pose, _followed(shooting, advice)], seeds) ** 2).mean())
     assert with_advice < 0.6 * without
     assert with_advice < 0.7 * with_another
     # What it promised: the worst cell's own figure, both coordinates of it, within a factor of two of the truth.
@@ -242,7 +242,7 @@ def test_the_advised_pose_lowers_the_real_error_of_the_worst_cell_more_than_one_
 def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
     shooting = _shooting(only=("left",))
     random = np.random.default_rng(5)
-    stood = [
+    board_pose = [
         held(
             CHESSBOARD,
             tilt=(random.uniform(-35, 35), random.uniform(-35, 35)),
@@ -250,12 +250,14 @@ def test_the_stated_uncertainty_is_that_of_repeated_solves() -> None:
         )
         for _ in range(8)
     ]
-    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(stood)]
+    poses = [shooting.shot(f"pose_{index:02d}", each) for index, each in enumerate(board_pose)]
     poses = [pose for pose in poses if pose.views]
     guess = rig_guess(poses, CHESSBOARD, shooting.sizes).devices["left"]
     stated = np.sqrt(2) * _cells(guess.information[None], _reach(guess)).max()
     found = np.sqrt(
-        (_errors_px(shooting, [each for each in stood if shooting.shot("x", each).views], range(200, 220)) ** 2).mean()
+        (
+            _errors_px(shooting, [each for each in board_pose if shooting.shot("x", each).views], range(200, 220)) ** 2
+        ).mean()
     )
     assert 0.6 < found / stated < 1.6
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from slrig.calibration.solving.adjustment import CAUCHY, Deviations, Prior, adjusted, kept_of, losses_of, residuals_of
-from slrig.calibration.solving.deviations import DeviceNoise, deviations_of, inflated, noise_of
+from slrig.calibration.solving.deviations import DeviceNoise, deviations_of, noise_of, with_design_effect
 from slrig.calibration.solving.measurements import Measurements, measured
 from slrig.calibration.solving.parameters import Geometry, difference, pose_row
 from slrig.calibration.solving.problem import flat_geometry
@@ -17,7 +17,7 @@ from tests.unit.calibration.solving.test_projection import row_of
 from tests.unit.calibration.synthetic import Recipe, board_poses, made
 
 FOUR = ("k1", "k2", "p1", "p2")
-QUIET = Recipe(poses=6, cameras=2, side=12, corner_px=0.0, light_px=0.0, alike_px=0.0, outlying=0.0)
+QUIET = Recipe(poses=6, cameras=2, side=12, corner_px=0.0, match_px=0.0, alike_px=0.0, outlying=0.0)
 
 
 def true_geometry(recipe: Recipe) -> tuple[Geometry, Measurements]:
@@ -27,12 +27,12 @@ def true_geometry(recipe: Recipe) -> tuple[Geometry, Measurements]:
     geometry = flat_geometry(
         recipe.board, np.array([row_of(one) for one in devices]), np.array([pose_row(*pose) for pose in poses])
     )
-    return geometry, measured(observations, {}, light_per_view=2000)
+    return geometry, measured(observations, {}, matches_per_view=2000)
 
 
 def unit(seen: Measurements, sigma_px: float = 0.05) -> Deviations:
-    corners, light = np.full(len(seen.corner_px), sigma_px), np.full(len(seen.light_px), sigma_px)
-    return Deviations(corners, light, np.ones(len(corners)), np.ones(len(light)))
+    corners, matches = np.full(len(seen.corner_px), sigma_px), np.full(len(seen.match_px), sigma_px)
+    return Deviations(corners, matches, np.ones(len(corners)), np.ones(len(matches)))
 
 
 def all_free(geometry: Geometry, *, shape: bool = False) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -87,9 +87,9 @@ def test_outliers_have_no_weight() -> None:
 def test_a_loss_is_a_square_where_it_is_small_and_grows_slowly_where_it_is_large() -> None:
     geometry, seen = true_geometry(QUIET)
     left = residuals_of(geometry, seen)
-    light = np.full_like(left.light, 0.05 * 1e-3)
-    light[0] = 0.05 * 100 * CAUCHY
-    _, losses = losses_of(replace(left, light=light), unit(seen))
+    matches = np.full_like(left.matches, 0.05 * 1e-3)
+    matches[0] = 0.05 * 100 * CAUCHY
+    _, losses = losses_of(replace(left, matches=matches), unit(seen))
     assert losses[1] == pytest.approx(1e-6, rel=1e-3)
     assert losses[0] == pytest.approx(CAUCHY**2 * np.log1p(1e4))
 
@@ -98,7 +98,7 @@ def test_a_loss_is_a_square_where_it_is_small_and_grows_slowly_where_it_is_large
 def test_the_board_s_shape_is_found_where_it_is_asked_for() -> None:
     rng = np.random.default_rng(8)
     offsets = np.column_stack([rng.normal(0, 0.05, (88, 2)), np.zeros(88)])
-    recipe = Recipe(poses=10, side=20, corner_px=0.02, light_px=0.02, alike_px=0.0, outlying=0.0, bow_mm=1.0)
+    recipe = Recipe(poses=10, side=20, corner_px=0.02, match_px=0.02, alike_px=0.0, outlying=0.0, bow_mm=1.0)
     geometry, seen = true_geometry(replace(recipe, offsets_mm=offsets))
     flat = adjusted(geometry, seen, all_free(geometry), unit(seen, 0.02))
     shaped = adjusted(geometry, seen, all_free(geometry, shape=True), unit(seen, 0.02), prior=Prior(0.2, 0.2))
@@ -120,24 +120,24 @@ def test_the_board_s_shape_is_found_where_it_is_asked_for() -> None:
 
 @pytest.mark.parametrize("share", [0.4, 1.0, 3.0])
 def test_deviations_fit_the_residuals_whatever_was_stated(share: float) -> None:
-    recipe = Recipe(poses=8, side=30, corner_px=0.06, light_px=0.05, alike_px=0.0, stated_share=share)
+    recipe = Recipe(poses=8, side=30, corner_px=0.06, match_px=0.05, alike_px=0.0, stated_share=share)
     geometry, seen = true_geometry(recipe)
     left = residuals_of(geometry, seen)
     sigma = deviations_of(seen, noise_of(left, seen, 2, True), True)
     # The poses here are true and not fitted, and what a fit would take is made up for: 4 % of 1408 coordinates.
     assert float(np.median(sigma.corners)) == pytest.approx(0.06, rel=0.08)
-    assert float(np.median(sigma.light)) == pytest.approx(0.05, rel=0.03)
+    assert float(np.median(sigma.matches)) == pytest.approx(0.05, rel=0.03)
 
 
 def test_errors_that_neighbours_share_count_for_less() -> None:
-    def worth(alike_px: float) -> float:
-        geometry, seen = true_geometry(Recipe(poses=8, side=40, light_px=0.05, alike_px=alike_px))
+    def weight(alike_px: float) -> float:
+        geometry, seen = true_geometry(Recipe(poses=8, side=40, match_px=0.05, alike_px=alike_px))
         left = residuals_of(geometry, seen)
         noise = noise_of(left, seen, 2, True)
-        return inflated(noise, geometry, left, seen, True)[-1].inflation
+        return with_design_effect(noise, geometry, left, seen, True)[-1].design_effect
 
-    assert worth(0.0) < 1.8
-    assert worth(0.05) > 3.0
+    assert weight(0.0) < 1.8
+    assert weight(0.05) > 3.0
 
 
 def test_a_print_that_is_off_counts_for_less() -> None:
@@ -145,13 +145,13 @@ def test_a_print_that_is_off_counts_for_less() -> None:
     for shape, least, most in ((None, 1.0, 1.6), (offsets, 3.0, 20.0)):
         geometry, seen = true_geometry(Recipe(poses=12, side=4, offsets_mm=shape))
         left = residuals_of(geometry, seen)
-        noise = inflated(noise_of(left, seen, 2, True), geometry, left, seen, True)
-        assert least <= noise[0].inflation < most
+        noise = with_design_effect(noise_of(left, seen, 2, True), geometry, left, seen, True)
+        assert least <= noise[0].design_effect < most
 
 
 def test_worth_takes_weight_and_makes_no_outliers() -> None:
     geometry, seen = true_geometry(Recipe(poses=4, side=12))
-    one, four = (DeviceNoise(1.0, 0.0, inflation) for inflation in (1.0, 4.0))
+    one, four = (DeviceNoise(1.0, 0.0, design_effect) for design_effect in (1.0, 4.0))
     left = residuals_of(geometry, seen)
     plain, less = deviations_of(seen, [one, one], True), deviations_of(seen, [four, four], True)
     for a, b in zip(kept_of(left, plain), kept_of(left, less), strict=True):

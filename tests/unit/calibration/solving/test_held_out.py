@@ -17,7 +17,7 @@ from tests.unit.calibration.synthetic import Recipe
 def problem_of(recipe: Recipe) -> tuple[Problem, dict[str, tuple[str, ...]]]:
     _, seen = true_geometry(recipe)
     names = tuple(f"pose {number}" for number in range(recipe.poses))
-    return Problem(("left",), names, False, seen.of_poses(np.ones(recipe.poses, np.bool_), light=False)), {}
+    return Problem(("left",), names, False, seen.of_poses(np.ones(recipe.poses, np.bool_), matches=False)), {}
 
 
 def chosen(recipe: Recipe) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ SYMMETRIC = Board(BoardKind.CHESSBOARD, 10, 8, 12.0)
 def lit(recipe: Recipe) -> tuple[Observations, Calibration, Start, Measurements]:
     observations, truth = made(recipe)
     start = start_of(observations)
-    return observations, truth, start, measured(observations, start.flipped, light_per_view=500)
+    return observations, truth, start, measured(observations, start.flipped, matches_per_view=500)
 
 
 def test_cameras_start_near_the_truth() -> None:
@@ -91,10 +91,10 @@ def test_a_pose_seen_by_no_camera_has_no_start() -> None:
 @pytest.mark.parametrize("lens_shift", [False, True])
 @pytest.mark.parametrize("outlying", [0.0, 0.15])
 def test_the_projector_starts_near_the_truth(lens_shift: bool, outlying: float) -> None:
-    observations, truth, start, light = lit(Recipe(poses=8, side=24, lens_shift=lens_shift, outlying=outlying))
+    observations, truth, start, matches = lit(Recipe(poses=8, side=24, lens_shift=lens_shift, outlying=outlying))
     assert truth.projector is not None
     assert observations.projector is not None
-    row = projector_start(start.devices, start.poses, light, observations.projector)
+    row = projector_start(start.devices, start.poses, matches, observations.projector)
     assert truth.projector.size.height_px > 765
     np.testing.assert_allclose(row[:2], np.diag(truth.projector.matrix)[:2], rtol=0.05)
     np.testing.assert_allclose(row[2:4], truth.projector.matrix[:2, 2], atol=120)
@@ -102,25 +102,25 @@ def test_the_projector_starts_near_the_truth(lens_shift: bool, outlying: float) 
 
 
 def test_points_of_the_light_lie_on_the_board() -> None:
-    _, _, start, light = lit(Recipe(poses=4, side=10))
-    points = met_points(start.devices, start.poses, light)
-    board = start.poses[light.light_where[:, 1]]
+    _, _, start, matches = lit(Recipe(poses=4, side=10))
+    points = met_points(start.devices, start.poses, matches)
+    board = start.poses[matches.match_where[:, 1]]
     height = np.einsum("ni,ni->n", board[:, [2, 5, 8]], points - board[:, 9:])
     np.testing.assert_allclose(height, 0, atol=1e-9)
 
 
 def test_light_of_one_axis_alone_is_refused() -> None:
-    observations, _, start, light = lit(Recipe(poses=4, side=20))
+    observations, _, start, matches = lit(Recipe(poses=4, side=20))
     assert observations.projector is not None
-    columns = light.of(np.ones(len(light.corner_px), np.bool_), light.light_where[:, 2] == COLUMN)
+    columns = matches.of(np.ones(len(matches.corner_px), np.bool_), matches.match_where[:, 2] == COLUMN)
     with pytest.raises(SolveRefusedError, match="both are needed"):
         projector_start(start.devices, start.poses, columns, observations.projector)
 
 
 def test_a_mirrored_projector_is_refused() -> None:
-    observations, _, start, light = lit(Recipe(poses=8, side=20))
+    observations, _, start, matches = lit(Recipe(poses=8, side=20))
     assert observations.projector is not None
-    columns = light.light_where[:, 2] == COLUMN
-    mirrored = np.where(columns, observations.projector.width_px - 1 - light.light_px, light.light_px)
+    columns = matches.match_where[:, 2] == COLUMN
+    mirrored = np.where(columns, observations.projector.width_px - 1 - matches.match_px, matches.match_px)
     with pytest.raises(SolveRefusedError, match="mirror"):
-        projector_start(start.devices, start.poses, replace(light, light_px=mirrored), observations.projector)
+        projector_start(start.devices, start.poses, replace(matches, match_px=mirrored), observations.projector)

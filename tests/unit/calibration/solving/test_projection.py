@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.solving.adjustment import corner_terms, light_terms
+from slrig.calibration.solving.adjustment import corner_terms, match_terms
 from slrig.calibration.solving.linear import solved
 from slrig.calibration.solving.measurements import Measurements, groups, measured, spread
 from slrig.calibration.solving.parameters import Geometry, device_row, difference, pose_row, to_pinhole
@@ -17,7 +17,7 @@ from slrig.model import FloatArray, Pinhole
 from tests.unit.calibration.synthetic import Recipe, board_poses, made
 
 EXACT = Recipe(
-    poses=3, cameras=2, side=8, corner_px=0.0, light_px=0.0, alike_px=0.0, outlying=0.0, bow_mm=1.7, most_tilt_deg=30.0
+    poses=3, cameras=2, side=8, corner_px=0.0, match_px=0.0, alike_px=0.0, outlying=0.0, bow_mm=1.7, most_tilt_deg=30.0
 )
 
 
@@ -35,22 +35,22 @@ def exact() -> tuple[Geometry, Measurements]:
     geometry = flat_geometry(EXACT.board, devices, poses)
     bend = np.zeros(7)
     bend[0] = EXACT.bow_mm
-    return replace(geometry, bend=bend), measured(observations, {}, light_per_view=100)
+    return replace(geometry, bend=bend), measured(observations, {}, matches_per_view=100)
 
 
 def test_corners_and_light_fall_where_opencv_says(exact: tuple[Geometry, Measurements]) -> None:
     geometry, seen = exact
     corners, _ = corner_terms(geometry, seen, jacobian=False)
-    light, _ = light_terms(geometry, seen, jacobian=False)
+    matches, _ = match_terms(geometry, seen, jacobian=False)
     assert len(corners) > 400
-    assert len(light) > 500
+    assert len(matches) > 500
     np.testing.assert_allclose(corners, 0, atol=1e-8)
-    np.testing.assert_allclose(light, 0, atol=1e-7)
+    np.testing.assert_allclose(matches, 0, atol=1e-7)
 
 
 def test_derivatives_are_those_of_the_residuals(exact: tuple[Geometry, Measurements]) -> None:
     geometry, everything = exact
-    seen = everything.of(np.arange(len(everything.corner_px)) % 17 == 0, np.arange(len(everything.light_px)) % 11 == 0)
+    seen = everything.of(np.arange(len(everything.corner_px)) % 17 == 0, np.arange(len(everything.match_px)) % 11 == 0)
     rng = np.random.default_rng(3)
     geometry = replace(
         geometry, bend=rng.normal(0, 0.5, 7), offsets=rng.normal(0, 0.05, geometry.offsets.shape),
@@ -58,26 +58,26 @@ def test_derivatives_are_those_of_the_residuals(exact: tuple[Geometry, Measureme
     geometry.devices[:, 8] = 0.02
     layout = geometry.layout
     _, corner_rows = corner_terms(geometry, seen, jacobian=True)
-    _, light_rows = light_terms(geometry, seen, jacobian=True)
-    corners, light = np.zeros((len(corner_rows), 2, layout.count)), np.zeros((len(light_rows), layout.count))
+    _, match_rows = match_terms(geometry, seen, jacobian=True)
+    corners, matches = np.zeros((len(corner_rows), 2, layout.count)), np.zeros((len(match_rows), layout.count))
     for i, (camera, pose, corner) in enumerate(seen.corner_where):
         place = np.concatenate([
             15 * camera + np.arange(15), layout.first_pose + 6 * pose + np.arange(6),
             layout.first_offset + 2 * corner + np.arange(2), np.arange(layout.first_bend, layout.count),
         ])  # fmt: skip
         corners[i][:, place] = corner_rows[i]
-    for i, (camera, pose, _) in enumerate(seen.light_where):
+    for i, (camera, pose, _) in enumerate(seen.match_where):
         place = np.concatenate([
             15 * camera + np.arange(15), 15 * (layout.devices - 1) + np.arange(15),
             layout.first_pose + 6 * pose + np.arange(6), np.arange(layout.first_bend, layout.count),
         ])  # fmt: skip
-        light[i][place] = light_rows[i]
+        matches[i][place] = match_rows[i]
     step = 1e-5
     for k in range(layout.count):
         one = np.zeros(layout.count)
         one[k] = step
         ahead, behind = geometry.moved(one), geometry.moved(-one)
-        for terms, rows in ((corner_terms, corners), (light_terms, light)):
+        for terms, rows in ((corner_terms, corners), (match_terms, matches)):
             by_number = (terms(ahead, seen, jacobian=False)[0] - terms(behind, seen, jacobian=False)[0]) / (2 * step)
             size = max(float(np.abs(by_number).max()), 1e-3)
             np.testing.assert_allclose(rows[..., k], by_number, atol=2e-5 * size, err_msg=f"parameter {k}")
@@ -87,7 +87,7 @@ def test_light_that_misses_the_board_has_no_residual(exact: tuple[Geometry, Meas
     geometry, seen = exact
     away = geometry.poses.copy()
     away[:, 9:] *= -1
-    assert np.isnan(light_terms(replace(geometry, poses=away), seen, jacobian=False)[0]).all()
+    assert np.isnan(match_terms(replace(geometry, poses=away), seen, jacobian=False)[0]).all()
     assert np.isnan(corner_terms(replace(geometry, poses=away), seen, jacobian=False)[0]).all()
 
 
@@ -145,8 +145,8 @@ def test_light_is_thinned_evenly_and_always_alike() -> None:
 
 def test_measurements_lie_in_runs_of_one_camera_and_pose(exact: tuple[Geometry, Measurements]) -> None:
     _, seen = exact
-    runs = groups(seen.light_where)
+    runs = groups(seen.match_where)
     assert len(runs) == 2 * 3 * 2
-    assert len({tuple(seen.light_where[run.start]) for run in runs}) == len(runs)
+    assert len({tuple(seen.match_where[run.start]) for run in runs}) == len(runs)
     thin = seen.thinned(20)
-    assert [run.stop - run.start for run in groups(thin.light_where)] == [20] * len(runs)
+    assert [run.stop - run.start for run in groups(thin.match_where)] == [20] * len(runs)

@@ -111,7 +111,7 @@ def test_a_pose_in_which_the_board_moved_is_left_out_by_name() -> None:
 @pytest.mark.slow
 def test_with_next_to_no_noise_no_pose_is_called_off() -> None:
     """A lens that is not done justice to must not make outliers of the poses at the image's border."""
-    solution, _ = solved(replace(SMALL, cameras=2, corner_px=0.003, light_px=0.01, alike_px=0.0, outlying=0.0, seed=9))
+    solution, _ = solved(replace(SMALL, cameras=2, corner_px=0.003, match_px=0.01, alike_px=0.0, outlying=0.0, seed=9))
     assert solution.outliers == {}
     assert solution.residuals["right"].rms_px < 0.006
 

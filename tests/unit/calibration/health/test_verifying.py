@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from slrig.calibration.health.drift import Change
-from slrig.calibration.health.look import Look, health_of_scan, look_from_document
-from slrig.calibration.health.looking import look_at_board
 from slrig.calibration.health.verdict import HealthState, judged
+from slrig.calibration.health.verification import Verification, health_of_scan, verification_from_document
+from slrig.calibration.health.verifying import verify_by_board
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Pinhole
@@ -43,9 +43,9 @@ def planted(devices: Mapping[str, Pinhole], change: str) -> Mapping[str, Pinhole
     }[change]
 
 
-def looked(rig: Bench, devices: Mapping[str, Pinhole], seed: int = 0) -> Look:
+def looked(rig: Bench, devices: Mapping[str, Pinhole], seed: int = 0) -> Verification:
     """One verification of it."""
-    return look_at_board([look_of(devices, seed)], BOARD, rig.calibration)
+    return verify_by_board([look_of(devices, seed)], BOARD, rig.calibration)
 
 
 @pytest.mark.parametrize(
@@ -120,8 +120,10 @@ def test_a_device_that_takes_no_part_in_a_look_raises_no_alarm_and_is_told() -> 
     rig = bench(3, cameras=2)
     for absent, others in (("left", "right"), ("right", "left")):
         whole = look_of(rig.devices, 5)
-        one = replace(whole, views={others: whole.views[others]}, light={others: whole.light[others]})
-        found = look_at_board([one], BOARD, rig.calibration)
+        one = replace(
+            whole, views={others: whole.views[others]}, correspondences={others: whole.correspondences[others]}
+        )
+        found = verify_by_board([one], BOARD, rig.calibration)
         assert found.unseen == (absent,)
         assert not found.drifts
         # What is not seen is not as bad as anything that might have happened to it. By its noise one look makes some
@@ -129,16 +131,18 @@ def test_a_device_that_takes_no_part_in_a_look_raises_no_alarm_and_is_told() -> 
         assert (found.expected_mm or 0) < 1.4 * (found.stated_mm or 0)
         health = judged([found])
         assert health.state is HealthState.GOOD
-        assert f"camera '{absent}' did not take part in the last look" in health.reasons[0]
+        assert f"camera '{absent}' did not take part in the last verification" in health.reasons[0]
         # A change of the others is found all the same.
         lamp = planted(rig.devices, "projector focal")
         seen = look_of(lamp, 5)
-        other = replace(seen, views={others: seen.views[others]}, light={others: seen.light[others]})
-        alarm = judged([look_at_board([other], BOARD, rig.calibration)])
+        other = replace(
+            seen, views={others: seen.views[others]}, correspondences={others: seen.correspondences[others]}
+        )
+        alarm = judged([verify_by_board([other], BOARD, rig.calibration)])
         assert alarm.state is HealthState.STALE
         assert alarm.reasons[-1].startswith(f"camera '{absent}' did not take part")
-    dark = replace(look_of(rig.devices, 5), light={})
-    assert look_at_board([dark], BOARD, rig.calibration).unseen == (PROJECTOR,)
+    dark = replace(look_of(rig.devices, 5), correspondences={})
+    assert verify_by_board([dark], BOARD, rig.calibration).unseen == (PROJECTOR,)
 
 
 @pytest.mark.slow
@@ -169,25 +173,25 @@ def test_a_rig_of_other_cameras_is_refused_with_words() -> None:
     rig = bench()
     other = Calibration({"front": rig.calibration.cameras["left"]}, rig.calibration.projector)
     with pytest.raises(CalibrationError, match="of camera front, the board was seen by left: check the calibration"):
-        look_at_board([look_of(rig.devices, 0)], BOARD, other)
+        verify_by_board([look_of(rig.devices, 0)], BOARD, other)
 
 
 def test_a_calibration_that_says_nothing_of_its_error_is_judged_by_the_residuals() -> None:
     rig = bench()
     bare = Calibration({"left": rig.devices["left"]}, rig.devices[PROJECTOR])
-    clean = look_at_board([look_of(rig.devices, 0)], BOARD, bare)
+    clean = verify_by_board([look_of(rig.devices, 0)], BOARD, bare)
     assert clean.stated_mm is None
     assert judged([clean]).state is HealthState.GOOD
-    knocked = look_at_board([look_of(planted(rig.devices, "camera turned up"), 0)], BOARD, bare)
+    knocked = verify_by_board([look_of(planted(rig.devices, "camera turned up"), 0)], BOARD, bare)
     assert judged([knocked]).state is HealthState.STALE
 
 
 def test_a_look_survives_its_document() -> None:
     rig = bench()
     found = looked(rig, planted(rig.devices, "baseline"))
-    assert look_from_document(found.document()).document() == found.document()
+    assert verification_from_document(found.document()).document() == found.document()
     old = {name: value for name, value in found.document().items() if name != "unseen"}
-    assert look_from_document(old) == look_from_document(found.document())
+    assert verification_from_document(old) == verification_from_document(found.document())
 
 
 def test_a_scan_with_two_cameras_is_a_look_too() -> None:

@@ -42,7 +42,7 @@ class Drift:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Verification:
     """What one verification found: numbers and words, JSON values throughout; NaN is None.
 
     scale_percent, scale_mm : by how much the board measures larger than it is, and that over its diagonal; None of a
@@ -72,17 +72,17 @@ class Look:
         return asdict(self)
 
 
-def look_from_document(document: Mapping[str, Any], /) -> Look:
-    """The look that `Look.document` gave."""
+def verification_from_document(document: Mapping[str, Any], /) -> Verification:
+    """The verification that `Verification.document` gave."""
     given = dict(document)
     given["pairs"] = tuple(PairFigures(**each) for each in given["pairs"])
     given["drifts"] = tuple(Drift(**each) for each in given["drifts"])
     # Looks on record from before it was told have none.
     given["unseen"] = tuple(given.get("unseen", ()))
-    return Look(**given)
+    return Verification(**given)
 
 
-def health_of_scan(pairs: Sequence[Mapping[str, Any]], /) -> Look | None:
+def health_of_scan(pairs: Sequence[Mapping[str, Any]], /) -> Verification | None:
     """Judge by the redundancy of a scan: `residual_px` of that section of its report; None where it has no pair.
 
     The spare equation of two cameras tells that a calibration does not hold, and neither which device changed nor by
@@ -98,4 +98,4 @@ def health_of_scan(pairs: Sequence[Mapping[str, Any]], /) -> Look | None:
         for pair in pairs
         if pair["pairs"]
     )  # fmt: skip
-    return Look(kind="scan", pairs=found) if found else None
+    return Verification(kind="scan", pairs=found) if found else None

@@ -1,4 +1,4 @@
-"""One look at a board that is left in view: what it says of the calibration."""
+"""One verification by a board that is left in view: what it says of the calibration."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from slrig.calibration.health.devices import devices_of
 from slrig.calibration.health.drift import ALIKE, Change, Hypothesis, board_growth, hypotheses, rivals
 from slrig.calibration.health.equations import equations
 from slrig.calibration.health.error import ErrorNow, error_now
-from slrig.calibration.health.look import Drift, Look, PairFigures
 from slrig.calibration.health.residuals import BoardScale, PairResidual, board_scales, pair_residuals
+from slrig.calibration.health.verification import Drift, PairFigures, Verification
 from slrig.calibration.health.words import change_words, remedy_words, rival_words
 from slrig.calibration.observations import PoseObservation
 from slrig.calibration.solution import PROJECTOR, BoardPose
@@ -23,7 +23,7 @@ from slrig.model import Calibration, FloatArray
 _LISTED = 5
 
 
-def look_at_board(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> Look:
+def verify_by_board(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> Verification:
     """Judge a calibration by one or more poses of a board, shot after it.
 
     Raises
@@ -33,7 +33,7 @@ def look_at_board(poses: Sequence[PoseObservation], board: Board, calibration: C
     """
     if not calibration.triangulates:
         message = (
-            "expected a calibration of two devices, which a look holds against each other, found one of camera "
+            "expected a calibration of two devices, which a verification holds against each other, found one of camera "
             f"'{next(iter(calibration.cameras))}' alone: calibrate it again, and see what changed with slrig calibrate "
             "compare"
         )
@@ -53,7 +53,7 @@ def look_at_board(poses: Sequence[PoseObservation], board: Board, calibration: C
     listed = (
         [each for each in ranked if each.kind is not Change.NONE and each.evidence > 0][:_LISTED] if changed else []
     )
-    return Look(
+    return Verification(
         kind="board",
         pairs=tuple(_figures(pair) for pair in pairs),
         **_of_scale(scales),
@@ -70,7 +70,7 @@ def look_at_board(poses: Sequence[PoseObservation], board: Board, calibration: C
 def _unseen(poses: Sequence[PoseObservation], calibration: Calibration) -> tuple[str, ...]:
     """The devices that no pose says anything of."""
     seen = {name for pose in poses for name in pose.views}
-    if any(len(light.axis) for pose in poses for light in pose.light.values()):
+    if any(len(light.axis) for pose in poses for light in pose.correspondences.values()):
         seen.add(PROJECTOR)
     return tuple(name for name in devices_of(calibration) if name not in seen)
 
