@@ -7,8 +7,8 @@ reads the bundle instead.
 
 from __future__ import annotations
 
+import queue
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -77,12 +77,10 @@ class FrameFeed:
     def __init__(self, send: Callable[[object], bool], *, most_bytes: int = MOST_WAITING_BYTES) -> None:
         self._send = send
         self._most_bytes = most_bytes
-        self._changed = threading.Condition()
-        self._waiting: deque[Begin | Take | End] = deque()
-        self._waiting_bytes = 0
+        self._waiting: queue.Queue[Begin | Take | End | Abandon] = queue.Queue()
         self._taken: set[tuple[int, str, float | None]] = set()
-        self._ended = False
-        self._given_up = False
+        self._given_up = threading.Event()
+        self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
     def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
@@ -90,7 +88,7 @@ class FrameFeed:
         if calibration is None:
             self.abandon()
             return
-        self._put(Begin(outline, calibration))
+        self._waiting.put(Begin(outline, calibration))
         self._thread = threading.Thread(target=self._carry, name="slrig-feed", daemon=True)
         self._thread.start()
 
@@ -99,28 +97,26 @@ class FrameFeed:
         which = (shot.pattern, shot.camera, shot.exposure_s)
         again = which in self._taken
         self._taken.add(which)
-        with self._changed:
-            behind = not self._given_up and self._waiting_bytes + shot.image.nbytes > self._most_bytes
+        if self._given_up.is_set():
+            return
         if again:
             # What was concluded from the first one cannot be taken back.
             _log.info("a frame was shot again; the reconstruction will read the bundle", pattern=shot.pattern)
             self.abandon()
-        elif behind:
+        elif (self._waiting.qsize() + 1) * shot.image.nbytes > self._most_bytes:
             _log.info("the reconstruction falls behind the capture; it will read the bundle")
             self.abandon()
         else:
-            self._put(Take(shot))
+            self._waiting.put(Take(shot))
 
     def end(self, evidence: EvidenceSummary) -> None:
         """Queue the end."""
-        self._put(End(evidence))
+        self._waiting.put(End(evidence))
 
     def abandon(self) -> None:
         """Send no more, and have what was sent forgotten. After the end has been sent this does nothing."""
-        with self._changed:
-            self._given_up = True
-            self._waiting.clear()
-            self._changed.notify_all()
+        self._given_up.set()
+        self._waiting.put(Abandon())
 
     def settled(self, timeout_s: float) -> bool:
         """Wait at most so long; return whether nothing more will be sent."""
@@ -131,36 +127,21 @@ class FrameFeed:
     @property
     def whole(self) -> bool:
         """Whether every frame was sent, and the end."""
-        with self._changed:
-            return self._ended
-
-    def _put(self, message: Begin | Take | End) -> None:
-        with self._changed:
-            if not self._given_up:
-                self._waiting.append(message)
-                self._waiting_bytes += _bytes(message)
-                self._changed.notify_all()
+        return self._ended.is_set()
 
     def _carry(self) -> None:
         while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._given_up)
-                message = None if self._given_up else self._waiting.popleft()
-            if message is None:
+            message = self._waiting.get()
+            if self._given_up.is_set():
+                self._waiting = queue.Queue()  # lets the frames go
                 self._send(Abandon())
                 return
             if not self._send(message):
-                self.abandon()
+                self._given_up.set()
                 return
-            with self._changed:
-                self._waiting_bytes -= _bytes(message)
-                if isinstance(message, End):
-                    self._ended = True
-                    return
-
-
-def _bytes(message: Begin | Take | End) -> int:
-    return message.shot.image.nbytes if isinstance(message, Take) else 0
+            if isinstance(message, End):
+                self._ended.set()
+                return
 
 
 class FedFrames:

@@ -11,7 +11,7 @@ from slrig.errors import NothingToReconstructError, setting
 from slrig.meshing.rasteriser import rasterised
 from slrig.model import Mesh, Refusal, Size
 from slrig.reconstruction.optics import project
-from slrig.scan.stream import Seen
+from slrig.scan.stream import CameraResult
 
 FAIR_SHARE = 0.6
 """Sound scans of real rigs have 0.8 and more, borders of two pixels that are refused included."""
@@ -19,7 +19,7 @@ _PICTURE_PX = 480
 """Wide enough for a share, and a tenth of the work at full size."""
 
 
-def covered_share(mesh: Mesh, seen: Seen) -> float | None:
+def covered_share(mesh: Mesh, seen: CameraResult) -> float | None:
     """The share of the pixels that the camera decoded whose ray meets the mesh; None where it decoded none.
 
     Counted on a picture of at most 480 pixels' width. A pixel of it is decoded where half of its camera pixels are.
@@ -49,7 +49,7 @@ def coverage_notes(name: str, share: float | None) -> list[str]:
     ]
 
 
-def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[Seen]) -> None:
+def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[CameraResult]) -> None:
     """Refuse a scan that holds no surface (NothingToReconstructError), with the figures that tell why."""
     if holds:
         return

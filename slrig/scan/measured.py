@@ -27,7 +27,7 @@ from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.report import capture_notes, capture_report
 from slrig.scan.resolved import unresolved_notes
-from slrig.scan.stream import LiveScan, ScanStream, Seen, cell_px, step_px
+from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, triangulated
 
 _STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
@@ -46,7 +46,7 @@ class Walked:
     devices: Calibration
     axis: Axis
     shown: frozenset[Axis]
-    seen: list[Seen]
+    seen: list[CameraResult]
     step_px: float
     cell_px: float
     sections: dict[str, object]
@@ -108,7 +108,7 @@ def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> 
     return found.share_across < FAIR_SHARE or _decoded_share(walked.seen) < FAIR_DECODED
 
 
-def _decoded_share(cameras: Sequence[Seen]) -> float:
+def _decoded_share(cameras: Sequence[CameraResult]) -> float:
     """Of the pixels that are lit."""
     lit = sum(np.count_nonzero(seen.curves.refusal != Refusal.NOT_LIT) for seen in cameras)
     return sum(seen.curves.decoded_pixels for seen in cameras) / max(lit, 1)
@@ -177,13 +177,14 @@ def _walked(
     if (
         live is not None
         and live.evidence is not None
-        and axis in (None, live.stream.axis)
+        and axis in (None, live.axis)
         and _is_of(live, folder, calibration_file)
     ):
-        names += live.stream.outline.cameras
-        devices, stream, evidence = live.calibration, live.stream, live.evidence
+        names += live.outline.cameras
+        devices, evidence = live.calibration, live.evidence
+        stream: ScanStream = live
         _require_calibration(folder, names, devices)
-        seen = live.finish(stage_entered)
+        seen = live.finished(stage_entered)
     else:
         recorded = read_bundle(folder, calibration_file=calibration_file)
         capture, cut_short = without_missing_bits(recorded.capture)
@@ -216,7 +217,7 @@ def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
     )  # fmt: skip
     path = folder / CALIBRATION if calibration_file is None else calibration_file
     return (
-        CaptureHeader.of(live.stream.capture) == listed
+        CaptureHeader.of(live.capture) == listed
         and path.exists()
         and read_calibration(path).digest == live.calibration.digest
     )

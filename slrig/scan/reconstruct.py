@@ -43,7 +43,7 @@ from slrig.scan.report import (
 )
 from slrig.scan.resolved import steps
 from slrig.scan.staging import REPORT, staged_folder
-from slrig.scan.stream import LiveScan, Seen
+from slrig.scan.stream import CameraResult, LiveScan
 from slrig.scan.triangulated import Triangulated, widest_gap_px
 
 
@@ -59,7 +59,7 @@ class _Meshed:
     curves: PointCurves
     share_mm: FloatArray | None
     mesh_share_mm: FloatArray | None
-    cameras: list[Seen]
+    cameras: list[CameraResult]
     stages: tuple[Stage, ...]
     figures: Mapping[str, object]
     redundancy: Mapping[str, object]
@@ -240,7 +240,7 @@ def _calibration_share(
     return calibration_sigma(modes, points.points_mm, normals, points.source, found.joined.camera, tangents)
 
 
-def _write_pictures(mesh: Mesh, cameras: list[Seen], staging: Path) -> None:
+def _write_pictures(mesh: Mesh, cameras: list[CameraResult], staging: Path) -> None:
     first = cameras[0]
     write_png(staging / "preview.png", preview(mesh, first.device, first.white, int(first.full_scale)))
     for seen in cameras:

@@ -5,8 +5,8 @@ Frames wait in a queue of bounded size: a disk that cannot keep up slows the cap
 
 from __future__ import annotations
 
+import queue
 import threading
-from collections import deque
 from types import TracebackType
 from typing import Self
 
@@ -16,6 +16,8 @@ from slrig.model import Shot
 
 MOST_WAITING_BYTES = 256 * 2**20
 """How much of frames may wait for the disk."""
+
+_LEAST_FRAME_BYTES = 2**18  # a smaller camera's frames do not wait in thousands
 
 
 class Recorder:
@@ -28,19 +30,16 @@ class Recorder:
     def __init__(self, writer: BundleWriter, *, most_bytes: int = MOST_WAITING_BYTES) -> None:
         self._writer = writer
         self._most_bytes = most_bytes
-        self._changed = threading.Condition()
-        self._waiting: deque[Shot | Refused] = deque()
-        self._waiting_bytes = 0
-        self._ending = False
+        self._waiting: queue.Queue[Shot | Refused | None] = queue.Queue()
+        self._thread: threading.Thread | None = None
+        self._stopped = False
         self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._write, name="slrig-recorder", daemon=True)
 
     def __enter__(self) -> Self:
-        self._thread.start()
         return self
 
     def add(self, shot: Shot) -> None:
-        """Have a frame written; waits while too much is waiting already. Raises as `BundleWriter.add` does."""
+        """Have a frame written; waits while too many are waiting already. Raises as `BundleWriter.add` does."""
         self._put(shot)
 
     def refuse(self, refused: Refused) -> None:
@@ -49,7 +48,10 @@ class Recorder:
 
     def finish(self) -> None:
         """Wait until everything is written. Idempotent. Raises what the writer raised."""
-        self._end(drop=False)
+        if self._thread is not None:
+            self._waiting.put(None)
+            self._thread.join()
+            self._thread = None
         if self._error is not None:
             raise self._error
 
@@ -58,53 +60,31 @@ class Recorder:
     ) -> None:
         if error is None:
             self.finish()
-        else:
-            self._end(drop=True)
-
-    def _end(self, *, drop: bool) -> None:
-        with self._changed:
-            self._ending = True
-            if drop:
-                self._waiting.clear()
-            self._changed.notify_all()
-        self._thread.join()
+        elif self._thread is not None:
+            self._stopped = True
+            self._waiting.put(None)
+            self._thread.join()
 
     def _put(self, item: Shot | Refused) -> None:
-        size = _bytes(item)
-        with self._changed:
-            # One frame may always wait, however large it is.
-            self._changed.wait_for(
-                lambda: self._error is not None or not self._waiting or self._waiting_bytes + size <= self._most_bytes
-            )
-            if self._error is not None:
-                raise self._error
-            self._waiting.append(item)
-            self._waiting_bytes += size
-            self._changed.notify_all()
+        if self._error is not None:
+            raise self._error
+        if self._thread is None:
+            shot = item if isinstance(item, Shot) else item.shot
+            size = _LEAST_FRAME_BYTES if shot is None else max(shot.image.nbytes, _LEAST_FRAME_BYTES)
+            self._waiting = queue.Queue(max(1, self._most_bytes // size))
+            self._thread = threading.Thread(target=self._write, name="slrig-recorder", daemon=True)
+            self._thread.start()
+        self._waiting.put(item)
 
     def _write(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._ending)
-                if not self._waiting:
-                    return
-                item = self._waiting.popleft()
+        while (item := self._waiting.get()) is not None:
+            if self._stopped:
+                continue
             try:
                 if isinstance(item, Shot):
                     self._writer.add(item)
                 else:
                     self._writer.refuse(item)
             except Exception as error:  # noqa: BLE001 - it is raised again on the thread that captures
-                with self._changed:
-                    self._error = error
-                    self._waiting.clear()
-                    self._changed.notify_all()
-                return
-            with self._changed:
-                self._waiting_bytes -= _bytes(item)
-                self._changed.notify_all()
-
-
-def _bytes(item: Shot | Refused) -> int:
-    shot = item if isinstance(item, Shot) else item.shot
-    return 0 if shot is None else shot.image.nbytes
+                # Go on taking frames, so that whoever captures never waits for room, and write none of them.
+                self._error, self._stopped = error, True

@@ -14,7 +14,7 @@ from slrig.model import FloatArray, IntArray
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.merging import MergedCurves
 from slrig.scan.report import lit_share
-from slrig.scan.stream import Seen
+from slrig.scan.stream import CameraResult
 
 _WORTH_TELLING = 0.02
 _WIDEST_BRIDGES = 2.5
@@ -32,7 +32,13 @@ class Steps:
 
 
 def steps(
-    cameras: Sequence[Seen], joined: MergedCurves, step_px: float, cell_px: float, *, max_gap: int, widest_gap_px: float
+    cameras: Sequence[CameraResult],
+    joined: MergedCurves,
+    step_px: float,
+    cell_px: float,
+    *,
+    max_gap: int,
+    widest_gap_px: float,
 ) -> Steps:
     """How far apart curves lie, and which are neighbours.
 
@@ -68,7 +74,7 @@ def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[n
     return edges_px if curves.unresolved.any() else None
 
 
-def unresolved_notes(cameras: Sequence[Seen], step_px: float, cell_px: float) -> list[str]:
+def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: float) -> list[str]:
     """One sentence for each camera that does not resolve the finest patterns on a part of what is lit."""
     notes = []
     for seen in cameras:

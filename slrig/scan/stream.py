@@ -42,7 +42,7 @@ _WHITE_OVER_USUAL = 2.5
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class CameraResult:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
     white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white. A bracket's are
@@ -73,14 +73,14 @@ class ScanStream:
         self.outline = outline
         devices = [calibration.cameras[name] for name in outline.cameras]
         self.axis = axis or chosen_axis(outline.axes, devices, calibration.projector)
-        self._calibration = calibration
+        self.calibration = calibration
         self._shots: list[Shot] = []
-        self._eyes = {name: _Eye(name, outline, self.axis, entered) for name in outline.cameras}
+        self._cameras = {name: _CameraFrames(name, outline, self.axis, entered) for name in outline.cameras}
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
         self._shots.append(shot)
-        self._eyes[shot.camera].take(shot)
+        self._cameras[shot.camera].take(shot)
 
     @property
     def capture(self) -> Capture:
@@ -88,7 +88,7 @@ class ScanStream:
         outline = self.outline
         return Capture(outline.projector, outline.patterns, outline.cameras, tuple(self._shots))
 
-    def finish(self) -> list[Seen]:
+    def finish(self) -> list[CameraResult]:
         """The curves of every camera, once all frames are in.
 
         Raises
@@ -97,14 +97,14 @@ class ScanStream:
             The frames cannot be decoded.
         """
         capture, seen = self.capture, []
-        for name in list(self._eyes):
+        for name in list(self._cameras):
             # What it held of its frames is not needed any more, and the memory is.
-            curves, frames, fused = self._eyes.pop(name).finish(capture)
+            curves, frames, fused = self._cameras.pop(name).finish(capture)
             used = curves.refusal == Refusal.NONE
             seen.append(
-                Seen(
+                CameraResult(
                     name=name,
-                    device=self._calibration.cameras[name],
+                    device=self.calibration.cameras[name],
                     curves=curves,
                     white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
                     largest_contrast=float(frames.contrast.max()),
@@ -115,7 +115,7 @@ class ScanStream:
         return seen
 
 
-class _Eye:
+class _CameraFrames:
     """One camera's share of a stream.
 
     Frames of a sequence that shows each pattern once are used as they come. Repeats and exposure brackets tell nothing
@@ -176,30 +176,29 @@ class _Eye:
         return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
 
 
-class LiveScan:
+class LiveScan(ScanStream):
     """A stream that is fed while the scan is captured, with the seconds it took so far."""
 
     def __init__(self, outline: CaptureHeader, calibration: Calibration) -> None:
-        self.calibration = calibration
         self.evidence: EvidenceSummary | None = None
         self.watch = Stopwatch()
-        self._entered: Entered = lambda stage, _camera: self.watch.enter(stage)
-        self.stream = ScanStream(outline, calibration, entered=lambda stage, camera: self._entered(stage, camera))
+        self._told: Entered = lambda stage, _camera: self.watch.enter(stage)
+        super().__init__(outline, calibration, entered=lambda stage, camera: self._told(stage, camera))
         self.watch.enter(WAITING)
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
-        self.stream.take(shot)
+        super().take(shot)
         self.watch.enter(WAITING)
 
     def end(self, evidence: EvidenceSummary) -> None:
         """Take note that all frames have come, and what they have proven."""
         self.evidence = evidence
 
-    def finish(self, entered: Entered) -> list[Seen]:
-        """As `ScanStream.finish`; `entered` is told the stages from here on."""
-        self._entered = entered
-        return self.stream.finish()
+    def finished(self, entered: Entered) -> list[CameraResult]:
+        """As `finish`; `entered` is told the stages from here on."""
+        self._told = entered
+        return self.finish()
 
 
 def _shown_white(frames: AxisFrames, used: NDArray[np.bool_]) -> float:

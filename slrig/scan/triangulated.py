@@ -14,7 +14,7 @@ from slrig.reconstruction.merging import MergedCurves, merged
 from slrig.reconstruction.redundancy import Redundancy, redundancy
 from slrig.reconstruction.sheet_curves import selected
 from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
-from slrig.scan.stream import Seen
+from slrig.scan.stream import CameraResult
 
 _WIDEST_GAP_PX = 4.0
 _STEEP_ENOUGH = 0.5  # of the pair whose stripes cross its epipolar lines most steeply: errors twice its at most
@@ -31,12 +31,12 @@ class Triangulated:
 
     joined: MergedCurves
     spare: Redundancy
-    cameras: list[Seen]
+    cameras: list[CameraResult]
     share_across: float
     second: int = 1
 
 
-def triangulated(cameras: list[Seen], projector: Pinhole | None, axis: Axis) -> Triangulated:
+def triangulated(cameras: list[CameraResult], projector: Pinhole | None, axis: Axis) -> Triangulated:
     """Triangulate the curves of an axis; without a projector, of at least two cameras.
 
     With a projector, a camera is left out whose baseline lies along the stripes: it sees them edge on, and where others
@@ -85,7 +85,9 @@ def widest_gap_px(projector: Pinhole | None, axis: Axis) -> float:
     return _WIDEST_GAP_PX * max(1.0, float(projector.matrix[along, along] / projector.matrix[across, across]))
 
 
-def _on_sheets(seen: Seen, projector: Pinhole, axis: Axis, *, told: bool) -> tuple[SheetCurves, NDArray[np.uint8]]:
+def _on_sheets(
+    seen: CameraResult, projector: Pinhole, axis: Axis, *, told: bool
+) -> tuple[SheetCurves, NDArray[np.uint8]]:
     """`camera_projector`, with nothing kept of a camera that the axis tells no depth."""
     part, cause = camera_projector(seen.curves.ensemble, seen.device, projector, axis)
     if told:

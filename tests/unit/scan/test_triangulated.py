@@ -11,7 +11,7 @@ from slrig.model import Axis, FloatArray, Pinhole, Refusal
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.noise import NoiseModel
-from slrig.scan.stream import Seen
+from slrig.scan.stream import CameraResult
 from slrig.scan.triangulated import triangulated, widest_gap_px
 from tests.unit.reconstruction.builders import (
     CAMERA,
@@ -44,7 +44,7 @@ def curves_in(camera: Pinhole, rows: FloatArray, projector: Pinhole = PROJECTOR)
     return replace(ensemble_of(pixels, COLUMNS), normals=normals)
 
 
-def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> Seen:
+def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> CameraResult:
     curves = CameraCurves(
         ensemble=ensemble,
         refusal=np.zeros(device.size.shape, dtype=np.uint8),
@@ -56,7 +56,7 @@ def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> Seen:
         refined=True,
         disagreement_px=np.zeros(0),
     )
-    return Seen(name, device, curves, np.zeros(device.size.shape, dtype=np.uint16), 1.0, 255.0)
+    return CameraResult(name, device, curves, np.zeros(device.size.shape, dtype=np.uint16), 1.0, 255.0)
 
 
 FEW, MANY = np.arange(100.0, 140.0, 1.5), np.arange(80.0, 160.0, 1.5)
