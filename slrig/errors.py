@@ -86,9 +86,17 @@ class NothingToReconstructError(SlrigError):
 
 
 class DeviceError(SlrigError):
-    """A camera or projector did not do what it was told. Raise a child where one fits."""
+    """A camera or projector did not do what it was told. Raise a child where one fits.
+
+    place : the device and the call that it came of, told after the message; None where the message names them.
+    """
 
     code = "device"
+    place: str | None = None
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return text if self.place is None else f"{text} ({self.place})"
 
 
 class DeviceGoneError(DeviceError):

@@ -54,14 +54,14 @@ def failure_of(error: BaseException) -> JobFailure:
         return JobFailure(StorageError.code, disk_refusal(error, None))
     message = (
         f"slrig met an error it did not expect ({type(error).__name__}). The service's log has the details under "
-        "this scan's id; please report them."
+        "this job's id; please report them."
     )
     return JobFailure(UNEXPECTED, message)
 
 
 def interruption() -> ScanInterruptedError:
-    """The error that stands for a scan cut off by the end of the service."""
-    return ScanInterruptedError("The service ended while this scan was under way. Scan again.")
+    """The error that stands for a job cut off by the end of the service."""
+    return ScanInterruptedError("The service ended while this was under way. Start it again.")
 
 
 def disk_refusal(error: OSError, path: Path | None) -> str:

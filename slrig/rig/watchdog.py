@@ -122,7 +122,10 @@ class Calls:
             with progress_heard(heard):
                 value = function()
         except SlrigError as error:
-            self._note(_placed(error, device, step))
+            # Whoever opens a device names it; and capture tells of a frame that did not come in words of its own.
+            if isinstance(error, DeviceError) and not isinstance(error, FrameTimeoutError) and step != OPEN:
+                error.place = f"{device}, in {step}"
+            self._note(error)
             raise
         except OSError as error:
             told = _of_the_system(error, call)
@@ -276,17 +279,6 @@ class _GuardedProjector:
         info = self._projector.info
         device = f"projector '{info.name}'"
         return self._calls.make(device, step, info.limits.call_s, function, computed=info.limits.computed)
-
-
-def _placed(error: SlrigError, device: str, step: str) -> SlrigError:
-    """The error itself, with the place where it happened at the end of its text, once."""
-    place = f"({device}, in {step})"
-    text = str(error)
-    # Whoever opens a device names it; and capture tells of a frame that did not come in words of its own.
-    unplaced = isinstance(error, DeviceError) and not isinstance(error, FrameTimeoutError) and step != OPEN
-    if unplaced and not text.endswith(place):
-        error.args = (f"{text} {place}", *error.args[1:])
-    return error
 
 
 def _of_the_system(error: OSError, call: Call) -> DeviceError:
