@@ -13,7 +13,7 @@ from slrig.conformance.check import Need
 from tests.contract.dlpc350_bench import CHECKS as ON_A_NODE
 from tests.contract.guest.machine import FILES, Module, require_guest, run_in_guest
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.one_core]
 
 TIMEOUT_S = 420.0
 

@@ -151,7 +151,7 @@ def test_sessions_over_a_bad_line_are_exact(interpreter: str, sessions: int) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.alone
+@pytest.mark.one_core
 def test_500_sessions_over_a_bad_line_are_exact(capsys: pytest.CaptureFixture[str]) -> None:
     def played(seed: int) -> Tallied:
         tallied, scene = Tallied(), Scene()

@@ -15,7 +15,7 @@ from tests.contract.guest.vivid import modules
 from tests.contract.guest.vivid_checks import ALL
 from tests.contract.vivid_bench import DRIVERS
 
-pytestmark = [pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.slow, pytest.mark.one_core]
 
 TIMEOUT_S = 540.0
 TRIGGERS = {Need.SOFTWARE, Need.HARDWARE, Need.PLAYS}
