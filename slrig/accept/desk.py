@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
-import structlog
-
 from slrig.accept.plan import AcceptancePlan
-from slrig.accept.records import AcceptanceRecord, AcceptanceState, RequestKey
+from slrig.accept.records import AcceptanceRecord, AcceptanceState, with_jobs
 from slrig.accept.running import Evaluate, by_positioner, measured, required_calibration
-from slrig.accept.store import AcceptanceStore, interruption_fault
+from slrig.accept.store import AcceptanceStore
 from slrig.accept.verdicts import AcceptanceResult, verdicts
-from slrig.calibrate.pose_shooting import RigQueue
 from slrig.devices import Rig
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -26,29 +23,20 @@ from slrig.errors import (
     InvalidInputError,
     JobNotFoundError,
     ScanCancelledError,
-    ScanInterruptedError,
     ScanStateError,
-    StorageError,
 )
-from slrig.failure import failure_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
-from slrig.jobs.records import Clock, JobProgress, require_same_body, utc_now
+from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.records import Clock, JobRecord, utc_now
+from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
+from slrig.jobs.store import JobStore
 from slrig.model import Calibration
-
-_log = structlog.get_logger(__name__)
-
-
-@dataclass(slots=True)
-class _Held:
-    """A test, and the id of its work with the rig."""
-
-    record: AcceptanceRecord
-    work_id: UUID | None = None
+from slrig.scan.runner import RigAccess
 
 
 class AcceptanceDesk:
-    """The tests of one service, those of earlier runs among them. Any thread may call.
+    """The tests of one service, those of earlier runs among them. Any thread may call; `close` at the end.
 
     Raises
     ------
@@ -59,31 +47,45 @@ class AcceptanceDesk:
     def __init__(
         self,
         folder: DataFolder,
-        queue: RigQueue,
+        queue: RigAccess,
+        jobs: JobStore,
         *,
         evaluate: Evaluate,
         report: Callable[[AcceptanceResult, Path], None],
         clock: Clock = utc_now,
     ) -> None:
-        """`evaluate` : as `slrig.accept.running.evaluated`. report : writes the reports of a test."""
+        """`evaluate` : as `slrig.accept.running.evaluated`. report : writes the reports of a test. jobs : those of
+        positions.
+        """
         self._store = AcceptanceStore(folder)
         self._queue = queue
+        self.jobs = jobs
+        self._work = RigJobs(jobs, queue, folder)
         self._clock = clock
         self._evaluate, self._report = evaluate, report
         self._lock = threading.RLock()
-        self._tests = {record.id: _Held(record) for record in self._store.load()}
+        self._tests = {record.id: record for record in self._store.load()}
 
-    def open(
-        self, plan_of: Callable[[Calibration], AcceptancePlan], *, key: RequestKey | None = None
-    ) -> AcceptanceRecord:
-        """Open a test of the rig as it is calibrated now, or return the one that a request with this key opened before.
+    def take_up(self) -> None:
+        """Go on with the positions that waited when the service ended; those that had the rig were interrupted."""
+        for test_id, jobs in self.jobs.of().items():
+            if test_id not in self._tests:
+                self.jobs.delete_of(test_id)
+                continue
+            for job in jobs:
+                if not job.state.final:
+                    parts = self._parts(test_id, scripted=job.plan["scripted"])
+                    self._work.take_up(job, parts, holder=_holder(test_id))
 
-        Touches no device.
+    def close(self) -> None:
+        """Put on record what the disk refused before. Idempotent."""
+        self._work.close()
+
+    def open(self, plan_of: Callable[[Calibration], AcceptancePlan]) -> AcceptanceRecord:
+        """Open a test of the rig as it is calibrated now. Touches no device.
 
         Raises
         ------
-        IdempotencyError
-            The key was sent before with another request.
         DeviceBusyError
             The rig is not open yet.
         CalibrationError, InvalidInputError
@@ -92,12 +94,6 @@ class AcceptanceDesk:
             The disk refused.
         """
         with self._lock:
-            if key is not None:
-                for held in self._tests.values():
-                    opened = held.record.opened_by
-                    if opened is not None and opened.key == key.key:
-                        require_same_body(opened.fingerprint, key.fingerprint, made="request")
-                        return held.record
             status = self._queue.status()
             if status.facts is None:
                 message = "The rig is being opened. Ask again in a moment."
@@ -106,22 +102,24 @@ class AcceptanceDesk:
             if calibration is None:
                 message = f"rig '{status.rig}' has no calibration, and nothing can be measured; calibrate it first"
                 raise CalibrationError(message)
-            number = 1 + max((held.record.number for held in self._tests.values()), default=0)
+            number = 1 + max((record.number for record in self._tests.values()), default=0)
             record = AcceptanceRecord(
-                number, uuid4(), self._clock(), status.rig, calibration.solve_id, plan_of(calibration), opened_by=key
+                number, uuid4(), self._clock(), status.rig, calibration.solve_id, plan_of(calibration)
             )
             self._store.save(record)
-            self._tests[record.id] = _Held(record)
+            self._tests[record.id] = record
         return record
 
     def get(self, test_id: UUID) -> AcceptanceRecord:
         """Return a test. Raises JobNotFoundError."""
-        return self._held(test_id).record
+        with self._lock:
+            return with_jobs(self._found(test_id), self.jobs.of(test_id).get(test_id, ()))
 
     def latest(self) -> tuple[AcceptanceRecord, ...]:
         """Return all tests, newest first."""
         with self._lock:
-            return tuple(held.record for held in reversed(self._tests.values()))
+            jobs = self.jobs.of()
+            return tuple(with_jobs(record, jobs.get(record.id, ())) for record in reversed(self._tests.values()))
 
     def measure(
         self,
@@ -129,72 +127,57 @@ class AcceptanceDesk:
         *,
         wait: bool,
         scripted: bool,
-        key: RequestKey | None = None,
+        key: str | None = None,
         holder: Holder | None = None,
-    ) -> AcceptanceRecord:
-        """Have the next position measured, or, scripted, all that are left; return at once.
+    ) -> JobRecord:
+        """Have the next position measured, or, scripted, all that are left; return the job at once.
 
-        By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. A request with
-        a key that came before changes nothing. holder : whom a refusal names meanwhile; None the test.
+        By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. key : the
+        idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the test.
 
         Raises
         ------
         JobNotFoundError, ScanStateError
             There is no such test, or it is being measured, or it is over.
-        IdempotencyError
-            The key was sent before with another request.
         RigBusyError, QueueFullError, DeviceError
             As a scan.
         """
         with self._lock:
-            held = self._held(test_id)
-            if key is not None and key.key in held.record.measured_by:
-                require_same_body(held.record.measured_by[key.key], key.fingerprint, made="request")
-                return held.record
-            if not held.record.state.waiting:
-                message = f"Acceptance test {test_id} is {held.record.state}; a position is measured while it is open."
+            record = self.get(test_id)
+            if not record.state.waiting:
+                message = f"Acceptance test {test_id} is {record.state}; a position is measured while it is open."
                 raise ScanStateError(message)
-            words = f"acceptance test {test_id}"
-            keys = {} if key is None else {key.key: key.fingerprint}
-
-            def begun(work_id: UUID) -> None:
-                held.work_id = work_id
-                held.record = replace(
-                    held.record,
-                    state=AcceptanceState.MEASURING,
-                    fault=None,
-                    measured_by={**held.record.measured_by, **keys},
-                )
-
-            self._queue.submit_work(
-                lambda rig, cancelled: self._measure(held, rig, cancelled, scripted=scripted),
-                holder=holder or Holder(words, words, f"/acceptance/{test_id}"),
+            job_id = uuid4()
+            self._work.submit(
+                job_id,
+                self._parts(test_id, scripted=scripted),
+                holder=holder or _holder(test_id),
                 wait=wait,
-                ended=lambda error: self._ended(held, error),
-                begun=begun,
+                record=lambda: self.jobs.create(
+                    {"scripted": scripted}, rig=record.rig, label=None, key=key, job_id=job_id, parent=test_id
+                ),
             )
-            return held.record
+            return self.jobs.get(job_id)
 
     def cancel(self, test_id: UUID) -> AcceptanceRecord:
         """End a test. Returns at once; one that is over stays so. Raises JobNotFoundError, StorageError."""
         with self._lock:
-            held = self._held(test_id)
-            work_id = held.work_id
-            if held.record.state.waiting:
-                self._change(held, state=AcceptanceState.CANCELLED)
-        if work_id is not None:
-            self._queue.cancel_work(work_id)
-        return held.record
+            if self.get(test_id).state.waiting:
+                self._change(test_id, state=AcceptanceState.CANCELLED)
+            under_way = [job.id for job in self.jobs.of(test_id).get(test_id, ()) if not job.state.final]
+        for job_id in under_way:
+            self._work.cancel(job_id)
+        return self.get(test_id)
 
     def delete(self, test_id: UUID) -> None:
         """Forget a test and remove its files. Raises JobNotFoundError, ScanStateError, StorageError."""
         with self._lock:
-            held = self._held(test_id)
-            if held.record.state is AcceptanceState.MEASURING:
+            if self.get(test_id).state is AcceptanceState.MEASURING:
                 message = f"Acceptance test {test_id} is being measured. Cancel it, then delete it."
                 raise ScanStateError(message)
             self._store.delete(test_id)
             del self._tests[test_id]
+            self.jobs.delete_of(test_id)
 
     def file(self, test_id: UUID, name: str) -> Path:
         """Return where a report lies. Raises JobNotFoundError, ArtefactNotReadyError."""
@@ -207,34 +190,50 @@ class AcceptanceDesk:
             raise ArtefactNotReadyError(message)
         return path
 
-    def _held(self, test_id: UUID) -> _Held:
+    def _found(self, test_id: UUID) -> AcceptanceRecord:
+        """A test as it is on disk."""
         with self._lock:
-            held = self._tests.get(test_id)
-        if held is None:
+            record = self._tests.get(test_id)
+        if record is None:
             message = f"No acceptance test {test_id} is on record here. GET /acceptance lists those that are."
             raise JobNotFoundError(message)
-        return held
+        return record
 
-    def _measure(self, held: _Held, rig: Rig, cancelled: Callable[[], bool], *, scripted: bool) -> None:
+    def _parts(self, test_id: UUID, *, scripted: bool) -> Parts:
+        """Captures and evaluates, with the rig; then the report, where all is measured."""
+        calibration: Calibration | None = None
+
+        def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
+            nonlocal calibration
+            calibration = _same_calibration(self._found(test_id), rig)
+            self._measure(test_id, rig, progress, cancelled, scripted=scripted)
+
+        def compute(_: ProgressRecorder) -> Outcome:
+            record = self._found(test_id)
+            if record.next_take is None and calibration is not None:
+                self._conclude(record, calibration)
+            return Outcome({"captures_done": len(record.readings)})
+
+        return Parts(capture=capture, compute=compute)
+
+    def _measure(
+        self, test_id: UUID, rig: Rig, progress: ProgressRecorder, cancelled: Cancelled, *, scripted: bool
+    ) -> None:
         """On the rig's thread: measure one position, or all that are left."""
-        with self._lock:
-            self._change(held, readings=held.record.from_first_take().readings)
-        plan = held.record.plan
-        calibration = _same_calibration(held.record, rig)
+        record = self._change(test_id, readings=self._found(test_id).from_first_take().readings)
+        plan = record.plan
         if plan.rendered and rig.truth() is None:
             message = "exact artefacts are those of a rendered rig, and this one is not; send the certificates' values"
             raise InvalidInputError(message)
         place = by_positioner(rig, plan) if scripted else None
-        folder = self._store.folder(held.record.id)
+        folder = self._store.folder(test_id)
         count = len(plan.takes)
-        while (following := held.record.next_take) is not None:
+        while (following := record.next_take) is not None:
             step, take = following
-            done = len(held.record.readings)
+            done = len(record.readings)
 
             def told(stage: str, fraction: float, detail: str, /, name: str = step.name, done: int = done) -> None:
-                share = (done + min(max(fraction, 0.0), 1.0)) / count
-                with self._lock:
-                    held.record = replace(held.record, progress=JobProgress(f"{name}: {stage}", share, detail))
+                progress(f"{name}: {stage}", (done + min(max(fraction, 0.0), 1.0)) / count, detail)
 
             if cancelled():
                 message = f"the acceptance test was cancelled before {step.name}"
@@ -242,44 +241,33 @@ class AcceptanceDesk:
             if place is not None and take == 0:
                 place(rig, step)
             found = measured(rig, plan, step, take, folder, progress=told, cancelled=cancelled, evaluate=self._evaluate)
-            self._change(held, readings=(*held.record.readings, found))
-            following = held.record.next_take
+            record = self._change(test_id, readings=(*record.readings, found))
+            following = record.next_take
             # A repeat goes with its first: nothing is moved between them.
             if place is None and (following is None or following[1] == 0):
                 break
-        if held.record.next_take is None:
-            record = held.record
-            result = AcceptanceResult(
-                rig.name, record.created_at, self._clock(), plan, calibration, record.readings,
-                verdicts(record.readings, plan),
-            )  # fmt: skip
-            self._report(result, folder)
-            self._change(held, state=AcceptanceState.FINISHED, decision=result.decision, progress=None)
 
-    def _change(self, held: _Held, **changes: Any) -> None:
-        """Put a change on record. Raises StorageError, and changes nothing then."""
+    def _conclude(self, record: AcceptanceRecord, calibration: Calibration) -> None:
+        """Decide, and write the reports: every position is measured."""
+        result = AcceptanceResult(
+            record.rig, record.created_at, self._clock(), record.plan, calibration, record.readings,
+            verdicts(record.readings, record.plan),
+        )  # fmt: skip
+        self._report(result, self._store.folder(record.id))
+        self._change(record.id, state=AcceptanceState.FINISHED, decision=result.decision)
+
+    def _change(self, test_id: UUID, **changes: Any) -> AcceptanceRecord:
+        """Put a change on record, and return the test. Raises StorageError, and changes nothing then."""
         with self._lock:
-            changed = replace(held.record, **changes)
+            changed = replace(self._found(test_id), **changes)
             self._store.save(changed)
-            held.record = changed
+            self._tests[test_id] = changed
+            return changed
 
-    def _ended(self, held: _Held, error: Exception | None) -> None:
-        """The rig is free."""
-        state, fault = AcceptanceState.OPEN, None if error is None else failure_of(error)
-        if held.record.state is AcceptanceState.FINISHED:
-            state = AcceptanceState.FINISHED
-        elif isinstance(error, ScanCancelledError):
-            state = AcceptanceState.CANCELLED
-        elif isinstance(error, ScanInterruptedError):
-            state, fault = AcceptanceState.INTERRUPTED, interruption_fault()
-        with self._lock:
-            held.work_id = None
-            held.record = replace(held.record, state=state, fault=fault, progress=None)
-            try:
-                self._store.save(held.record)
-            except StorageError:
-                # Whoever waits is told by the record in memory.
-                _log.exception("the end of a measurement could not be put on record", acceptance=str(held.record.id))
+
+def _holder(test_id: UUID) -> Holder:
+    words = f"acceptance test {test_id}"
+    return Holder(words, words, f"/acceptance/{test_id}")
 
 
 def _same_calibration(record: AcceptanceRecord, rig: Rig) -> Calibration:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -19,7 +19,7 @@ from slrig.calibrate.records import plain
 from slrig.calibration.artefacts import Decision
 from slrig.errors import StorageError
 from slrig.failure import JobFailure
-from slrig.jobs.records import JobProgress
+from slrig.jobs.records import JobProgress, JobRecord, JobState
 
 _FORMAT = "slrig-acceptance-test"
 
@@ -44,21 +44,15 @@ class AcceptanceState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class RequestKey:
-    """An idempotency key, and what tells its request from another."""
-
-    key: str
-    fingerprint: str
-
-
-@dataclass(frozen=True, slots=True)
 class AcceptanceRecord:
     """One test.
 
     number : rises with every test and orders lists. calibration : id of the one that it is done with. readings : of
-    every capture so far, in the order of the plan. fault : why the last position was not measured, None where it was;
-    it may be measured again. progress : of what is under way. decision : None before the end. opened_by : the key of
-    the request that opened it; measured_by : by key, the fingerprints of those that had positions measured.
+    every capture so far, in the order of the plan. state : on disk OPEN, FINISHED or CANCELLED. decision : None before
+    the end.
+
+    The last two are of its jobs, and not on disk. fault : why the last position was not measured, None where it was; it
+    may be measured again. progress : of what is under way.
     """
 
     number: int
@@ -69,11 +63,9 @@ class AcceptanceRecord:
     plan: AcceptancePlan
     state: AcceptanceState = AcceptanceState.OPEN
     readings: tuple[Reading, ...] = ()
+    decision: Decision | None = None
     fault: JobFailure | None = None
     progress: JobProgress | None = None
-    decision: Decision | None = None
-    opened_by: RequestKey | None = None
-    measured_by: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def next_take(self) -> tuple[Step, int] | None:
@@ -90,9 +82,24 @@ class AcceptanceRecord:
         return self if following is None else replace(self, readings=self.readings[: len(self.readings) - following[1]])
 
 
+_AFTER = {JobState.INTERRUPTED: AcceptanceState.INTERRUPTED, JobState.CANCELLED: AcceptanceState.CANCELLED}
+"""What a test is when its newest job ended so."""
+
+
+def with_jobs(record: AcceptanceRecord, jobs: Sequence[JobRecord]) -> AcceptanceRecord:
+    """A test as it is on disk, completed by what its jobs, oldest first, say."""
+    if not record.state.waiting or not jobs:
+        return record
+    job = jobs[-1]
+    if not job.state.final:
+        return replace(record, state=AcceptanceState.MEASURING, progress=job.progress)
+    return replace(record, state=_AFTER.get(job.state, record.state), fault=job.fault)
+
+
 def record_json(record: AcceptanceRecord) -> bytes:
-    """A record as JSON text; how far it is within a capture is left out."""
-    document = {"format": _FORMAT, "version": 1, **plain(replace(record, progress=None))}
+    """A record as JSON text, without what its jobs say."""
+    document = {"format": _FORMAT, "version": 2, **plain(replace(record, progress=None, fault=None))}
+    del document["progress"], document["fault"]
     document["created_at"] = record.created_at.isoformat()
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
@@ -103,7 +110,7 @@ def record_from_json(text: bytes, source: str) -> AcceptanceRecord:
         found = json.loads(text)
         if found["format"] != _FORMAT:
             raise KeyError(found["format"])  # noqa: TRY301 - told with the other faults of the file
-        fault, key, decision = found["fault"], found["opened_by"], found["decision"]
+        decision = found["decision"]
         return AcceptanceRecord(
             number=int(found["number"]),
             id=UUID(found["id"]),
@@ -113,10 +120,7 @@ def record_from_json(text: bytes, source: str) -> AcceptanceRecord:
             plan=_plan(found["plan"]),
             state=AcceptanceState(found["state"]),
             readings=tuple(_reading(each) for each in found["readings"]),
-            fault=None if fault is None else JobFailure(**fault),
             decision=None if decision is None else Decision(decision),
-            opened_by=None if key is None else RequestKey(**key),
-            measured_by=found["measured_by"],
         )
     except (ValueError, KeyError, TypeError) as error:
         message = f"{source} is not an acceptance test as this version of slrig writes it: {error!r}"

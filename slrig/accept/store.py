@@ -20,8 +20,8 @@ import structlog
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import Decision
-from slrig.errors import ScanInterruptedError, StorageError
-from slrig.failure import JobFailure, disk_errors
+from slrig.errors import StorageError
+from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
 
 RECORD, HTML, JSON = "test.json", "report.html", "report.json"
@@ -85,18 +85,9 @@ class AcceptanceStore:
         shutil.rmtree(gone, ignore_errors=True)
 
     def _settled(self, record: AcceptanceRecord) -> AcceptanceRecord:
-        """The record of a test that nothing is done for; the same object if nothing was."""
-        if record.state is not AcceptanceState.MEASURING:
-            return record
+        """The record of a test that was cut off between its report and its record; the same object if it was not."""
         report = self.folder(record.id) / JSON
-        if report.is_file():
-            # Cut off between its report and its record.
-            decided = Decision(json.loads(report.read_bytes())["decision"])
-            return replace(record, state=AcceptanceState.FINISHED, decision=decided)
-        return replace(record, state=AcceptanceState.INTERRUPTED, fault=interruption_fault())
-
-
-def interruption_fault() -> JobFailure:
-    """The fault of a test that the end of the service cut off."""
-    message = "The service ended while a position was measured. Measure it again to go on, or cancel the test."
-    return JobFailure(ScanInterruptedError.code, message)
+        if record.state is not AcceptanceState.OPEN or not report.is_file():
+            return record
+        decided = Decision(json.loads(report.read_bytes())["decision"])
+        return replace(record, state=AcceptanceState.FINISHED, decision=decided)

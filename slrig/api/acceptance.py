@@ -12,14 +12,15 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
 from slrig.accept.asking import AcceptanceRequest
-from slrig.accept.records import AcceptanceRecord, AcceptanceState, RequestKey
+from slrig.accept.records import AcceptanceRecord, AcceptanceState
 from slrig.accept.store import HTML, JSON
-from slrig.api.idempotency import IdempotencyKey
+from slrig.api.idempotency import IdempotencyKey, once, started_once
 from slrig.api.openapi import problems
-from slrig.api.schemas import AnyFault, filled, fingerprint
+from slrig.api.schemas import AnyFault, filled
 from slrig.api.service import Serving
 from slrig.bundle.faults import Strict
 from slrig.calibration.artefacts import Decision
+from slrig.jobs.records import JobRecord
 
 router = APIRouter(prefix="/acceptance", tags=["acceptance"])
 
@@ -90,7 +91,14 @@ def open_acceptance(
     idempotency_key: IdempotencyKey = None,
 ) -> AcceptanceBody:
     """Open an acceptance test of the rig as it is calibrated now. Touches no device."""
-    record = service.acceptance.open(request.plan, key=_key(idempotency_key, request))
+
+    def start(key: str | None) -> UUID:
+        made = service.acceptance.open(request.plan).id
+        if key is not None:
+            service.keys.tie(key, made)
+        return made
+
+    record = service.acceptance.get(once(service.keys, idempotency_key, request, start))
     response.headers["Location"] = f"/acceptance/{record.id}"
     # As it was when it was opened, so that a repeated request gets the same answer.
     opened = replace(record, state=AcceptanceState.OPEN, readings=(), fault=None, progress=None, decision=None)
@@ -117,9 +125,13 @@ def measure_position(
     idempotency_key: IdempotencyKey = None,
 ) -> AcceptanceBody:
     """Measure the next position, with its repeats; by script, all that are left. The answer comes at once."""
-    wait = request.if_busy == "queue"
-    key = _key(idempotency_key, request)
-    return _body(service.acceptance.measure(test_id, wait=wait, scripted=request.scripted, key=key))
+    desk, wait = service.acceptance, request.if_busy == "queue"
+
+    def start(key: str | None) -> JobRecord:
+        return desk.measure(test_id, wait=wait, scripted=request.scripted, key=key)
+
+    started_once(service.keys, desk.jobs, idempotency_key, request, start, parent=test_id)
+    return _body(desk.get(test_id))
 
 
 @router.post("/{test_id}/cancel", status_code=202, responses=problems(404, 422, 507))
@@ -144,10 +156,6 @@ def acceptance_page(service: Serving, test_id: UUID) -> FileResponse:
 def acceptance_report(service: Serving, test_id: UUID) -> FileResponse:
     """Return the report for machines."""
     return FileResponse(service.acceptance.file(test_id, JSON), media_type="application/json")
-
-
-def _key(given: str | None, request: BaseModel) -> RequestKey | None:
-    return None if given is None else RequestKey(given, fingerprint(request))
 
 
 def _summary(record: AcceptanceRecord) -> AcceptanceSummary:

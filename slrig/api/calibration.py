@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Body, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
 from slrig.api.calibration_schemas import (
@@ -25,16 +27,17 @@ from slrig.api.calibration_schemas import (
     comparison_body,
     pose_body,
 )
-from slrig.api.idempotency import IdempotencyKey
+from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
-from slrig.api.schemas import fingerprint, pattern_plan
+from slrig.api.schemas import pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibrate.records import PoseRecord, PoseState, SessionRecord
+from slrig.calibrate.records import PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT
 from slrig.calibration.board import USUAL_BOARD
+from slrig.jobs.records import JobRecord
 
 IMPORT_PATH = "/calibration/import"
 MOST_IMPORT_BYTES = MOST_CALIBRATION_BYTES
@@ -62,7 +65,7 @@ def answered(service: Service, record: SessionRecord) -> CalibrationBody:
         record,
         active=calibrations.active,
         files=ready_files(service, record),
-        last_event=calibrations.register.last_event(record.id),
+        last_event=calibrations.register.jobs.last_event_of(record.id),
     )
 
 
@@ -156,9 +159,12 @@ def shoot_pose(
     idempotency_key: IdempotencyKey = None,
 ) -> PoseBody:
     """Shoot a pose of the board. The answer comes at once; look at the pose for what was found."""
-    asked = PoseRequest(request.position, request.exposure_s, idempotency_key, fingerprint(request))
-    pose = service.calibrations.poses.shoot(calibration_id, asked, wait=request.if_busy == "queue")
-    return _accepted(service, response, calibration_id, pose)
+    asked, wait = PoseRequest(request.position, request.exposure_s), request.if_busy == "queue"
+    poses = service.calibrations.poses
+    return _accepted(
+        service, response, calibration_id, idempotency_key, request,
+        lambda key: poses.shoot(calibration_id, asked, wait=wait, key=key),
+    )  # fmt: skip
 
 
 @router.post("/{calibration_id}/script", status_code=202, responses=problems(404, 409, 422, 429, 502, 503, 507))
@@ -172,18 +178,31 @@ def shoot_script(
     """Have the positioner take its poses one after the other, and shoot each; return the first. Other work may come
     between two of them. To stop, cancel the pose that is under way.
     """
-    asked = PoseRequest(None, request.exposure_s, idempotency_key, fingerprint(request))
+    asked, wait = PoseRequest(None, request.exposure_s), request.if_busy == "queue"
     poses = service.calibrations.poses
-    pose = poses.script(calibration_id, request.positions, asked, wait=request.if_busy == "queue")
-    return _accepted(service, response, calibration_id, pose)
+    return _accepted(
+        service, response, calibration_id, idempotency_key, request,
+        lambda key: poses.script(calibration_id, request.positions, asked, wait=wait, key=key),
+    )  # fmt: skip
 
 
-def _accepted(service: Service, response: Response, calibration_id: UUID, pose: PoseRecord) -> PoseBody:
+def _accepted(
+    service: Service,
+    response: Response,
+    calibration_id: UUID,
+    key: str | None,
+    request: BaseModel,
+    shoot: Callable[[str | None], PoseRecord],
+) -> PoseBody:
     """The pose as it was when it was made, so that a repeated request gets the same answer."""
-    first = PoseRecord(
-        pose.number, PoseState.QUEUED, pose.created_at, pose.position, pose.position_name, pose.exposure_s
-    )
-    body = pose_body(calibration_id, first, service.calibrations.register.get(calibration_id).cameras)
+    register = service.calibrations.register
+    cameras = register.get(calibration_id).cameras
+
+    def start(key: str | None) -> JobRecord:
+        return register.jobs.get(shoot(key).id)
+
+    job = started_once(service.keys, register.jobs, key, request, start, parent=calibration_id)
+    body = pose_body(calibration_id, pose_of(job), cameras)
     response.headers["Location"] = body.links.self
     return body
 

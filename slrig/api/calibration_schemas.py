@@ -11,9 +11,10 @@ from pydantic import BaseModel, BeforeValidator, Field
 
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
 from slrig.bundle.faults import Strict
-from slrig.calibrate.records import PoseRecord, PoseState, SessionRecord, SessionState, plain
+from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, plain
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import Comparison
+from slrig.jobs.records import JobState
 from slrig.scan.plan import PatternPlan
 
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
@@ -106,7 +107,8 @@ class PoseBody(BaseModel):
 
     number: int
     name: str
-    state: PoseState
+    state: JobState = Field(description="succeeded where a solve takes it")
+    accepted: bool | None = Field(description="whether a solve takes it, by what was found; null until it was read")
     created_at: datetime
     position: int | None
     position_name: str | None
@@ -227,10 +229,11 @@ def board_of(request: BoardRequest) -> Board:
 def pose_body(session_id: UUID, pose: PoseRecord, cameras: Mapping[str, object]) -> PoseBody:
     """A pose as an answer; `cameras` are those of the session."""
     here = f"/calibration/{session_id}/pose/{pose.number}"
-    shown = pose.state in {PoseState.ACCEPTED, PoseState.REFUSED}
+    shown = pose.accepted or pose.refused
     pictures = {name: f"{here}/picture.png?camera={name}" for name in cameras} if shown else {}
     links = PoseLinks(self=here, events=f"/calibration/{session_id}/events", cancel=f"{here}/cancel", pictures=pictures)
-    return filled(PoseBody, pose, error=pose.fault, links=links)
+    judged = True if pose.accepted else False if pose.refused else None
+    return filled(PoseBody, pose, accepted=judged, error=pose.fault, links=links)
 
 
 def calibration_summary(record: SessionRecord, *, active: UUID | None, files: Mapping[str, str]) -> CalibrationSummary:

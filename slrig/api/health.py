@@ -169,7 +169,7 @@ def verify_rig(
             board, position=request.position, exposure_s=request.exposure_s, wait=request.if_busy == "queue", key=key
         )
 
-    job = started_once(service.verifications.jobs, idempotency_key, request, start)
+    job = started_once(service.keys, service.verifications.jobs, idempotency_key, request, start)
     body = _body(job)
     response.headers["Location"] = body.links["self"]
     return body

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
+from uuid import UUID
 
 from fastapi import Header
 from pydantic import BaseModel
 
 from slrig.api.schemas import fingerprint
+from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobProgress, JobRecord, JobState
 from slrig.jobs.store import JobStore
 
@@ -19,33 +21,59 @@ IdempotencyKey = Annotated[
         min_length=1,
         max_length=255,
         description="makes a repeat of this request return what the first one made instead of making another; kept "
-        "for a day, or as long as the calibration or the acceptance test that it belongs to",
+        "for a day, or as long as the service's settings say",
     ),
 ]
 
 
 def started_once(
-    store: JobStore, key: str | None, request: BaseModel, start: Callable[[str | None], JobRecord]
+    keys: RequestKeys,
+    store: JobStore,
+    key: str | None,
+    request: BaseModel,
+    start: Callable[[str | None], JobRecord],
+    *,
+    parent: UUID | None = None,
 ) -> JobRecord:
     """The job that a request makes, or made before with this key, as it was when it was made.
 
-    start : makes it, and ties it to the key that it is given; what it raises leaves the key free.
+    start : makes it, and ties it to the key that it is given; what it raises leaves the key free. parent : to which the
+    job belongs.
 
     Raises
     ------
     IdempotencyError
         The key was sent with another request, or its first request is still being answered.
     """
+    made = once(keys, key, request, lambda key: start(key).id, parent=parent)
+    return _at_first(store.get(made))
+
+
+def once(
+    keys: RequestKeys,
+    key: str | None,
+    request: BaseModel,
+    start: Callable[[str | None], UUID],
+    *,
+    parent: UUID | None = None,
+) -> UUID:
+    """The id of what a request makes, or made before with this key. See `started_once`."""
     if key is None:
-        return _at_first(start(None))
-    earlier = store.reserve_key(key, fingerprint(request))
+        return start(None)
+    mine = own_key(key, request, parent)
+    earlier = keys.reserve(mine, fingerprint(request))
     if earlier is not None:
-        return _at_first(store.get(earlier))
+        return earlier
     try:
-        return _at_first(start(key))
+        return start(mine)
     finally:
-        # Does nothing when the key has its job; a refused request may be tried again with the same key.
-        store.release_key(key)
+        # Does nothing when the key has what it made; a refused request may be tried again with the same key.
+        keys.release(mine)
+
+
+def own_key(key: str, request: BaseModel, parent: UUID | None = None) -> str:
+    """A key as it is on record: that of one kind of request, below one parent."""
+    return " ".join([type(request).__name__, *([] if parent is None else [str(parent)]), key])
 
 
 def _at_first(record: JobRecord) -> JobRecord:

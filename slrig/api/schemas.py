@@ -112,7 +112,7 @@ def filled(body: type[Body], source: object, /, **others: Any) -> Body:
 
 def fingerprint(request: BaseModel) -> str:
     """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
-    return hashlib.sha256(f"{type(request).__name__} {request.model_dump_json()}".encode()).hexdigest()
+    return hashlib.sha256(request.model_dump_json().encode()).hexdigest()
 
 
 def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:

@@ -59,7 +59,7 @@ def open_service(
     folder = DataFolder(settings.data_dir)
     try:
         prepare_kernel_cache(folder.root / "cache")
-        store = JobStore(Database(folder.database), JobKind.SCAN, key_life_s=settings.idempotency_keep_s)
+        store = JobStore(Database(folder.database), JobKind.SCAN)
         swept = sweep(store, folder)
     except BaseException:
         folder.release()

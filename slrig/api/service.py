@@ -15,6 +15,7 @@ from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
@@ -42,6 +43,7 @@ class Service:
     scan_defaults: ScanDefaults
     folder: DataFolder
     store: JobStore
+    keys: RequestKeys
     runner: Runner
     calibrations: Calibrations
     verifications: VerificationDesk
@@ -69,8 +71,8 @@ class Service:
         self.runner.close(timeout_s=self.settings.shutdown_s)
         # A run that held a deaf driver has its answer now.
         self.scheduler.close(timeout_s=_SCHEDULE_END_S)
-        self.verifications.close()
-        self.calibrations.close()
+        for desk in (self.verifications, self.calibrations, self.acceptance):
+            desk.close()
 
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""
@@ -102,9 +104,12 @@ def assembled_service(
         The disk refused. What was given is still the caller's to close.
     """
     spare_bytes = settings.min_free_bytes
+    keys = RequestKeys(store.database, life_s=settings.idempotency_keep_s)
+    keys.release_all()
     calibrations = Calibrations(
         folder,
         runner,
+        JobStore(store.database, JobKind.POSE, JobKind.SOLVE),
         rig_name=rig_name,
         tools=calibration_tools or usual_calibration_tools(worker),
         spare_bytes=spare_bytes,
@@ -121,13 +126,15 @@ def assembled_service(
         spare_bytes=spare_bytes,
     )
     runner.watch_health(verifications)
-    verifications.take_up()
     acceptance = AcceptanceDesk(
         folder,
         runner,
+        JobStore(store.database, JobKind.POSITION),
         evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
         report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
     )
+    for desk in (verifications, calibrations, acceptance):
+        desk.take_up()
     retention = Retention(
         calibrations,
         folder,
@@ -145,6 +152,7 @@ def assembled_service(
         scan_defaults=scan_defaults,
         folder=folder,
         store=store,
+        keys=keys,
         runner=runner,
         calibrations=calibrations,
         verifications=verifications,

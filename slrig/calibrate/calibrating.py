@@ -14,11 +14,12 @@ from slrig.bundle.calibration_file import write_calibration
 from slrig.bundle.opencv_calibration import write_opencv_calibration
 from slrig.bundle.storage import write_durably
 from slrig.calibrate.pose_answering import PoseAnswers, setting_of
-from slrig.calibrate.pose_shooting import PoseDesk, RigQueue
+from slrig.calibrate.pose_shooting import PoseDesk
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solves import SolveDesk
 from slrig.calibrate.store import CALIBRATION, ActivePointer, CalibrationStore
+from slrig.calibrate.sweep import sweep_calibrations
 from slrig.calibrate.tools import CalibrationTools, sizes_of
 from slrig.calibration.board import Board
 from slrig.calibration.judging.comparison import Comparison
@@ -26,9 +27,12 @@ from slrig.errors import ArtefactNotReadyError, CalibrationError, CalibrationSta
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import Clock, utc_now
+from slrig.jobs.rig_jobs import RigJobs
+from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import PatternPlan
+from slrig.scan.runner import RigAccess
 
 EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 """The forms in which a calibration can be had, and taken in."""
@@ -36,7 +40,7 @@ EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 _log = structlog.get_logger(__name__)
 
 
-class CalibratedRig(RigQueue, Protocol):
+class CalibratedRig(RigAccess, Protocol):
     """`slrig.scan.runner.Runner`: does work with the rig, and takes a calibration for what is begun from now on."""
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:
@@ -47,7 +51,7 @@ class CalibratedRig(RigQueue, Protocol):
 class Calibrations:
     """The calibrations of a data folder, and the work on them. Any thread may call; `close` at the end.
 
-    `poses` shoots, `solves` solves, `register` has the records.
+    jobs : those of poses and solves. `poses` shoots, `solves` solves, `register` has the records.
 
     Raises
     ------
@@ -59,6 +63,7 @@ class Calibrations:
         self,
         folder: DataFolder,
         rig: CalibratedRig,
+        jobs: JobStore,
         *,
         rig_name: str,
         tools: CalibrationTools,
@@ -66,21 +71,25 @@ class Calibrations:
         spare_bytes: int = 0,
     ) -> None:
         self.store = CalibrationStore(folder)
-        self.register = CalibrationRegister(self.store)
-        self._folder = folder
+        self.register = CalibrationRegister(self.store, jobs)
+        self._work = RigJobs(jobs, rig, folder)
         self._rig = rig
         self._rig_name = rig_name
         self._clock = clock
         self._tools = tools
         self.answers = PoseAnswers(self.register, self._tools)
         self.poses = PoseDesk(
-            self.register, folder, rig, self._tools, self.answers, clock=clock, spare_bytes=spare_bytes
+            self.register, folder, rig, self._work, self._tools, self.answers, clock=clock, spare_bytes=spare_bytes
         )
-        self.solves = SolveDesk(self.register, self._tools, self.answers, clock=clock, earlier=self._in_use)
+        self.solves = SolveDesk(self.register, self._work, self._tools, self.answers, clock=clock, earlier=self._in_use)
         found = self.store.active_calibration()
         if found is not None:
             pointer, calibration = found
             rig.use_calibration(ActiveCalibration(str(pointer.id), calibration))
+
+    def take_up(self) -> None:
+        """Go on with what the last run of the service left: see `sweep_calibrations`."""
+        sweep_calibrations(self.register, self.poses, self.solves)
 
     def open(self, board: Board, *, label: str | None = None, patterns: PatternPlan = USUAL_PATTERNS) -> SessionRecord:
         """Open a session for a board. Touches no device. Raises StorageError."""
@@ -131,10 +140,11 @@ class Calibrations:
                 self.register.add(replace(record, state=SessionState.OPEN, solve=0))
                 try:
                     self.store.commit_solve(session_id, 1, staged)
-                    return self.register.change(session_id, lambda _: record)
+                    self.register.change(session_id, lambda _: record)
                 except BaseException:
                     self.register.remove(session_id)
                     raise
+                return record
         finally:
             self.store.discard(staged)
 
@@ -261,8 +271,8 @@ class Calibrations:
         return self.register.all()
 
     def close(self) -> None:
-        """Record what is under way as cut off. Idempotent; after the rig's runner has been closed."""
-        self.register.close()
+        """Put on record what the disk refused before. Idempotent; after the rig's runner has been closed."""
+        self._work.close()
 
     def _calibration(self, record: SessionRecord) -> Calibration:
         if not record.solve:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import structlog
 
 from slrig.calibrate.pose_answering import PoseAnswers, board_of, opened
-from slrig.calibrate.records import KeptKey, PoseRecord, PoseState, SessionRecord, SessionState
+from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, pose_of
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.store import BUNDLE
 from slrig.calibrate.tools import CalibrationTools
@@ -20,65 +18,47 @@ from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
     CalibrationStateError,
+    PoseRefusedError,
     SlrigError,
     UnsupportedByDeviceError,
 )
+from slrig.failure import JobFailure
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
-from slrig.jobs.records import Clock, require_same_body
+from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.records import Clock, JobKind, JobRecord, JobState
+from slrig.jobs.rig_jobs import Cancelled, Parts, RigJobs
 from slrig.model import Size
 from slrig.rig.session import RigFacts
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
-from slrig.scan.runner import RunnerStatus
+from slrig.scan.runner import RigAccess
 
 _log = structlog.get_logger(__name__)
-
-
-class RigQueue(Protocol):
-    """`slrig.scan.runner.Runner`, as far as a session needs it."""
-
-    def submit_work(
-        self,
-        work: Callable[[Rig, Callable[[], bool]], None],
-        *,
-        holder: Holder,
-        wait: bool,
-        ended: Callable[[Exception | None], None],
-        begun: Callable[[UUID], None],
-    ) -> UUID:
-        """Have work done with the rig."""
-        ...
-
-    def cancel_work(self, work_id: UUID) -> None:
-        """Ask it to end early."""
-        ...
-
-    def status(self) -> RunnerStatus:
-        """What the rig is."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
 class PoseRequest:
     """A pose that is asked for. position : index or name of a pose of the positioner; None leaves the board where it
-    is. key, fingerprint : of the request, so that its repeat shoots nothing.
+    is.
     """
 
     position: int | str | None = None
     exposure_s: float | None = None
-    key: str | None = None
-    fingerprint: str = ""
 
 
 class PoseDesk:
-    """Shoots, cancels and drops poses. Any thread may call."""
+    """Shoots, cancels and drops poses. Any thread may call.
+
+    A job's summary is what the pose's folder says of it: see `slrig.calibrate.pose_answering`.
+    """
 
     def __init__(
         self,
         register: CalibrationRegister,
         folder: DataFolder,
-        queue: RigQueue,
+        queue: RigAccess,
+        work: RigJobs,
         tools: CalibrationTools,
         answers: PoseAnswers,
         *,
@@ -89,16 +69,24 @@ class PoseDesk:
         self._store = register.store
         self._folder = folder
         self._queue = queue
+        self._work = work
         self._tools = tools
         self._clock = clock
         self._spare_bytes = spare_bytes
         self._answers = answers
-        self._work_ids: dict[tuple[UUID, int], UUID] = {}
 
-    def shoot(self, session_id: UUID, request: PoseRequest, *, wait: bool, holder: Holder | None = None) -> PoseRecord:
+    def shoot(
+        self,
+        session_id: UUID,
+        request: PoseRequest,
+        *,
+        wait: bool,
+        key: str | None = None,
+        holder: Holder | None = None,
+    ) -> PoseRecord:
         """Have a pose shot; `wait` lets it stand in line. Returns at once.
 
-        holder : whom a refusal names meanwhile; None the pose.
+        key : the idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the pose.
 
         Raises
         ------
@@ -108,8 +96,6 @@ class PoseDesk:
             The rig has no positioner, or not that position, or a camera cannot expose so long.
         CalibrationError
             The rig is not the one of the session's other poses.
-        IdempotencyError
-            The key was sent before with another request.
         StorageError
             There is too little room, or the disk refused.
         RigBusyError, QueueFullError, DeviceError
@@ -117,39 +103,50 @@ class PoseDesk:
         """
         with self._register.lock:
             record = self._register.get(session_id)
-            earlier = _kept(record, request)
-            if earlier is not None:
-                return self._register.pose(session_id, earlier)
             _refuse_closed(record)
-            facts = self._queue.status().facts
-            place, name = _position(request.position, facts)
-            plan = ScanPlan(patterns=record.patterns, exposure_s=request.exposure_s)
-            if facts is not None:
-                require_same_rig(record, facts)
-                self._folder.require_space(2 * check_plan(plan, facts) + self._spare_bytes)
+            status = self._queue.status()
+            place, name = _position(request.position, status.facts)
+            scan = _scan(record, request.exposure_s)
+            if status.facts is not None:
+                require_same_rig(record, status.facts)
+                self._folder.require_space(2 * check_plan(scan, status.facts) + self._spare_bytes)
             number = record.latest_pose + 1
-            pose = PoseRecord(number, PoseState.QUEUED, self._clock(), place, name, request.exposure_s)
+            job_id = uuid4()
+            pose = PoseRecord(number, job_id, JobState.QUEUED, self._clock(), place, name, request.exposure_s)
 
-            def begun(work_id: UUID) -> None:
-                self._work_ids[session_id, number] = work_id
-                self._register.change(session_id, lambda found: _with_new(found, pose, request))
+            def begun() -> None:
+                self._register.change(session_id, lambda found: replace(found, latest_pose=number))
+                self._register.jobs.create(
+                    pose.plan,
+                    rig=status.rig,
+                    label=None,
+                    key=key,
+                    job_id=job_id,
+                    kind=JobKind.POSE,
+                    parent=session_id,
+                )
 
-            own = Holder(
-                f"calibration {session_id}, pose {number}",
-                f"calibration {session_id}, pose {number}",
-                f"/calibration/{session_id}/pose/{number}",
-            )
-            self._queue.submit_work(
-                lambda rig, cancelled: self._shoot(session_id, pose, plan, rig, cancelled),
-                holder=holder or own,
-                wait=wait,
-                ended=lambda error: self._shot(session_id, number, error),
-                begun=begun,
-            )
-            return pose
+            parts = self._parts(session_id, job_id, pose, scan)
+            self._work.submit(job_id, parts, holder=holder or _holder(session_id, number), wait=wait, record=begun)
+            return self._register.pose(session_id, number)
+
+    def take_up(self, session_id: UUID, job: JobRecord) -> None:
+        """Go on with a pose of an earlier run of the service: one that waited is shot, one that was read is read once
+        more, one that had the rig was interrupted.
+        """
+        pose = pose_of(job)
+        parts = self._parts(session_id, job.id, pose, _scan(self._register.get(session_id), pose.exposure_s))
+        whole = (self._folder.staging(job.id) / BUNDLE).is_dir()
+        self._work.take_up(job, parts, holder=_holder(session_id, pose.number), resumes=whole)
 
     def script(
-        self, session_id: UUID, positions: Sequence[int | str], request: PoseRequest, *, wait: bool
+        self,
+        session_id: UUID,
+        positions: Sequence[int | str],
+        request: PoseRequest,
+        *,
+        wait: bool,
+        key: str | None = None,
     ) -> PoseRecord:
         """Have poses of the positioner shot one after the other, and return the first; none means all of them.
 
@@ -157,26 +154,21 @@ class PoseDesk:
         does not. Raises as `shoot` does.
         """
         with self._register.lock:
-            record = self._register.get(session_id)
-            earlier = _kept(record, request)
-            if earlier is not None:
-                return self._register.pose(session_id, earlier)
             facts = self._queue.status().facts
             asked = positions or range(len(facts.positions) if facts is not None else 0)
             indices = [place for place, _ in (_position(each, facts) for each in asked) if place is not None]
             if not indices:
                 _position(0, facts)
-            first = self.shoot(session_id, replace(request, position=indices[0]), wait=wait)
-            self._register.change(session_id, lambda found: replace(found, script=tuple(indices[1:])))
+            first = self.shoot(session_id, replace(request, position=indices[0]), wait=wait, key=key)
+            self._set_script(session_id, tuple(indices[1:]))
             return first
 
     def cancel(self, session_id: UUID, number: int) -> PoseRecord:
         """Ask a pose to end early, and the script that it belongs to. Returns at once; a pose that is over stays so."""
         pose = self._register.pose(session_id, number)
-        work_id = self._work_ids.get((session_id, number))
-        if work_id is not None and not pose.state.final:
-            self._register.change(session_id, lambda found: replace(found, script=()), must_last=False)
-            self._queue.cancel_work(work_id)
+        if not pose.state.final:
+            self._set_script(session_id, ())
+            self._work.cancel(pose.id)
         return self._register.pose(session_id, number)
 
     def drop(self, session_id: UUID, number: int) -> None:
@@ -188,32 +180,41 @@ class PoseDesk:
                 what = f"{pose.name} is {pose.state}" if not pose.state.final else "the calibration is being solved"
                 message = f"{what[:1].upper()}{what[1:]}. Wait until that is over, then drop the pose."
                 raise CalibrationStateError(message)
-
-            def without(found: SessionRecord) -> SessionRecord:
-                kept = replace(found, poses=tuple(each for each in found.poses if each.number != number))
-                return opened(kept) if pose.state is PoseState.ACCEPTED else kept
-
-            self._register.change(session_id, without)
+            if pose.accepted:
+                self._register.change(session_id, opened)
             self._store.discard_pose(session_id, number)
+            self._register.jobs.delete(pose.id)
         self._answers.survey(session_id)
 
-    def _shoot(
-        self, session_id: UUID, pose: PoseRecord, plan: ScanPlan, rig: Rig, cancelled: Callable[[], bool]
-    ) -> None:
-        """On the rig's thread: move the board if asked, and record a bundle."""
-        self._register.change_pose(session_id, pose.number, lambda found: replace(found, state=PoseState.SHOOTING))
-        self._meet(session_id, rig)
-        if pose.position is not None and rig.positioner is not None:
-            self._register.progress(session_id, "move", 0.0, pose.position_name or "", pose=pose.number)
-            rig.positioner.move(pose.position)
-        staged = self._store.stage_pose(session_id, pose.number)
+    def _parts(self, session_id: UUID, job_id: UUID, pose: PoseRecord, scan: ScanPlan) -> Parts:
+        """The two parts of a pose."""
+        staged = self._folder.staging(job_id)
+        last_frame_s = time.monotonic()
 
-        def progress(stage: str, fraction: float, detail: str) -> None:
-            self._register.progress(session_id, stage, fraction, detail, pose=pose.number)
+        def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
+            """Move the board if asked, and record a bundle."""
+            nonlocal last_frame_s
+            self._meet(session_id, rig)
+            if pose.position is not None and rig.positioner is not None:
+                progress("move", 0.0, pose.position_name or "")
+                rig.positioner.move(pose.position)
+            # Neither an earlier calibration nor what a rendered rig knows of its scene is any business of this one's.
+            bare = replace(rig, calibration=None, head=None)
+            self._tools.capture(bare, scan, staged / BUNDLE, progress=progress, cancelled=cancelled)
+            last_frame_s = time.monotonic()
 
-        # Neither an earlier calibration nor what a rendered rig knows of its scene is any business of this one's.
-        bare = replace(rig, calibration=None, head=None)
-        self._tools.capture(bare, plan, staged / BUNDLE, progress=progress, cancelled=cancelled)
+        def ended(state: JobState, fault: JobFailure | None) -> None:
+            """Remove a pose that came to nothing, and end the script with it."""
+            if state is not JobState.SUCCEEDED and (fault is None or fault.code != PoseRefusedError.code):
+                self._set_script(session_id, ())
+                self._store.discard_pose(session_id, pose.number)
+
+        return Parts(
+            capture=capture,
+            captured=lambda: self._go_on(session_id, pose.exposure_s),
+            compute=lambda _: self._answers.read(session_id, pose, staged, last_frame_s),
+            ended=ended,
+        )
 
     def _meet(self, session_id: UUID, rig: Rig) -> None:
         """Take the rig's devices down with the first pose, and hold the others against them."""
@@ -224,22 +225,8 @@ class PoseDesk:
             projector = _projector(record, facts)
             self._register.change(session_id, lambda found: replace(found, cameras=facts.sizes, projector=projector))
 
-    def _shot(self, session_id: UUID, number: int, error: Exception | None) -> None:
-        """The rig is free: read the pose on a thread of its own, or tell why there is nothing to be read."""
-        self._work_ids.pop((session_id, number), None)
-        if error is not None:
-            self._store.discard(self._store.staged_pose(session_id, number))
-            self._answers.end(session_id, number, error)
-            return
-        since_s = time.monotonic()
-        self._register.change_pose(
-            session_id, number, lambda found: replace(found, state=PoseState.READING), must_last=False
-        )
-        # Daemons, so that a reading under way never holds up the end of the service.
-        threading.Thread(
-            target=self._answers.read, args=(session_id, number, since_s), name="slrig-reading", daemon=True
-        ).start()
-        self._go_on(session_id, self._register.pose(session_id, number).exposure_s)
+    def _set_script(self, session_id: UUID, left: tuple[int, ...]) -> None:
+        self._register.change(session_id, lambda found: replace(found, script=left), must_last=False)
 
     def _go_on(self, session_id: UUID, exposure_s: float | None) -> None:
         """Have the next pose of a script shot, exposed like the one before."""
@@ -247,12 +234,12 @@ class PoseDesk:
             script = self._register.get(session_id).script
             if not script:
                 return
+            self._set_script(session_id, script[1:])
             try:
-                self._register.change(session_id, lambda found: replace(found, script=script[1:]))
                 self.shoot(session_id, PoseRequest(script[0], exposure_s), wait=True)
             except SlrigError as error:
                 _log.warning("the script of poses ends", calibration=str(session_id), cause=str(error))
-                self._register.change(session_id, lambda found: replace(found, script=()), must_last=False)
+                self._set_script(session_id, ())
 
 
 def require_same_rig(record: SessionRecord, facts: RigFacts) -> None:
@@ -284,20 +271,14 @@ def _refuse_closed(record: SessionRecord) -> None:
         raise CalibrationStateError(message)
 
 
-def _kept(record: SessionRecord, request: PoseRequest) -> int | None:
-    """The number of the pose that an earlier request with this key made. Raises IdempotencyError."""
-    kept = None if request.key is None else record.keys.get(request.key)
-    if kept is None:
-        return None
-    require_same_body(kept.fingerprint, request.fingerprint, made="pose")
-    return kept.pose
+def _scan(record: SessionRecord, exposure_s: float | None) -> ScanPlan:
+    """What a pose is lit with."""
+    return ScanPlan(patterns=record.patterns, exposure_s=exposure_s)
 
 
-def _with_new(record: SessionRecord, pose: PoseRecord, request: PoseRequest) -> SessionRecord:
-    keys = dict(record.keys)
-    if request.key is not None:
-        keys[request.key] = KeptKey(request.fingerprint, pose.number)
-    return replace(record.with_pose(pose), keys=keys, progress=None)
+def _holder(session_id: UUID, number: int) -> Holder:
+    words = f"calibration {session_id}, pose {number}"
+    return Holder(words, words, f"/calibration/{session_id}/pose/{number}")
 
 
 def _position(asked: int | str | None, facts: RigFacts | None) -> tuple[int | None, str | None]:

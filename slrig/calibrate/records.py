@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
 from typing import Any
@@ -15,9 +15,9 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.calibration.board import Board
-from slrig.errors import InvalidInputError, StorageError
+from slrig.errors import InvalidInputError, PoseRefusedError, StorageError
 from slrig.failure import JobFailure
-from slrig.jobs.records import JobProgress
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
 from slrig.model import Size
 from slrig.scan.plan import PatternPlan
 
@@ -34,38 +34,18 @@ class SessionState(StrEnum):
     FAILED = "failed"
 
 
-class PoseState(StrEnum):
-    """Where a pose stands. The last four are final."""
-
-    QUEUED = "queued"
-    SHOOTING = "shooting"
-    READING = "reading"
-    ACCEPTED = "accepted"
-    REFUSED = "refused"
-    FAILED = "failed"
-    CANCELLED = "cancelled"
-
-    @property
-    def final(self) -> bool:
-        """True when nothing more will happen to the pose.
-
-        >>> PoseState.REFUSED.final, PoseState.READING.final
-        (True, False)
-        """
-        return self not in {PoseState.QUEUED, PoseState.SHOOTING, PoseState.READING}
-
-
 @dataclass(frozen=True, slots=True)
 class PoseRecord:
-    """One pose. `number` counts from 1 within the session and is never given twice.
+    """One pose, as its job says. `number` counts from 1 within the session and is never given twice.
 
-    position : index of the pose that the positioner was asked for, None where a person holds the board.
-    answer : what was found of it, as JSON values, see `slrig.calibrate.pose_judging`; None until read.
-    fault : why it was refused or failed. seconds : from the last frame to the answer.
+    state : one that is accepted has succeeded. position : index of the pose that the positioner was asked for, None
+    where a person holds the board. answer : what was found of it, as JSON values, see `slrig.calibrate.pose_judging`;
+    None until read. fault : why it was refused or failed. seconds : from the last frame to the answer.
     """
 
     number: int
-    state: PoseState
+    id: UUID
+    state: JobState
     created_at: datetime
     position: int | None = None
     position_name: str | None = None
@@ -78,18 +58,40 @@ class PoseRecord:
     def name(self) -> str:
         """As a person calls it, and as the solve names it.
 
-        >>> PoseRecord(3, PoseState.QUEUED, datetime(2026, 11, 22)).name
+        >>> PoseRecord(3, UUID(int=0), JobState.QUEUED, datetime(2026, 11, 22)).name
         'pose 3'
         """
         return f"pose {self.number}"
 
+    @property
+    def plan(self) -> dict[str, Any]:
+        """That of its job."""
+        names = ("number", "position", "position_name", "exposure_s")
+        return {name: getattr(self, name) for name in names}
 
-@dataclass(frozen=True, slots=True)
-class KeptKey:
-    """The pose that an idempotency key made, and the fingerprint of the request that made it."""
+    @property
+    def accepted(self) -> bool:
+        """Whether a solve takes it."""
+        return self.state is JobState.SUCCEEDED
 
-    fingerprint: str
-    pose: int
+    @property
+    def refused(self) -> bool:
+        """Whether its frames show no pose that a solve could take."""
+        return self.fault is not None and self.fault.code == PoseRefusedError.code
+
+
+def pose_of(job: JobRecord) -> PoseRecord:
+    """The pose that a job is."""
+    found = job.summary or {}
+    return PoseRecord(
+        id=job.id,
+        state=job.state,
+        created_at=job.created_at,
+        answer=found.get("answer"),
+        fault=job.fault,
+        seconds=found.get("seconds"),
+        **job.plan,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +99,12 @@ class SessionRecord:
     """A calibration: of a session that shot poses, or imported.
 
     number : rises with every calibration and orders lists. board : None where it was imported. cameras, projector :
-    the extents of the rig's devices, from the first pose on. solve : the number of the last solve that went well, 0
-    before; result : its figures as JSON values. latest_pose : the highest number given. keys : of requests for poses.
+    the extents of the rig's devices, from the first pose on. latest_pose : the highest number given. state : on disk
+    never SOLVING. solve : the number of the last solve that went well, 0 before; result : its figures as JSON values.
+    script : positions that are still to be taken.
+
+    The last four are of its jobs, and not on disk. fault : of the last solve. progress : of what is under way.
+    under_way : whether a pose is being shot or read, or a solve runs.
     """
 
     number: int
@@ -111,41 +117,45 @@ class SessionRecord:
     cameras: Mapping[str, Size] = field(default_factory=dict)
     projector: Size | None = None
     state: SessionState = SessionState.OPEN
-    poses: tuple[PoseRecord, ...] = ()
     latest_pose: int = 0
-    progress: JobProgress | None = None
-    fault: JobFailure | None = None
     solve: int = 0
     solved_at: datetime | None = None
     result: Mapping[str, Any] | None = None
     coverage: Mapping[str, Any] | None = None
     next_move: Mapping[str, Any] | None = None
     script: tuple[int, ...] = ()
-    keys: Mapping[str, KeptKey] = field(default_factory=dict)
+    poses: tuple[PoseRecord, ...] = ()
+    progress: JobProgress | None = None
+    fault: JobFailure | None = None
+    under_way: bool = False
 
     @property
     def accepted(self) -> tuple[PoseRecord, ...]:
         """The poses that a solve takes."""
-        return tuple(pose for pose in self.poses if pose.state is PoseState.ACCEPTED)
-
-    @property
-    def under_way(self) -> bool:
-        """Whether a pose is being shot or read, or a solve runs."""
-        return self.state is SessionState.SOLVING or any(not pose.state.final for pose in self.poses)
-
-    def with_pose(self, pose: PoseRecord) -> SessionRecord:
-        """The record with a pose put in the place of the one of its number, or added."""
-        others = [each for each in self.poses if each.number != pose.number]
-        poses = tuple(sorted([*others, pose], key=lambda each: each.number))
-        return dataclasses.replace(self, poses=poses, latest_pose=max(self.latest_pose, pose.number))
+        return tuple(pose for pose in self.poses if pose.accepted)
 
 
+def with_jobs(session: SessionRecord, jobs: Sequence[JobRecord]) -> SessionRecord:
+    """A session as it is on disk, completed by what its jobs, oldest first, say."""
+    poses = tuple(sorted((pose_of(job) for job in jobs if job.kind is JobKind.POSE), key=lambda pose: pose.number))
+    solves = [job for job in jobs if job.kind is JobKind.SOLVE]
+    running = [job for job in jobs if not job.state.final]
+    state = session.state
+    if any(job.kind is JobKind.SOLVE for job in running):
+        state = SessionState.SOLVING
+    told = [job.progress for job in running if job.state is not JobState.QUEUED]
+    fault = solves[-1].fault if solves and state is SessionState.FAILED else None
+    progress = told[0] if told else None
+    return replace(session, state=state, poses=poses, progress=progress, fault=fault, under_way=bool(running))
+
+
+_OF_JOBS = {"poses", "progress", "fault", "under_way"}
 _session_adapter = TypeAdapter(SessionRecord)
 
 
 def session_json(session: SessionRecord) -> dict[str, Any]:
-    """A session as JSON values."""
-    document: dict[str, Any] = _session_adapter.dump_python(session, mode="json")
+    """A session as JSON values, without what its jobs say."""
+    document: dict[str, Any] = _session_adapter.dump_python(session, mode="json", exclude=_OF_JOBS)
     return document
 
 

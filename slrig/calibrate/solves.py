@@ -1,11 +1,11 @@
-"""The solve of a session, on a thread of its own: its progress, its results on disk, and its end."""
+"""The solve of a session: a job without the rig, with its results on disk."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 import structlog
@@ -17,16 +17,18 @@ from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.store import BUNDLE, CALIBRATION, REPORT
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibration.board import BoardShape
-from slrig.errors import CalibrationError, CalibrationStateError, ScanInterruptedError, SlrigError, SolveRefusedError
-from slrig.failure import failure_of
-from slrig.jobs.records import Clock, JobProgress
+from slrig.errors import CalibrationError, CalibrationStateError, SolveRefusedError
+from slrig.failure import JobFailure
+from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.records import Clock, JobKind, JobRecord, JobState
+from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
 from slrig.model import Calibration
 
 _log = structlog.get_logger(__name__)
 
 
 class SolveDesk:
-    """Solves sessions, one at a time. Any thread may call.
+    """Solves sessions. Any thread may call.
 
     earlier : gives the calibration in use, for the solve to be held against; None where there is none.
     """
@@ -34,6 +36,7 @@ class SolveDesk:
     def __init__(
         self,
         register: CalibrationRegister,
+        work: RigJobs,
         tools: CalibrationTools,
         answers: PoseAnswers,
         *,
@@ -42,11 +45,11 @@ class SolveDesk:
     ) -> None:
         self._register = register
         self._store = register.store
+        self._work = work
         self._tools = tools
         self._answers = answers
         self._clock = clock
         self._earlier = earlier
-        self._solving = threading.Lock()
 
     def solve(self, session_id: UUID, *, board_shape: BoardShape = BoardShape.AUTO) -> SessionRecord:
         """Begin to solve a session from its accepted poses. Returns at once.
@@ -82,36 +85,28 @@ class SolveDesk:
                     f"(POST /calibration/{session_id}/pose); GET /calibration/{session_id} tells what to shoot."
                 )
                 raise SolveRefusedError(message)
-            begun = JobProgress("solve", 0.0, "")
-            record = self._register.change(
-                session_id, lambda found: replace(found, state=SessionState.SOLVING, fault=None, progress=begun)
-            )
-        threading.Thread(target=self._run, args=(record, board_shape), name="slrig-solve", daemon=True).start()
-        return record
+            plan = {"number": record.solve + 1, "board_shape": str(board_shape)}
+            job = self._register.jobs.create(plan, rig=record.rig, label=None, kind=JobKind.SOLVE, parent=session_id)
+            self._work.compute(job.id, self._parts(session_id, job))
+            return self._register.get(session_id)
 
-    def _run(self, record: SessionRecord, board_shape: BoardShape) -> None:
-        try:
-            with self._solving:
-                self._solved(record, board_shape)
-        except ScanInterruptedError:
-            # The service ends: the register marks what is under way, now or at the next start.
-            return
-        except Exception as error:  # noqa: BLE001 - whatever goes wrong, the session gets out of SOLVING
-            fault = failure_of(error)
-            if isinstance(error, SlrigError):
-                _log.warning("solve failed", calibration=str(record.id), code=fault.code, cause=fault.message)
-            else:
-                _log.exception("solve failed", calibration=str(record.id))
-            self._register.change(
-                record.id,
-                lambda found: replace(found, state=SessionState.FAILED, fault=fault, progress=None),
-                must_last=False,
-            )
+    def take_up(self, session_id: UUID, job: JobRecord) -> None:
+        """End a solve that the end of the service cut off: as what it came to, or as interrupted."""
+        if self._register.get(session_id).solve >= job.plan["number"]:
+            self._register.jobs.finish(job.id, JobState.SUCCEEDED)
+        else:
+            self._work.interrupt(job.id, self._parts(session_id, job))
 
-    def _solved(self, record: SessionRecord, board_shape: BoardShape) -> None:
-        def progress(stage: str, fraction: float, detail: str) -> None:
-            self._register.progress(record.id, stage, fraction, detail)
+    def _parts(self, session_id: UUID, job: JobRecord) -> Parts:
+        def ended(state: JobState, _: JobFailure | None) -> None:
+            if state is not JobState.SUCCEEDED:
+                failed = lambda found: replace(found, state=SessionState.FAILED)  # noqa: E731 - of one line
+                self._register.change(session_id, failed, must_last=False)
 
+        return Parts(compute=lambda progress: self._solve(session_id, job.plan, progress), ended=ended)
+
+    def _solve(self, session_id: UUID, plan: Mapping[str, Any], progress: ProgressRecorder) -> Outcome:
+        record = self._register.get(session_id)
         setting = setting_of(record)
         poses = self._answers.readings(record)
         result = self._tools.solve(
@@ -121,9 +116,9 @@ class SolveDesk:
             poses,
             progress=progress,
             earlier=self._comparable(record),
-            board_shape=board_shape,
+            board_shape=BoardShape(plan["board_shape"]),
         )
-        number = record.solve + 1
+        number = plan["number"]
         if result.calibration.solved is not None:
             solved = replace(result.calibration.solved, id=solve_name(record.id, number))
             result = replace(result, calibration=replace(result.calibration, solved=solved))
@@ -139,16 +134,11 @@ class SolveDesk:
         self._register.change(
             record.id,
             lambda found: replace(
-                found,
-                state=SessionState.SOLVED,
-                solve=number,
-                solved_at=self._clock(),
-                result=summary,
-                progress=None,
-                fault=None,
+                found, state=SessionState.SOLVED, solve=number, solved_at=self._clock(), result=summary
             ),
         )
         _log.info("calibration solved", calibration=str(record.id), solve=number)
+        return Outcome({"solve": number})
 
     def _bundles(self, record: SessionRecord) -> dict[str, Path]:
         return {pose.name: self._store.pose(record.id, pose.number) / BUNDLE for pose in record.accepted}

@@ -1,6 +1,6 @@
 """Calibrations on disk, each a folder that is whole at every instant.
 
-DATA/calibrations/ID/session.json      the session: board, poses, states, figures
+DATA/calibrations/ID/session.json      the session: board, devices, figures; its poses and solves are jobs on record
 DATA/calibrations/ID/poses/NN/         a pose: bundle/, answer.json, picture-CAMERA.png, and reading.npz if accepted
 DATA/calibrations/ID/solves/N/         a solve: calibration.json, report.html; never changed once it is there
 DATA/calibrations/active.json          which solve of which calibration scans use
@@ -14,22 +14,16 @@ import json
 import shutil
 import uuid
 from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.storage import sync_folder, write_durably, write_file
-from slrig.calibrate.records import (
-    PoseState,
-    SessionRecord,
-    SessionState,
-    session_from_json,
-    session_json,
-)
-from slrig.errors import CalibrationError, CalibrationNotFoundError, ScanInterruptedError, StorageError
-from slrig.failure import JobFailure, disk_errors
+from slrig.calibrate.records import SessionRecord, session_from_json, session_json
+from slrig.errors import CalibrationError, CalibrationNotFoundError, StorageError
+from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder, sync_tree
 from slrig.model import Calibration
 
@@ -65,19 +59,12 @@ class CalibrationStore:
         """Where a pose lies once it was read."""
         return self.folder(session_id) / "poses" / f"{number:02d}"
 
-    def staged_pose(self, session_id: UUID, number: int) -> Path:
-        """Where a pose is made."""
-        return self._folder.incoming / f"pose-{session_id}-{number:02d}"
-
     def solve(self, session_id: UUID, number: int) -> Path:
         """Where the results of a solve lie."""
         return self.folder(session_id) / "solves" / str(number)
 
     def load(self) -> Sequence[SessionRecord]:
-        """Return every calibration on record, oldest first, after what was cut off has been marked as such.
-
-        For the start of the service, when nothing can be under way. A folder that cannot be read is put aside.
-        """
+        """Return every calibration on record, oldest first. A folder that cannot be read is put aside."""
         found: list[SessionRecord] = []
         for place in sorted(self._folder.calibrations.iterdir()):
             if not place.is_dir():
@@ -90,11 +77,7 @@ class CalibrationStore:
                 self._folder.orphans.mkdir(exist_ok=True)
                 place.rename(self._folder.orphans / place.name)
                 continue
-            settled = swept(session)
-            if settled is not session:
-                self.save(settled)
-            self._remove_strays(settled)
-            found.append(settled)
+            found.append(session)
         return sorted(found, key=lambda session: session.number)
 
     def create(self, session: SessionRecord) -> None:
@@ -116,21 +99,26 @@ class CalibrationStore:
         """Put a session on record in place of what it was. Raises StorageError."""
         write_file(self.folder(session.id) / SESSION, _text(session))
 
-    def stage_pose(self, session_id: UUID, number: int) -> Path:
-        """Make the folder that a pose is made in, empty."""
-        staged = self.staged_pose(session_id, number)
-        with disk_errors(staged):
-            staged.mkdir()
-        return staged
-
-    def commit_pose(self, session_id: UUID, number: int) -> None:
+    def commit_pose(self, session_id: UUID, number: int, staged: Path) -> None:
         """Move a pose into place, whole and durable."""
-        self._commit(self.staged_pose(session_id, number), self.pose(session_id, number))
+        self._commit(staged, self.pose(session_id, number))
 
     def discard_pose(self, session_id: UUID, number: int) -> None:
-        """Remove a pose, staged or in place. Idempotent."""
+        """Remove a pose. Idempotent."""
         self._remove(self.pose(session_id, number))
-        shutil.rmtree(self.staged_pose(session_id, number), ignore_errors=True)
+
+    def pose_numbers(self, session_id: UUID) -> list[int]:
+        """The numbers of the poses that are in place."""
+        places = (self.folder(session_id) / "poses").iterdir()
+        return sorted(int(place.name) for place in places if place.name.isdigit())
+
+    def answer(self, session_id: UUID, number: int) -> dict[str, Any] | None:
+        """What the pose in place says of itself; None where it cannot be read."""
+        try:
+            found = json.loads((self.pose(session_id, number) / ANSWER).read_bytes())
+            return found if isinstance(found, dict) else None
+        except (OSError, ValueError):
+            return None
 
     def stage_solve(self, session_id: UUID) -> Path:
         """Make a folder for the results of a solve."""
@@ -224,40 +212,11 @@ class CalibrationStore:
             place.rename(gone)
         shutil.rmtree(gone, ignore_errors=True)
 
-    def _remove_strays(self, session: SessionRecord) -> None:
-        """Remove the folders of poses that were cut off between their rename and their record, or half dropped."""
-        known = {self.pose(session.id, pose.number).name for pose in session.poses}
-        kept = {self.pose(session.id, pose.number).name for pose in session.poses if pose.answer is not None}
-        with suppress(FileNotFoundError):
-            for place in (self.folder(session.id) / "poses").iterdir():
-                if place.name not in known & kept:
-                    self._remove(place)
-
 
 def not_found(session_id: UUID) -> CalibrationNotFoundError:
     """The error for an id that is on record nowhere."""
     message = f"No calibration {session_id} is on record here. GET /calibration lists those that are."
     return CalibrationNotFoundError(message)
-
-
-def pose_interruption() -> JobFailure:
-    """The fault of a pose that the end of the service cut off."""
-    return JobFailure(ScanInterruptedError.code, "The service ended while this pose was under way. Shoot it again.")
-
-
-def solve_interruption() -> JobFailure:
-    """The fault of a solve that the end of the service cut off."""
-    return JobFailure(ScanInterruptedError.code, "The service ended during the solve. Solve again.")
-
-
-def swept(session: SessionRecord) -> SessionRecord:
-    """The session with what was cut off marked as such; the same object if there was nothing."""
-    for pose in session.poses:
-        if not pose.state.final:
-            session = session.with_pose(replace(pose, state=PoseState.FAILED, fault=pose_interruption()))
-    if session.state is SessionState.SOLVING:
-        session = replace(session, state=SessionState.FAILED, fault=solve_interruption(), progress=None)
-    return replace(session, script=()) if session.script else session
 
 
 def _text(session: SessionRecord) -> bytes:

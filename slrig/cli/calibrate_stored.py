@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from slrig.bundle import read_calibration, write_calibration
-from slrig.cli.calibration_screen import tell_result
+from slrig.cli.calibration_screen import refused, tell_result
 from slrig.cli.client import ServiceClient
 from slrig.cli.coverage_screen import coverage_picture, tell_next
 from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
@@ -81,9 +81,8 @@ def show_calibration(client: ServiceClient, beginning: str, *, as_json: bool) ->
     if session["active"]:
         console.print("Scans use it.", style="green")
     if session["result"] is not None:
-        refused = {pose["name"]: pose["error"]["detail"] for pose in session["shot"] if pose["state"] == "refused"}
         console.print()
-        tell_result({**session["result"], "refused": refused}, console)
+        tell_result({**session["result"], "refused": refused(session)}, console)
     if session["error"] is not None:
         console.print(Text(session["error"]["detail"], style="red"))
     if session["coverage"] is not None and session["state"] != "solved":

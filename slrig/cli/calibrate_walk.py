@@ -15,16 +15,16 @@ from rich.table import Table
 from rich.text import Text
 
 from slrig.calibration.board import Board
-from slrig.cli.calibration_screen import tell_result
+from slrig.cli.calibration_screen import outcome, refused, tell_result
 from slrig.cli.client import ServiceClient
 from slrig.cli.coverage_screen import coverage_picture, tell_next
 from slrig.cli.demo import still_missing
 from slrig.cli.display import progress_shown
 from slrig.errors import CalibrationStateError, PoseRefusedError, ServiceError, SolveRefusedError
 
-FINAL = frozenset({"accepted", "refused", "failed", "cancelled"})
+FINAL = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 _POLL_S = 0.2
-_STATES = {"queued": "waiting for the rig", "shooting": "shooting", "reading": "reading the board"}
+_STATES = {"queued": "waiting for the rig", "capturing": "shooting", "computing": "reading the board"}
 _KEYS = "[bold]Enter[/bold] shoot   [bold]s[/bold] solve   [bold]d[/bold] drop the last   [bold]q[/bold] leave"
 
 
@@ -128,7 +128,7 @@ class Walk:
                 if answer == "":
                     pose = self._shot(self._client.post(f"{self._path}/pose", {**self._exposure, "if_busy": "queue"}))
                     # A pose that was not taken in changes nothing: what to do next is enough.
-                    self._stand(picture=pose["state"] == "accepted")
+                    self._stand(picture=pose["accepted"] is True)
                 elif answer == "s":
                     if self._solved() and self._offer_activation():
                         return
@@ -155,7 +155,7 @@ class Walk:
         pose: Mapping[str, Any] | None = self._client.post(f"{self._path}/script", request)
         while pose is not None:
             told = self._shot(pose)
-            if told["state"] == "failed":
+            if told["state"] in {"failed", "interrupted"} and told["accepted"] is None:
                 message = f"{told['name']}: {told['error']['detail']}"
                 raise ServiceError(message)
             if told["state"] == "cancelled":
@@ -197,7 +197,7 @@ class Walk:
                 display(f"{pose['name']}: {_STATES[pose['state']]}", fraction, detail)
                 self._pause(_POLL_S)
                 pose = self._client.get(pose["links"]["self"])
-            display(f"{pose['name']}: {pose['state']}", 1.0, "")
+            display(f"{pose['name']}: {outcome(pose)}", 1.0, "")
         tell_pose(pose, self._console)
         return pose
 
@@ -229,7 +229,7 @@ class Walk:
         return {camera["name"]: camera["size_px"] for camera in self._client.get("/rig")["cameras"]}
 
     def _drop_last(self) -> None:
-        shot = [pose for pose in self._session()["shot"] if pose["state"] == "accepted"]
+        shot = [pose for pose in self._session()["shot"] if pose["accepted"]]
         if not shot:
             self._console.print("There is no accepted pose to drop.")
             return
@@ -248,9 +248,8 @@ class Walk:
             display(session["state"], 1.0, "")
         if session["state"] != "solved":
             raise SolveRefusedError(session["error"]["detail"])
-        refused = {pose["name"]: pose["error"]["detail"] for pose in session["shot"] if pose["state"] == "refused"}
         self._console.print()
-        tell_result({**session["result"], "refused": refused}, self._console)
+        tell_result({**session["result"], "refused": refused(session)}, self._console)
         self._console.print()
         self._console.print(f"report: slrig calibrate export {self._id[:8]} report.html", markup=False, style="dim")
         return True
@@ -275,8 +274,9 @@ class Walk:
 
 def tell_pose(pose: Mapping[str, Any], console: Console) -> None:
     """Print what was found of one pose: a line of figures per camera, then warnings, or why it was refused."""
-    colour = {"accepted": "green", "refused": "red", "failed": "red"}.get(pose["state"], "yellow")
-    console.print(Text.assemble((pose["name"], "bold"), " ", (pose["state"], f"bold {colour}")))
+    words = outcome(pose)
+    colour = {"accepted": "green", "refused": "red", "failed": "red"}.get(words, "yellow")
+    console.print(Text.assemble((pose["name"], "bold"), " ", (words, f"bold {colour}")))
     table = Table.grid(padding=(0, 2))
     answer = pose["answer"] or {}
     for camera, corners in (answer.get("corners_found") or {}).items():

@@ -23,6 +23,17 @@ _MOST_REASONS = 4
 _MOST_POSES = 6
 
 
+def outcome(pose: Mapping[str, Any]) -> str:
+    """What became of a pose, as the service tells of it, in a word."""
+    words: dict[bool | None, str] = {True: "accepted", False: "refused", None: pose["state"]}
+    return words[pose["accepted"]]
+
+
+def refused(session: Mapping[str, Any]) -> dict[str, str]:
+    """By name, why the poses of a session were refused that were."""
+    return {pose["name"]: pose["error"]["detail"] for pose in session["shot"] if pose["accepted"] is False}
+
+
 def tell_result(document: Mapping[str, Any], console: Console) -> None:
     """Print what `pose_judging.summary` of a session holds, and which poses were `refused` or have `remarks`."""
     verdict = document["verdict"]

@@ -15,8 +15,8 @@ from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
-from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import Health, HealthState, judged
+from slrig.calibration.health.verification import Verification
 from slrig.cli.display import progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -44,38 +44,41 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
         if source.is_dir():
             calibration = _calibration(calibration_file or source / "calibration.json")
             display("reading", 0.0, "")
-            look = verify_bundle(source, board, calibration)
+            verification = verify_bundle(source, board, calibration)
         else:
-            look = _shot(source, board, calibration_file, position, display)
-    health = judged([look])
+            verification = _shot(source, board, calibration_file, position, display)
+    health = judged([verification])
     if as_json:
         found = {"state": str(health.state), "reasons": list(health.reasons), "remedy": health.remedy}
-        typer.echo(json.dumps({**found, **look.document()}, indent=1, ensure_ascii=False))
+        typer.echo(json.dumps({**found, **verification.document()}, indent=1, ensure_ascii=False))
     else:
-        tell(look, health, Console())
+        tell(verification, health, Console())
     return health.state is not HealthState.STALE
 
 
-def tell(look: Look, health: Health, console: Console) -> None:
+def tell(verification: Verification, health: Health, console: Console) -> None:
     """Print a verification for people."""
     console.print(f"[{_COLOURS[health.state]}]{health.state}[/{_COLOURS[health.state]}]  {escape(health.reasons[0])}")
     for reason in health.reasons[1:]:
         console.print(f"       {escape(reason)}")
     if health.remedy:
         console.print(f"[bold]do[/bold]     {escape(health.remedy)}")
-    for pair in look.pairs:
+    for pair in verification.pairs:
         console.print(
             f"{escape(pair.first)} - {escape(pair.second)}: mean {pair.mean_px:+.3f} ± {pair.mean_sigma_px:.3f} px, "
             f"rms {pair.rms_px:.3f} px, predicted {pair.predicted_px:.3f} px, {pair.count:,} points"
         )
-    if look.scale_percent is not None and look.scale_mm is not None:
+    if verification.scale_percent is not None and verification.scale_mm is not None:
         console.print(
-            f"board: measures {look.scale_percent:+.3f} ± {look.scale_sigma_percent:.3f} % against its true size, "
-            f"{look.scale_mm:+.3f} mm over its diagonal"
+            f"board: measures {verification.scale_percent:+.3f} ± {verification.scale_sigma_percent:.3f} % against its "
+            "true size, "
+            f"{verification.scale_mm:+.3f} mm over its diagonal"
         )
 
 
-def _shot(source: Path, board: Board, calibration_file: Path | None, position: int | None, display: Progress) -> Look:
+def _shot(
+    source: Path, board: Board, calibration_file: Path | None, position: int | None, display: Progress
+) -> Verification:
     config = read_rig(source)
     given = None if calibration_file is None else _calibration(calibration_file)
     with open_rig(config) as rig, tempfile.TemporaryDirectory(prefix="slrig-verify-") as folder:

@@ -76,7 +76,7 @@ class Endings:
             with self._lock:
                 self._unrecorded = [each for each in self._unrecorded if each is not ending]
             if made:
-                _log.info("job finished", kind=str(self._store.kind), job=str(ending.id), state=str(ending.state))
+                _log.info("job finished", job=str(ending.id), state=str(ending.state))
 
     def _try_again(self) -> None:
         with self._lock:

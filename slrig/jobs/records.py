@@ -1,4 +1,4 @@
-"""What is on record about a job of any kind: frozen values, the clock that dates them, and the key of a request."""
+"""What is on record about a job of any kind: frozen values, and the clock that dates them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
-from slrig.errors import IdempotencyError
 from slrig.failure import JobFailure
 
 Clock = Callable[[], datetime]
@@ -26,6 +25,9 @@ class JobKind(StrEnum):
 
     SCAN = "scan"
     VERIFICATION = "verification"
+    POSE = "pose"
+    SOLVE = "solve"
+    POSITION = "position"
 
 
 class JobState(StrEnum):
@@ -66,12 +68,13 @@ class JobProgress:
 class JobRecord:
     """One job. `number` rises with every job and orders lists; times are UTC. plan : what was asked, as JSON values.
 
-    summary : what came of it, as far as a list shows it; None until the job has succeeded. pinned : no retention
-    removes it.
+    parent : the calibration of a pose or a solve, the acceptance test of a position. summary : what came of it, as far
+    as a list shows it; None before. pinned : no retention removes it.
     """
 
     number: int
     id: UUID
+    kind: JobKind
     state: JobState
     label: str | None
     rig: str
@@ -83,22 +86,21 @@ class JobRecord:
     fault: JobFailure | None
     summary: Mapping[str, Any] | None
     pinned: bool = False
+    parent: UUID | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class JobEvent:
-    """One thing that happened to a job. `number` counts from 1 within the job and never changes."""
+    """One thing that happened to a job. `number` rises and never changes: it counts from 1 within the job, or, where
+    all jobs of one parent are followed, over all events on record. job : whose it is.
+    """
 
     number: int
     kind: str
     data: Mapping[str, Any]
+    job: UUID
 
 
-def require_same_body(first: str, again: str, *, made: str) -> None:
-    """Raise IdempotencyError unless both requests with one key have one fingerprint. made : what a request makes."""
-    if first != again:
-        message = (
-            "This Idempotency-Key was sent before with another request body. "
-            f"Use a new key for a new {made}, or repeat the first body unchanged."
-        )
-        raise IdempotencyError(message)
+def stamp(moment: datetime) -> str:
+    """A moment as it stands on record."""
+    return moment.isoformat(timespec="milliseconds")

@@ -1,50 +1,37 @@
-"""The record of jobs of one kind, their events and idempotency keys, in the service's database."""
+"""The record of jobs and their events, in the service's database."""
 
 from __future__ import annotations
 
-import math
 import threading
-import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import Any
 from uuid import UUID, uuid4
 
-import structlog
-from sqlalchemy import delete, select, text
+from sqlalchemy import delete, func, select, text
 from sqlalchemy.orm import Session
 
-from slrig.errors import JobNotFoundError, KeyInFlightError, StorageError
+from slrig.errors import JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
-from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, require_same_body, utc_now
+from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, stamp, utc_now
 from slrig.jobs.tables import EventRow, JobRow, KeyRow
-
-_log = structlog.get_logger(__name__)
-
-KEY_LIFE_S = 24 * 3600.0
-"""How long an idempotency key is remembered unless told otherwise."""
 
 _LISTED = {
     JobKind.SCAN: "GET /scan lists those that are.",
     JobKind.VERIFICATION: "GET /rig/health/history lists past ones.",
 }
 
-_LEAST_STEP = 0.01
 _PROGRESS_PATIENCE_S = 0.2  # the work waits meanwhile
-_DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
 
 
 class JobStore:
-    """Jobs of one kind, their events and idempotency keys. Any thread of the one process that owns it may call."""
+    """Jobs of one kind, or of a few that belong together. Any thread of the one process that owns it may call."""
 
-    def __init__(
-        self, database: Database, kind: JobKind, *, clock: Clock = utc_now, key_life_s: float = KEY_LIFE_S
-    ) -> None:
-        self.kind = kind
+    def __init__(self, database: Database, *kinds: JobKind, clock: Clock = utc_now) -> None:
+        self.kinds = kinds
         self._clock = clock
-        self._key_life = timedelta(seconds=key_life_s)
         self._watching = threading.Lock()
         self._watchers: dict[UUID, list[Callable[[], None]]] = defaultdict(list)
         self.database = database
@@ -62,11 +49,16 @@ class JobStore:
         label: str | None,
         key: str | None = None,
         job_id: UUID | None = None,
+        kind: JobKind | None = None,
+        parent: UUID | None = None,
     ) -> JobRecord:
-        """Record a new job as queued and, in the same transaction, tie its idempotency key to it."""
+        """Record a new job as queued and, in the same transaction, tie its idempotency key to it. kind : one of the
+        store's, its first by default.
+        """
         row = JobRow(
             id=str(job_id or uuid4()),
-            kind=self.kind,
+            kind=kind or self.kinds[0],
+            parent=None if parent is None else str(parent),
             state=JobState.QUEUED,
             label=label,
             rig=rig,
@@ -84,7 +76,10 @@ class JobStore:
             if key is not None and (held := session.get(KeyRow, key)) is not None:
                 held.job_id = row.id
             _append(session, row, "state", {"state": row.state, "time": row.created_at})
-            return _record(row)
+            made = _record(row)
+        if parent is not None:
+            self._wake(parent)
+        return made
 
     def restore(
         self,
@@ -96,19 +91,22 @@ class JobStore:
         label: str | None,
         created_at: datetime,
         started_at: datetime,
+        fault: JobFailure | None = None,
+        parent: UUID | None = None,
     ) -> None:
-        """Put a job that succeeded on record again. How it went is not known any more; its end is taken for now.
-        Whether it was pinned is not known either: it is pinned.
+        """Put a job that ended on record again. How it went is not known any more; its end is taken for now. Whether it
+        was pinned is not known either: it is pinned. fault : why it failed, None where it succeeded.
         """
         row = JobRow(
             id=str(job_id),
-            kind=self.kind,
+            kind=self.kinds[0],
+            parent=None if parent is None else str(parent),
             state=JobState.SUCCEEDED,
             label=label,
             rig=rig,
             plan=dict(plan),
-            created_at=_stamp(created_at),
-            started_at=_stamp(started_at),
+            created_at=stamp(created_at),
+            started_at=stamp(started_at),
             stage="",
             fraction=0.0,
             detail="",
@@ -118,7 +116,7 @@ class JobStore:
         with self.database.changing() as session:
             session.add(row)
             session.flush()
-            self._close_row(session, row, JobState.SUCCEEDED, None, summary)
+            self._close_row(session, row, JobState.SUCCEEDED if fault is None else JobState.FAILED, fault, summary)
 
     def get(self, job_id: UUID) -> JobRecord:
         """Return a job. Raises JobNotFoundError."""
@@ -127,7 +125,7 @@ class JobStore:
 
     def page(self, *, before: int | None, limit: int) -> Sequence[JobRecord]:
         """Return up to `limit` jobs, newest first, whose number is below `before`."""
-        query = select(JobRow).where(JobRow.kind == self.kind).order_by(JobRow.number.desc()).limit(limit)
+        query = select(JobRow).where(JobRow.kind.in_(self.kinds)).order_by(JobRow.number.desc()).limit(limit)
         if before is not None:
             query = query.where(JobRow.number < before)
         with self.database.reading() as session:
@@ -136,16 +134,32 @@ class JobStore:
     def unfinished(self) -> Sequence[JobRecord]:
         """Return the jobs that are in no final state, oldest first."""
         running = [state for state in JobState if not state.final]
-        query = select(JobRow).where(JobRow.kind == self.kind, JobRow.state.in_(running)).order_by(JobRow.number)
+        query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.state.in_(running)).order_by(JobRow.number)
         with self.database.reading() as session:
             return [_record(row) for row in session.scalars(query)]
 
     def finished(self) -> Sequence[JobRecord]:
         """Return the jobs that are in a final state, newest first."""
         running = [state for state in JobState if not state.final]
-        query = select(JobRow).where(JobRow.kind == self.kind, JobRow.state.not_in(running))
+        query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.state.not_in(running))
         with self.database.reading() as session:
             return [_record(row) for row in session.scalars(query.order_by(JobRow.number.desc()))]
+
+    def of(self, *parents: UUID) -> dict[UUID, list[JobRecord]]:
+        """Return the jobs of each parent, oldest first; without a parent named, those of all that have one."""
+        query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.parent.is_not(None)).order_by(JobRow.number)
+        if parents:
+            query = query.where(JobRow.parent.in_(map(str, parents)))
+        found: dict[UUID, list[JobRecord]] = defaultdict(list)
+        with self.database.reading() as session:
+            for row in session.scalars(query):
+                found[UUID(row.parent)].append(_record(row))
+        return found
+
+    def attempts(self, job_id: UUID) -> int:
+        """How often the computing part of a job was begun."""
+        states = [event.data["state"] for event in self.events(job_id, after=0) if event.kind == "state"]
+        return states.count(JobState.COMPUTING)
 
     def pin(self, job_id: UUID, *, pinned: bool) -> JobRecord:
         """Have a job kept by every retention, or not any more. Raises JobNotFoundError."""
@@ -157,7 +171,7 @@ class JobStore:
     def states(self) -> dict[UUID, JobState]:
         """Return the state of every job on record."""
         with self.database.reading() as session:
-            query = select(JobRow.id, JobRow.state).where(JobRow.kind == self.kind)
+            query = select(JobRow.id, JobRow.state).where(JobRow.kind.in_(self.kinds))
             return {UUID(found): JobState(state) for found, state in session.execute(query)}
 
     def advance(self, job_id: UUID, state: JobState) -> datetime:
@@ -168,7 +182,7 @@ class JobStore:
             now = self._now()
             row.started_at = row.started_at or now
             _append(session, row, "state", {"state": state, "time": now})
-        self._wake(job_id)
+        self._wake(job_id, row.parent)
         return datetime.fromisoformat(now)
 
     def progress(self, job_id: UUID, progress: JobProgress) -> None:
@@ -177,7 +191,7 @@ class JobStore:
             row = self._find(session, job_id)
             row.stage, row.fraction, row.detail = progress.stage, progress.fraction, progress.detail
             _append(session, row, "progress", {**progress.as_json(), "state": row.state})
-        self._wake(job_id)
+        self._wake(job_id, row.parent)
 
     def finish(
         self,
@@ -193,7 +207,7 @@ class JobStore:
             if JobState(row.state).final:
                 return False
             self._close_row(session, row, state, fault, summary)
-        self._wake(job_id)
+        self._wake(job_id, row.parent)
         return True
 
     def lose_files(self, job_id: UUID, fault: JobFailure) -> None:
@@ -204,13 +218,20 @@ class JobStore:
     def delete(self, job_id: UUID) -> None:
         """Forget a job and its events. Raises JobNotFoundError."""
         with self.database.changing() as session:
-            session.delete(self._find(session, job_id))
+            row = self._find(session, job_id)
+            session.delete(row)
         # Whoever waits for its next event would wait for ever.
-        self._wake(job_id)
+        self._wake(job_id, row.parent)
+
+    def delete_of(self, parent: UUID) -> None:
+        """Forget the jobs of a parent that is gone."""
+        with self.database.changing() as session:
+            session.execute(delete(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent)))
+        self._wake(parent)
 
     def prune(self, keep: int) -> None:
         """Forget the oldest finished jobs, so that `keep` are left."""
-        query = select(JobRow).where(JobRow.kind == self.kind).order_by(JobRow.number.desc()).offset(keep)
+        query = select(JobRow).where(JobRow.kind.in_(self.kinds)).order_by(JobRow.number.desc()).offset(keep)
         with self.database.changing() as session:
             for row in session.scalars(query):
                 if JobState(row.state).final:
@@ -222,7 +243,25 @@ class JobStore:
             select(EventRow).where(EventRow.job_id == str(job_id), EventRow.number > after).order_by(EventRow.number)
         )
         with self.database.reading() as session:
-            return [JobEvent(row.number, row.kind, row.data) for row in session.scalars(query)]
+            return [JobEvent(row.number, row.kind, row.data, job_id) for row in session.scalars(query)]
+
+    def events_of(self, parent: UUID, *, after: int) -> Sequence[JobEvent]:
+        """Return the events of all jobs of a parent whose number is above `after`, in order."""
+        query = (
+            select(EventRow)
+            .join(JobRow, JobRow.id == EventRow.job_id)
+            .where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent), EventRow.id > after)
+            .order_by(EventRow.id)
+        )
+        with self.database.reading() as session:
+            return [JobEvent(row.id, row.kind, row.data, UUID(row.job_id)) for row in session.scalars(query)]
+
+    def last_event_of(self, parent: UUID) -> int:
+        """Return the number of the newest event of all jobs of a parent, 0 before the first."""
+        events = select(func.max(EventRow.id)).join(JobRow, JobRow.id == EventRow.job_id)
+        with self.database.reading() as session:
+            found = session.scalar(events.where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent)))
+        return found or 0
 
     def last_event(self, job_id: UUID) -> int:
         """Return the number of a job's newest event. Raises JobNotFoundError."""
@@ -230,8 +269,8 @@ class JobStore:
             return self._find(session, job_id).last_event
 
     def watch(self, job_id: UUID, wake: Callable[[], None]) -> Callable[[], None]:
-        """Have `wake` called, from any thread, after each new event of a job and after its deletion. Returns the
-        call that ends it.
+        """Have `wake` called, from any thread, after each new event of a job, or of any job of a parent, and after a
+        deletion. Returns the call that ends it.
         """
         with self._watching:
             self._watchers[job_id].append(wake)
@@ -244,43 +283,10 @@ class JobStore:
 
         return unwatch
 
-    def reserve_key(self, key: str, fingerprint: str) -> UUID | None:
-        """Hold an idempotency key for a request, or return the job that the first request with it made.
-
-        Raises
-        ------
-        KeyInFlightError
-            The first request is still being answered.
-        IdempotencyError
-            The first request had another body.
-        """
-        with self.database.changing() as session:
-            expired = _stamp(self._clock() - self._key_life)
-            session.execute(delete(KeyRow).where(KeyRow.created_at < expired))
-            held = session.get(KeyRow, key)
-            if held is None:
-                session.add(KeyRow(key=key, fingerprint=fingerprint, job_id=None, created_at=self._now()))
-                return None
-            require_same_body(held.fingerprint, fingerprint, made=self.kind)
-            if held.job_id is None:
-                message = "The first request with this Idempotency-Key is still being answered. Ask again in a second."
-                raise KeyInFlightError(message)
-            return UUID(held.job_id)
-
-    def release_key(self, key: str) -> None:
-        """Free a key whose request made no job, so that it may be tried again."""
-        with self.database.changing() as session:
-            session.execute(delete(KeyRow).where(KeyRow.key == key, KeyRow.job_id.is_(None)))
-
-    def release_keys(self) -> None:
-        """Free every key whose request was cut off. For the start of the service, when none can be in flight."""
-        with self.database.changing() as session:
-            session.execute(delete(KeyRow).where(KeyRow.job_id.is_(None)))
-
     def _find(self, session: Session, job_id: UUID) -> JobRow:
-        row = session.scalar(select(JobRow).where(JobRow.id == str(job_id), JobRow.kind == self.kind))
+        row = session.scalar(select(JobRow).where(JobRow.id == str(job_id), JobRow.kind.in_(self.kinds)))
         if row is None:
-            message = f"No {self.kind} {job_id} is on record here. {_LISTED[self.kind]}"
+            message = f"No {self.kinds[0]} {job_id} is on record here. {_LISTED.get(self.kinds[0], '')}".rstrip()
             raise JobNotFoundError(message)
         return row
 
@@ -303,47 +309,14 @@ class JobStore:
         _append(session, row, "state", {"state": state, "time": row.finished_at, "error": error})
 
     def _now(self) -> str:
-        return _stamp(self._clock())
+        return stamp(self._clock())
 
-    def _wake(self, job_id: UUID) -> None:
+    def _wake(self, job_id: UUID, parent: str | None = None) -> None:
+        woken = (job_id,) if parent is None else (job_id, UUID(parent))
         with self._watching:
-            watchers = list(self._watchers.get(job_id, ()))
+            watchers = [wake for each in woken for wake in self._watchers.get(each, ())]
         for wake in watchers:
             wake()
-
-
-class ProgressRecorder:
-    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, or another
-    detail of a stage that goes on.
-    """
-
-    def __init__(
-        self, store: JobStore, job_id: UUID, *, hidden: str, now_s: Callable[[], float] = time.monotonic
-    ) -> None:
-        """`hidden` is left out of what is recorded."""
-        self._now_s = now_s
-        self._told_s = -math.inf
-        self._hidden = hidden
-        self._store = store
-        self._job_id = job_id
-        self._start, self._end = 0.0, 1.0
-        self._told = JobProgress("", -1.0, "")
-
-    def span(self, start: float, end: float) -> None:
-        """Map the fractions that follow into start..end of the whole job."""
-        self._start, self._end = start, end
-
-    def __call__(self, stage: str, fraction: float, detail: str) -> None:
-        """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""
-        overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
-        goes_on = detail != self._told.detail and self._now_s() - self._told_s >= _DETAIL_S
-        if goes_on or stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
-            self._told = JobProgress(stage, overall, detail.replace(self._hidden, ""))
-            self._told_s = self._now_s()
-            try:
-                self._store.progress(self._job_id, self._told)
-            except StorageError as error:
-                _log.warning("how far a job is could not be recorded", job=str(self._job_id), cause=str(error))
 
 
 def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> None:
@@ -355,6 +328,7 @@ def _record(row: JobRow) -> JobRecord:
     return JobRecord(
         number=row.number,
         id=UUID(row.id),
+        kind=JobKind(row.kind),
         state=JobState(row.state),
         label=row.label,
         rig=row.rig,
@@ -366,11 +340,15 @@ def _record(row: JobRow) -> JobRecord:
         fault=None if row.failure_code is None else JobFailure(row.failure_code, row.failure_message or ""),
         summary=row.summary,
         pinned=row.pinned,
+        parent=None if row.parent is None else UUID(row.parent),
     )
 
 
-def _stamp(moment: datetime) -> str:
-    return moment.isoformat(timespec="milliseconds")
+def unfinished_ids(database: Database) -> set[str]:
+    """The jobs of every kind that are in no final state."""
+    running = [state for state in JobState if not state.final]
+    with database.reading() as session:
+        return set(session.scalars(select(JobRow.id).where(JobRow.state.in_(running))))
 
 
 def _moment(stamp: str | None) -> datetime | None:

@@ -16,13 +16,16 @@ class Base(DeclarativeBase):
 
 
 class JobRow(Base):
-    """One job of any kind. pinned : no retention removes it."""
+    """One job of any kind. parent : the calibration or the acceptance test that it belongs to, if it belongs to one.
+    pinned : no retention removes it.
+    """
 
     __tablename__ = "job"
 
     number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(String(36), unique=True)
     kind: Mapped[str] = mapped_column(String(16))
+    parent: Mapped[str | None] = mapped_column(String(36))
     state: Mapped[str] = mapped_column(String(16))
     label: Mapped[str | None] = mapped_column(String(200))
     rig: Mapped[str] = mapped_column(String(200))
@@ -39,29 +42,37 @@ class JobRow(Base):
     last_event: Mapped[int] = mapped_column(Integer)
     pinned: Mapped[bool] = mapped_column(Boolean)
 
-    __table_args__ = (Index("ix_job_kind_state", "kind", "state"), {"sqlite_autoincrement": True})
+    __table_args__ = (
+        Index("ix_job_kind_state", "kind", "state"),
+        Index("ix_job_parent", "parent"),
+        {"sqlite_autoincrement": True},
+    )
 
 
 class EventRow(Base):
-    """One event of one job; `number` counts from 1 within the job."""
+    """One event of one job; `number` counts from 1 within the job, `id` rises over the events of all jobs."""
 
     __tablename__ = "event"
 
-    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"), primary_key=True)
-    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
+    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("job.id", ondelete="CASCADE"))
+    number: Mapped[int] = mapped_column(Integer)
     kind: Mapped[str] = mapped_column(String(16))
     data: Mapped[dict[str, Any]] = mapped_column(JSON)
 
+    __table_args__ = (UniqueConstraint("job_id", "number", name="uq_event_number"), {"sqlite_autoincrement": True})
+
 
 class KeyRow(Base):
-    """One idempotency key. `job_id` is empty while the first request is being answered.
+    """One idempotency key, with the kind of request that it came with. `job_id` is empty while the first request is
+    being answered.
 
     No foreign key: a job may be deleted before its key expires, and a late repeat must not start it again.
     """
 
     __tablename__ = "idempotency_key"
 
-    key: Mapped[str] = mapped_column(String(255), primary_key=True)
+    key: Mapped[str] = mapped_column(String(400), primary_key=True)
     fingerprint: Mapped[str] = mapped_column(String(64))
     job_id: Mapped[str | None] = mapped_column(String(36))
     created_at: Mapped[str] = mapped_column(String(32))
@@ -114,7 +125,7 @@ class RunRow(Base):
 
 
 class VerificationRow(Base):
-    """What one verification, or one scan's redundancy, said of a calibration. `look` is `Look.document`."""
+    """What one verification, or one scan's redundancy, said of a calibration. `found` is `Verification.document`."""
 
     __tablename__ = "verification"
 
@@ -126,7 +137,7 @@ class VerificationRow(Base):
     state: Mapped[str] = mapped_column(String(16))
     reasons: Mapped[list[str]] = mapped_column(JSON)
     remedy: Mapped[str | None] = mapped_column(String)
-    look: Mapped[dict[str, Any]] = mapped_column(JSON)
+    found: Mapped[dict[str, Any]] = mapped_column(JSON)
 
     __table_args__ = (
         Index("ix_verification_calibration", "calibration", "number"),

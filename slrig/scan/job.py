@@ -19,8 +19,9 @@ from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
 from slrig.jobs.endings import Ending, Endings
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
 from slrig.jobs.job import Holder
+from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobRecord, JobState
-from slrig.jobs.store import JobStore, ProgressRecorder
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession, driver_errors
 from slrig.scan.plan import ReconstructionPlan, ScanPlan

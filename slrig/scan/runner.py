@@ -6,7 +6,8 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from uuid import UUID, uuid4
+from typing import Protocol
+from uuid import UUID
 
 import structlog
 
@@ -18,6 +19,7 @@ from slrig.jobs.endings import Endings
 from slrig.jobs.job import Holder, RigWork
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobRecord, JobState, utc_now
+from slrig.jobs.rig_jobs import RigQueue
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.preview import Light, Watch
@@ -52,6 +54,14 @@ class RunnerStatus:
     reconstruction: str
     preparing: bool
     ending: bool
+
+
+class RigAccess(RigQueue, Protocol):
+    """`Runner`, as far as work that is no scan needs it."""
+
+    def status(self) -> RunnerStatus:
+        """What the rig is."""
+        ...
 
 
 class Runner:
@@ -146,14 +156,15 @@ class Runner:
         self,
         work: Callable[[Rig, Callable[[], bool]], None],
         *,
+        work_id: UUID,
         holder: Holder,
         wait: bool,
         ended: Callable[[Exception | None], None],
-        begun: Callable[[UUID], None] = lambda _: None,
-    ) -> UUID:
-        """Have `work` done with the rig, in line with the scans, and return its id. See `RigWork`.
+        begun: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Have `work` done with the rig, in line with the scans. See `RigWork`.
 
-        `begun` is told that number once a place in the line is certain, before the work can begin.
+        `begun` is called once a place in the line is certain, before the work can begin.
 
         Raises
         ------
@@ -163,11 +174,10 @@ class Runner:
         self._queue.refuse_while_stuck()
 
         def make() -> RigWork:
-            job = RigWork(uuid4(), holder, utc_now(), work, ended, lambda: self._queue.ending)
-            begun(job.id)
-            return job
+            begun()
+            return RigWork(work_id, holder, utc_now(), work, ended, lambda: self._queue.ending)
 
-        return self._queue.submit(make, wait=wait).id
+        self._queue.submit(make, wait=wait)
 
     def cancel_work(self, work_id: UUID) -> None:
         """Ask work that has the rig, or waits for it, to end early. Returns at once; one that is over stays so."""

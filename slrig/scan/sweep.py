@@ -12,7 +12,7 @@ from slrig.errors import StorageError
 from slrig.failure import failure_of, interruption
 from slrig.jobs.data_folder import DataFolder, missing_files
 from slrig.jobs.records import JobState
-from slrig.jobs.store import JobStore
+from slrig.jobs.store import JobStore, unfinished_ids
 from slrig.scan.records import plan_json, read_record, report_summary
 
 
@@ -41,7 +41,6 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
     - A finished scan without a record, as beside a database that was lost, is on record again, as it says itself.
     - Other files without a record are put aside in `.orphans`, not deleted.
     """
-    store.release_keys()
     interrupted, resumed, recovered, lost = [], [], [], []
     for record in store.unfinished():
         placed = folder.scan(record.id)
@@ -52,7 +51,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
             continue
         # Reconstruction starts only after the bundle was made durable, so this bundle is whole.
         whole = record.state is JobState.COMPUTING and (folder.staging(record.id) / "bundle").is_dir()
-        if record.state is JobState.QUEUED or (whole and _attempts(store, record.id) == 1):
+        if record.state is JobState.QUEUED or (whole and store.attempts(record.id) == 1):
             resumed.append(record.id)
             continue
         if whole:
@@ -67,17 +66,13 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
             message = f"{' and '.join(missing)} of this scan is gone from {folder.scan(scan_id)}. Scan again."
             store.lose_files(scan_id, failure_of(StorageError(message)))
             lost.append(scan_id)
+    # Those of other kinds see to their own files.
+    going_on = unfinished_ids(store.database)
     for leftover in folder.incoming.iterdir():
-        if leftover.name not in map(str, resumed):
+        if leftover.name not in going_on:
             shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
     recovered += _restored(store, folder)
     return Swept(tuple(interrupted), tuple(resumed), tuple(recovered), tuple(lost), _put_aside(store, folder))
-
-
-def _attempts(store: JobStore, scan_id: UUID) -> int:
-    """How often the reconstruction of a scan was begun."""
-    states = [event.data["state"] for event in store.events(scan_id, after=0) if event.kind == "state"]
-    return states.count(JobState.COMPUTING)
 
 
 def _restored(store: JobStore, folder: DataFolder) -> list[UUID]:

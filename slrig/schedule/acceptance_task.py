@@ -9,9 +9,9 @@ from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
 from slrig.accept.records import AcceptanceState
 from slrig.accept.verdicts import verdicts
-from slrig.calibrate.pose_shooting import RigQueue
 from slrig.failure import failure_of
 from slrig.jobs.job import Holder
+from slrig.scan.runner import RigAccess
 from slrig.schedule.polling import error_of, until
 from slrig.schedule.positions import require_positions
 from slrig.schedule.task_options import checked
@@ -20,7 +20,7 @@ from slrig.schedule.task_options import checked
 class AcceptanceTask:
     """Implements `slrig.schedule.tasks.Task`. The rig is held for the whole of the test."""
 
-    def __init__(self, queue: RigQueue, desk: AcceptanceDesk) -> None:
+    def __init__(self, queue: RigAccess, desk: AcceptanceDesk) -> None:
         self._queue = queue
         self._desk = desk
 

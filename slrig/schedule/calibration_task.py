@@ -8,8 +8,8 @@ from typing import Any
 from uuid import UUID
 
 from slrig.calibrate.calibrating import Calibrations
-from slrig.calibrate.pose_shooting import PoseRequest, RigQueue
-from slrig.calibrate.records import PoseState, SessionRecord, SessionState
+from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.records import SessionRecord, SessionState
 from slrig.calibration.judging.verdict import Grade
 from slrig.errors import (
     CalibrationNotFoundError,
@@ -19,6 +19,8 @@ from slrig.errors import (
     WorkerLostError,
 )
 from slrig.jobs.job import Holder
+from slrig.jobs.records import JobState
+from slrig.scan.runner import RigAccess
 from slrig.schedule.polling import error_of, until
 from slrig.schedule.positions import require_positions
 from slrig.schedule.task_options import CalibrationOptions, checked
@@ -30,7 +32,7 @@ class CalibrationTask:
     tidy : called after each, however it ended, so that they do not pile up.
     """
 
-    def __init__(self, queue: RigQueue, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+    def __init__(self, queue: RigAccess, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._tidy = tidy
@@ -83,12 +85,12 @@ class CalibrationTask:
 
     def _await_rig(self, session: UUID, cancelled: Callable[[], bool]) -> None:
         """Until the last pose was shot: it may still be read while the next one is."""
-        self._await(session, {PoseState.QUEUED, PoseState.SHOOTING}, cancelled)
+        self._await(session, {JobState.QUEUED, JobState.CAPTURING}, cancelled)
 
     def _await_poses(self, session: UUID, cancelled: Callable[[], bool]) -> None:
-        self._await(session, {PoseState.QUEUED, PoseState.SHOOTING, PoseState.READING}, cancelled)
+        self._await(session, {JobState.QUEUED, JobState.CAPTURING, JobState.COMPUTING}, cancelled)
 
-    def _await(self, session: UUID, pending: set[PoseState], cancelled: Callable[[], bool]) -> None:
+    def _await(self, session: UUID, pending: set[JobState], cancelled: Callable[[], bool]) -> None:
         register, poses = self._calibrations.register, self._calibrations.poses
 
         def cancel() -> None:
@@ -97,7 +99,7 @@ class CalibrationTask:
 
         until(lambda: not any(pose.state in pending for pose in register.get(session).poses), cancelled, cancel=cancel)
         for pose in register.get(session).poses:
-            if pose.state in {PoseState.FAILED, PoseState.CANCELLED} and pose.fault is not None:
+            if pose.fault is not None and not pose.refused:
                 raise error_of(pose.fault)
 
     def _solved(self, session: UUID, cancelled: Callable[[], bool]) -> SessionRecord:
@@ -123,7 +125,7 @@ class CalibrationTask:
             "refused": {
                 pose.position_name or pose.name: None if pose.fault is None else pose.fault.message
                 for pose in record.poses
-                if pose.state is PoseState.REFUSED
+                if pose.refused
             },
             "verdict": verdict.get("summary"),
             "expected_error_mm": (result.get("expected") or {}).get("point_mm"),

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 
 import structlog
 
-from slrig.calibration.health.look import Look
 from slrig.calibration.health.verdict import HealthState
+from slrig.calibration.health.verification import Verification
 from slrig.jobs.database import Database
 from slrig.jobs.records import Clock, utc_now
 from slrig.schedule.records import Run, RunState, Schedule
@@ -148,10 +148,10 @@ class NoticedHealth(HealthStore):
         self._notices = notices
         self._adding = threading.Lock()
 
-    def add(self, look: Look, *, calibration: str, at: datetime) -> VerificationRecord:
+    def add(self, found: Verification, *, calibration: str, at: datetime) -> VerificationRecord:
         """See `HealthStore`."""
         with self._adding:
             before = self.latest()
-            record = super().add(look, calibration=calibration, at=at)
+            record = super().add(found, calibration=calibration, at=at)
         self._notices.health(before, record)
         return record

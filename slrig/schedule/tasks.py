@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
-from uuid import UUID
+from uuid import UUID, uuid4
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.calibrate.calibrating import Calibrations
-from slrig.calibrate.pose_shooting import RigQueue
 from slrig.errors import ScanStateError
 from slrig.jobs.job import Holder
+from slrig.scan.runner import RigAccess
 from slrig.schedule.acceptance_task import AcceptanceTask
 from slrig.schedule.calibration_task import CalibrationTask
 from slrig.schedule.polling import until
@@ -48,7 +48,7 @@ class Tasks:
 
     def __init__(
         self,
-        queue: RigQueue,
+        queue: RigAccess,
         calibrations: Calibrations,
         verifications: VerificationDesk,
         acceptance: AcceptanceDesk,
@@ -98,8 +98,9 @@ class Tasks:
         if self._queue.status().facts is not None:
             return
         errors: list[Exception | None] = []
-        work_id = self._queue.submit_work(
-            lambda *_: None, holder=holder, wait=False, ended=errors.append, begun=lambda _: None
+        work_id = uuid4()
+        self._queue.submit_work(
+            lambda *_: None, work_id=work_id, holder=holder, wait=False, ended=errors.append, begun=lambda: None
         )
         until(lambda: bool(errors), cancelled, cancel=lambda: self._queue.cancel_work(work_id))
         if errors[0] is not None:

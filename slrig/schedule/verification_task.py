@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from slrig.calibrate.calibrating import Calibrations
-from slrig.calibrate.pose_shooting import RigQueue
 from slrig.calibration.board import Board
 from slrig.errors import CalibrationError, ScheduleError
 from slrig.jobs.job import Holder
+from slrig.scan.runner import RigAccess
 from slrig.schedule.polling import error_of, until
 from slrig.schedule.positions import require_positions
 from slrig.schedule.task_options import VerificationOptions, checked
@@ -21,7 +21,7 @@ _TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent
 class VerificationTask:
     """Implements `slrig.schedule.tasks.Task`."""
 
-    def __init__(self, queue: RigQueue, calibrations: Calibrations, desk: VerificationDesk) -> None:
+    def __init__(self, queue: RigAccess, calibrations: Calibrations, desk: VerificationDesk) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._desk = desk

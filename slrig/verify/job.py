@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-import shutil
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
 
-import structlog
 from pydantic import TypeAdapter
 
-from slrig.calibrate.pose_shooting import RigQueue
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
-from slrig.calibration.health.look import Look, health_of_scan
 from slrig.calibration.health.verdict import Health, HealthState
+from slrig.calibration.health.verification import Verification, health_of_scan
 from slrig.devices import Rig
-from slrig.errors import (
-    CalibrationError,
-    CalibrationStateError,
-    ScanCancelledError,
-    ScanInterruptedError,
-    SlrigError,
-    StorageError,
-    UnsupportedByDeviceError,
-)
-from slrig.failure import disk_errors, failure_of, interruption
+from slrig.errors import CalibrationError, CalibrationStateError, UnsupportedByDeviceError
+from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.endings import Ending, Endings
 from slrig.jobs.job import Holder
-from slrig.jobs.records import Clock, JobRecord, JobState, utc_now
+from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.records import Clock, JobRecord, utc_now
+from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
+from slrig.scan.runner import RigAccess
 from slrig.verify.store import HealthStore, VerificationRecord
 from slrig.verify.verification import VerificationTools, health_stamp, verify_bundle
 
@@ -48,8 +37,6 @@ _UNCALIBRATED = (
     "The rig has no calibration that could be verified. Calibrate it (POST /calibration), activate the result, then "
     "verify that."
 )
-
-_log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +65,7 @@ class VerificationDesk:
     def __init__(
         self,
         folder: DataFolder,
-        queue: RigQueue,
+        queue: RigAccess,
         store: HealthStore,
         jobs: JobStore,
         *,
@@ -93,19 +80,13 @@ class VerificationDesk:
         self._tools = VerificationTools() if tools is None else tools
         self._clock = clock
         self._spare_bytes = spare_bytes
-        self._endings = Endings(jobs)
-        self._work_ids: dict[UUID, UUID] = {}
+        self._work = RigJobs(jobs, queue, folder)
 
     def take_up(self) -> None:
-        """Submit again those that waited when the service was killed; what had the rig then was interrupted."""
+        """Go on with what waited when the service ended; what had the rig then was interrupted."""
         for record in self.jobs.unfinished():
-            if record.state is not JobState.QUEUED:
-                self.jobs.finish(record.id, JobState.INTERRUPTED, fault=failure_of(interruption()))
-                continue
-            try:
-                self._submit(record.id, _plan_adapter.validate_python(record.plan), wait=True)
-            except SlrigError as error:
-                self.jobs.finish(record.id, JobState.INTERRUPTED, fault=failure_of(error))
+            plan = _plan_adapter.validate_python(record.plan)
+            self._work.take_up(record, self._parts(record.id, plan), holder=_holder(record.id))
 
     def shoot(
         self,
@@ -143,40 +124,15 @@ class VerificationDesk:
         job_id = uuid4()
         document = _plan_adapter.dump_python(plan, mode="json")
         record = partial(self.jobs.create, document, rig=status.rig, label=None, key=key, job_id=job_id)
-        self._submit(job_id, plan, wait=wait, record=record, holder=holder)
+        parts = self._parts(job_id, plan)
+        self._work.submit(job_id, parts, holder=holder or _holder(job_id), wait=wait, record=record)
         self.jobs.prune(_KEPT)
         return self.jobs.get(job_id)
 
-    def _submit(
-        self,
-        job_id: UUID,
-        plan: VerificationPlan,
-        *,
-        wait: bool,
-        record: Callable[[], object] = lambda: None,
-        holder: Holder | None = None,
-    ) -> None:
-        calibrations: list[Calibration] = []
-        words = f"verification {job_id}"
-
-        def begun(work_id: UUID) -> None:
-            record()
-            self._work_ids[job_id] = work_id
-
-        self._queue.submit_work(
-            lambda rig, cancelled: self._shoot(job_id, plan, rig, cancelled, calibrations),
-            holder=holder or Holder(words, words, f"/rig/verification/{job_id}"),
-            wait=wait,
-            ended=lambda error: self._shot(job_id, plan, calibrations, error),
-            begun=begun,
-        )
-
     def cancel(self, job_id: UUID) -> JobRecord:
         """Ask a verification to end early. Returns at once; one that is over stays so. Raises JobNotFoundError."""
-        found = self.jobs.get(job_id)
-        work_id = self._work_ids.get(job_id)
-        if work_id is not None and not found.state.final:
-            self._queue.cancel_work(work_id)
+        self.jobs.get(job_id)
+        self._work.cancel(job_id)
         return self.jobs.get(job_id)
 
     def health(self) -> tuple[Health, VerificationRecord | None, Calibration | None]:
@@ -198,79 +154,46 @@ class VerificationDesk:
     def note(self, report: Mapping[str, Any]) -> None:
         """See `slrig.scan.job.WatchesHealth`."""
         _, _, calibration = self.health()
-        look = health_of_scan(report["redundancy"].get("residual_px") or ())
-        if look is not None and calibration is not None:
-            self.note_scan(look, calibration)
+        found = health_of_scan(report["redundancy"].get("residual_px") or ())
+        if found is not None and calibration is not None:
+            self.note_scan(found, calibration)
 
-    def note_scan(self, look: Look, calibration: Calibration) -> VerificationRecord:
+    def note_scan(self, found: Verification, calibration: Calibration) -> VerificationRecord:
         """Put on record what a scan's own redundancy says of the calibration that it was measured by."""
-        return self.store.add(look, calibration=calibration.solve_id, at=self._clock())
+        return self.store.add(found, calibration=calibration.solve_id, at=self._clock())
 
     def close(self) -> None:
         """Put on record what the disk refused before. Idempotent."""
-        self._endings.close()
+        self._work.close()
 
-    def _shoot(
-        self,
-        job_id: UUID,
-        plan: VerificationPlan,
-        rig: Rig,
-        cancelled: Callable[[], bool],
-        found: list[Calibration],
-    ) -> None:
-        """On the rig's thread: move the board if asked, and record a bundle."""
-        self.jobs.advance(job_id, JobState.CAPTURING)
-        if rig.calibration is None:
-            raise CalibrationStateError(_UNCALIBRATED)
-        found.append(rig.calibration)
-        if plan.position is not None and rig.positioner is not None:
-            rig.positioner.move(plan.position)
-        staged = self._folder.stage(job_id)
-        # A verification must not use what a rendered rig knows of its scene.
-        bare = replace(rig, calibration=None, head=None)
-        with disk_errors(staged):
-            self._tools.capture(bare, plan.scan, staged / "bundle", progress=lambda *_: None, cancelled=cancelled)
+    def _parts(self, job_id: UUID, plan: VerificationPlan) -> Parts:
+        """The two parts of a verification."""
+        bundle = self._folder.staging(job_id) / "bundle"
+        calibration: Calibration | None = None
 
-    def _shot(self, job_id: UUID, plan: VerificationPlan, found: list[Calibration], error: Exception | None) -> None:
-        """The rig is free: read and judge on a thread of its own, or tell why there is nothing to be read."""
-        self._work_ids.pop(job_id, None)
-        if error is not None or not found:
-            self._fail(job_id, error or CalibrationError(_UNCALIBRATED))
-            return
-        # A daemon, so that a reading under way never holds up the end of the service.
-        threading.Thread(
-            target=self._judge, args=(job_id, plan.board, found[0]), name="slrig-verification", daemon=True
-        ).start()
+        def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
+            """Move the board if asked, and record a bundle."""
+            nonlocal calibration
+            if rig.calibration is None:
+                raise CalibrationStateError(_UNCALIBRATED)
+            calibration = rig.calibration
+            if plan.position is not None and rig.positioner is not None:
+                rig.positioner.move(plan.position)
+            # A verification must not use what a rendered rig knows of its scene.
+            bare = replace(rig, calibration=None, head=None)
+            with disk_errors(bundle):
+                self._tools.capture(bare, plan.scan, bundle, progress=progress, cancelled=cancelled)
 
-    def _judge(self, job_id: UUID, board: Board, calibration: Calibration) -> None:
-        try:
-            self.jobs.advance(job_id, JobState.COMPUTING)
-        except StorageError as error:
-            # That record is for whoever looks on.
-            _log.warning("that a verification is judged could not be recorded", job=str(job_id), cause=str(error))
-        try:
-            bundle: Path = self._folder.staging(job_id) / "bundle"
-            look = verify_bundle(bundle, board, calibration, tools=self._tools)
-            record = self.store.add(look, calibration=calibration.solve_id, at=self._clock())
-        except Exception as error:  # noqa: BLE001 - whatever happens, whoever waits has to be told
-            self._fail(job_id, error)
-        else:
-            self._end(Ending(job_id, JobState.SUCCEEDED, None, record.document()))
+        def compute(_: ProgressRecorder) -> Outcome:
+            """Read the board, and judge the calibration by it."""
+            if calibration is None:
+                raise CalibrationError(_UNCALIBRATED)
+            found = verify_bundle(bundle, plan.board, calibration, tools=self._tools)
+            return Outcome(self.store.add(found, calibration=calibration.solve_id, at=self._clock()).document())
 
-    def _fail(self, job_id: UUID, error: Exception) -> None:
-        state = JobState.FAILED
-        if isinstance(error, ScanCancelledError):
-            state = JobState.CANCELLED
-        elif isinstance(error, ScanInterruptedError):
-            if self.jobs.get(job_id).state is JobState.QUEUED:
-                # The next start of the service takes it up.
-                return
-            state = JobState.INTERRUPTED
-        else:
-            _log.warning("a verification failed", job=str(job_id), cause=str(error))
-        self._end(Ending(job_id, state, failure_of(error)))
+        return Parts(capture=capture, compute=compute)
 
-    def _end(self, ending: Ending) -> None:
-        shutil.rmtree(self._folder.staging(ending.id), ignore_errors=True)
-        self._endings.add(ending)
-        self._endings.settle()
+
+def _holder(job_id: UUID) -> Holder:
+    words = f"verification {job_id}"
+    return Holder(words, words, f"/rig/verification/{job_id}")

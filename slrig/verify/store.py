@@ -10,8 +10,8 @@ from uuid import UUID, uuid4
 
 from sqlalchemy import select
 
-from slrig.calibration.health.look import Look, look_from_document
 from slrig.calibration.health.verdict import Health, HealthState, judged
+from slrig.calibration.health.verification import Verification, verification_from_document
 from slrig.jobs.database import Database
 from slrig.jobs.tables import VerificationRow
 
@@ -30,7 +30,7 @@ class VerificationRecord:
     id: UUID
     at: datetime
     calibration: str
-    look: Look
+    found: Verification
     health: Health
 
     def document(self) -> dict[str, Any]:
@@ -42,7 +42,7 @@ class VerificationRecord:
             "state": str(self.health.state),
             "reasons": list(self.health.reasons),
             "remedy": self.health.remedy,
-            **self.look.document(),
+            **self.found.document(),
         }
 
 
@@ -52,8 +52,8 @@ class HealthStore:
     def __init__(self, database: Database) -> None:
         self.database = database
 
-    def add(self, look: Look, *, calibration: str, at: datetime) -> VerificationRecord:
-        """Judge a look together with those before it since the calibration, and put it on record.
+    def add(self, found: Verification, *, calibration: str, at: datetime) -> VerificationRecord:
+        """Judge a verification together with those before it since the calibration, and put it on record.
 
         Raises
         ------
@@ -66,10 +66,10 @@ class HealthStore:
             first = list(session.scalars(query.order_by(VerificationRow.number).limit(3)))
             last = list(session.scalars(query.order_by(VerificationRow.number.desc()).limit(_TREND)))
             rows = {row.number: row for row in [*first, *reversed(last)]}
-            health = judged([*(look_from_document(rows[number].look) for number in sorted(rows)), look])
+            health = judged([*(verification_from_document(rows[number].found) for number in sorted(rows)), found])
             row = VerificationRow(
-                id=str(uuid4()), at=_stamp(at), calibration=calibration, kind=look.kind, state=str(health.state),
-                reasons=list(health.reasons), remedy=health.remedy, look=look.document(),
+                id=str(uuid4()), at=_stamp(at), calibration=calibration, kind=found.kind, state=str(health.state),
+                reasons=list(health.reasons), remedy=health.remedy, found=found.document(),
             )  # fmt: skip
             session.add(row)
             session.flush()
@@ -105,7 +105,12 @@ class HealthStore:
 def _record(row: VerificationRow) -> VerificationRecord:
     health = Health(HealthState(row.state), tuple(row.reasons), row.remedy)
     return VerificationRecord(
-        row.number, UUID(row.id), datetime.fromisoformat(row.at), row.calibration, look_from_document(row.look), health
+        row.number,
+        UUID(row.id),
+        datetime.fromisoformat(row.at),
+        row.calibration,
+        verification_from_document(row.found),
+        health,
     )
 
 

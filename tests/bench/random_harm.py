@@ -16,7 +16,7 @@ from tests.e2e.test_calibration_walk import BOARD, Caller, write_rig
 
 KINDS = ("scan", "pose", "solve", "verification", "schedule")
 LIMIT_S = 180.0
-FINAL = {"succeeded", "failed", "cancelled", "interrupted", "accepted", "refused", "solved", "skipped", "missed"}
+FINAL = {"succeeded", "failed", "cancelled", "interrupted", "solved", "skipped", "missed"}
 
 
 def calibrated_rig(folder: Path) -> Path:
@@ -64,7 +64,7 @@ def session(service: ServiceProcess) -> tuple[dict[str, Any], dict[str, Any]]:
     with Caller(service) as caller:
         made = caller.opened()
         caller.post(f"{made['links']['self']}/script", 202, positions=list(range(1, 7)))
-        assert [pose["state"] for pose in caller.settled(made)["shot"]] == ["accepted"] * 6
+        assert [pose["state"] for pose in caller.settled(made)["shot"]] == ["succeeded"] * 6
         schedule = caller.post(
             "/schedule", 201, cron="* * * * *", task="verification", options={"board": BOARD, "position": 1}
         )
@@ -95,6 +95,16 @@ def whole(service: ServiceProcess) -> list[str]:
                 faults.append(f"scan {scan['id']} succeeded without {missing}")
             if scan["state"] not in FINAL:
                 faults.append(f"scan {scan['id']} is {scan['state']}")
+        for listed in caller.get("/calibration")["calibrations"]:
+            made = caller.get(listed["links"]["self"])
+            place = service.data / "calibrations" / made["id"]
+            for pose in made["shot"]:
+                if pose["state"] not in FINAL:
+                    faults.append(f"{pose['name']} is {pose['state']}")
+                if pose["accepted"] and not (place / "poses" / f"{pose['number']:02d}" / "reading.npz").is_file():
+                    faults.append(f"{pose['name']} was accepted without its reading")
+            if made["result"] is not None and set(made["links"]["files"]) < {"calibration.json", "report.html"}:
+                faults.append(f"calibration {made['id']} was solved without its files")
     return faults
 
 

@@ -94,7 +94,7 @@ def marked(service: ServiceProcess, scan: dict[str, Any]) -> str:
     if record["state"] == "succeeded":
         return "succeeded"
     assert record["error"]["type"] == "/problems/scan-interrupted", record
-    assert "Scan again" in record["error"]["detail"]
+    assert "Start it again" in record["error"]["detail"]
     return str(record["state"])
 
 

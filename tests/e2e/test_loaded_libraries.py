@@ -43,7 +43,7 @@ def worked(service: ServiceProcess) -> None:
         made = caller.post("/calibration", 201, board=BOARD)
         caller.post(made["links"]["pose"], 202)
         (pose,) = caller.settled(made)["shot"]
-        assert pose["state"] == "accepted", pose["error"]
+        assert pose["state"] == "succeeded", pose["error"]
         caller.post(made["links"]["solve"], 202)
         assert caller.settled(made)["error"]["type"] == "/problems/solve-refused"
         assert caller.http.get(caller.settled(made)["links"]["coverage"]["left"]).content[:4] == b"\x89PNG"

@@ -24,10 +24,10 @@ def test_schedule_is_kept_through_a_kill_in_the_middle_of_a_run(start: Start, tm
     service = start(rig)
     with Caller(service) as caller:
         caller.ready()
-        made = caller.post(
-            "/schedule", 201, cron="* * * * *", task="verification", options={"board": BOARD, "position": 1}
-        )
-        assert len(made["upcoming"]) == 5
+        options = {"board": BOARD, "position": 1}
+        made = caller.post("/schedule", 201, cron="* * * * *", task="verification", enabled=False, options=options)
+        at_once(caller, service, made)
+        assert len(caller.get(made["links"]["self"])["upcoming"]) == 5
         name = awaited(lambda: caller.get("/rig")["holder"], "the run")
         assert name.startswith(f"schedule {made['id'][:8]}, verification due ")
         refused = caller.post("/scan", 409)
@@ -40,6 +40,8 @@ def test_schedule_is_kept_through_a_kill_in_the_middle_of_a_run(start: Start, tm
         (cut_off,) = caller.get(made["links"]["runs"])["runs"]
         assert (cut_off["state"], cut_off["reason"]) == ("interrupted", "the service ended in the middle of it")
         assert list((service.data / ".incoming").iterdir()) == []
+        # This one comes by the clock.
+        caller.post(made["links"]["resume"], 200)
         run = awaited(lambda: newest(caller, made, "succeeded"), "a whole run")
         assert run["due"] > cut_off["due"]
         assert run["result"]["state"] == "good", run["result"]

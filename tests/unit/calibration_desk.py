@@ -86,6 +86,7 @@ class Desk:
             "position": None,
             "position_name": None,
             "exposure_s": None,
+            "accepted": None,
             "answer": None,
             "error": None,
             "seconds": None,
@@ -98,8 +99,9 @@ class Desk:
     def _end(self, pose: dict[str, Any]) -> None:
         if self.stuck:
             return
-        pose["state"] = "refused" if pose["number"] in self.refusals else "accepted"
-        if pose["state"] == "refused":
+        pose["accepted"] = pose["number"] not in self.refusals
+        pose["state"] = "succeeded" if pose["accepted"] else "failed"
+        if not pose["accepted"]:
             problem = {"type": "about:blank", "title": "t", "status": 422, "detail": "the board moved: hold it still"}
             pose["error"] = problem
         pose["answer"] = {
@@ -114,7 +116,7 @@ class Desk:
         }
 
     def _advance(self) -> None:
-        if self.script > 1 and all(pose["state"] in {"accepted", "refused"} for pose in self.shot):
+        if self.script > 1 and all(pose["accepted"] is not None for pose in self.shot):
             self.script -= 1
             self._begun()
         elif self.script == 1:
@@ -124,7 +126,7 @@ class Desk:
 
     def session(self) -> dict[str, Any]:
         here = f"/calibration/{ID}"
-        accepted = sum(pose["state"] == "accepted" for pose in self.shot)
+        accepted = sum(pose["accepted"] is True for pose in self.shot)
         cells = [[accepted * (row < 2 and column < 3) for column in range(6)] for row in range(6)]
         device = {
             "cells": cells,

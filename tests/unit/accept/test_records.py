@@ -10,15 +10,8 @@ from uuid import UUID
 
 import numpy as np
 
-from slrig.accept.records import (
-    AcceptanceRecord,
-    AcceptanceState,
-    RequestKey,
-    record_from_json,
-    record_json,
-)
+from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
 from slrig.calibration.artefacts import Decision
-from slrig.failure import JobFailure
 from tests.unit.accept.test_running import PLAN, told
 
 RECORD = AcceptanceRecord(
@@ -28,12 +21,9 @@ RECORD = AcceptanceRecord(
     "bench",
     "0123456789ab",
     replace(PLAN, exposure_s=0.02, notes="after the move"),
-    AcceptanceState.INTERRUPTED,
+    AcceptanceState.OPEN,
     (told("sphere-1", 0, 0.004), replace(told("sphere-1", 1, -0.001), noise_mm=math.nan)),
-    JobFailure("nothing-to-reconstruct", "sphere-1: nothing there"),
     decision=Decision.UNDECIDED,
-    opened_by=RequestKey("key", "body"),
-    measured_by={"other": "position"},
 )
 
 

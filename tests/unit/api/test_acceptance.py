@@ -14,6 +14,7 @@ from slrig.accept.desk import AcceptanceDesk
 from slrig.api import acceptance as router_module
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
+from slrig.jobs.keys import RequestKeys
 from tests.unit.accept.test_desk import PLAN, TameQueue, desk, desks, queue
 from tests.unit.accept.test_running import RIG
 
@@ -34,7 +35,9 @@ def client(desk: AcceptanceDesk) -> TestClient:
     app = FastAPI()
     app.include_router(router_module.router)
     install_problems(app)
-    app.dependency_overrides[_of_request] = lambda: SimpleNamespace(acceptance=desk)
+    app.dependency_overrides[_of_request] = lambda: SimpleNamespace(
+        acceptance=desk, keys=RequestKeys(desk.jobs.database)
+    )
     return TestClient(app)
 
 

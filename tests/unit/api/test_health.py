@@ -16,6 +16,7 @@ from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.verify.job import VerificationDesk
@@ -36,7 +37,8 @@ def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
     store = HealthStore(Database(folder.database))
     desk = VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), tools=TAME)
     service = SimpleNamespace(
-        verifications=desk, refuse_when_stale=True, calibrations=SimpleNamespace(active=None)
+        verifications=desk, keys=RequestKeys(store.database), refuse_when_stale=True,
+        calibrations=SimpleNamespace(active=None),
     )  # fmt: skip
     app = FastAPI()
     app.include_router(health.router)

@@ -17,7 +17,7 @@ def test_old_calibrations_are_removed_when_the_service_starts(tmp_path: Path) ->
     bench = ServedBench(tmp_path, keep_calibrations=1)
     old, new = (bench.service.calibrations.open(BOARD).id for _ in range(2))
     removed = threading.Event()
-    bench.service.calibrations.register.watch(old, removed.set)
+    bench.service.calibrations.register.jobs.watch(old, removed.set)
     headers = {"Authorization": f"Bearer {KEY}"}
     with TestClient(bench.app, base_url="http://127.0.0.1", headers=headers) as client:
         assert removed.wait(WAIT_S)

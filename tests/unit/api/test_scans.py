@@ -12,6 +12,7 @@ import pytest
 import trimesh
 from fastapi.testclient import TestClient
 
+from slrig.api.idempotency import own_key
 from slrig.api.schemas import ScanRequest, fingerprint
 from slrig.jobs.worker import Worker
 from tests.unit.api.conftest import ServedBench, ended
@@ -210,11 +211,11 @@ def test_refused_request_leaves_its_key_free(client: TestClient, served: ServedB
 
 
 def test_key_in_flight_is_refused_for_a_moment(client: TestClient, served: ServedBench) -> None:
-    served.service.store.reserve_key("slow", fingerprint(ScanRequest()))
+    served.service.keys.reserve(own_key("slow", ScanRequest()), fingerprint(ScanRequest()))
     refused = client.post("/scan", headers={"Idempotency-Key": "slow"})
     assert (refused.status_code, refused.json()["type"]) == (409, "/problems/key-in-flight")
     assert refused.headers["Retry-After"] == "1"
-    served.service.store.release_keys()
+    served.service.keys.release_all()
     assert client.post("/scan", headers={"Idempotency-Key": "slow"}).status_code == 202
 
 

@@ -23,6 +23,8 @@ from slrig.calibration.observations import BoardView, PoseObservation
 from slrig.calibration.poses.figures import ViewFigures
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError, ScanCancelledError
+from slrig.jobs.records import JobKind
+from slrig.jobs.store import JobStore
 from slrig.model import Calibration, Pinhole, Size, Solved
 from slrig.scan.plan import Progress, ScanPlan
 from tests.unit.scan.bench import Bench
@@ -181,7 +183,14 @@ class CalibrationBench(Bench):
         tools = self.tame.tools()
         if solve is not None:
             tools = replace(tools, solve=self.worker.task(solve, "solve"))
-        self.calibrations = Calibrations(self.folder, self.runner, rig_name="bench", tools=tools)
+        self.jobs = JobStore(self.store.database, JobKind.POSE, JobKind.SOLVE)
+        self.calibrations = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=tools)
+
+    def restarted(self) -> Calibrations:
+        """The calibrations as the next start of the service has them."""
+        again = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
+        again.take_up()
+        return again
 
     def open_rig(self) -> Rig:
         rig = super().open_rig()
@@ -200,7 +209,7 @@ class CalibrationBench(Bench):
             if done(register.get(session_id)):
                 reached.set()
 
-        unwatch = register.watch(session_id, look)
+        unwatch = register.jobs.watch(session_id, look)
         look()
         assert reached.wait(WAIT_S)
         unwatch()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
+import threading
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from uuid import uuid4
 
@@ -11,9 +14,8 @@ import numpy as np
 import pytest
 
 from slrig.bundle.calibration_file import read_calibration, write_calibration
-from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.pose_shooting import PoseRequest
-from slrig.calibrate.records import PoseState, SessionState
+from slrig.calibrate.records import PoseRecord, SessionState
 from slrig.calibrate.store import CalibrationStore
 from slrig.errors import (
     ArtefactNotReadyError,
@@ -21,13 +23,13 @@ from slrig.errors import (
     CalibrationNotFoundError,
     CalibrationStateError,
     DeviceGoneError,
-    IdempotencyError,
     RigBusyError,
     SolveRefusedError,
     StorageError,
     UnsupportedByDeviceError,
 )
-from slrig.jobs.records import JobState
+from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.store import JobStore
 from slrig.model import Size
 from slrig.scan.sweep import sweep
 from tests.unit.calibrate.calibration_bench import PNG, CalibrationBench, tame_calibration
@@ -55,7 +57,7 @@ def moved(tmp_path: Path) -> Iterator[CalibrationBench]:
 def test_session_walks_from_poses_to_the_calibration_in_use(bench: CalibrationBench) -> None:
     session_id = bench.session()
     first, second = bench.shot(session_id), bench.shot(session_id)
-    assert [first.state, second.state] == [PoseState.ACCEPTED] * 2
+    assert [first.state, second.state] == [JobState.SUCCEEDED] * 2
     assert first.answer == {"corners_found": {"cam0": 12}}
     assert bench.tame.judged == [[], ["pose 1"]]
     record = bench.calibrations.register.get(session_id)
@@ -105,7 +107,7 @@ def test_bad_pose_is_refused_with_its_cause_and_its_picture(bench: CalibrationBe
     unseen = bench.shot(session_id)
     bench.tame.unseen = False
     for pose, words in ((judged, "hold it still."), (unseen, "no camera sees the board. Move it into view.")):
-        assert pose.state is PoseState.REFUSED
+        assert (pose.state, pose.refused) == (JobState.FAILED, True)
         assert pose.fault is not None
         assert pose.fault.code == "pose-refused"
         assert pose.fault.message.endswith(words)
@@ -130,7 +132,7 @@ def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
     assert bench.runner.status().holder == f"calibration {session_id}, pose 1"
     queued = bench.scan(wait=True)
     bench.gate.set()
-    assert bench.until_pose(session_id, pose.number).state is PoseState.ACCEPTED
+    assert bench.until_pose(session_id, pose.number).state is JobState.SUCCEEDED
     assert bench.until(queued.id).state is JobState.SUCCEEDED
 
     scan = bench.held()
@@ -139,37 +141,37 @@ def test_pose_and_scan_stand_in_one_line(bench: CalibrationBench) -> None:
     assert busy.value.holder == str(scan.id)
     assert bench.calibrations.register.get(session_id).latest_pose == 1
     waiting = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
-    assert bench.calibrations.register.pose(session_id, waiting.number).state is PoseState.QUEUED
+    assert bench.calibrations.register.pose(session_id, waiting.number).state is JobState.QUEUED
     bench.gate.set()
-    assert bench.until_pose(session_id, waiting.number).state is PoseState.ACCEPTED
+    assert bench.until_pose(session_id, waiting.number).state is JobState.SUCCEEDED
 
 
 def test_cancel_ends_a_pose_under_way_and_one_that_waits(bench: CalibrationBench) -> None:
     session_id = bench.session()
     first = bench.held_pose(session_id)
     second = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
-    assert bench.calibrations.poses.cancel(session_id, second.number).state is PoseState.CANCELLED
+    assert bench.calibrations.poses.cancel(session_id, second.number).state is JobState.CANCELLED
     bench.calibrations.poses.cancel(session_id, first.number)
-    assert bench.until_pose(session_id, first.number).state is PoseState.CANCELLED
+    assert bench.until_pose(session_id, first.number).state is JobState.CANCELLED
     assert bench.opened[0][1].dark
     assert list(bench.folder.incoming.iterdir()) == []
-    assert bench.calibrations.poses.cancel(session_id, first.number).state is PoseState.CANCELLED
+    assert bench.calibrations.poses.cancel(session_id, first.number).state is JobState.CANCELLED
 
 
 def test_device_that_vanishes_fails_the_pose_and_is_opened_again(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
     pose = bench.shot(session_id)
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "device-gone")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "device-gone")
     assert bench.opened_again.wait(WAIT_S)
-    assert bench.shot(session_id).state is PoseState.ACCEPTED
+    assert bench.shot(session_id).state is JobState.SUCCEEDED
 
 
 def test_full_disk_during_a_pose_fails_it_and_leaves_nothing(bench: CalibrationBench) -> None:
     session_id = bench.session()
     bench.error = StorageError("000.png: the disk refused: No space left on device")
     pose = bench.shot(session_id)
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "storage")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "storage")
     assert list(bench.folder.incoming.iterdir()) == []
     assert not bench.calibrations.store.pose(session_id, 1).exists()
     assert not bench.opened[0][1].closed
@@ -189,9 +191,9 @@ def test_full_disk_while_a_pose_is_read_fails_it(bench: CalibrationBench, monkey
     monkeypatch.setattr(CalibrationStore, "commit_pose", commit)
     pose = bench.shot(session_id)
     monkeypatch.undo()
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "storage")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "storage")
     assert list(bench.folder.incoming.iterdir()) == []
-    assert bench.shot(session_id).state is PoseState.ACCEPTED
+    assert bench.shot(session_id).state is JobState.SUCCEEDED
 
 
 def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,17 +206,35 @@ def test_end_that_the_disk_refuses_is_not_lost(bench: CalibrationBench, monkeypa
 
     monkeypatch.setattr(CalibrationStore, "save", save)
     bench.gate.set()
-    assert bench.until_pose(session_id, pose.number).state is PoseState.ACCEPTED
+    assert bench.until_pose(session_id, pose.number).state is JobState.SUCCEEDED
     monkeypatch.undo()
-    assert bench.shot(session_id).state is PoseState.ACCEPTED
+    assert bench.shot(session_id).state is JobState.SUCCEEDED
     (record,) = CalibrationStore(bench.folder).load()
-    assert [each.state for each in record.poses] == [PoseState.ACCEPTED] * 2
+    assert record.coverage == {"poses": ["pose 1", "pose 2"]}
+
+
+def test_end_that_the_records_refuse_is_on_record_when_they_take_it(
+    bench: CalibrationBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session_id = bench.session()
+    refused = threading.Event()
+
+    def finish(*_: object, **__: object) -> bool:
+        refused.set()
+        message = "The service's records could not be used: database or disk is full."
+        raise StorageError(message)
+
+    monkeypatch.setattr(JobStore, "finish", finish)
+    pose = bench.calibrations.poses.shoot(session_id, PoseRequest(), wait=True)
+    assert refused.wait(WAIT_S)
+    monkeypatch.undo()
+    assert bench.until_pose(session_id, pose.number).state is JobState.SUCCEEDED
 
 
 def test_defect_in_the_reading_is_told_without_its_traceback(bench: CalibrationBench) -> None:
     bench.tame.read_error = ZeroDivisionError("secret")
     pose = bench.shot(bench.session())
-    assert (pose.state, None if pose.fault is None else pose.fault.code) == (PoseState.FAILED, "unexpected")
+    assert (pose.state, None if pose.fault is None else pose.fault.code) == (JobState.FAILED, "unexpected")
     assert pose.fault is not None
     assert "secret" not in pose.fault.message
 
@@ -232,22 +252,8 @@ def test_dropped_pose_is_in_no_solve_and_its_number_is_not_given_again(bench: Ca
         bench.calibrations.poses.drop(session_id, 1)
     assert bench.shot(session_id).number == 3
     held = bench.held_pose(session_id)
-    with pytest.raises(CalibrationStateError, match="Pose 4 is shooting"):
+    with pytest.raises(CalibrationStateError, match="Pose 4 is capturing"):
         bench.calibrations.poses.drop(session_id, held.number)
-
-
-def test_repeated_request_shoots_nothing(bench: CalibrationBench) -> None:
-    session_id = bench.session()
-    request = PoseRequest(key="k", fingerprint="a")
-    first = bench.shot(session_id, request)
-    again = bench.calibrations.poses.shoot(session_id, request, wait=False)
-    assert again.number == first.number
-    assert len(bench.tame.captured) == 1
-    with pytest.raises(IdempotencyError):
-        bench.calibrations.poses.shoot(session_id, PoseRequest(key="k", fingerprint="b"), wait=False)
-    bench.calibrations.poses.drop(session_id, first.number)
-    with pytest.raises(CalibrationNotFoundError):
-        bench.calibrations.poses.shoot(session_id, request, wait=False)
 
 
 def test_positioner_takes_a_pose_or_all_in_turn(moved: CalibrationBench) -> None:
@@ -275,11 +281,11 @@ def test_failed_or_cancelled_pose_ends_its_script(moved: CalibrationBench) -> No
     assert moved.began.wait(WAIT_S)
     assert moved.calibrations.register.get(session_id).script == (1, 2)
     moved.calibrations.poses.cancel(session_id, first.number)
-    assert moved.until_pose(session_id, first.number).state is PoseState.CANCELLED
+    assert moved.until_pose(session_id, first.number).state is JobState.CANCELLED
     moved.gate.set()
     moved.error = DeviceGoneError("Camera 'cam0' was unplugged.")
     second = moved.calibrations.poses.script(session_id, (), PoseRequest(), wait=True)
-    assert moved.until_pose(session_id, second.number).state is PoseState.FAILED
+    assert moved.until_pose(session_id, second.number).state is JobState.FAILED
     record = moved.calibrations.register.get(session_id)
     assert (record.script, record.latest_pose, moved.tame.visited) == ((), 2, [0, 0])
 
@@ -422,19 +428,18 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     bench.calibrations.activate(active)
     session_id = bench.session()
     bench.shot(session_id)
-    bench.held_pose(session_id)
-    staged = bench.calibrations.store.staged_pose(session_id, 2)
+    staged = bench.folder.staging(bench.held_pose(session_id).id)
     assert staged.is_dir()
     # What a power cut leaves, seen by the next start.
     sweep(bench.store, bench.folder)
-    again = Calibrations(bench.folder, bench.runner, rig_name="bench", tools=bench.tame.tools())
+    again = bench.restarted()
     assert not staged.exists()
     assert again.active == active
     record = again.register.get(session_id)
-    assert [pose.state for pose in record.poses] == [PoseState.ACCEPTED, PoseState.FAILED]
+    assert [pose.state for pose in record.poses] == [JobState.SUCCEEDED, JobState.INTERRUPTED]
     fault = record.poses[1].fault
     assert fault is not None
-    assert (fault.code, "Shoot it again" in fault.message) == ("scan-interrupted", True)
+    assert (fault.code, "Start it again" in fault.message) == ("scan-interrupted", True)
     assert [each.id for each in again.latest()] == [session_id, active]
     assert [each.observation.name for each in again.answers.readings(record)] == ["pose 1"]
 
@@ -448,10 +453,52 @@ def test_end_of_the_service_cuts_off_what_is_under_way(bench: CalibrationBench) 
     bench.runner.close()
     bench.calibrations.close()
     assert bench.opened[0][1].dark
-    records = {record.id: record for record in CalibrationStore(bench.folder).load()}
-    assert records[session_id].poses[0].state is PoseState.FAILED
-    assert records[other].state is SessionState.FAILED
+    register = bench.calibrations.register
+    assert register.pose(session_id, 1).state is JobState.INTERRUPTED
+    # A solve may end yet; the next start tells of one that did not.
+    assert bench.restarted().register.get(other).state is SessionState.FAILED
     bench.tame.solving.set()
+
+
+def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_read(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    bench.shot(session_id)
+    waiting, whole, answered = (
+        bench.jobs.create(
+            PoseRecord(number, uuid4(), JobState.QUEUED, datetime.now(UTC)).plan,
+            rig="bench", label=None, kind=JobKind.POSE, parent=session_id,
+        )
+        for number in (2, 3, 4)
+    )  # fmt: skip
+    bench.jobs.advance(whole.id, JobState.COMPUTING)
+    bundle = bench.folder.stage(whole.id) / "bundle"
+    bundle.mkdir()
+    (bundle / "bundle.json").write_text("{}")
+    bench.jobs.advance(answered.id, JobState.COMPUTING)
+    place = bench.calibrations.store.pose(session_id, 4)
+    shutil.copytree(bench.calibrations.store.pose(session_id, 1), place)
+    sweep(bench.store, bench.folder)
+    bench.calibrations = bench.restarted()
+    record = bench.until_session(session_id, lambda found: not found.under_way)
+    assert [pose.state for pose in record.poses] == [JobState.SUCCEEDED] * 4
+    assert len(bench.tame.captured) == 2
+    assert bench.jobs.attempts(waiting.id) == 1
+
+
+def test_poses_outlive_their_records_and_records_do_not_outlive_their_files(bench: CalibrationBench) -> None:
+    session_id = bench.session()
+    poses = [bench.shot(session_id) for _ in range(2)]
+    bench.tame.refusals = ("hold it still.",)
+    bench.shot(session_id)
+    before = bench.calibrations.register.get(session_id)
+    bench.jobs.delete_of(session_id)
+    again = bench.restarted().register.get(session_id)
+    told = [(pose.number, pose.state, pose.answer, pose.fault) for pose in again.poses]
+    assert told == [(pose.number, pose.state, pose.answer, pose.fault) for pose in before.poses]
+    assert len(again.accepted) == len(poses)
+    shutil.rmtree(bench.calibrations.store.pose(session_id, 1))
+    lost = bench.restarted().register.pose(session_id, 1)
+    assert (lost.state, None if lost.fault is None else lost.fault.code) == (JobState.FAILED, "storage")
 
 
 def test_folder_that_is_no_session_is_put_aside(bench: CalibrationBench) -> None:
@@ -467,18 +514,16 @@ def test_active_calibration_that_is_gone_ends_the_start(bench: CalibrationBench)
     bench.calibrations.activate(session_id)
     (bench.calibrations.store.solve(session_id, 1) / "calibration.json").unlink()
     with pytest.raises(StorageError, match=r"active calibration .* cannot be read .* Remove .*active\.json"):
-        Calibrations(bench.folder, bench.runner, rig_name="bench", tools=bench.tame.tools())
+        bench.restarted()
 
 
 def test_events_tell_of_poses_and_of_the_solve(bench: CalibrationBench) -> None:
     session_id = bench.solved(poses=1)
-    events = bench.calibrations.register.events(session_id, after=0)
-    assert [event.number for event in events] == list(range(1, len(events) + 1))
-    assert [event.data["state"] for event in events if event.kind == "pose"] == [
-        "queued",
-        "shooting",
-        "reading",
-        "accepted",
-    ]
-    assert [event.data["state"] for event in events if event.kind == "state"] == ["solving", "solved"]
+    events = bench.jobs.events_of(session_id, after=0)
+    numbers = [event.number for event in events]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == bench.jobs.last_event_of(session_id)
+    assert [event.data["state"] for event in events if event.kind == "state"] == [
+        "queued", "capturing", "computing", "succeeded", "queued", "computing", "succeeded",
+    ]  # fmt: skip
     assert {"capture", "adjust"} <= {event.data["stage"] for event in events if event.kind == "progress"}

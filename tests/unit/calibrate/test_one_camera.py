@@ -19,7 +19,7 @@ from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose, solve_poses
 from slrig.calibrate.tools import Setting
 from slrig.calibration.board import BoardShape
-from slrig.calibration.health.looking import look_at_board
+from slrig.calibration.health.verifying import verify_by_board
 from slrig.calibration.judging.comparison import comparison
 from slrig.calibration.poses.figures import ViewFigures
 from slrig.cli.calibration_screen import tell_result
@@ -124,4 +124,4 @@ def test_it_is_no_calibration_for_scans_or_looks_at_a_board() -> None:
         "with a second camera"
     )
     with pytest.raises(CalibrationError, match="one of camera 'left' alone: calibrate it again"):
-        look_at_board([poses()[0][0].observation], CHESSBOARD, result().calibration)
+        verify_by_board([poses()[0][0].observation], CHESSBOARD, result().calibration)

@@ -65,7 +65,7 @@ def test_a_pose_gives_every_corner_and_light_that_is_right_within_what_it_states
     assert read.observation.name == "pose 1"
     view = read.observation.views["left"]
     assert view.corner.tolist() == list(range(BOARD.corner_count))
-    for rms_px, ratio, count in off_px(read.observation.light["left"]).values():
+    for rms_px, ratio, count in off_px(read.observation.correspondences["left"]).values():
         assert count > 3000
         assert rms_px <= 0.02
         assert 0.8 <= ratio <= 1.25
@@ -83,7 +83,7 @@ def test_figures_say_how_well_the_board_was_seen(read: ReadPose) -> None:
 @pytest.mark.slow
 def test_without_line_shift_code_edges_tell_the_light() -> None:
     found = read_captured(shot(line_shift=False), BOARD, "gray")
-    for rms_px, ratio, count in off_px(found.observation.light["left"]).values():
+    for rms_px, ratio, count in off_px(found.observation.correspondences["left"]).values():
         # An edge every two columns.
         assert count > 1800
         assert rms_px <= 0.03
@@ -97,7 +97,7 @@ def test_without_inverses_a_pose_is_read_all_the_same(pose: Capture) -> None:
         if not (isinstance(pattern := pose.patterns[each.pattern], Gray) and pattern.inverted)
     )
     found = read_captured(replace(pose, shots=bare), BOARD, "bare")
-    for rms_px, _, count in off_px(found.observation.light["left"]).values():
+    for rms_px, _, count in off_px(found.observation.correspondences["left"]).values():
         assert count > 3000
         assert rms_px <= 0.02
 
@@ -106,7 +106,7 @@ def test_a_bundle_reads_as_its_frames_do(pose: Capture, read: ReadPose, tmp_path
     write_bundle(tmp_path / "one", pose)
     again = read_pose(tmp_path / "one", BOARD, "pose 1")
     np.testing.assert_array_equal(
-        again.observation.light["left"].position_px, read.observation.light["left"].position_px
+        again.observation.correspondences["left"].position_px, read.observation.correspondences["left"].position_px
     )
     assert again.figures == read.figures
     assert bundle_device_sizes(tmp_path / "one") == device_sizes(pose)
@@ -116,7 +116,7 @@ def test_white_alone_gives_corners_and_no_light(pose: Capture) -> None:
     alone = without(pose, Black, Gray, LineShift)
     found = read_captured(alone, BOARD, "cameras")
     assert len(found.observation.views["left"].corner) == BOARD.corner_count
-    assert not found.observation.light
+    assert not found.observation.correspondences
     figures = found.figures["left"]
     assert np.isnan(figures.decoded)
     assert 0.6 < figures.contrast < 0.9
@@ -130,7 +130,7 @@ def test_one_camera_that_does_not_see_the_board_leaves_the_other(pose: Capture) 
     blind = shot(Standing(away=True), camera="right")
     found = read_captured(both(blind, pose), BOARD, "half")
     assert set(found.observation.views) == set(found.figures) == {"left"}
-    assert set(found.observation.light) == {"left"}
+    assert set(found.observation.correspondences) == {"left"}
 
 
 def test_a_board_in_no_camera_is_refused_by_camera_and_cause() -> None:

@@ -248,9 +248,9 @@ def test_every_pose_is_listed_with_its_figures_and_reasons() -> None:
             continue
         for device, rms in pose.rms_px.items():
             assert close(page().number(f"{name}.{device}.rms_px"), rms, digits=3)
-        stood = board_poses()[name]
-        middle = stood.rotation @ BOARD.points_mm.mean(axis=0) + stood.translation_mm
-        steep = math.degrees(math.acos(abs(stood.rotation[:, 2] @ middle) / np.linalg.norm(middle)))
+        board_pose = board_poses()[name]
+        middle = board_pose.rotation @ BOARD.points_mm.mean(axis=0) + board_pose.translation_mm
+        steep = math.degrees(math.acos(abs(board_pose.rotation[:, 2] @ middle) / np.linalg.norm(middle)))
         assert close(page().number(f"{name}.tilt_deg"), steep, digits=0)
         assert close(page().number(f"{name}.distance_mm"), middle[2], digits=0)
     words = "".join(page().words)

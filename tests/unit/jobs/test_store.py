@@ -8,11 +8,11 @@ from uuid import uuid4
 
 import pytest
 
-from slrig.errors import IdempotencyError, JobNotFoundError, KeyInFlightError
+from slrig.errors import JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, JobProgress, JobState
-from slrig.jobs.store import JobStore, ProgressRecorder
+from slrig.jobs.store import JobStore
 from slrig.scan.plan import PatternPlan, ScanPlan
 from slrig.scan.records import plan_from_json, plan_json
 from tests.unit.scan.fakes import SetClock
@@ -101,58 +101,27 @@ def test_watcher_is_woken_by_its_scan_only_and_until_it_leaves(store: JobStore) 
     assert calls == [2]
 
 
-def test_idempotency_key_leads_back_to_its_scan(store: JobStore) -> None:
-    assert store.reserve_key("k", "body") is None
-    with pytest.raises(KeyInFlightError):
-        store.reserve_key("k", "body")
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None, key="k")
-    assert store.reserve_key("k", "body") == scan.id
-    with pytest.raises(IdempotencyError, match="another request body"):
-        store.reserve_key("k", "other body")
-
-
-def test_key_of_a_refused_request_is_free_again(store: JobStore) -> None:
-    store.reserve_key("k", "body")
-    store.release_key("k")
-    assert store.reserve_key("k", "other body") is None
-
-
-def test_key_of_a_scan_is_not_released(store: JobStore) -> None:
-    store.reserve_key("k", "body")
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None, key="k")
-    store.release_key("k")
-    store.release_keys()
-    assert store.reserve_key("k", "body") == scan.id
-
-
-def test_key_is_forgotten_after_a_day(store: JobStore, clock: SetClock) -> None:
-    store.reserve_key("k", "body")
-    store.create(plan_json(ScanPlan()), rig="bench", label=None, key="k")
-    clock.move(hours=23, minutes=59)
-    with pytest.raises(IdempotencyError):
-        store.reserve_key("k", "other body")
-    clock.move(minutes=2)
-    assert store.reserve_key("k", "other body") is None
-
-
-def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(store: JobStore) -> None:
-    scan = store.create(plan_json(ScanPlan()), rig="bench", label=None)
-    now_s = [0.0]
-    record = ProgressRecorder(store, scan.id, hidden="secret/", now_s=lambda: now_s[0])
-    for at_s, stage, fraction, detail in (
-        (0.0, "preparing kernels", 0.0, "0 of 56"),
-        (0.5, "preparing kernels", 0.0, "1 of 56"),  # too soon to be told
-        (2.5, "preparing kernels", 0.0, "9 of 56"),
-        (9.0, "preparing kernels", 0.0, "9 of 56"),  # nothing new
-        (9.1, "decode", 0.001, "secret/a"),
-        (9.2, "decode", 0.5, ""),
-    ):
-        now_s[0] = at_s
-        record(stage, fraction, detail)
-    events = [event.data for event in store.events(scan.id, after=0) if event.kind == "progress"]
-    assert [(each["stage"], each["detail"]) for each in events] == [
-        ("preparing kernels", "0 of 56"),
-        ("preparing kernels", "9 of 56"),
-        ("decode", "a"),
-        ("decode", ""),
-    ]
+def test_jobs_of_one_parent_are_listed_and_followed_together(tmp_path: Path, clock: SetClock) -> None:
+    jobs = JobStore(Database(tmp_path / "poses.sqlite"), JobKind.POSE, JobKind.SOLVE, clock=clock)
+    session, other = uuid4(), uuid4()
+    woken: list[str] = []
+    unwatch = jobs.watch(session, lambda: woken.append("session"))
+    first = jobs.create({"number": 1}, rig="bench", label=None, parent=session)
+    alone = jobs.create({"number": 1}, rig="bench", label=None, parent=other)
+    solve = jobs.create({"number": 1}, rig="bench", label=None, kind=JobKind.SOLVE, parent=session)
+    jobs.finish(first.id, JobState.SUCCEEDED, summary={"answer": {}})
+    assert jobs.of(session) == {session: [jobs.get(first.id), jobs.get(solve.id)]}
+    assert [job.id for job in jobs.of()[other]] == [alone.id]
+    events = jobs.events_of(session, after=0)
+    assert [(event.job, event.data["state"]) for event in events] == [
+        (first.id, "queued"), (solve.id, "queued"), (first.id, "succeeded"),
+    ]  # fmt: skip
+    assert jobs.events_of(session, after=events[1].number) == events[2:]
+    assert jobs.last_event_of(session) == events[-1].number
+    assert jobs.last_event_of(uuid4()) == 0
+    assert len(woken) == 3
+    jobs.delete_of(session)
+    assert (jobs.of(session), jobs.events_of(session, after=0)) == ({}, [])
+    assert jobs.get(alone.id).parent == other
+    unwatch()
+    jobs.database.close()

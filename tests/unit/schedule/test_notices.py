@@ -22,7 +22,7 @@ from slrig.schedule.cron import Cron
 from slrig.schedule.notices import TOLD, NoticedHealth, Notices
 from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
 from tests.unit.scan.fakes import WAIT_S
-from tests.unit.verify.health_bench import a_look, hours
+from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
 SCHEDULE = Schedule(UUID(int=7), Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION), DUE, DUE)
@@ -93,9 +93,11 @@ def test_runs_that_a_person_has_to_know_of_are_sent_and_no_others(hook: Hook) ->
 def test_health_is_told_when_it_changes(hook: Hook, tmp_path: Path) -> None:
     notices = Notices(hook.url, rig="bench")
     health = NoticedHealth(Database(tmp_path / "slrig.sqlite"), notices)
-    for hour, look in enumerate([a_look(), a_look(), a_look(6.0, evidence=400.0), a_look(6.0, evidence=400.0)]):
+    for hour, look in enumerate(
+        [a_verification(), a_verification(), a_verification(6.0, evidence=400.0), a_verification(6.0, evidence=400.0)]
+    ):
         health.add(look, calibration="one", at=hours(hour))
-    health.add(a_look(), calibration="two", at=hours(9))
+    health.add(a_verification(), calibration="two", at=hours(9))
     first, second = (hook.came.get(timeout=WAIT_S) for _ in range(2))
     notices.close()
     health.database.close()

@@ -8,7 +8,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import pytest
 
@@ -47,7 +47,7 @@ from slrig.verify.verification import VerificationTools
 from tests.unit.accept.test_desk import PLAN, TameQueue, desk, desks, queue
 from tests.unit.calibrate.calibration_bench import CalibrationBench
 from tests.unit.scan.fakes import WAIT_S, SetClock
-from tests.unit.verify.health_bench import a_look
+from tests.unit.verify.health_bench import a_verification
 
 __all__ = ["desk", "desks", "queue"]
 
@@ -60,14 +60,17 @@ class TaskBench(CalibrationBench):
     def __init__(self, tmp_path: Path, *, positioner: bool = True) -> None:
         super().__init__(tmp_path, positioner=positioner)
         self.queue = self.runner
-        self.calibrations = Calibrations(self.folder, self.queue, rig_name="bench", tools=self.tame.tools())
+        self.calibrations = Calibrations(self.folder, self.queue, self.jobs, rig_name="bench", tools=self.tame.tools())
         self.health = HealthStore(Database(self.folder.database))
         tools = self.tame.tools()
-        verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_look())
+        verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_verification())
         self.verifications = VerificationDesk(
             self.folder, self.queue, self.health, JobStore(self.health.database, JobKind.VERIFICATION), tools=verifying
         )
-        self.acceptance = AcceptanceDesk(self.folder, self.queue, evaluate=evaluated, report=write_reports)
+        self.acceptance = AcceptanceDesk(
+            self.folder, self.queue, JobStore(self.health.database, JobKind.POSITION), evaluate=evaluated,
+            report=write_reports,
+        )  # fmt: skip
         self.tidied: list[int] = []
         self.tasks = Tasks(
             self.queue, self.calibrations, self.verifications, self.acceptance,
@@ -88,7 +91,9 @@ class TaskBench(CalibrationBench):
     def open(self) -> None:
         """Wait until the rig is open."""
         opened = threading.Event()
-        self.queue.submit_work(lambda *_: None, holder=Holder("a", "b", "/c"), wait=True, ended=lambda _: opened.set())
+        self.queue.submit_work(
+            lambda *_: None, work_id=uuid4(), holder=Holder("a", "b", "/c"), wait=True, ended=lambda _: opened.set()
+        )
         assert opened.wait(WAIT_S)
 
     def close(self) -> None:

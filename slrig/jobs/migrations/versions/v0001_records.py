@@ -6,7 +6,7 @@ import sqlalchemy as sa
 from alembic import op
 
 # Databases from before there was one chain call their first state 0001.
-revision = "records1"
+revision = "records2"
 down_revision = None
 
 
@@ -17,6 +17,7 @@ def upgrade() -> None:
         sa.Column("number", sa.Integer, primary_key=True, autoincrement=True),
         sa.Column("id", sa.String(36), nullable=False, unique=True),
         sa.Column("kind", sa.String(16), nullable=False),
+        sa.Column("parent", sa.String(36)),
         sa.Column("state", sa.String(16), nullable=False),
         sa.Column("label", sa.String(200)),
         sa.Column("rig", sa.String(200), nullable=False),
@@ -35,16 +36,20 @@ def upgrade() -> None:
         sqlite_autoincrement=True,
     )
     op.create_index("ix_job_kind_state", "job", ["kind", "state"])
+    op.create_index("ix_job_parent", "job", ["parent"])
     op.create_table(
         "event",
-        sa.Column("job_id", sa.String(36), sa.ForeignKey("job.id", ondelete="CASCADE"), primary_key=True),
-        sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
+        sa.Column("id", sa.Integer, primary_key=True, autoincrement=True),
+        sa.Column("job_id", sa.String(36), sa.ForeignKey("job.id", ondelete="CASCADE"), nullable=False),
+        sa.Column("number", sa.Integer, nullable=False),
         sa.Column("kind", sa.String(16), nullable=False),
         sa.Column("data", sa.JSON, nullable=False),
+        sa.UniqueConstraint("job_id", "number", name="uq_event_number"),
+        sqlite_autoincrement=True,
     )
     op.create_table(
         "idempotency_key",
-        sa.Column("key", sa.String(255), primary_key=True),
+        sa.Column("key", sa.String(400), primary_key=True),
         sa.Column("fingerprint", sa.String(64), nullable=False),
         sa.Column("job_id", sa.String(36)),
         sa.Column("created_at", sa.String(32), nullable=False),
@@ -94,7 +99,7 @@ def upgrade() -> None:
         sa.Column("state", sa.String(16), nullable=False),
         sa.Column("reasons", sa.JSON, nullable=False),
         sa.Column("remedy", sa.String),
-        sa.Column("look", sa.JSON, nullable=False),
+        sa.Column("found", sa.JSON, nullable=False),
         sqlite_autoincrement=True,
     )
     op.create_index("ix_verification_calibration", "verification", ["calibration", "number"])

@@ -1,0 +1,53 @@
+"""How far a job is, put on record as often as a person cares to know."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from uuid import UUID
+
+import structlog
+
+from slrig.errors import StorageError
+from slrig.jobs.records import JobProgress
+from slrig.jobs.store import JobStore
+
+_LEAST_STEP = 0.01
+_DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
+
+_log = structlog.get_logger(__name__)
+
+
+class ProgressRecorder:
+    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, or another
+    detail of a stage that goes on.
+    """
+
+    def __init__(
+        self, store: JobStore, job_id: UUID, *, hidden: str, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        """`hidden` is left out of what is recorded."""
+        self._now_s = now_s
+        self._told_s = -math.inf
+        self._hidden = hidden
+        self._store = store
+        self._job_id = job_id
+        self._start, self._end = 0.0, 1.0
+        self._told = JobProgress("", -1.0, "")
+
+    def span(self, start: float, end: float) -> None:
+        """Map the fractions that follow into start..end of the whole job."""
+        self._start, self._end = start, end
+
+    def __call__(self, stage: str, fraction: float, detail: str) -> None:
+        """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""
+        overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
+        goes_on = detail != self._told.detail and self._now_s() - self._told_s >= _DETAIL_S
+        if goes_on or stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
+            self._told = JobProgress(stage, overall, detail.replace(self._hidden, ""))
+            self._told_s = self._now_s()
+            try:
+                self._store.progress(self._job_id, self._told)
+            except StorageError as error:
+                _log.warning("how far a job is could not be recorded", job=str(self._job_id), cause=str(error))
