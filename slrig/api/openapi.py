@@ -1,9 +1,8 @@
-"""The description of the interface. `python -m slrig.api.openapi` prints it, kept as config/openapi.json."""
+"""The description of the interface, kept as config/openapi.json: `python -m slrig.api` prints it."""
 
 from __future__ import annotations
 
 import json
-import sys
 from http import HTTPStatus
 from typing import Any
 
@@ -57,9 +56,3 @@ def describe(app: FastAPI) -> dict[str, Any]:
 def text(app: FastAPI) -> str:
     """The document as it is kept in config/openapi.json."""
     return json.dumps(describe(app), indent=2, ensure_ascii=False) + "\n"
-
-
-if __name__ == "__main__":
-    from slrig.api.app import bare_app
-
-    sys.stdout.write(text(bare_app()))

@@ -6,7 +6,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from tests.e2e.conftest import ServiceProcess
@@ -37,14 +37,23 @@ def newest(caller: Caller, schedule: dict[str, Any], *states: str) -> dict[str, 
 def at_once(caller: Caller, service: ServiceProcess, schedule: dict[str, Any]) -> None:
     """Have a paused schedule of every minute be due in the minute that is, and only then.
 
-    Its record is made to look as if it had been there before this minute began; the clock is the real one.
+    Its record is made to look as if it had been there before this minute began, and as if it were due in this minute of
+    the year alone, whenever the next one begins; the clock is the real one.
     """
     minute = datetime.now(UTC).replace(second=0, microsecond=0)
+    _rewrite(service, schedule, f"{minute:%M %H %d %m} *", minute)
+    caller.post(schedule["links"]["resume"], 200)
+    runs = lambda: caller.get(schedule["links"]["runs"])["runs"]  # noqa: E731 - of one line
+    awaited(lambda: any(datetime.fromisoformat(run["due"]) == minute for run in runs()), "the run")
+    caller.post(schedule["links"]["pause"], 200)
+    _rewrite(service, schedule, "* * * * *", datetime.now(UTC).replace(second=0, microsecond=0) + timedelta(minutes=1))
+
+
+def _rewrite(service: ServiceProcess, schedule: dict[str, Any], cron: str, due: datetime) -> None:
     with sqlite3.connect(service.data / "slrig.sqlite", timeout=10) as database:
-        stamp = minute.isoformat(timespec="milliseconds")
-        changed = database.execute("UPDATE schedule SET next_due = ? WHERE id = ?", (stamp, schedule["id"]))
+        stamp = due.isoformat(timespec="milliseconds")
+        changed = database.execute(
+            "UPDATE schedule SET cron = ?, next_due = ? WHERE id = ?", (cron, stamp, schedule["id"])
+        )
         assert changed.rowcount == 1
     database.close()
-    caller.post(schedule["links"]["resume"], 200)
-    awaited(lambda: caller.get(schedule["links"]["runs"])["runs"], "the run")
-    caller.post(schedule["links"]["pause"], 200)
