@@ -22,7 +22,6 @@ from slrig.errors import (
     DeviceBusyError,
     InvalidInputError,
     JobNotFoundError,
-    ScanCancelledError,
     ScanStateError,
 )
 from slrig.jobs.data_folder import DataFolder
@@ -226,21 +225,10 @@ class AcceptanceDesk:
             message = "exact artefacts are those of a rendered rig, and this one is not; send the certificates' values"
             raise InvalidInputError(message)
         place = by_positioner(rig, plan) if scripted else None
-        folder = self._store.folder(test_id)
-        count = len(plan.takes)
-        while (following := record.next_take) is not None:
-            step, take = following
-            done = len(record.readings)
-
-            def told(stage: str, fraction: float, detail: str, /, name: str = step.name, done: int = done) -> None:
-                progress(f"{name}: {stage}", (done + min(max(fraction, 0.0), 1.0)) / count, detail)
-
-            if cancelled():
-                message = f"the acceptance test was cancelled before {step.name}"
-                raise ScanCancelledError(message)
-            if place is not None and take == 0:
-                place(rig, step)
-            found = measured(rig, plan, step, take, folder, progress=told, cancelled=cancelled, evaluate=self._evaluate)
+        for found in measured(
+            rig, plan, len(record.readings), self._store.folder(test_id),
+            progress=progress, cancelled=cancelled, place=place, evaluate=self._evaluate,
+        ):  # fmt: skip
             record = self._change(test_id, readings=(*record.readings, found))
             following = record.next_take
             # A repeat goes with its first: nothing is moved between them.

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator
 
 from slrig.accept.plan import AcceptancePlan, Artefact, Quantity, Step
-from slrig.calibration.artefacts import FittedPlane, FittedSphere, fitted_plane, fitted_sphere
-from slrig.calibration.artefacts import flatness as flatness_of
-from slrig.calibration.artefacts import probing as probing_of
-from slrig.calibration.artefacts import spacing as spacing_of
+from slrig.calibration.artefacts import FittedPlane, FittedSphere, dispersion_mm, fitted_plane, fitted_sphere
 from slrig.calibration.segmentation import ball_points, plane_points, seen_well
 from slrig.errors import NothingToReconstructError
 from slrig.model import Calibration, FloatArray, IntArray, Mesh
@@ -20,6 +20,9 @@ from slrig.model import Calibration, FloatArray, IntArray, Mesh
 BORDER_RINGS = 2
 """Points so few steps from a border of the mesh do not count: there a stripe is cut, and its middle is not where it
 seems. A step is about one pixel along a stripe, and one column across."""
+
+Measured = Annotated[float, BeforeValidator(lambda given: math.nan if given is None else given)]
+"""A number that may be NaN, for which JSON holds null."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +38,16 @@ class Reading:
 
     step: str
     take: int
-    errors_mm: Mapping[Quantity, float]
-    limits_mm: Mapping[Quantity, float]
-    noise_mm: float
-    sigma_mm: float
-    dispersion_mm: float
+    errors_mm: Mapping[Quantity, Measured]
+    limits_mm: Mapping[Quantity, Measured]
+    noise_mm: Measured
+    sigma_mm: Measured
+    dispersion_mm: Measured
     on_artefact: int
     steep: int
     at_border: int
     used: int
-    rejected_share: float
+    rejected_share: Measured
 
     @property
     def beyond(self) -> bool:
@@ -84,8 +87,8 @@ def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan, rig: Calibr
         facing = seen_well(points, normals, [device.centre_mm for device in devices])
         inner = ~near_border(mesh.faces, len(points), rings=BORDER_RINGS)
         kept = [part[facing[part] & inner[part]] for part in parts]
-        fits = [_fit(points[each], step) for each in kept]
-        errors, rejected = _errors(step, [points[each] for each in kept], plan)
+        fit = fitted_plane if step.artefact is Artefact.PLANE else fitted_sphere
+        fits: list[FittedSphere | FittedPlane] = [fit(points[each]) for each in kept]
     except NothingToReconstructError as cause:
         message = f"{step.name}: {cause}"
         raise NothingToReconstructError(message) from cause
@@ -93,12 +96,13 @@ def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan, rig: Calibr
     noise_mm = float(np.sqrt(np.mean(sigma[counted] ** 2)))
     distances = np.full(len(points), np.nan)
     artefact = np.zeros(len(points), np.uint8)
-    for number, (part, fit) in enumerate(zip(parts, fits, strict=True), 1):
+    for number, (part, fitted) in enumerate(zip(parts, fits, strict=True), 1):
         artefact[part] = number
-        distances[part] = _off(points[part], fit)
+        distances[part] = _off(points[part], fitted)
     used = np.zeros(len(points), dtype=bool)
     used[counted] = True
-    off = np.concatenate([fit.distances_mm for fit in fits])
+    off = np.concatenate([each.distances_mm for each in fits])
+    errors = _errors_mm(fits, plan)
     found = Reading(
         step=step.name,
         take=take,
@@ -106,12 +110,12 @@ def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan, rig: Calibr
         limits_mm={quantity: plan.limits.limit_mm(quantity, noise_mm) for quantity in errors},
         noise_mm=noise_mm,
         sigma_mm=float(np.std(off)),
-        dispersion_mm=_shell_mm(off),
+        dispersion_mm=dispersion_mm(off),
         on_artefact=len(whole),
         steep=int((~facing[whole]).sum()),
         at_border=int((facing[whole] & ~inner[whole]).sum()),
         used=len(counted),
-        rejected_share=rejected,
+        rejected_share=sum(each.rejected for each in fits) / len(counted),
     )
     return found, Evidence(points, artefact, used, distances, sigma)
 
@@ -143,10 +147,6 @@ def _parts(points: FloatArray, normals: FloatArray, step: Step, plan: Acceptance
     return ball_points(points, normals, plan.artefacts.ball_mm, 2)
 
 
-def _fit(points: FloatArray, step: Step) -> FittedSphere | FittedPlane:
-    return fitted_plane(points) if step.artefact is Artefact.PLANE else fitted_sphere(points)
-
-
 def _off(points: FloatArray, fit: FittedSphere | FittedPlane) -> FloatArray:
     """(n,) how far the points lie from the fit; of a plane, towards its normal."""
     if isinstance(fit, FittedPlane):
@@ -154,20 +154,15 @@ def _off(points: FloatArray, fit: FittedSphere | FittedPlane) -> FloatArray:
     return np.asarray(np.linalg.norm(points - fit.centre_mm, axis=1) - fit.radius_mm)
 
 
-def _errors(step: Step, parts: list[FloatArray], plan: AcceptancePlan) -> tuple[dict[Quantity, float], float]:
-    """The errors of a position by quantity, mm, and the share of points left out of the fits."""
-    if step.artefact is Artefact.SPHERE:
-        probed = probing_of(parts[0], plan.artefacts.diameter.value_mm)
-        return {Quantity.FORM: probed.form_mm, Quantity.SIZE: probed.size_mm}, probed.rejected_share
-    if step.artefact is Artefact.BAR:
-        spaced = spacing_of(parts[0], parts[1], plan.artefacts.distance.value_mm)
-        return {Quantity.SPACING: spaced.error_mm}, spaced.rejected_share
-    flat = flatness_of(parts[0])
-    return {Quantity.FLATNESS: flat.form_mm}, flat.rejected_share
-
-
-def _shell_mm(distances_mm: FloatArray) -> float:
-    """The narrowest shell that holds 95 % of the distances (D95 %)."""
-    rising = np.sort(distances_mm)
-    inside = int(np.ceil(0.95 * len(rising)))
-    return float((rising[inside - 1 :] - rising[: len(rising) - inside + 1]).min())
+def _errors_mm(fits: Sequence[FittedSphere | FittedPlane], plan: AcceptancePlan) -> dict[Quantity, float]:
+    """The errors of a position, in the manner of VDI/VDE 2634-2: of a fitted plane, of a sphere, or of two balls."""
+    match fits:
+        case [FittedPlane() as plane]:
+            return {Quantity.FLATNESS: float(np.ptp(plane.distances_mm))}
+        case [FittedSphere() as sphere]:
+            return {
+                Quantity.FORM: float(np.ptp(sphere.distances_mm)),
+                Quantity.SIZE: 2 * sphere.radius_mm - plan.artefacts.diameter.value_mm,
+            }
+    apart_mm = float(np.linalg.norm(fits[0].centre_mm - fits[1].centre_mm))
+    return {Quantity.SPACING: apart_mm - plan.artefacts.distance.value_mm}

@@ -6,13 +6,18 @@ No conformity is claimed. The working volume is a box along the world's axes; L0
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
+from pydantic import PlainValidator
 
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray
+
+Numbers = Annotated[FloatArray, PlainValidator(lambda given: np.array(given, np.float64))]
+"""An array, float64, that pydantic reads from lists."""
 
 USUAL_FORM_SIGMAS = 6.5
 """Errors of form may be so many standard deviations of a point: noise alone gives 5.9 when 0.3 % are left out."""
@@ -43,15 +48,12 @@ class Quantity(StrEnum):
     @property
     def words(self) -> str:
         """Its name for a person."""
-        return _WORDS[self]
-
-
-_WORDS = {
-    Quantity.FORM: "probing error, form",
-    Quantity.SIZE: "probing error, size",
-    Quantity.SPACING: "sphere spacing error",
-    Quantity.FLATNESS: "flatness error",
-}
+        return {
+            "PF": "probing error, form",
+            "PS": "probing error, size",
+            "SD": "sphere spacing error",
+            "F": "flatness error",
+        }[self]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,13 +89,12 @@ class Artefacts:
 
     def uncertainty_mm(self, quantity: Quantity) -> float | None:
         """The expanded uncertainty (k = 2) that the artefact brings into an error; None where it was not told."""
-        told = {
+        return {
             Quantity.FORM: self.sphere_form_mm,
             Quantity.SIZE: self.diameter.uncertainty_mm,
             Quantity.SPACING: self.distance.uncertainty_mm,
             Quantity.FLATNESS: self.plane_form_mm,
-        }
-        return told[quantity]
+        }[quantity]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +130,8 @@ class Step:
 
     name: str
     artefact: Artefact
-    centre_mm: FloatArray
-    axis: FloatArray
+    centre_mm: Numbers
+    axis: Numbers
     words: str
 
 
@@ -141,14 +142,14 @@ class AcceptancePlan:
     repeats : so often is the first position of each artefact measured, for the scatter of repeated captures.
     """
 
-    volume_mm: FloatArray
+    volume_mm: Numbers
     artefacts: Artefacts
     limits: Limits
     steps: tuple[Step, ...]
     rendered: bool
     repeats: int = USUAL_REPEATS
     exposure_s: float | None = None
-    notes: str = field(default="")
+    notes: str = ""
 
     @property
     def diagonal_mm(self) -> float:
@@ -194,27 +195,24 @@ def exact_artefacts(volume_mm: FloatArray) -> Artefacts:
     )
 
 
+_CERTIFIED = {
+    Quantity.SIZE: "the sphere's diameter",
+    Quantity.SPACING: "the bar's distance",
+    Quantity.FORM: "the sphere's form",
+    Quantity.FLATNESS: "the plane's form",
+}
+"""What of the artefacts a certificate tells the uncertainty of, by the quantity that it enters."""
+
+
 def require_fitting(artefacts: Artefacts, volume_mm: FloatArray, *, rendered: bool) -> None:
     """Refuse artefacts that a test of this volume cannot be done with. Raises InvalidInputError with all faults."""
-    faults = _unusable(artefacts, volume_mm)
-    if not faults:
-        faults = _unfit(artefacts, volume_mm)
-    if not rendered:
-        unknown = [
-            name
-            for name, value in (
-                ("the sphere's diameter", artefacts.diameter.uncertainty_mm),
-                ("the bar's distance", artefacts.distance.uncertainty_mm),
-                ("the sphere's form", artefacts.sphere_form_mm),
-                ("the plane's form", artefacts.plane_form_mm),
-            )
-            if value is None
-        ]
-        if unknown:
-            faults.append(
-                f"the certificate's expanded uncertainty of {', '.join(unknown)} is not told; without it nothing can "
-                "be decided on metal: copy it from the certificate"
-            )
+    faults = _unusable(artefacts, volume_mm) or _unfit(artefacts, volume_mm)
+    unknown = [name for quantity, name in _CERTIFIED.items() if artefacts.uncertainty_mm(quantity) is None]
+    if unknown and not rendered:
+        faults.append(
+            f"the certificate's expanded uncertainty of {', '.join(unknown)} is not told; without it nothing can "
+            "be decided on metal: copy it from the certificate"
+        )
     if faults:
         message = "\n".join(["the acceptance test cannot be done so; correct each and try again:", *faults])
         raise InvalidInputError(message)
@@ -233,22 +231,13 @@ def _unusable(artefacts: Artefacts, volume_mm: FloatArray) -> list[str]:
         "the plane's length": artefacts.plane_mm[0],
         "the plane's width": artefacts.plane_mm[1],
     }
-    faults += [
-        f"{name}: expected a length above 0 mm, found {value:g} mm"
-        for name, value in lengths.items()
-        if not 0 < value < math.inf
-    ]
-    certain = {
-        "the sphere's diameter": artefacts.diameter.uncertainty_mm,
-        "the bar's distance": artefacts.distance.uncertainty_mm,
-        "the sphere's form": artefacts.sphere_form_mm,
-        "the plane's form": artefacts.plane_form_mm,
-    }
-    faults += [
-        f"the uncertainty of {name}: expected 0 mm or more, found {value:g} mm"
-        for name, value in certain.items()
-        if value is not None and not 0 <= value < math.inf
-    ]
+    for name, value in lengths.items():
+        if not 0 < value < math.inf:
+            faults.append(f"{name}: expected a length above 0 mm, found {value:g} mm")
+    for quantity, name in _CERTIFIED.items():
+        uncertainty = artefacts.uncertainty_mm(quantity)
+        if uncertainty is not None and not 0 <= uncertainty < math.inf:
+            faults.append(f"the uncertainty of {name}: expected 0 mm or more, found {uncertainty:g} mm")
     return faults
 
 

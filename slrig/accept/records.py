@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
 from uuid import UUID
 
-import numpy as np
+from pydantic import TypeAdapter
 
 from slrig.accept.evaluation import Reading
-from slrig.accept.plan import AcceptancePlan, Artefact, Artefacts, Certified, Limits, Quantity, Step
+from slrig.accept.plan import AcceptancePlan, Step
 from slrig.calibrate.records import plain
 from slrig.calibration.artefacts import Decision
 from slrig.errors import StorageError
@@ -96,11 +94,13 @@ def with_jobs(record: AcceptanceRecord, jobs: Sequence[JobRecord]) -> Acceptance
     return replace(record, state=_AFTER.get(job.state, record.state), fault=job.fault)
 
 
+_records = TypeAdapter(AcceptanceRecord)
+
+
 def record_json(record: AcceptanceRecord) -> bytes:
     """A record as JSON text, without what its jobs say."""
-    document = {"format": _FORMAT, "version": 2, **plain(replace(record, progress=None, fault=None))}
+    document = {"format": _FORMAT, "version": 2, **plain(record), "created_at": record.created_at.isoformat()}
     del document["progress"], document["fault"]
-    document["created_at"] = record.created_at.isoformat()
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
@@ -110,52 +110,7 @@ def record_from_json(text: bytes, source: str) -> AcceptanceRecord:
         found = json.loads(text)
         if found["format"] != _FORMAT:
             raise KeyError(found["format"])  # noqa: TRY301 - told with the other faults of the file
-        decision = found["decision"]
-        return AcceptanceRecord(
-            number=int(found["number"]),
-            id=UUID(found["id"]),
-            created_at=datetime.fromisoformat(found["created_at"]),
-            rig=found["rig"],
-            calibration=found["calibration"],
-            plan=_plan(found["plan"]),
-            state=AcceptanceState(found["state"]),
-            readings=tuple(_reading(each) for each in found["readings"]),
-            decision=None if decision is None else Decision(decision),
-        )
+        return _records.validate_python(found)
     except (ValueError, KeyError, TypeError) as error:
         message = f"{source} is not an acceptance test as this version of slrig writes it: {error!r}"
         raise StorageError(message) from error
-
-
-def _plan(given: Mapping[str, Any]) -> AcceptancePlan:
-    artefacts = given["artefacts"]
-    certified = {name: Certified(**artefacts[name]) for name in ("diameter", "distance")}
-    steps = tuple(
-        Step(
-            each["name"], Artefact(each["artefact"]), np.array(each["centre_mm"], np.float64),
-            np.array(each["axis"], np.float64), each["words"],
-        )
-        for each in given["steps"]
-    )  # fmt: skip
-    return AcceptancePlan(
-        **{
-            **given,
-            "volume_mm": np.array(given["volume_mm"], np.float64),
-            "artefacts": Artefacts(**{**artefacts, **certified, "plane_mm": tuple(artefacts["plane_mm"])}),
-            "limits": Limits(**given["limits"]),
-            "steps": steps,
-        }
-    )
-
-
-def _reading(given: Mapping[str, Any]) -> Reading:
-    by_quantity = {
-        name: {Quantity(quantity): _number(value) for quantity, value in given[name].items()}
-        for name in ("errors_mm", "limits_mm")
-    }
-    return Reading(**{**{name: _number(value) for name, value in given.items()}, **by_quantity})
-
-
-def _number(value: Any) -> Any:
-    """JSON has no NaN: `plain` wrote null in its place."""
-    return math.nan if value is None else value

@@ -11,8 +11,7 @@ import numpy as np
 from slrig.accept.charts import error_map, volume_view
 from slrig.accept.evaluation import BORDER_RINGS, Evidence, Reading
 from slrig.accept.plan import Artefact
-from slrig.accept.points import kept_points, points_file
-from slrig.accept.store import HTML, JSON
+from slrig.accept.store import HTML, JSON, kept_points, points_file
 from slrig.accept.verdicts import FORMULA, AcceptanceResult
 from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import REJECTED_SHARE

@@ -6,14 +6,13 @@ In the manner of VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
 
 from slrig.accept.evaluation import Reading, reading
 from slrig.accept.plan import AcceptancePlan, Step
-from slrig.accept.points import keep_points
+from slrig.accept.store import keep_points
 from slrig.accept.verdicts import AcceptanceResult, verdicts
 from slrig.bundle.storage import refusals_of
 from slrig.devices import Rig
@@ -27,7 +26,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     setting,
 )
-from slrig.jobs.records import Clock, utc_now
+from slrig.jobs.records import utc_now
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.artefacts import decode_mesh_ply
@@ -35,145 +34,12 @@ from slrig.scan.plan import Progress, ReconstructionPlan, ScanPlan
 
 _BUNDLE, _MESH = "bundle", "mesh"
 
+Place = Callable[[Rig, Step], None]
+"""Brings the artefact of a step to its place, before each capture but those that repeat one without a move; returns
+when it stands there and is still."""
 
-class Place(Protocol):
-    """Brings the artefact of a step to its place, before each capture but those that repeat one without a move."""
-
-    def __call__(self, rig: Rig, step: Step, /) -> None:
-        """Return when it stands there and is still."""
-        ...
-
-
-class ReconstructBundle(Protocol):
-    """`slrig.scan.reconstruct.reconstruct_bundle`."""
-
-    def __call__(
-        self,
-        bundle: Path,
-        output: Path,
-        /,
-        *,
-        plan: ReconstructionPlan,
-        progress: Progress,
-        cancelled: Callable[[], bool],
-    ) -> Mapping[str, Any]:
-        """Write the mesh into `output`."""
-        ...
-
-
-class Evaluate(Protocol):
-    """`evaluated`, or a way to have it done elsewhere."""
-
-    def __call__(
-        self,
-        work: Path,
-        folder: Path,
-        plan: AcceptancePlan,
-        step: Step,
-        take: int,
-        calibration: Calibration,
-        /,
-        *,
-        progress: Progress,
-        cancelled: Callable[[], bool],
-    ) -> Reading:
-        """Return what one position gave, and keep its points in `folder`."""
-        ...
-
-
-def run_acceptance(
-    rig: Rig,
-    plan: AcceptancePlan,
-    folder: Path,
-    *,
-    progress: Progress,
-    cancelled: Callable[[], bool],
-    place: Place | None = None,
-    again: Callable[[Step, SlrigError], bool] | None = None,
-    evaluate: Evaluate | None = None,
-    clock: Clock = utc_now,
-) -> AcceptanceResult:
-    """Measure every position of a plan, evaluate, and write report.html, report.json and the points into `folder`.
-
-    `place` None has the rig's positioner move the artefacts: its poses are called as the steps are. `again` is asked
-    where an artefact was not found or a frame contradicted its pattern: whether to place it anew and capture once more.
-    The points of each capture stay in `folder`/points, as they come; the reports appear at the end.
-
-    Raises
-    ------
-    CalibrationError
-        The rig has no calibration.
-    UnsupportedByDeviceError
-        `place` is None, and the rig has no positioner, or one that does not know a position.
-    NothingToReconstructError
-        An artefact is not where it should be. What was measured before is kept.
-    ScanCancelledError
-        `cancelled()` became true.
-    InvalidInputError
-        `folder` holds something else.
-    DeviceError, ScanEvidenceError, StorageError
-        As a scan.
-    """
-    # Late: the service measures position by position, and has the worker write the reports.
-    from slrig.accept.report import write_reports
-
-    calibration = required_calibration(rig)
-    mover = by_positioner(rig, plan) if place is None else place
-    _require_free(folder)
-    begun = clock()
-    readings: list[Reading] = []
-    takes = plan.takes
-    for index, (step, take) in enumerate(takes):
-        told = _part_of(progress, step, take, index, len(takes))
-        if cancelled():
-            message = f"the acceptance test was cancelled before {step.name}; what was measured is in {folder}"
-            raise ScanCancelledError(message)
-        moved = take > 0
-        while True:
-            if not moved:
-                told("place", 0.0, step.words)
-                mover(rig, step)
-            try:
-                found = measured(rig, plan, step, take, folder, progress=told, cancelled=cancelled, evaluate=evaluate)
-                break
-            except (NothingToReconstructError, ScanEvidenceError) as error:
-                if again is None or not again(step, error):
-                    raise
-                # A repeat is to be without a move between captures, so that it shows the scanner's scatter alone.
-                moved = take > 0
-        readings.append(found)
-    result = AcceptanceResult(rig.name, begun, clock(), plan, calibration, tuple(readings), verdicts(readings, plan))
-    write_reports(result, folder)
-    return result
-
-
-def measured(
-    rig: Rig,
-    plan: AcceptancePlan,
-    step: Step,
-    take: int,
-    folder: Path,
-    *,
-    progress: Progress,
-    cancelled: Callable[[], bool],
-    evaluate: Evaluate | None = None,
-) -> Reading:
-    """Capture and evaluate one position, and keep its points. Raises as `run_acceptance`."""
-    calibration = required_calibration(rig)
-    work = folder / f".{step.name}-{take + 1}"
-    shutil.rmtree(work, ignore_errors=True)
-    try:
-        with refusals_of(work):
-            work.mkdir(parents=True)
-        scan = ScanPlan(exposure_s=plan.exposure_s)
-        # The test must not use what a rendered rig knows of its scene; and the noise of a point, by which form
-        # is judged, is to hold nothing of the calibration's own error, which is what form is to show.
-        blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
-        capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)
-        judge = evaluated if evaluate is None else evaluate
-        return judge(work, folder, plan, step, take, calibration, progress=progress, cancelled=cancelled)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+Evaluate = Callable[..., Reading]
+"""`evaluated`, or a way to have it done elsewhere."""
 
 
 def evaluated(
@@ -187,16 +53,134 @@ def evaluated(
     *,
     progress: Progress,
     cancelled: Callable[[], bool],
-    reconstruct: ReconstructBundle | None = None,
 ) -> Reading:
     """Reconstruct the bundle in `work`, measure the artefact in its mesh, and keep its points in `folder`."""
-    make = _usual_reconstruction() if reconstruct is None else reconstruct
-    make(work / _BUNDLE, work / _MESH, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
+    # The process that owns the rig loads the mathematics only if it has to do it itself.
+    from slrig.scan.reconstruct import reconstruct_bundle
+
+    reconstruct_bundle(work / _BUNDLE, work / _MESH, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
     with refusals_of(work):
         mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
     found, evidence = reading(mesh, step, take, plan, calibration)
     keep_points(evidence, folder, step.name, take)
     return found
+
+
+def run_acceptance(
+    rig: Rig,
+    plan: AcceptancePlan,
+    folder: Path,
+    *,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    place: Place | None = None,
+    again: Callable[[Step, SlrigError], bool] | None = None,
+    evaluate: Evaluate = evaluated,
+) -> AcceptanceResult:
+    """Measure every position of a plan, evaluate, and write report.html, report.json and the points into `folder`.
+
+    `place` None has the rig's positioner move the artefacts: its poses are called as the steps are. The points of each
+    capture stay in `folder`/points, as they come; the reports appear at the end. Raises as `measured`, and
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        `place` is None, and the rig has no positioner, or one that does not know a position.
+    InvalidInputError
+        `folder` holds something else.
+    """
+    # Late: the service measures position by position, and has the worker write the reports.
+    from slrig.accept.report import write_reports
+
+    calibration = required_calibration(rig)
+    mover = by_positioner(rig, plan) if place is None else place
+    _require_free(folder)
+    begun = utc_now()
+    readings = tuple(
+        measured(
+            rig, plan, 0, folder, progress=progress, cancelled=cancelled, place=mover, again=again, evaluate=evaluate
+        )
+    )
+    result = AcceptanceResult(rig.name, begun, utc_now(), plan, calibration, readings, verdicts(readings, plan))
+    write_reports(result, folder)
+    return result
+
+
+def measured(
+    rig: Rig,
+    plan: AcceptancePlan,
+    done: int,
+    folder: Path,
+    *,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    place: Place | None,
+    again: Callable[[Step, SlrigError], bool] | None = None,
+    evaluate: Evaluate = evaluated,
+) -> Iterator[Reading]:
+    """Capture and evaluate what is left of a plan, one capture after the other, and keep its points in `folder`.
+
+    done : how many captures of the plan were made before. `place` None: the artefact stands in its place. `again` is
+    asked where an artefact was not found or a frame contradicted its pattern: whether to place it anew and capture once
+    more; a repeat is captured without a move, so that it shows the scanner's scatter alone.
+
+    Raises
+    ------
+    CalibrationError
+        The rig has no calibration.
+    NothingToReconstructError
+        An artefact is not where it should be. What was measured before is kept.
+    ScanCancelledError
+        `cancelled()` became true.
+    DeviceError, ScanEvidenceError, StorageError
+        As a scan.
+    """
+    takes = plan.takes
+    for index, (step, take) in enumerate(takes[done:], done):
+
+        def told(stage: str, fraction: float, detail: str, /, name: str = step.name, index: int = index) -> None:
+            progress(f"{name}: {stage}", (index + min(max(fraction, 0.0), 1.0)) / len(takes), detail)
+
+        if cancelled():
+            message = f"the acceptance test was cancelled before {step.name}; what was measured before is kept"
+            raise ScanCancelledError(message)
+        while True:
+            if place is not None and take == 0:
+                told("place", 0.0, step.words)
+                place(rig, step)
+            try:
+                found = _captured(rig, plan, step, take, folder, told, cancelled, evaluate)
+                break
+            except (NothingToReconstructError, ScanEvidenceError) as error:
+                if again is None or not again(step, error):
+                    raise
+        yield found
+
+
+def _captured(
+    rig: Rig,
+    plan: AcceptancePlan,
+    step: Step,
+    take: int,
+    folder: Path,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    evaluate: Evaluate,
+) -> Reading:
+    calibration = required_calibration(rig)
+    work = folder / f".{step.name}-{take + 1}"
+    shutil.rmtree(work, ignore_errors=True)
+    try:
+        with refusals_of(work):
+            work.mkdir(parents=True)
+        scan = ScanPlan(exposure_s=plan.exposure_s)
+        # The test must not use what a rendered rig knows of its scene; and the noise of a point, by which form
+        # is judged, is to hold nothing of the calibration's own error, which is what form is to show.
+        blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
+        capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)
+        return evaluate(work, folder, plan, step, take, calibration, progress=progress, cancelled=cancelled)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def by_positioner(rig: Rig, plan: AcceptancePlan) -> Place:
@@ -213,7 +197,7 @@ def by_positioner(rig: Rig, plan: AcceptancePlan) -> Place:
 
     def move(rig: Rig, step: Step, /) -> None:
         if rig.positioner is not None:
-            rig.positioner.move(list(rig.positioner.poses).index(step.name))
+            rig.positioner.move(poses.index(step.name))
 
     return move
 
@@ -224,24 +208,6 @@ def required_calibration(rig: Rig) -> Calibration:
         message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
         raise CalibrationError(message)
     return rig.calibration
-
-
-def _part_of(progress: Progress, step: Step, take: int, index: int, count: int) -> Progress:
-    """Progress of one capture, told as a part of the whole test."""
-    name = step.name if take == 0 else f"{step.name}, again"
-
-    def told(stage: str, fraction: float, detail: str, /) -> None:
-        words = f"{stage}, {detail}" if detail else stage
-        progress(name, (index + min(max(fraction, 0.0), 1.0)) / count, words)
-
-    return told
-
-
-def _usual_reconstruction() -> ReconstructBundle:
-    # The process that owns the rig loads the mathematics only if it has to do it itself.
-    from slrig.scan.reconstruct import reconstruct_bundle
-
-    return reconstruct_bundle
 
 
 def _require_free(folder: Path) -> None:

@@ -1,7 +1,7 @@
 """Acceptance tests on disk, each a folder.
 
 DATA/acceptance/ID/test.json   what is on record of it
-DATA/acceptance/ID/points/     what each capture gave
+DATA/acceptance/ID/points/POSITION-CAPTURE.npz   the points behind each capture
 DATA/acceptance/ID/report.html, report.json   when every position is measured; the second is written last
 """
 
@@ -12,13 +12,16 @@ import shutil
 import uuid
 from collections.abc import Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from uuid import UUID
 
+import numpy as np
 import structlog
 
+from slrig.accept.evaluation import Evidence
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
-from slrig.bundle.storage import write_file
+from slrig.bundle.storage import refusals_of, write_file
 from slrig.calibration.artefacts import Decision
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
@@ -91,3 +94,42 @@ class AcceptanceStore:
             return record
         decided = Decision(json.loads(report.read_bytes())["decision"])
         return replace(record, state=AcceptanceState.FINISHED, decision=decided)
+
+
+def points_file(step: str, take: int) -> str:
+    """Where the points of a capture lie below the folder of their test.
+
+    >>> points_file("sphere-1", 0)
+    'points/sphere-1-1.npz'
+    """
+    return f"points/{step}-{take + 1}.npz"
+
+
+def keep_points(evidence: Evidence, folder: Path, step: str, take: int) -> None:
+    """Write the points of a capture into the folder of its test. Raises StorageError."""
+    packed = BytesIO()
+    np.savez_compressed(
+        packed,
+        points_mm=evidence.points_mm.astype(np.float32),
+        artefact=evidence.artefact,
+        used=evidence.used,
+        distances_mm=evidence.distances_mm,
+        sigma_mm=evidence.sigma_mm.astype(np.float32),
+    )
+    path = folder / points_file(step, take)
+    with refusals_of(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, packed.getvalue())
+
+
+def kept_points(folder: Path, step: str, take: int) -> Evidence:
+    """The points of a capture, coordinates and deviations to single precision. Raises StorageError."""
+    path = folder / points_file(step, take)
+    with refusals_of(path), np.load(path) as kept:
+        return Evidence(
+            kept["points_mm"].astype(np.float64),
+            kept["artefact"],
+            kept["used"],
+            kept["distances_mm"],
+            kept["sigma_mm"].astype(np.float64),
+        )

@@ -1,4 +1,4 @@
-"""Errors of measured artefacts in the manner of VDI/VDE 2634 part 2 and ISO 10360-13: spheres, ball bars, planes.
+"""Spheres and planes fitted to scans of artefacts, and the decision, after VDI/VDE 2634 part 2 and ISO 10360-13.
 
 No conformity is claimed. A sphere or plane is fitted by least squares of the distances to it; at most three points in a
 thousand, those that lie furthest off, are left out, and how many is said.
@@ -42,43 +42,6 @@ class FittedPlane:
     rejected: int
 
 
-@dataclass(frozen=True, slots=True)
-class Probing:
-    """Probing errors of one sphere, mm.
-
-    form_mm : PF, the range of the radial distances; size_mm : PS, measured less calibrated diameter; dispersion_mm :
-    the width of the shell that holds 95 % of the points (D95 %, ISO 10360-13); sigma_mm : standard deviation of the
-    radial distances. rejected_share : of all points.
-    """
-
-    form_mm: float
-    size_mm: float
-    dispersion_mm: float
-    sigma_mm: float
-    points: int
-    rejected_share: float
-
-
-@dataclass(frozen=True, slots=True)
-class Spacing:
-    """Error of one distance of two sphere centres, mm: SD, measured less calibrated."""
-
-    error_mm: float
-    measured_mm: float
-    rejected_share: float
-
-
-@dataclass(frozen=True, slots=True)
-class Flatness:
-    """Flatness error of one plane, mm: F, the range of the distances; the shell that holds 95 %; their deviation."""
-
-    form_mm: float
-    dispersion_mm: float
-    sigma_mm: float
-    points: int
-    rejected_share: float
-
-
 class Decision(StrEnum):
     """Whether an error keeps to its limit, given how well it is known (ISO 14253-1)."""
 
@@ -98,53 +61,6 @@ def decision(error_mm: float, limit_mm: float, uncertainty_mm: float) -> Decisio
     return Decision.FAILS if abs(error_mm) > limit_mm + uncertainty_mm else Decision.UNDECIDED
 
 
-def probing(points_mm: FloatArray, diameter_mm: float) -> Probing:
-    """Probing errors of a sphere of known diameter; its points, (n, 3) mm, in the world.
-
-    Raises
-    ------
-    NothingToReconstructError
-        There are too few points.
-    """
-    found = fitted_sphere(points_mm)
-    distances = found.distances_mm
-    return Probing(
-        form_mm=float(np.ptp(distances)),
-        size_mm=2 * found.radius_mm - diameter_mm,
-        dispersion_mm=_dispersion(distances),
-        sigma_mm=float(np.std(distances)),
-        points=len(points_mm),
-        rejected_share=found.rejected / len(points_mm),
-    )
-
-
-def spacing(first_mm: FloatArray, second_mm: FloatArray, distance_mm: float) -> Spacing:
-    """Error of the distance of two balls' centres; their points, (n, 3) and (m, 3) mm. Radii are free.
-
-    Raises
-    ------
-    NothingToReconstructError
-        There are too few points.
-    """
-    first, second = fitted_sphere(first_mm), fitted_sphere(second_mm)
-    measured = float(np.linalg.norm(first.centre_mm - second.centre_mm))
-    rejected = (first.rejected + second.rejected) / (len(first_mm) + len(second_mm))
-    return Spacing(measured - distance_mm, measured, rejected)
-
-
-def flatness(points_mm: FloatArray) -> Flatness:
-    """Flatness error of a plane; its points, (n, 3) mm. Raises NothingToReconstructError."""
-    found = fitted_plane(points_mm)
-    distances = found.distances_mm
-    return Flatness(
-        form_mm=float(np.ptp(distances)),
-        dispersion_mm=_dispersion(distances),
-        sigma_mm=float(np.std(distances)),
-        points=len(points_mm),
-        rejected_share=found.rejected / len(points_mm),
-    )
-
-
 def fitted_sphere(points_mm: FloatArray) -> FittedSphere:
     """Least squares of the radial distances, radius free; points (n, 3) mm. Raises NothingToReconstructError."""
     _require_enough(points_mm, "a sphere")
@@ -162,6 +78,13 @@ def fitted_plane(points_mm: FloatArray) -> FittedPlane:
     kept = _kept((points_mm - centre) @ normal)
     centre, normal = _plane(points_mm[kept])
     return FittedPlane(centre, normal, (points_mm[kept] - centre) @ normal, int((~kept).sum()))
+
+
+def dispersion_mm(distances_mm: FloatArray) -> float:
+    """The width of the narrowest shell that holds 95 % of the distances (D95 %, ISO 10360-13)."""
+    rising = np.sort(distances_mm)
+    inside = int(np.ceil(_DISPERSED * len(rising)))
+    return float((rising[inside - 1 :] - rising[: len(rising) - inside + 1]).min())
 
 
 def _sphere(points_mm: FloatArray) -> tuple[FloatArray, float]:
@@ -201,13 +124,6 @@ def _kept(distances_mm: FloatArray) -> NDArray[np.bool_]:
     if count:
         kept[np.argpartition(np.abs(distances_mm), -count)[-count:]] = False
     return kept
-
-
-def _dispersion(distances_mm: FloatArray) -> float:
-    """The narrowest interval that holds 95 % of the distances."""
-    rising = np.sort(distances_mm)
-    inside = int(np.ceil(_DISPERSED * len(rising)))
-    return float((rising[inside - 1 :] - rising[: len(rising) - inside + 1]).min())
 
 
 def _require_enough(points_mm: FloatArray, what: str) -> None:

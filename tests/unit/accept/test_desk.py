@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -128,10 +127,12 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> 
         (output / "mesh.ply").write_bytes(encode_mesh_ply(scan_of(step)))
         return {}
 
+    monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", reconstruct)
+
     def make() -> Desk:
         desk = Desk(
             folder, queue, JobStore(database, JobKind.POSITION),
-            evaluate=partial(evaluated, reconstruct=reconstruct), report=write_reports,
+            evaluate=evaluated, report=write_reports,
         )  # fmt: skip
         desk.take_up()
         return desk

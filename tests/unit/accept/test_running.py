@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from slrig.accept import running as acceptance
 from slrig.accept.evaluation import Reading, near_border, reading
 from slrig.accept.plan import AcceptancePlan, Artefact, Limits, Quantity, Step
 from slrig.accept.positions import acceptance_plan
-from slrig.accept.running import Place, evaluated, run_acceptance
+from slrig.accept.running import Place, run_acceptance
 from slrig.accept.verdicts import AcceptanceResult, verdicts
 from slrig.calibration.artefacts import Decision
 from slrig.devices import Rig
@@ -235,10 +234,10 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., Accept
             (output / "mesh.ply").write_bytes(encode_mesh_ply(scan(step)))
             return {}
 
+        monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", reconstruct)
         return run_acceptance(
-            rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, place=place, again=again,
-            evaluate=partial(evaluated, reconstruct=reconstruct),
-        )  # fmt: skip
+            rig, plan, tmp_path / "out", progress=lambda *_: None, cancelled=cancelled, place=place, again=again
+        )
 
     return go
 

@@ -11,11 +11,9 @@ from slrig.calibration.artefacts import (
     REJECTED_SHARE,
     Decision,
     decision,
+    dispersion_mm,
     fitted_plane,
     fitted_sphere,
-    flatness,
-    probing,
-    spacing,
 )
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
@@ -41,33 +39,19 @@ def test_an_exact_ball_is_found_exactly(seed: int, radius_mm: float, x_mm: float
     found = fitted_sphere(points)
     np.testing.assert_allclose(found.centre_mm, (x_mm, 12.0, z_mm), atol=1e-7)
     assert found.radius_mm == pytest.approx(radius_mm, abs=1e-7)
-    error = probing(points, 2 * radius_mm)
-    assert abs(error.form_mm) + abs(error.size_mm) + error.dispersion_mm < 1e-6
+    assert np.ptp(found.distances_mm) + dispersion_mm(found.distances_mm) < 1e-6
 
 
 def test_probing_of_pure_noise_is_what_theory_says() -> None:
     # Trimming 0.3 % of normal noise leaves a range of about 5.9 deviations; 95 % lie within 3.92.
     sigma_mm = 0.01
     points = cap(20_000, centre_mm=(0.0, 0.0, 500.0), radius_mm=20.0, sigma_mm=sigma_mm, seed=3)
-    error = probing(points, 40.0)
-    assert error.form_mm / sigma_mm == pytest.approx(5.9, abs=0.15)
-    assert error.dispersion_mm / sigma_mm == pytest.approx(3.92, abs=0.08)
-    assert error.sigma_mm / sigma_mm == pytest.approx(1.0, abs=0.03)
-    assert abs(error.size_mm) < 0.002
-    assert error.rejected_share == pytest.approx(REJECTED_SHARE, abs=1e-4)
-
-
-def test_size_has_the_sign_of_what_is_too_large() -> None:
-    points = cap(2000, centre_mm=(0.0, 0.0, 500.0), radius_mm=20.05, sigma_mm=0.0, seed=4)
-    assert probing(points, 40.0).size_mm == pytest.approx(0.1, abs=1e-6)
-
-
-def test_spacing_is_that_of_the_centres() -> None:
-    first = cap(5000, centre_mm=(-50.0, 0.0, 500.0), radius_mm=15.0, sigma_mm=0.005, seed=5)
-    second = cap(5000, centre_mm=(50.03, 0.0, 500.0), radius_mm=15.0, sigma_mm=0.005, seed=6)
-    found = spacing(first, second, 100.0)
-    assert found.error_mm == pytest.approx(0.03, abs=0.002)
-    assert found.measured_mm == pytest.approx(100.03, abs=0.002)
+    found = fitted_sphere(points)
+    assert np.ptp(found.distances_mm) / sigma_mm == pytest.approx(5.9, abs=0.15)
+    assert dispersion_mm(found.distances_mm) / sigma_mm == pytest.approx(3.92, abs=0.08)
+    assert np.std(found.distances_mm) / sigma_mm == pytest.approx(1.0, abs=0.03)
+    assert abs(2 * found.radius_mm - 40.0) < 0.002
+    assert found.rejected / len(points) == pytest.approx(REJECTED_SHARE, abs=1e-4)
 
 
 def test_a_bowed_plane_has_the_range_of_its_bow() -> None:
@@ -75,9 +59,9 @@ def test_a_bowed_plane_has_the_range_of_its_bow() -> None:
     bow = 0.04 * (x / 100) ** 2
     turn = np.linalg.qr(np.random.default_rng(2).standard_normal((3, 3)))[0]
     points = np.column_stack([x.ravel(), y.ravel(), bow.ravel()]) @ turn.T + (10.0, 20.0, 600.0)
-    found = flatness(points)
-    assert found.form_mm == pytest.approx(0.04, rel=0.02)
-    assert abs(fitted_plane(points).normal @ turn[:, 2]) == pytest.approx(1.0, abs=1e-6)
+    found = fitted_plane(points)
+    assert np.ptp(found.distances_mm) == pytest.approx(0.04, rel=0.02)
+    assert abs(found.normal @ turn[:, 2]) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_far_outliers_are_left_out_and_counted() -> None:

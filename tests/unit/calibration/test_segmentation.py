@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.calibration.artefacts import fitted_plane, spacing
+from slrig.calibration.artefacts import fitted_plane, fitted_sphere
 from slrig.calibration.segmentation import ball_points, plane_points, seen_well
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
@@ -50,7 +50,8 @@ def test_two_balls_before_a_wall_are_found() -> None:
     assert (owner[first] == 1).mean() > 0.999
     assert (owner[second] == 2).mean() > 0.999
     assert len(first) > 0.98 * 6000
-    assert abs(spacing(points[first], points[second], 100.0).error_mm) < 0.003
+    ends = [fitted_sphere(points[each]).centre_mm for each in (first, second)]
+    assert abs(np.linalg.norm(ends[0] - ends[1]) - 100.0) < 0.003
 
 
 def test_a_third_ball_is_missed_in_words() -> None:
