@@ -49,16 +49,11 @@ class ArtefactsRequest(Strict):
 
     def artefacts(self) -> Artefacts:
         """The artefacts that are meant."""
+        sphere, bar = (Certified(**dict(each)) for each in (self.sphere, self.bar))
         return Artefacts(
-            Certified(self.sphere.value_mm, self.sphere.uncertainty_mm),
-            Certified(self.bar.value_mm, self.bar.uncertainty_mm),
-            self.plane_mm,
-            self.ball_mm,
-            self.sphere_form_mm,
-            self.plane_form_mm,
-            self.certificate,
+            sphere, bar, self.plane_mm, self.ball_mm, self.sphere_form_mm, self.plane_form_mm, self.certificate,
             self.temperature_c,
-        )
+        )  # fmt: skip
 
 
 class LimitsRequest(Strict):

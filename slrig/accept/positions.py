@@ -5,6 +5,8 @@ They fill the working volume, and are told as the first camera sees them: its le
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 
@@ -30,6 +32,9 @@ _TILT_DEG = 25.0
 _NEAR = 0.15  # of the half volume: what lies nearer to the middle than this has no side
 
 _NAMES = (("left", "right"), ("upper", "lower"), ("front", "back"))
+
+_Lie = tuple[FloatArray, FloatArray, str]
+"""Where an artefact lies: a step's centre_mm, axis and words."""
 
 _DIAGONALS = ((-1, -1, -1), (1, -1, -1), (-1, 1, -1), (1, 1, -1))
 _CORNERS = tuple((x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1))
@@ -58,34 +63,31 @@ def acceptance_plan(
         message = f"repeats: expected 1 or more, found {repeats}; 3 tell the scatter"
         raise InvalidInputError(message)
     camera = next(iter(calibration.cameras.values()))
-    steps = (
-        *_sphere_steps(volume_mm, artefacts, camera),
-        *_bar_steps(volume_mm, artefacts, camera),
-        *_plane_steps(volume_mm, artefacts),
+    lies = {
+        Artefact.SPHERE: _spheres(volume_mm, artefacts, camera),
+        Artefact.BAR: _bars(volume_mm, artefacts, camera),
+        Artefact.PLANE: _planes(volume_mm, artefacts),
+    }
+    steps = tuple(
+        Step(f"{artefact}-{number}", artefact, *each)
+        for artefact, found in lies.items()
+        for number, each in enumerate(found, 1)
     )
     chosen = usual_limits(volume_mm, rendered=rendered) if limits is None else limits
     return AcceptancePlan(volume_mm, artefacts, chosen, steps, rendered, repeats, exposure_s, notes)
 
 
 def rig_volume_mm(calibration: Calibration) -> FloatArray:
-    """(2, 3) float64: the working volume: the one in which the board was held, else the box that all devices see.
+    """(2, 3) float64: the working volume: the one in which the board was held, else the largest box of usual
+    proportions, about where the devices look, that all of them see.
 
     Raises
     ------
     InvalidInputError
         The devices look past one another.
     """
-    return common_volume_mm(calibration) if calibration.solved is None else calibration.solved.volume_mm
-
-
-def common_volume_mm(calibration: Calibration) -> FloatArray:
-    """(2, 3) float64: the largest box of usual proportions, about where the devices look, that all of them see.
-
-    Raises
-    ------
-    InvalidInputError
-        There is none.
-    """
+    if calibration.solved is not None:
+        return calibration.solved.volume_mm
     devices = [*calibration.cameras.values()]
     if calibration.projector is not None:
         devices.append(calibration.projector)
@@ -128,44 +130,35 @@ def _sees(device: Pinhole, points_mm: FloatArray) -> bool:
     return bool(((pixels > _SEEN_SHARE * extent) & (pixels < (1 - _SEEN_SHARE) * extent)).all())
 
 
-def _sphere_steps(volume_mm: FloatArray, artefacts: Artefacts, camera: Pinhole) -> list[Step]:
+def _spheres(volume_mm: FloatArray, artefacts: Artefacts, camera: Pinhole) -> Iterator[_Lie]:
     middle, room = _inside(volume_mm, artefacts.diameter.value_mm / 2)
-    places = [(0.0, 0.0, 0.0), *_CORNERS, (0.0, 0.0, -1.0)]
-    steps = []
-    for number, place in enumerate(places, 1):
+    for place in ((0.0, 0.0, 0.0), *_CORNERS, (0.0, 0.0, -1.0)):
         centre = middle + np.array(place) * room
-        words = f"Put the sphere {_where(camera, centre, volume_mm)} of the volume."
-        steps.append(Step(f"sphere-{number}", Artefact.SPHERE, centre, np.zeros(3), words))
-    return steps
+        told = _where(camera, centre, volume_mm)
+        at = "in the middle" if told == "the middle" else f"at {told}"
+        yield centre, np.zeros(3), f"Put the sphere {at} of the volume."
 
 
-def _bar_steps(volume_mm: FloatArray, artefacts: Artefacts, camera: Pinhole) -> list[Step]:
+def _bars(volume_mm: FloatArray, artefacts: Artefacts, camera: Pinhole) -> Iterator[_Lie]:
     length_mm = artefacts.distance.value_mm
     middle, room = _inside(volume_mm, artefacts.ball_mm / 2)
-    lies: list[tuple[FloatArray, FloatArray, str]] = []
-    for signs in _DIAGONALS:
-        axis = -np.array(signs) * room / np.linalg.norm(room)
-        lies.append((middle, axis, "along the diagonal"))
-    wide = int(room[1] > room[0])
-    edge = np.eye(3)[wide]
-    lies.append((middle - room * (1 - edge), edge, "along the edge of the front"))
+    edge = np.eye(3)[int(room[1] > room[0])]
     face = np.array([room[0], room[1], 0.0])
-    lies.append((middle + np.array([0, 0, room[2]]), face / np.linalg.norm(face), "across the back face"))
     # As deep as the volume allows, and aslant across the line of the devices, where neither ball shades the other.
     deep = min(_STEEPEST_BAR, 2 * float(room[2]) / length_mm)
-    lies.append((middle, np.array([0.0, np.sqrt(1 - deep**2), deep]), "into the depth, aslant"))
-    steps = []
-    for number, (centre, axis, how) in enumerate(lies, 1):
-        first, second = centre - axis * length_mm / 2, centre + axis * length_mm / 2
-        words = (
-            f"Put the ball bar {how}, from {_where(camera, first, volume_mm, bare=True)} to "
-            f"{_where(camera, second, volume_mm, bare=True)}."
-        )
-        steps.append(Step(f"bar-{number}", Artefact.BAR, centre, axis, words))
-    return steps
+    lies = [
+        *((middle, -np.array(signs) * room / np.linalg.norm(room), "along the diagonal") for signs in _DIAGONALS),
+        (middle - room * (1 - edge), edge, "along the edge of the front"),
+        (middle + np.array([0, 0, room[2]]), face / np.linalg.norm(face), "across the back face"),
+        (middle, np.array([0.0, np.sqrt(1 - deep**2), deep]), "into the depth, aslant"),
+    ]
+    for centre, axis, how in lies:
+        ends = (centre - axis * length_mm / 2, centre + axis * length_mm / 2)
+        first, second = (_where(camera, end, volume_mm) for end in ends)
+        yield centre, axis, f"Put the ball bar {how}, from {first} to {second}."
 
 
-def _plane_steps(volume_mm: FloatArray, artefacts: Artefacts) -> list[Step]:
+def _planes(volume_mm: FloatArray, artefacts: Artefacts) -> Iterator[_Lie]:
     middle = volume_mm.mean(axis=0)
     half = (volume_mm[1] - volume_mm[0]) / 2
     # A tilted plane reaches as deep as the volume, and no deeper.
@@ -181,16 +174,8 @@ def _plane_steps(volume_mm: FloatArray, artefacts: Artefacts) -> list[Step]:
         (0.0, (0.0, lean, -level), f"in the middle, tipped by {degrees:.0f}° about the level"),
         (0.0, (-aslant, aslant, -level), f"in the middle, turned and tipped by {degrees:.0f}° in all"),
     ]
-    return [
-        Step(
-            f"plane-{number}",
-            Artefact.PLANE,
-            middle + np.array([0.0, 0.0, depth * half[2]]),
-            np.array(normal),
-            f"Put the plane {words}.",
-        )
-        for number, (depth, normal, words) in enumerate(lies, 1)
-    ]
+    for depth, normal, words in lies:
+        yield middle + np.array([0.0, 0.0, depth * half[2]]), np.array(normal), f"Put the plane {words}."
 
 
 def _inside(volume_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatArray]:
@@ -198,7 +183,7 @@ def _inside(volume_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, FloatA
     return volume_mm.mean(axis=0), (volume_mm[1] - volume_mm[0]) / 2 - radius_mm
 
 
-def _where(camera: Pinhole, point_mm: FloatArray, volume_mm: FloatArray, *, bare: bool = False) -> str:
+def _where(camera: Pinhole, point_mm: FloatArray, volume_mm: FloatArray) -> str:
     """Where in the volume a point lies, as the camera sees it.
 
     Each side of the volume is named by the camera's direction that it lies nearest to, so that a world that stands
@@ -211,5 +196,4 @@ def _where(camera: Pinhole, point_mm: FloatArray, volume_mm: FloatArray, *, bare
         if abs(share[axis]) > _NEAR:
             sides[along] = _NAMES[along][int(share[axis] * camera.rotation[along, axis] > 0)]
     told = " ".join(sides[along] for along in (1, 0, 2) if along in sides)
-    place = f"the {told}" if told else "the middle"
-    return place if bare else f"at {place}" if told else "in the middle"
+    return f"the {told}" if told else "the middle"
