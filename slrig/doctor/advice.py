@@ -54,15 +54,13 @@ def unsnapped(seen: Seen, refresh_hz: float | None) -> list[Finding]:
     """Say so where a rig's exposure is no multiple of the display's refresh period."""
     if refresh_hz is None or is_whole(seen.own_exposure_s, 1 / refresh_hz):
         return []
-    return [
-        note(
-            "exposure.refresh",
-            camera_named(seen.name),
-            f"its exposure of {ms(seen.own_exposure_s)} is no multiple of the display's refresh period, "
-            f"{ms(1 / refresh_hz)}: it may see a part of the picture twice, or part of a colour cycle",
-            f"expose for a multiple of {ms(1 / refresh_hz)}; where that saturates, close the lens's aperture",
-        )
-    ]
+    period = ms(1 / refresh_hz)
+    found = (
+        f"its exposure of {ms(seen.own_exposure_s)} is no multiple of the display's refresh period, {period}: it may "
+        "see a part of the picture twice, or part of a colour cycle"
+    )
+    remedy = f"expose for a multiple of {period}; where that saturates, close the lens's aperture"
+    return [note("exposure.refresh", camera_named(seen.name), found, remedy)]
 
 
 def is_whole(exposure_s: float, period_s: float) -> bool:

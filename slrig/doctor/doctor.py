@@ -19,7 +19,7 @@ from slrig.doctor.flicker import Flicker, flicker
 from slrig.doctor.focus import focus
 from slrig.doctor.geometry import picture
 from slrig.doctor.light import Seen, at_exposure, look
-from slrig.doctor.measures.response import ResponseCurve
+from slrig.doctor.measures.levels import ResponseCurve
 from slrig.doctor.response import response
 from slrig.doctor.viewing import Viewer
 from slrig.errors import DeviceError, DeviceGoneError, UnsupportedByDeviceError
@@ -143,11 +143,10 @@ class _Examination:
             self.told(stage, number / len(steps), "")
             try:
                 step()
-            except DeviceGoneError as error:
-                self.findings.append(_failed(stage, error))
-                return
             except DeviceError as error:
                 self.findings.append(_failed(stage, error))
+                if isinstance(error, DeviceGoneError):
+                    return
 
     def diagnosis(self) -> Diagnosis:
         order = list(Severity)[::-1]
@@ -180,13 +179,8 @@ class _Examination:
             raise
         except DeviceError as error:
             self.rig.projector.load(self.sequence)
-            self.findings.append(
-                ok(
-                    "patterns.own",
-                    "projector",
-                    f"it is examined with the patterns of a scan, since it does not take others: {error}",
-                )
-            )
+            found = f"it is examined with the patterns of a scan, since it does not take others: {error}"
+            self.findings.append(ok("patterns.own", "projector", found))
 
     def _look(self) -> None:
         others = _others(self.displays)
@@ -274,14 +268,8 @@ def _declared(rig: Rig, displays: Sequence[FoundDevice]) -> list[Finding]:
         listed = "; ".join(f"{each.device} ({each.driver}): {each.label}" for each in displays)
         found.append(ok("device.displays", "projector", f"projectors and outputs that were found: {listed}"))
     if rig.calibration is None:
-        found.append(
-            note(
-                "device.uncalibrated",
-                "rig",
-                "it has no calibration",
-                "calibrate it once the other findings are put right; a scan without one gives no millimetres",
-            )
-        )
+        remedy = "calibrate it once the other findings are put right; a scan without one gives no millimetres"
+        found.append(note("device.uncalibrated", "rig", "it has no calibration", remedy))
     return found
 
 

@@ -49,6 +49,11 @@ def fault(name: str, subject: str, found: str, remedy: str) -> Finding:
     return Finding(name, subject, Severity.FAULT, found, remedy)
 
 
+def judged(kind: Severity | None, name: str, subject: str, found: str, remedy: str) -> Finding:
+    """A finding of a severity with its remedy; of None, something that is as it should be."""
+    return ok(name, subject, found) if kind is None else Finding(name, subject, kind, found, remedy)
+
+
 def camera_named(name: str) -> str:
     """Words for a camera.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
 from slrig.doctor.light import Seen
-from slrig.doctor.measures.flicker import Swing, passed, swings
+from slrig.doctor.measures.frequencies import Swing, passed, swings
 from slrig.doctor.timing import white_and_black
 from slrig.doctor.viewing import Viewer
 from slrig.model import FloatArray, Frame, PatternSequence
@@ -131,13 +131,10 @@ def _judged(each: Flicker, seen: Seen, name: str) -> Finding:
     if each.source == "room":
         mains = [hz for light_hz, hz in _MAINS_HZ.items() if abs(each.frequency_hz - light_hz) < _SAME * light_hz]
         lamps = f"lamps on mains of {mains[0]} Hz" if mains else "a lamp"
-        return kind(
-            "flicker.room", "room light", f"{lamps}: the light {words}", f"{wanted}, or switch them off or shade them"
-        )
-    return kind(
-        "flicker.projector",
-        "projector",
-        f"its light {words}",
+        remedy = f"{wanted}, or switch them off or shade them"
+        return kind("flicker.room", "room light", f"{lamps}: the light {words}", remedy)
+    remedy = (
         f"{wanted}: a colour wheel or dimmed lamp shows its whole cycle only then; a static mode without colour wheel "
-        "or dimming (bright, single colour) avoids it",
+        "or dimming (bright, single colour) avoids it"
     )
+    return kind("flicker.projector", "projector", f"its light {words}", remedy)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.geometry import Picture
 from slrig.doctor.light import Seen
-from slrig.doctor.measures.sharpness import BarContrast, EdgeBlur, bar_blur_px, bar_contrast, edge_blur
+from slrig.doctor.measures.pictures import BarContrast, EdgeBlur, bar_blur_px, bar_contrast, edge_blur
 from slrig.model import Axis, PatternSequence
 from slrig.patterns.gray import edge_indices
 
@@ -70,14 +70,8 @@ def _bars(axis: Axis, sequence: PatternSequence, seen: Seen, shown: Picture) -> 
         bit = each.pattern
         period_px = float(2 * bit.cell_px * edge_indices(bit.bit, bit.bits)[1])
         if bit.axis is axis and (period_px * _WHOLE_PERIODS <= extent_px or bit.bit == bit.bits - 1):
-            found.append(
-                bar_contrast(
-                    [each.difference[asked].astype(np.float64)],
-                    [seen.levels.contrast[asked]],
-                    noise_dn=seen.levels.noise_dn,
-                    period_px=period_px,
-                )
-            )
+            signal, white = each.difference[asked].astype(np.float64), seen.levels.contrast[asked]
+            found.append(bar_contrast(signal, white, noise_dn=seen.levels.noise_dn, period_px=period_px))
     return found
 
 
@@ -102,30 +96,22 @@ def _grown(mask: NDArray[np.bool_], reach_px: int) -> NDArray[np.bool_]:
 def _blame(edges: EdgeBlur | None, total_px: float) -> tuple[str, str, str]:
     """Which device is out of focus, why that is known, and what to do. total_px : of the bars, camera pixels."""
     if edges is None:
-        return (
-            "unknown",
-            "Which lens is out of focus cannot be told: the camera sees no sharp edge but those of the patterns",
+        why = "Which lens is out of focus cannot be told: the camera sees no sharp edge but those of the patterns"
+        remedy = (
             "turn the projector's focus until the patterns look sharp on the object; then turn the camera's focus. Put "
-            "a printed page into view and run the doctor again to have it told",
+            "a printed page into view and run the doctor again to have it told"
         )
+        return "unknown", why, remedy
     share = (edges.sigma_px / total_px) ** 2 if math.isfinite(total_px) else 0.0
     seen = f"the sharpest edges on the object itself are blurred by {edges.sigma_px:.2f} camera pixels"
     if share >= _CAMERA_SHARE:
-        return (
-            "camera",
-            f"It is the camera's lens: {seen}, as much as the bars are",
+        remedy = (
             "focus the camera on the object, or close its aperture; if nothing in view has sharp edges, put a printed "
-            "page there and run the doctor again",
+            "page there and run the doctor again"
         )
+        return "camera", f"It is the camera's lens: {seen}, as much as the bars are", remedy
     if share <= _PROJECTOR_SHARE:
-        return (
-            "projector",
-            f"It is the projector's lens: {seen}, far less than the bars are",
-            "focus the projector on the object; set its input to the native resolution, unscaled, with sharpness "
-            "neutral",
-        )
-    return (
-        "both",
-        f"Both lenses have their part in it: {seen}",
-        "focus the projector until the patterns are sharp on the object, then the camera, or close its aperture",
-    )
+        remedy = "focus the projector on the object; set its input to the native resolution, unscaled, with sharpness"
+        return "projector", f"It is the projector's lens: {seen}, far less than the bars are", f"{remedy} neutral"
+    remedy = "focus the projector until the patterns are sharp on the object, then the camera, or close its aperture"
+    return "both", f"Both lenses have their part in it: {seen}", remedy

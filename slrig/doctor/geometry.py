@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from slrig.capture.evidence import Evidence
 from slrig.doctor.findings import Finding, camera_named, fault, note, ok
 from slrig.doctor.light import Seen
-from slrig.doctor.measures.orientation import Orientation, apart_deg, expected_orientation, orientation
+from slrig.doctor.measures.pictures import Orientation, apart_deg, expected_orientation, orientation
 from slrig.doctor.viewing import Viewer
 from slrig.model import Axis, Calibration, FloatArray, Gray, PatternSequence, Shot
 from slrig.model.gray_code import gray_index
@@ -52,7 +52,7 @@ def picture(
     viewer: Viewer, sequence: PatternSequence, seen: Seen, calibration: Calibration | None
 ) -> tuple[Picture, list[Finding]]:
     """Show every pattern once: what the camera makes of them, and the findings."""
-    bars, findings = _played(viewer, sequence, seen)
+    bars, sound = _played(viewer, sequence, seen)
     position_px: dict[Axis, FloatArray] = {}
     cell_px: dict[Axis, int] = {}
     known = seen.levels.usable.copy()
@@ -72,10 +72,10 @@ def picture(
     if len(position_px) == len(Axis):
         lies = orientation(position_px[Axis.COLUMN], position_px[Axis.ROW], known)
     shown = Picture(bars, position_px, cell_px, known, lies)
-    return shown, [*findings, *_lies(viewer, sequence, shown, calibration)]
+    return shown, [sound, *_lies(viewer, sequence, shown, calibration)]
 
 
-def _played(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> tuple[tuple[Bars, ...], list[Finding]]:
+def _played(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> tuple[tuple[Bars, ...], Finding]:
     """Every Gray bit with its inverse, and whether the frames are what they claim."""
     patterns = sequence.patterns
     evidence = Evidence(patterns, {viewer.name: viewer.camera.info.format})
@@ -95,71 +95,66 @@ def _played(viewer: Viewer, sequence: PatternSequence, seen: Seen) -> tuple[tupl
             else:
                 difference = image.astype(np.float32) - other
                 bars.append(Bars(positive, -difference if pattern.inverted else difference))
-    summary = evidence.summary()
-    if causes:
-        return tuple(bars), [
-            fault(
-                "patterns.contradicted",
-                camera_named(viewer.name),
-                f"{len(causes)} of {len(patterns)} frames contradict the others, the first of them: {causes[0]}",
-                "put right what the other findings name, and run the doctor again; slrig conform tells faults of "
-                "drivers",
-            )
-        ]
-    return tuple(bars), [
-        ok("patterns.verified", camera_named(viewer.name), f"{summary}: it sees our patterns, each in its turn")
-    ]
+    subject = camera_named(viewer.name)
+    if not causes:
+        return tuple(bars), ok(
+            "patterns.verified", subject, f"{evidence.summary()}: it sees our patterns, each in its turn"
+        )
+    found = f"{len(causes)} of {len(patterns)} frames contradict the others, the first of them: {causes[0]}"
+    remedy = "put right what the other findings name, and run the doctor again; slrig conform tells faults of drivers"
+    return tuple(bars), fault("patterns.contradicted", subject, found, remedy)
 
 
-def _lies(viewer: Viewer, sequence: PatternSequence, shown: Picture, calibration: Calibration | None) -> list[Finding]:
+def _lies(
+    viewer: Viewer, sequence: PatternSequence, shown: Picture, calibration: Calibration | None
+) -> Iterator[Finding]:
     subject, lies = camera_named(viewer.name), shown.orientation
     if lies is None:
         missing = "its patterns have one axis" if len(shown.position_px) < len(Axis) else "too few codes can be read"
-        return [ok("picture.untold", subject, f"how the picture lies in the image cannot be told: {missing}")]
+        yield ok("picture.untold", subject, f"how the picture lies in the image cannot be told: {missing}")
+        return
     expected = None
     if calibration is not None and calibration.projector is not None and viewer.name in calibration.cameras:
         expected = expected_orientation(calibration.cameras[viewer.name], calibration.projector)
+    apart = 0.0 if expected is None else apart_deg(lies, expected)
     if lies.mirrored:
-        return [_mirrored(subject, lies, expected)]
-    if expected is not None and apart_deg(lies, expected) > _TURNED_DEG:
-        return [
-            fault(
-                "picture.turned",
-                "projector",
-                f"{subject} sees its picture turned by {apart_deg(lies, expected):.0f}° against the calibration",
-                "set the projector's menu to the projection that it was calibrated with (upright, not ceiling mount; "
-                "on a computer's output: rotation normal), or turn the camera's image back in its driver's options, "
-                "or calibrate again",
-            )
-        ]
-    return [_upright(subject, lies, expected), *_coverage(subject, sequence, shown), *_resolution(subject, lies)]
-
-
-def _mirrored(subject: str, lies: Orientation, expected: Orientation | None) -> Finding:
-    # Against a picture that lies as the calibration says, or upright where there is none.
-    relative = lies.jacobian if expected is None else lies.jacobian @ np.linalg.inv(expected.jacobian)
-    way = "left and right" if relative[0, 0] < relative[1, 1] else "top and bottom"
-    return fault(
-        "picture.mirrored",
-        "projector",
-        f"{subject} sees its picture mirrored, {way} exchanged: no calibration can describe that",
-        "set the projector's menu to front projection (rear projection and ceiling mount each mirror the picture). If "
-        "light does pass through a screen or over one mirror, set it to what undoes that. If the camera's driver flips "
-        "its image, switch that off",
-    )
-
-
-def _upright(subject: str, lies: Orientation, expected: Orientation | None) -> Finding:
-    against = "" if expected is None else f", {apart_deg(lies, expected):.0f}° from what the calibration foresees"
-    return ok(
-        "picture.upright",
-        subject,
+        # Against a picture that lies as the calibration says, or upright where there is none.
+        relative = lies.jacobian if expected is None else lies.jacobian @ np.linalg.inv(expected.jacobian)
+        way = "left and right" if relative[0, 0] < relative[1, 1] else "top and bottom"
+        found = f"{subject} sees its picture mirrored, {way} exchanged: no calibration can describe that"
+        remedy = (
+            "set the projector's menu to front projection (rear projection and ceiling mount each mirror the picture). "
+            "If light does pass through a screen or over one mirror, set it to what undoes that. If the camera's "
+            "driver flips its image, switch that off"
+        )
+        yield fault("picture.mirrored", "projector", found, remedy)
+        return
+    if apart > _TURNED_DEG:
+        found = f"{subject} sees its picture turned by {apart:.0f}° against the calibration"
+        remedy = (
+            "set the projector's menu to the projection that it was calibrated with (upright, not ceiling mount; "
+            "on a computer's output: rotation normal), or turn the camera's image back in its driver's options, "
+            "or calibrate again"
+        )
+        yield fault("picture.turned", "projector", found, remedy)
+        return
+    against = "" if expected is None else f", {apart:.0f}° from what the calibration foresees"
+    found = (
         f"the projector's picture is not mirrored, and turned by {lies.turn_deg:.0f}° in the image{against}; one of "
-        f"its pixels is {lies.camera_px:.2f} camera pixels long",
+        f"its pixels is {lies.camera_px:.2f} camera pixels long"
     )
+    yield ok("picture.upright", subject, found)
+    yield _coverage(subject, sequence, shown)
+    if lies.camera_px < _COARSE_CAMERA:
+        length = f"one projector pixel is only {lies.camera_px:.2f} camera pixels long"
+        remedy = (
+            "bring the camera nearer or give it a longer lens, or choose line_shift_period_px = "
+            f"{int(np.ceil(4 / lies.camera_px))} or more in [scan]"
+        )
+        yield note("picture.resolution", subject, f"{length}: fine patterns are lost between them", remedy)
 
 
-def _coverage(subject: str, sequence: PatternSequence, shown: Picture) -> list[Finding]:
+def _coverage(subject: str, sequence: PatternSequence, shown: Picture) -> Finding:
     parts, share = [], 1.0
     for axis, position_px in shown.position_px.items():
         half_px, last_px = shown.cell_px[axis] / 2, sequence.projector.along(axis) - 1
@@ -168,27 +163,7 @@ def _coverage(subject: str, sequence: PatternSequence, shown: Picture) -> list[F
         parts.append(f"{axis}s {first_px:.0f} to {final_px:.0f} of {last_px + 1}")
         share *= (final_px - first_px) / last_px
     found = f"it sees the projector's {' and '.join(parts)}, about"
-    if share < _SMALL_PART:
-        return [
-            note(
-                "picture.part",
-                subject,
-                f"{found}: {share:.0%} of its pixels are used",
-                "use more of the projector: bring it nearer, zoom it, or turn it to what the camera sees",
-            )
-        ]
-    return [ok("picture.part", subject, found)]
-
-
-def _resolution(subject: str, lies: Orientation) -> list[Finding]:
-    if lies.camera_px >= _COARSE_CAMERA:
-        return []
-    return [
-        note(
-            "picture.resolution",
-            subject,
-            f"one projector pixel is only {lies.camera_px:.2f} camera pixels long: fine patterns are lost between them",
-            "bring the camera nearer or give it a longer lens, or choose line_shift_period_px = "
-            f"{int(np.ceil(4 / lies.camera_px))} or more in [scan]",
-        )
-    ]
+    if share >= _SMALL_PART:
+        return ok("picture.part", subject, found)
+    remedy = "use more of the projector: bring it nearer, zoom it, or turn it to what the camera sees"
+    return note("picture.part", subject, f"{found}: {share:.0%} of its pixels are used", remedy)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
-from slrig.doctor.measures.light_levels import USUAL_SNR, LightLevels, light_levels
+from slrig.doctor.findings import Finding, Severity, camera_named, fault, judged, ms, note, ok
+from slrig.doctor.measures.levels import USUAL_SNR, LightLevels, light_levels
 from slrig.doctor.viewing import Viewer
 from slrig.model import Black, FloatArray, Gray, PatternSequence, White
 
@@ -77,27 +77,15 @@ def look(viewer: Viewer, sequence: PatternSequence, *, others: str) -> tuple[See
     if not _visible(levels):
         return None, [_nothing(subject, own, levels, own_s, others)]
     if _structure(viewer, sequence, exposure_s, levels) < _GLOW:
-        return None, [
-            fault(
-                "display.other",
-                "projector",
-                f"{subject} sees light come and go with the patterns ({levels.contrast_dn:.0f} DN), but none of their "
-                "structure: it is the glow of another display, and the projector shows something else or nothing",
-                "the patterns go to the wrong output: name the projector's connector in the rig file, or exchange the "
-                f"cables. {others}",
-            )
-        ]
-    seen = Seen(
-        viewer.name,
-        own_s,
-        own,
-        exposure_s,
-        levels,
-        levels.shortest_exposure_s(exposure_s),
-        levels.longest_exposure_s(exposure_s),
-        skew_s,
-    )
-    return seen, [*_part(subject, seen), *_exposure(subject, seen, viewer), *_room(subject, seen)]
+        found = (
+            f"{subject} sees light come and go with the patterns ({levels.contrast_dn:.0f} DN), but none of their "
+            "structure: it is the glow of another display, and the projector shows something else or nothing"
+        )
+        remedy = "the patterns go to the wrong output: name the projector's connector in the rig file, or exchange the"
+        return None, [fault("display.other", "projector", found, f"{remedy} cables. {others}")]
+    usable_s = (levels.shortest_exposure_s(exposure_s), levels.longest_exposure_s(exposure_s))
+    seen = Seen(viewer.name, own_s, own, exposure_s, levels, *usable_s, skew_s)
+    return seen, [_part(subject, seen), _exposure(subject, seen, viewer), _room(subject, seen)]
 
 
 def at_exposure(viewer: Viewer, sequence: PatternSequence, seen: Seen, exposure_s: float) -> Seen:
@@ -162,132 +150,86 @@ def _nothing(subject: str, own: LightLevels, levels: LightLevels, exposure_s: fl
     darker = float(np.mean(own.contrast < -max(2.0, 0.05 * own.full_scale)))
     means = f"white {own.white.mean():.1f} DN, black {own.black.mean():.1f} DN of {own.full_scale}"
     if darker >= _LEAST_LIT:
-        return fault(
-            "display.inverted",
-            "projector",
-            f"{subject} sees white darker than black on {darker:.0%} of its image ({means})",
+        found = f"{subject} sees white darker than black on {darker:.0%} of its image ({means})"
+        remedy = (
             "set the projector's picture to normal, not inverted, polarity; if it is, see whether its light comes "
-            "later than it says: slrig latency",
+            "later than it says: slrig latency"
         )
+        return fault("display.inverted", "projector", found, remedy)
     if levels.black_saturated_share > 0.5:
-        return fault(
-            "exposure.ambient",
-            subject,
+        found = (
             f"even black frames are saturated on {levels.black_saturated_share:.0%} of the image, at the shortest "
-            "exposure that was tried",
-            "shade the room's light, close the lens's aperture, or lower the gain",
+            "exposure that was tried"
         )
+        remedy = "shade the room's light, close the lens's aperture, or lower the gain"
+        return fault("exposure.ambient", subject, found, remedy)
     if own.bright_dn <= _DARK_SHARE * own.full_scale:
-        return fault(
-            "light.none",
-            subject,
+        found = (
             f"white and black frames are both dark at {ms(exposure_s)} ({means}), and longer exposures do not tell "
-            "them apart",
-            "switch the projector's lamp on and choose its input; take the lens caps off; turn the camera to what the "
-            f"projector lights. {others}",
+            "them apart"
         )
-    return fault(
-        "display.other",
-        "projector",
+        remedy = (
+            "switch the projector's lamp on and choose its input; take the lens caps off; turn the camera to what the "
+            f"projector lights. {others}"
+        )
+        return fault("light.none", subject, found, remedy)
+    found = (
         f"{subject} sees a bright picture that does not change with the patterns ({means}): what lights it is not "
-        "what slrig shows",
+        "what slrig shows"
+    )
+    remedy = (
         "if the projector shows a desktop or another source, the patterns go to another display: name the "
         "projector's connector in the rig file, or exchange the cables, or choose its other input. Cover the "
-        f"projector's lens to be sure: if nothing changes, its lamp is off, and this is the room's light. {others}",
+        f"projector's lens to be sure: if nothing changes, its lamp is off, and this is the room's light. {others}"
     )
+    return fault("display.other", "projector", found, remedy)
 
 
-def _part(subject: str, seen: Seen) -> list[Finding]:
-    top, bottom, left, right = seen.levels.box
-    found = (
-        f"the projector lights {seen.levels.lit_share:.0%} of the image, rows {top} to {bottom} and columns {left} to "
-        f"{right}"
-    )
-    if seen.levels.lit_share < _SMALL_PART:
-        return [
-            note(
-                "light.part",
-                subject,
-                found,
-                "aim camera and projector at the same place; see that nothing stands before one of the lenses",
-            )
-        ]
-    return [ok("light.part", subject, found)]
+def _part(subject: str, seen: Seen) -> Finding:
+    (top, bottom, left, right), share = seen.levels.box, seen.levels.lit_share
+    found = f"the projector lights {share:.0%} of the image, rows {top} to {bottom} and columns {left} to {right}"
+    remedy = "aim camera and projector at the same place; see that nothing stands before one of the lenses"
+    return judged(Severity.NOTE if share < _SMALL_PART else None, "light.part", subject, found, remedy)
 
 
-def _exposure(subject: str, seen: Seen, viewer: Viewer) -> list[Finding]:
+def _exposure(subject: str, seen: Seen, viewer: Viewer) -> Finding:
     own, own_s = seen.own, seen.own_exposure_s
     usable = f"usable exposures are {ms(min(seen.shortest_s, seen.longest_s))} to {ms(seen.longest_s)}"
+    bright = f"{own.bright_dn / own.full_scale:.0%} of full scale"
     if own.black_saturated_share > _SATURATED_NOTE:
-        return [
-            fault(
-                "exposure.ambient",
-                subject,
-                f"black frames are saturated on {own.black_saturated_share:.1%} of the image at {ms(own_s)}",
-                f"shade the room's light, or expose shorter: {usable}",
-            )
-        ]
+        found = f"black frames are saturated on {own.black_saturated_share:.1%} of the image at {ms(own_s)}"
+        return fault("exposure.ambient", subject, found, f"shade the room's light, or expose shorter: {usable}")
     if own.saturated_share > _SATURATED_NOTE:
         kind = fault if own.saturated_share > _SATURATED_FAULT else note
-        return [
-            kind(
-                "exposure.saturated",
-                subject,
-                f"white is saturated on {own.saturated_share:.1%} of what the projector lights, at {ms(own_s)}",
-                f"expose for {ms(seen.longest_s)} at most, close the lens's aperture or lower the gain; {usable}. If "
-                "only glints are saturated, take several exposures per pattern",
-            )
-        ]
-    if seen.shortest_s > seen.longest_s:
-        return [
-            fault(
-                "exposure.noise",
-                subject,
-                f"noise is {seen.levels.noise_dn:.1f} DN where white less black is {seen.levels.contrast_dn:.1f} DN, "
-                f"at the longest exposure that does not saturate ({ms(seen.longest_s)})",
-                "shade the room's light, open the lens's aperture, bring the projector nearer, or lower the gain and "
-                "expose longer",
-            )
-        ]
-    if not _visible(own) or own_s < 0.98 * seen.shortest_s:
-        return [
-            fault(
-                "exposure.dark",
-                subject,
-                f"at {ms(own_s)} the projector's light is too little for the camera's noise: signal over noise is "
-                f"{max(own.snr, 0.0) if _visible(own) else 0.0:.1f}, {USUAL_SNR:.0f} is needed",
-                f"expose longer, open the lens's aperture, or raise the gain; {usable}",
-            )
-        ]
-    if own.bright_dn < _SHORT * own.full_scale and viewer.within(seen.longest_s) > 2 * own_s:
-        return [
-            note(
-                "exposure.short",
-                subject,
-                f"the brightest parts reach {own.bright_dn / own.full_scale:.0%} of full scale at {ms(own_s)}",
-                f"expose up to {seen.longest_s / own_s:.1f} times longer for less noise; {usable}",
-            )
-        ]
-    return [
-        ok(
-            "exposure.range",
-            subject,
-            f"{ms(own_s)} exposes well: signal over noise is {own.snr:.0f}, the brightest parts reach "
-            f"{own.bright_dn / own.full_scale:.0%} of full scale; {usable}",
+        found = f"white is saturated on {own.saturated_share:.1%} of what the projector lights, at {ms(own_s)}"
+        remedy = (
+            f"expose for {ms(seen.longest_s)} at most, close the lens's aperture or lower the gain; {usable}. If "
+            "only glints are saturated, take several exposures per pattern"
         )
-    ]
+        return kind("exposure.saturated", subject, found, remedy)
+    if seen.shortest_s > seen.longest_s:
+        found = (
+            f"noise is {seen.levels.noise_dn:.1f} DN where white less black is {seen.levels.contrast_dn:.1f} DN, "
+            f"at the longest exposure that does not saturate ({ms(seen.longest_s)})"
+        )
+        remedy = "shade the room's light, open the lens's aperture, bring the projector nearer, or lower the gain and"
+        return fault("exposure.noise", subject, found, f"{remedy} expose longer")
+    if not _visible(own) or own_s < 0.98 * seen.shortest_s:
+        found = (
+            f"at {ms(own_s)} the projector's light is too little for the camera's noise: signal over noise is "
+            f"{max(own.snr, 0.0) if _visible(own) else 0.0:.1f}, {USUAL_SNR:.0f} is needed"
+        )
+        remedy = f"expose longer, open the lens's aperture, or raise the gain; {usable}"
+        return fault("exposure.dark", subject, found, remedy)
+    if own.bright_dn < _SHORT * own.full_scale and viewer.within(seen.longest_s) > 2 * own_s:
+        remedy = f"expose up to {seen.longest_s / own_s:.1f} times longer for less noise; {usable}"
+        return note("exposure.short", subject, f"the brightest parts reach {bright} at {ms(own_s)}", remedy)
+    found = f"{ms(own_s)} exposes well: signal over noise is {own.snr:.0f}, the brightest parts reach {bright}"
+    return ok("exposure.range", subject, f"{found}; {usable}")
 
 
-def _room(subject: str, seen: Seen) -> list[Finding]:
+def _room(subject: str, seen: Seen) -> Finding:
     share = seen.levels.ambient_dn / seen.levels.contrast_dn
     found = f"a black frame holds {share:.1%} of what the projector's white adds"
-    if share > _BRIGHT_ROOM:
-        return [
-            note(
-                "light.room",
-                subject,
-                found,
-                "shade the room's light; check the camera's black level, and that the projector's black is dark",
-            )
-        ]
-    return [ok("light.room", subject, found)]
+    remedy = "shade the room's light; check the camera's black level, and that the projector's black is dark"
+    return judged(Severity.NOTE if share > _BRIGHT_ROOM else None, "light.room", subject, found, remedy)

@@ -6,7 +6,7 @@ import numpy as np
 
 from slrig.doctor.findings import Finding, camera_named, note, ok
 from slrig.doctor.light import Seen
-from slrig.doctor.measures.response import ResponseCurve, camera_exponent, response_curve
+from slrig.doctor.measures.levels import ResponseCurve, camera_exponent, response_curve
 from slrig.doctor.viewing import Viewer
 from slrig.errors import DeviceError, DeviceGoneError
 from slrig.model import Black, FloatArray, Pattern, PatternSequence, Size, White
@@ -38,9 +38,8 @@ def response(viewer: Viewer, seen: Seen) -> tuple[ResponseCurve | None, list[Fin
     except DeviceGoneError:
         raise
     except DeviceError as error:
-        return None, [
-            ok("response.binary", "projector", f"it shows no greys, so nothing can bend its black and white: {error}")
-        ]
+        found = f"it shows no greys, so nothing can bend its black and white: {error}"
+        return None, [ok("response.binary", "projector", found)]
     light = _light(viewer, seen, sequence)
     if light[1] > _ALL_WHITE:
         return None, [ok("response.binary", "projector", "it shows every grey as white: nothing bends black and white")]
@@ -60,52 +59,39 @@ def _light(viewer: Viewer, seen: Seen, sequence: PatternSequence) -> FloatArray:
 
 
 def _projector(curve: ResponseCurve) -> list[Finding]:
-    found: list[Finding] = []
-    if curve.reversal > _REVERSAL:
-        found.append(
-            note(
-                "response.reversed",
-                "projector",
-                f"a higher grey value gives less light, by up to {curve.reversal:.0%} of white",
-                "switch off dynamic contrast, automatic iris, eco and image enhancement in the projector's menu",
-            )
-        )
-    if curve.black_knee > _KNEE:
-        found.append(
-            note(
-                "response.crushed",
-                "projector",
-                f"grey values up to {curve.black_knee:.0f} of 255 are as dark as black",
-                "set the output's range to full (0 to 255, not video levels), and the projector's brightness higher",
-            )
-        )
-    if curve.white_knee < 255 - _KNEE:
-        found.append(
-            note(
-                "response.clipped",
-                "projector",
-                f"grey values from {curve.white_knee:.0f} of 255 on are as bright as white",
-                "set the output's range to full (0 to 255, not video levels), and the projector's contrast lower",
-            )
-        )
-    if abs(curve.gamma - 1) > _STRAIGHT:
-        found.append(
-            note(
-                "response.gamma",
-                "projector",
-                f"light grows with the grey value to the power of {curve.gamma:.2f}, not in proportion (rms "
-                f"{curve.residual:.1%} off that law)",
-                "black and white patterns do not mind, unless something on their way makes greys of them: keep the "
-                "output at the projector's native resolution, unscaled, sharpness neutral. If the menu offers a gamma "
-                "of 1 (linear, DICOM off, no presentation mode), choose it",
-            )
-        )
-    return found or [
-        ok(
-            "response.straight",
-            "projector",
-            f"light grows in proportion to the grey value (power {curve.gamma:.2f}, rms {curve.residual:.1%} off)",
-        )
+    law = f"(rms {curve.residual:.1%} off that law)"
+    full_range = "set the output's range to full (0 to 255, not video levels), and the projector's"
+    faults = [
+        (
+            curve.reversal > _REVERSAL,
+            "reversed",
+            f"a higher grey value gives less light, by up to {curve.reversal:.0%} of white",
+            "switch off dynamic contrast, automatic iris, eco and image enhancement in the projector's menu",
+        ),
+        (
+            curve.black_knee > _KNEE,
+            "crushed",
+            f"grey values up to {curve.black_knee:.0f} of 255 are as dark as black",
+            f"{full_range} brightness higher",
+        ),
+        (
+            curve.white_knee < 255 - _KNEE,
+            "clipped",
+            f"grey values from {curve.white_knee:.0f} of 255 on are as bright as white",
+            f"{full_range} contrast lower",
+        ),
+        (
+            abs(curve.gamma - 1) > _STRAIGHT,
+            "gamma",
+            f"light grows with the grey value to the power of {curve.gamma:.2f}, not in proportion {law}",
+            "black and white patterns do not mind, unless something on their way makes greys of them: keep the "
+            "output at the projector's native resolution, unscaled, sharpness neutral. If the menu offers a gamma "
+            "of 1 (linear, DICOM off, no presentation mode), choose it",
+        ),
+    ]
+    straight = f"light grows in proportion to the grey value (power {curve.gamma:.2f}, rms {curve.residual:.1%} off)"
+    return [note(f"response.{name}", "projector", found, remedy) for wrong, name, found, remedy in faults if wrong] or [
+        ok("response.straight", "projector", straight)
     ]
 
 
@@ -126,14 +112,12 @@ def _camera(viewer: Viewer, seen: Seen, sequence: PatternSequence) -> list[Findi
         return []
     exponent = camera_exponent(exposures_s, contrast_dn)
     subject = camera_named(viewer.name)
-    if abs(exponent - 1) > _LINEAR:
-        return [
-            note(
-                "response.camera",
-                subject,
-                f"its values grow with the exposure to the power of {exponent:.2f}, not in proportion",
-                "switch off gamma, automatic gain, wide dynamic range and tone curves in the camera; if it is linear, "
-                "the projector's light flickers: see that finding",
-            )
-        ]
-    return [ok("response.camera", subject, f"its values grow in proportion to the exposure (power {exponent:.2f})")]
+    if abs(exponent - 1) <= _LINEAR:
+        found = f"its values grow in proportion to the exposure (power {exponent:.2f})"
+        return [ok("response.camera", subject, found)]
+    found = f"its values grow with the exposure to the power of {exponent:.2f}, not in proportion"
+    remedy = (
+        "switch off gamma, automatic gain, wide dynamic range and tone curves in the camera; if it is linear, "
+        "the projector's light flickers: see that finding"
+    )
+    return [note("response.camera", subject, found, remedy)]

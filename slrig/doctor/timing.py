@@ -14,7 +14,7 @@ from slrig.capture.latency_fit import CameraLatency
 from slrig.devices import CameraSettings, Rig, Synchronisation
 from slrig.doctor.findings import Finding, camera_named, fault, ms, note, ok
 from slrig.doctor.light import Seen
-from slrig.doctor.measures.refresh import refresh_hz
+from slrig.doctor.measures.frequencies import refresh_hz
 from slrig.doctor.viewing import Viewer
 from slrig.errors import ScanEvidenceError
 from slrig.model import Black, PatternSequence, Size, White
@@ -91,20 +91,20 @@ def punctual(rig: Rig, seen: Seen, cause: ScanEvidenceError) -> Finding:
             strange = max(strange, abs(level - (1 - number % 2)))
     subject = camera_named(seen.name)
     if strange <= _STRANGE:
-        return ok(
-            "timing.punctual",
-            subject,
+        found = (
             f"frames that are exposed right after the projector's word hold {1 - strange:.1%} of their own pattern's "
-            "light, or more; how much earlier they could be is not told by its trigger",
+            "light, or more; how much earlier they could be is not told by its trigger"
         )
-    return fault(
-        "timing.late",
-        subject,
+        return ok("timing.punctual", subject, found)
+    found = (
         f"frames that are exposed right after the projector's word miss up to {strange:.0%} of their own pattern's "
-        f"light; by how much it is late could not be measured: {cause}",
-        "measure it: slrig latency --exposure-s with more than the projector's latency, or --trigger free; write what "
-        "it says into [synchronisation]",
+        f"light; by how much it is late could not be measured: {cause}"
     )
+    remedy = (
+        "measure it: slrig latency --exposure-s with more than the projector's latency, or --trigger free; write what "
+        "it says into [synchronisation]"
+    )
+    return fault("timing.late", subject, found, remedy)
 
 
 def waited_s(synchronisation: Synchronisation | None) -> float:
@@ -126,60 +126,42 @@ def _late(measured: LatencyMeasurement, known: Synchronisation | None) -> Findin
     )
     if late_s(measured) > now_s + LATE_S:
         table = "its rig file has no [synchronisation]" if known is None else f"its rig file waits {ms(now_s)}"
-        return fault(
-            "timing.late",
-            "projector",
-            f"{words}; {table}: frames would show the pattern before",
+        remedy = (
             f"write latency_s = {slowest.latency_s:.6f} and latency_error_s = "
             f"{measured.synchronisation.latency_error_s:.6f} into [synchronisation], as the rig file of --output has "
-            "it; a game or low-latency mode of the projector, and no picture processing, make it faster",
+            "it; a game or low-latency mode of the projector, and no picture processing, make it faster"
         )
+        return fault("timing.late", "projector", f"{words}; {table}: frames would show the pattern before", remedy)
     if known is not None and now_s > waited_s(measured.synchronisation) + _NEEDLESS_S:
-        return note(
-            "timing.needless",
-            "projector",
-            f"{words}; its rig file waits {ms(now_s)}",
-            "measure again and replace the table [synchronisation]: scans get faster",
-        )
+        remedy = "measure again and replace the table [synchronisation]: scans get faster"
+        return note("timing.needless", "projector", f"{words}; its rig file waits {ms(now_s)}", remedy)
     return ok("timing.late", "projector", words)
 
 
 def _jitter(measured: LatencyMeasurement) -> list[Finding]:
-    slowest = measured.slowest
-    if slowest.jitter_s <= max(_JITTER_S, 2 * measured.shown_error_s):
+    jitter_s = measured.slowest.jitter_s
+    if jitter_s <= max(_JITTER_S, 2 * measured.shown_error_s):
         return []
-    return [
-        note(
-            "timing.jitter",
-            "projector",
-            f"the instant of light varies by {ms(slowest.jitter_s)} (standard deviation), the projector states "
-            f"± {ms(measured.shown_error_s)}",
-            "switch off the desktop's compositor and triple buffering, end other programs that draw; scans wait for "
-            "the latest light and stay right",
-        )
-    ]
+    found = (
+        f"the instant of light varies by {ms(jitter_s)} (standard deviation), the projector states "
+        f"± {ms(measured.shown_error_s)}"
+    )
+    remedy = (
+        "switch off the desktop's compositor and triple buffering, end other programs that draw; scans wait for "
+        "the latest light and stay right"
+    )
+    return [note("timing.jitter", "projector", found, remedy)]
 
 
 def _shutter(name: str, found: CameraLatency, skew_s: float, known: Synchronisation | None) -> Finding:
-    subject = camera_named(name)
-    if found.rolling:
-        words = (
-            f"rolling shutter: {found.line_time_s * 1e6:.1f} µs from row to row, {ms(found.skew_s)} from the first to "
-            "the last"
-        )
-        if skew_s > 0 or (known is not None and known.line_time_s.get(name, 0.0) > 0):
-            return ok("timing.shutter", subject, words)
-        return note(
-            "timing.shutter",
-            subject,
-            f"{words}; neither its driver nor the rig file says so",
-            f"write {name} = {found.line_time_s:.9f} into [synchronisation.line_time_s], as the rig file of --output "
-            "has it",
-        )
+    subject, line_us = camera_named(name), found.line_time_s * 1e6
     if found.scanned:
-        return ok(
-            "timing.shutter",
-            subject,
-            f"the projector builds up its picture row by row, {-found.line_time_s * 1e6:.1f} µs per camera row",
-        )
-    return ok("timing.shutter", subject, "global shutter, as far as the flashes tell")
+        words = f"the projector builds up its picture row by row, {-line_us:.1f} µs per camera row"
+        return ok("timing.shutter", subject, words)
+    if not found.rolling:
+        return ok("timing.shutter", subject, "global shutter, as far as the flashes tell")
+    words = f"rolling shutter: {line_us:.1f} µs from row to row, {ms(found.skew_s)} from the first to the last"
+    if skew_s > 0 or (known is not None and known.line_time_s.get(name, 0.0) > 0):
+        return ok("timing.shutter", subject, words)
+    where = f"{name} = {found.line_time_s:.9f} into [synchronisation.line_time_s], as the rig file of --output has it"
+    return note("timing.shutter", subject, f"{words}; neither its driver nor the rig file says so", f"write {where}")

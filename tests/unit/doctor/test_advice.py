@@ -9,7 +9,7 @@ from slrig.doctor.advice import exposure_advice, unsnapped
 from slrig.doctor.findings import Finding, Severity, fault, ok
 from slrig.doctor.flicker import Flicker
 from slrig.doctor.light import Seen
-from slrig.doctor.measures.light_levels import LightLevels, light_levels
+from slrig.doctor.measures.levels import LightLevels, light_levels
 
 
 def levels() -> LightLevels:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.doctor.measures.flicker import passed, swings
-from slrig.doctor.measures.light_levels import light_levels
-from slrig.doctor.measures.refresh import refresh_hz
-from slrig.doctor.measures.response import camera_exponent, response_curve
+from slrig.doctor.measures.frequencies import passed, refresh_hz, swings
+from slrig.doctor.measures.levels import camera_exponent, light_levels, response_curve
 from slrig.model import FloatArray, Pixels
 
 SHAPE = (60, 80)
@@ -102,8 +100,8 @@ def test_swings_are_told_from_uneven_samples_whatever_the_mean_rate() -> None:
     assert [swing.frequency_hz for swing in found] == pytest.approx([100.0, 180.0], abs=0.02)
     assert [swing.amplitude for swing in found] == pytest.approx([5.0, 2.0], abs=0.2)
     assert all(not swing.aliases_hz for swing in found)
-    assert found[0].left(0.01) == pytest.approx(0.0, abs=0.01)
-    assert found[0].left(0.005) == pytest.approx(5 * 2 / np.pi, abs=0.2)
+    assert found[0].amplitude * passed(found[0].frequency_hz, 0.01) == pytest.approx(0.0, abs=0.01)
+    assert found[0].amplitude * passed(found[0].frequency_hz, 0.005) == pytest.approx(5 * 2 / np.pi, abs=0.2)
 
 
 def test_noise_is_no_swing() -> None:

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from slrig.doctor.measures.orientation import apart_deg, expected_orientation, orientation
-from slrig.doctor.measures.sharpness import bar_blur_px, bar_contrast, edge_blur
+from slrig.doctor.measures.pictures import (
+    apart_deg,
+    bar_blur_px,
+    bar_contrast,
+    edge_blur,
+    expected_orientation,
+    orientation,
+)
 from slrig.model import FloatArray, Pinhole, Size
 
 SHAPE = (120, 160)
@@ -99,10 +105,7 @@ def test_bars_tell_their_blur(blur_px: float, camera_px: float, noise_dn: float)
     contrast = np.full((50, 200), 100.0)
     found = [
         bar_contrast(
-            [bars(period_px, blur_px, camera_px, noise_dn=noise_dn)],
-            [contrast],
-            noise_dn=noise_dn,
-            period_px=period_px,
+            bars(period_px, blur_px, camera_px, noise_dn=noise_dn), contrast, noise_dn=noise_dn, period_px=period_px
         )
         for period_px in (4.0, 8.0, 16.0, 32.0, 64.0)
     ]
@@ -112,9 +115,9 @@ def test_bars_tell_their_blur(blur_px: float, camera_px: float, noise_dn: float)
 
 def test_bars_that_are_gone_or_sharp_say_so() -> None:
     contrast = np.full((50, 200), 100.0)
-    gone = bar_contrast([bars(8.0, 8.0, 1.0)], [contrast], noise_dn=0.0, period_px=8.0)
+    gone = bar_contrast(bars(8.0, 8.0, 1.0), contrast, noise_dn=0.0, period_px=8.0)
     assert bar_blur_px([gone]) == float("inf")
-    sharp = bar_contrast([np.full((50, 200), 100.0)], [contrast], noise_dn=0.0, period_px=64.0)
+    sharp = bar_contrast(np.full((50, 200), 100.0), contrast, noise_dn=0.0, period_px=64.0)
     assert bar_blur_px([sharp]) is None
 
 

@@ -1,23 +1,36 @@
-"""Light that swings, found in the brightness of short exposures at uneven instants.
+"""How often light swings, and how often a display refreshes.
+
+Light that swings, found in the brightness of short exposures at uneven instants.
 
 An exposure of e seconds passes a swing of f hertz by the factor sinc(f·e) = sin(π f e)/(π f e): long ones average it
 out, whole periods cancel it. The spectrum is that of Lomb and Scargle with a floating mean (M. Zechmeister and
 M. Kürster, A&A 496, 2009), which takes samples at any instants: uneven ones have no aliases. A camera that runs by
 itself samples evenly, unless the rows of a rolling shutter tell the time between its frames; what it cannot tell apart
 is said. Swings are taken out one by one, the strongest first.
+
+A projector's refresh, from the instants at which its patterns became visible.
+
+A display changes at its refreshes only, so those instants lie on a grid. With f the grid's frequency all phases
+2π f t agree: R = |Σ exp(2πi f t)|/n is near 1, for multiples of f too, and far below for other frequencies when the
+patterns were asked for at random moments. The true one has the highest R: an error of the instants weighs more in its
+multiples.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from slrig.model import FloatArray
 
-LOWEST_HZ, HIGHEST_HZ = 20.0, 400.0
-
+_LOWEST_HZ, _HIGHEST_HZ = 20.0, 400.0
+_REFRESHES_HZ = (22.0, 260.0)
+_AGREE = 0.8
+_FINER = 16
+_NEARLY = 0.97
 _MOST_SWINGS = 4
 _CHANCE = 1e-6
 _FINE = 5
@@ -37,10 +50,6 @@ class Swing:
     amplitude: float
     power: float
     aliases_hz: tuple[float, ...] = ()
-
-    def left(self, exposure_s: float) -> float:
-        """The amplitude that exposures of this length show."""
-        return self.amplitude * passed(self.frequency_hz, exposure_s)
 
 
 def passed(frequency_hz: float, exposure_s: float) -> float:
@@ -70,7 +79,7 @@ def swings(t_s: FloatArray, samples: FloatArray, *, exposure_s: float) -> tuple[
     if len(t_s) < _FEWEST:
         return ()
     span_s = float(np.ptp(t_s))
-    frequencies = np.arange(LOWEST_HZ, HIGHEST_HZ, 1 / (_FINE * span_s))
+    frequencies = np.arange(_LOWEST_HZ, _HIGHEST_HZ, 1 / (_FINE * span_s))
     rest, found = samples - samples.mean(), []
     for _ in range(_MOST_SWINGS):
         if not np.ptp(rest) > 0:
@@ -103,7 +112,7 @@ def _refined(t_s: FloatArray, samples: FloatArray, frequency_hz: float, span_s: 
 
 def _by_chance(power: float, samples: int, span_s: float) -> float:
     """How likely noise alone gives such a peak somewhere in the spectrum."""
-    independent = span_s * (HIGHEST_HZ - LOWEST_HZ)
+    independent = span_s * (_HIGHEST_HZ - _LOWEST_HZ)
     return independent * math.exp(0.5 * (samples - 3) * math.log(max(1 - power, 1e-300)))
 
 
@@ -122,3 +131,30 @@ def _fitted(t_s: FloatArray, samples: FloatArray, frequencies: list[float]) -> t
     weights = np.linalg.lstsq(base, samples, rcond=None)[0]
     amplitudes = [float(np.hypot(*weights[1 + 2 * i : 3 + 2 * i])) for i in range(len(frequencies))]
     return np.asarray(base @ weights, np.float64), amplitudes
+
+
+def refresh_hz(t_visible_ns: Sequence[int]) -> float | None:
+    """Return the refresh rate that 20 or more instants tell, None where they lie on no grid.
+
+    >>> rng = np.random.default_rng(0)
+    >>> on_a_grid = np.cumsum(rng.integers(1, 9, 40)) * 1e9 / 59.94
+    >>> round(refresh_hz([round(t) for t in on_a_grid]), 2)
+    59.94
+    >>> refresh_hz([round(t) for t in np.cumsum(rng.uniform(0.01, 0.08, 40)) * 1e9]) is None
+    True
+    """
+    t_s = (np.array(t_visible_ns, np.float64) - t_visible_ns[0]) / 1e9
+    span_s = float(np.ptp(t_s))
+    if span_s <= 0:
+        return None
+    frequencies = np.arange(*_REFRESHES_HZ, 1 / (_FINER * span_s))
+    agreement = np.abs(np.exp(2j * np.pi * np.outer(frequencies, t_s)).mean(axis=1))
+    highest = float(agreement.max())
+    if highest < _AGREE:
+        return None
+    # Multiples agree as well where the instants are exact: the lowest of them is meant.
+    first = int(np.argmax(agreement > _NEARLY * highest))
+    near = slice(max(first - _FINER, 0), first + _FINER)
+    top_hz = float(frequencies[near][np.argmax(agreement[near])])
+    finer = np.linspace(top_hz - 1 / (_FINER * span_s), top_hz + 1 / (_FINER * span_s), 4 * _FINER + 1)
+    return float(finer[np.argmax(np.abs(np.exp(2j * np.pi * np.outer(finer, t_s)).mean(axis=1)))])
