@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -12,7 +13,6 @@ from slrig.accept.plan import (
     AcceptancePlan,
     Artefacts,
     Certified,
-    Limits,
     exact_artefacts,
     usual_limits,
 )
@@ -84,14 +84,12 @@ class AcceptanceRequest(Strict):
         if not (volume[0] < volume[1]).all():
             message = f"volume_mm: expected the least corner and then the greatest, found {volume.tolist()}"
             raise InvalidInputError(message)
-        given = self.limits
-        usual_mm = usual_limits(volume, rendered=rendered).spacing_mm
         return acceptance_plan(
             calibration,
             volume,
             exact_artefacts(volume) if self.artefacts is None else self.artefacts.artefacts(),
             rendered=rendered,
-            limits=Limits(given.spacing_mm or usual_mm, given.form_mm, given.size_mm, given.flatness_mm),
+            limits=replace(usual_limits(volume, rendered=rendered), **self.limits.model_dump(exclude_none=True)),
             repeats=self.repeats,
             exposure_s=self.exposure_s,
             notes=self.notes,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
@@ -35,12 +36,8 @@ from slrig.scan.runner import RigAccess
 
 
 class AcceptanceDesk:
-    """The tests of one service, those of earlier runs among them. Any thread may call; `close` at the end.
-
-    Raises
-    ------
-    StorageError
-        The disk refused.
+    """The tests of one service, those of earlier runs among them. Any thread may call; `close` at the end. Raises
+    StorageError.
     """
 
     def __init__(
@@ -83,14 +80,8 @@ class AcceptanceDesk:
     def open(self, plan_of: Callable[[Calibration], AcceptancePlan]) -> AcceptanceRecord:
         """Open a test of the rig as it is calibrated now. Touches no device.
 
-        Raises
-        ------
-        DeviceBusyError
-            The rig is not open yet.
-        CalibrationError, InvalidInputError
-            It has no calibration, or the plan cannot be done.
-        StorageError
-            The disk refused.
+        Raises DeviceBusyError if the rig is not open yet, CalibrationError if it has no calibration, InvalidInputError
+        if the plan cannot be done; StorageError.
         """
         with self._lock:
             status = self._queue.status()
@@ -101,10 +92,8 @@ class AcceptanceDesk:
             if calibration is None:
                 message = f"rig '{status.rig}' has no calibration, and nothing can be measured; calibrate it first"
                 raise CalibrationError(message)
-            number = 1 + max((record.number for record in self._tests.values()), default=0)
-            record = AcceptanceRecord(
-                number, uuid4(), self._clock(), status.rig, calibration.solve_id, plan_of(calibration)
-            )
+            number, plan = 1 + max((each.number for each in self._tests.values()), default=0), plan_of(calibration)
+            record = AcceptanceRecord(number, uuid4(), self._clock(), status.rig, calibration.solve_id, plan)
             self._store.save(record)
             self._tests[record.id] = record
         return record
@@ -121,41 +110,27 @@ class AcceptanceDesk:
             return tuple(with_jobs(record, jobs.get(record.id, ())) for record in reversed(self._tests.values()))
 
     def measure(
-        self,
-        test_id: UUID,
-        *,
-        wait: bool,
-        scripted: bool,
-        key: str | None = None,
-        holder: Holder | None = None,
+        self, test_id: UUID, *, wait: bool, scripted: bool, key: str | None = None, holder: Holder | None = None
     ) -> JobRecord:
         """Have the next position measured, or, scripted, all that are left; return the job at once.
 
         By hand, the artefact is to stand in its place. `wait` lets it stand in line behind other work. key : the
         idempotency key of the request, reserved. holder : whom a refusal names meanwhile; None the test.
 
-        Raises
-        ------
-        JobNotFoundError, ScanStateError
-            There is no such test, or it is being measured, or it is over.
-        RigBusyError, QueueFullError, DeviceError
-            As a scan.
+        Raises JobNotFoundError, ScanStateError if there is no such test, or it is being measured, or it is over;
+        RigBusyError, QueueFullError, DeviceError as a scan.
         """
         with self._lock:
             record = self.get(test_id)
             if not record.state.waiting:
                 message = f"Acceptance test {test_id} is {record.state}; a position is measured while it is open."
                 raise ScanStateError(message)
-            job_id = uuid4()
-            self._work.submit(
-                job_id,
-                self._parts(test_id, scripted=scripted),
-                holder=holder or _holder(test_id),
-                wait=wait,
-                record=lambda: self.jobs.create(
-                    {"scripted": scripted}, rig=record.rig, label=None, key=key, job_id=job_id, parent=test_id
-                ),
-            )
+            job_id, parts = uuid4(), self._parts(test_id, scripted=scripted)
+            told = partial(
+                self.jobs.create,
+                {"scripted": scripted}, rig=record.rig, label=None, key=key, job_id=job_id, parent=test_id,
+            )  # fmt: skip
+            self._work.submit(job_id, parts, holder=holder or _holder(test_id), wait=wait, record=told)
             return self.jobs.get(job_id)
 
     def cancel(self, test_id: UUID) -> AcceptanceRecord:
@@ -183,9 +158,8 @@ class AcceptanceDesk:
         record = self.get(test_id)
         path = self._store.folder(test_id) / name
         if record.state is not AcceptanceState.FINISHED or not path.is_file():
-            message = (
-                f"Acceptance test {test_id} is {record.state}, and has no {name} before every position is measured."
-            )
+            reason = f"has no {name} before every position is measured."
+            message = f"Acceptance test {test_id} is {record.state}, and {reason}"
             raise ArtefactNotReadyError(message)
         return path
 

@@ -72,12 +72,9 @@ class Evidence:
 
 
 def reading(mesh: Mesh, step: Step, take: int, plan: AcceptancePlan, rig: Calibration) -> tuple[Reading, Evidence]:
-    """The errors that a scan of one position shows.
+    """The errors that a scan of one position shows, and its points.
 
-    Raises
-    ------
-    NothingToReconstructError
-        The artefact is not in the scan, or too little of it counts.
+    Raises NothingToReconstructError if the artefact is not in the scan, or too little of it counts.
     """
     points, normals = mesh.vertices_mm.astype(np.float64), mesh.normals.astype(np.float64)
     sigma = mesh.sigma_mm.astype(np.float64)

@@ -53,10 +53,7 @@ def acceptance_plan(
 ) -> AcceptancePlan:
     """The test of a rig over a volume, (2, 3) float64, opposite corners in the world, mm.
 
-    Raises
-    ------
-    InvalidInputError
-        The artefacts do not suit the volume, or repeats is below 1: all faults in one message.
+    Raises InvalidInputError if the artefacts do not suit the volume, with all faults, or repeats is below 1.
     """
     require_fitting(artefacts, volume_mm, rendered=rendered)
     if repeats < 1:
@@ -79,12 +76,7 @@ def acceptance_plan(
 
 def rig_volume_mm(calibration: Calibration) -> FloatArray:
     """(2, 3) float64: the working volume: the one in which the board was held, else the largest box of usual
-    proportions, about where the devices look, that all of them see.
-
-    Raises
-    ------
-    InvalidInputError
-        The devices look past one another.
+    proportions, about where the devices look, that all of them see. Raises InvalidInputError if there is none.
     """
     if calibration.solved is not None:
         return calibration.solved.volume_mm

@@ -80,14 +80,10 @@ def run_acceptance(
     """Measure every position of a plan, evaluate, and write report.html, report.json and the points into `folder`.
 
     `place` None has the rig's positioner move the artefacts: its poses are called as the steps are. The points of each
-    capture stay in `folder`/points, as they come; the reports appear at the end. Raises as `measured`, and
+    capture stay in `folder`/points, as they come; the reports appear at the end.
 
-    Raises
-    ------
-    UnsupportedByDeviceError
-        `place` is None, and the rig has no positioner, or one that does not know a position.
-    InvalidInputError
-        `folder` holds something else.
+    Raises as `measured`; InvalidInputError if `folder` holds something else; UnsupportedByDeviceError if `place` is
+    None, and the rig has no positioner, or one that does not know a position.
     """
     # Late: the service measures position by position, and has the worker write the reports.
     from slrig.accept.report import write_reports
@@ -124,16 +120,9 @@ def measured(
     asked where an artefact was not found or a frame contradicted its pattern: whether to place it anew and capture once
     more; a repeat is captured without a move, so that it shows the scanner's scatter alone.
 
-    Raises
-    ------
-    CalibrationError
-        The rig has no calibration.
-    NothingToReconstructError
-        An artefact is not where it should be. What was measured before is kept.
-    ScanCancelledError
-        `cancelled()` became true.
-    DeviceError, ScanEvidenceError, StorageError
-        As a scan.
+    Raises CalibrationError if the rig has no calibration; NothingToReconstructError if an artefact is not where it
+    should be, and what was measured before is kept; ScanCancelledError; DeviceError, ScanEvidenceError, StorageError as
+    a scan.
     """
     takes = plan.takes
     for index, (step, take) in enumerate(takes[done:], done):

@@ -21,16 +21,9 @@ _ASIDE = 20.0  # diagonals of the volume: where artefacts stand that are not mea
 
 
 def scripted_config(config: RigConfig, plan: AcceptancePlan, folder: Path) -> RigConfig:
-    """The rig with the artefacts in place of its scene, and a pose for every position.
+    """The rig with the artefacts in place of its scene, which is written into `folder`, and a pose for every position.
 
-    Writes the scene into `folder`.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The rig's head has no scene: it is not rendered.
-    StorageError
-        The disk refused.
+    Raises UnsupportedByDeviceError if the rig's head has no scene, for it is not rendered then; StorageError.
     """
     if config.head is None or "scene" not in config.head.options:
         message = (

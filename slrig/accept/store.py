@@ -46,12 +46,8 @@ class AcceptanceStore:
     def load(self) -> Sequence[AcceptanceRecord]:
         """Return every test on record, oldest first, after what was cut off has been marked as such.
 
-        For the start of the service, when none can be under way. A folder that cannot be read is put aside.
-
-        Raises
-        ------
-        StorageError
-            The disk refused.
+        For the start of the service, when none can be under way. A folder that cannot be read is put aside. Raises
+        StorageError.
         """
         found: list[AcceptanceRecord] = []
         with disk_errors(self._root):

@@ -64,12 +64,10 @@ class Diagnosis:
 
 def doctor_sequence(size: Size) -> PatternSequence:
     """White, black, and a Gray code of single columns and rows: its finest bars tell the focus."""
-    return encode(
-        scan_patterns(
-            size, line_shift=False, period_px=8, line_width_px=1, gray_cell_px=1, gray_offset_px=0, rows=True
-        ),
-        size,
+    patterns = scan_patterns(
+        size, line_shift=False, period_px=8, line_width_px=1, gray_cell_px=1, gray_offset_px=0, rows=True
     )
+    return encode(patterns, size)
 
 
 def examine(
@@ -83,18 +81,10 @@ def examine(
 ) -> Diagnosis:
     """Examine an open rig. However it ends, the projector is dark and the cameras are disarmed afterwards.
 
-    Parameters
-    ----------
-    own_sequence
-        The patterns of a scan on this rig, for a projector that holds them and can show no others.
-    displays
-        Projectors and outputs that finders found, this rig's among them.
-    period_px
-        Distance of the lines that this rig scans with: what its focus is judged by.
-    search_s
-        How late light may be.
-    told
-        Is told the stage, the fraction done and a detail.
+    own_sequence : the patterns of a scan on this rig, for a projector that holds them and can show no others.
+    displays : projectors and outputs that finders found, this rig's among them. period_px : distance of the lines that
+    this rig scans with, by which its focus is judged. search_s : how late light may be. told : is told the stage, the
+    fraction done and a detail.
     """
     examination = _Examination(rig, own_sequence, displays, period_px, search_s, told)
     try:
@@ -150,14 +140,9 @@ class _Examination:
 
     def diagnosis(self) -> Diagnosis:
         order = list(Severity)[::-1]
+        findings = tuple(sorted(self.findings, key=lambda each: order.index(each.severity)))
         return Diagnosis(
-            rig=self.rig.name,
-            findings=tuple(sorted(self.findings, key=lambda each: order.index(each.severity))),
-            exposures=self._advice,
-            synchronisation=self.synchronisation,
-            refresh_hz=self.refresh_hz,
-            response=self.curve,
-            flickers=self.flickers,
+            self.rig.name, findings, self._advice, self.synchronisation, self.refresh_hz, self.curve, self.flickers
         )
 
     @property
@@ -236,14 +221,12 @@ class _Examination:
         return max(self.seen.values(), key=lambda each: each.levels.lit_share, default=None)
 
     def _response(self) -> None:
-        witness = self._witness()
-        if witness is not None:
+        if (witness := self._witness()) is not None:
             self.curve, findings = response(self._viewer(witness.name), witness)
             self.findings += findings
 
     def _flicker(self) -> None:
-        witness = self._witness()
-        if witness is None:
+        if (witness := self._witness()) is None:
             return
         viewer = self._viewer(witness.name)
         rows = viewer.camera.info.format.size.height_px
@@ -293,12 +276,9 @@ def _others(displays: Sequence[FoundDevice]) -> str:
 
 
 def _failed(stage: str, error: DeviceError, subject: str = "rig") -> Finding:
-    return fault(
-        "device.failed",
-        subject,
-        f"the examination of {stage} ended with a fault of a device: {error}",
-        "put that right, and run the doctor again; slrig conform tells faults of drivers",
-    )
+    remedy = "put that right, and run the doctor again; slrig conform tells faults of drivers"
+    found = f"the examination of {stage} ended with a fault of a device: {error}"
+    return fault("device.failed", subject, found, remedy)
 
 
 def _plain(value: Any) -> Any:

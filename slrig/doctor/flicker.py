@@ -36,34 +36,16 @@ class Flicker:
         """What exposures of this length show, of the projector's white."""
         return self.share * passed(self.frequency_hz, exposure_s)
 
-    @property
-    def period_s(self) -> float:
-        """Exposures of a multiple of this show nothing of it."""
-        return 1 / self.frequency_hz
-
-
-@dataclass(frozen=True, slots=True)
-class _Samples:
-    """t_s : (n,) float64. relative : (n,) float64, over its mean. mean_dn : of the pixels that were asked."""
-
-    t_s: FloatArray
-    relative: FloatArray
-    mean_dn: float
-    exposure_s: float
-
-    def swings(self) -> tuple[Swing, ...]:
-        return swings(self.t_s, self.relative * self.mean_dn, exposure_s=self.exposure_s)
-
 
 def flicker(viewer: Viewer, seen: Seen, *, line_time_s: float) -> tuple[tuple[Flicker, ...], list[Finding]]:
     """Watch black, then white, with short exposures at random moments: what swings, and the findings."""
     pair = white_and_black(viewer.projector.info.size)
-    dark, bright = (_watched(viewer, pair, index, seen, line_time_s) for index in (1, 0))
-    white_dn = max(bright.mean_dn - dark.mean_dn, 1e-6)
-    room = [Flicker("room", _told(s), s.amplitude / white_dn, s.aliases_hz) for s in dark.swings()]
+    (dark_dn, dark), (bright_dn, bright) = (_watched(viewer, pair, index, seen, line_time_s) for index in (1, 0))
+    white_dn = max(bright_dn - dark_dn, 1e-6)
+    room = [Flicker("room", _told(s), s.amplitude / white_dn, s.aliases_hz) for s in dark]
     lamp = [
         Flicker("projector", _told(s), s.amplitude / white_dn, s.aliases_hz)
-        for s in bright.swings()
+        for s in bright
         if not any(_alike(s, other) and other.share * white_dn > s.amplitude / 2 for other in room)
     ]
     found = tuple(each for each in (*room, *lamp) if each.share >= _NOTE)
@@ -74,7 +56,10 @@ def flicker(viewer: Viewer, seen: Seen, *, line_time_s: float) -> tuple[tuple[Fl
     return found, findings
 
 
-def _watched(viewer: Viewer, pair: PatternSequence, index: int, seen: Seen, line_time_s: float) -> _Samples:
+def _watched(
+    viewer: Viewer, pair: PatternSequence, index: int, seen: Seen, line_time_s: float
+) -> tuple[float, tuple[Swing, ...]]:
+    """The mean of the usable pixels, DN, and what swings in them."""
     rng = np.random.default_rng(index)
     times_s: list[FloatArray] = []
     values: list[FloatArray] = []
@@ -90,7 +75,9 @@ def _watched(viewer: Viewer, pair: PatternSequence, index: int, seen: Seen, line
             values.append(value)
     by_band = np.array(values)
     means = np.maximum(by_band.mean(axis=0), 1e-3)
-    return _Samples(np.concatenate(times_s), (by_band / means).ravel(), float(by_band.mean()), viewer.exposure_s)
+    mean_dn = float(by_band.mean())
+    found = swings(np.concatenate(times_s), (by_band / means).ravel() * mean_dn, exposure_s=viewer.exposure_s)
+    return mean_dn, found
 
 
 def _bands(frame: Frame, seen: Seen, line_time_s: float) -> tuple[FloatArray, FloatArray]:
@@ -127,7 +114,7 @@ def _judged(each: Flicker, seen: Seen, name: str) -> Finding:
     if each.aliases_hz:
         words += " (it samples evenly: the frequency may be another one)"
     kind = fault if left > _FAULT else note
-    wanted = f"expose for a multiple of {ms(each.period_s)}"
+    wanted = f"expose for a multiple of {ms(1 / each.frequency_hz)}"
     if each.source == "room":
         mains = [hz for light_hz, hz in _MAINS_HZ.items() if abs(each.frequency_hz - light_hz) < _SAME * light_hz]
         lamps = f"lamps on mains of {mains[0]} Hz" if mains else "a lamp"

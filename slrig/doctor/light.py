@@ -49,18 +49,9 @@ class Seen:
 
 
 def look(viewer: Viewer, sequence: PatternSequence, *, others: str) -> tuple[Seen | None, list[Finding]]:
-    """Look at white and black, and at whether the patterns' structure arrives.
-
-    Parameters
-    ----------
-    sequence
-        With white, black, and Gray patterns with their inverses.
-    others
-        Words on other displays that were found, to be put into a remedy.
-
-    Returns
-    -------
-    What was seen, None if nothing was, and the findings.
+    """Look at white and black, and at whether the patterns' structure arrives: what was seen, None if nothing was, and
+    the findings. sequence : with white, black, and Gray patterns with their inverses. others : words on other displays
+    that were found, for a remedy.
     """
     subject = camera_named(viewer.name)
     own_s = viewer.within(viewer.rig.settings[viewer.name].exposure_s)

@@ -22,6 +22,7 @@ from slrig.doctor.findings import Severity, ms
 from slrig.errors import ConfigError
 
 _WIDTH = 116
+_WAITS = "synchronisation"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 Path_ = tuple[str | int, ...]
@@ -32,14 +33,7 @@ def write_rig_file(diagnosis: Diagnosis, source: Path, target: Path, *, force: b
     """Write the rig file `source` to `target` with what was found: exposures and the table [synchronisation].
 
     Everything else stays; paths that are relative to the one file are made relative to the other. Its own comments are
-    not kept.
-
-    Raises
-    ------
-    ConfigError
-        There is a file of that name, and `force` is not given.
-    StorageError
-        The disk refused.
+    not kept. Raises ConfigError where there is a file of that name and `force` is not given; StorageError.
     """
     refuse_existing(target, force=force)
     data = tomllib.loads(read_text(source, MOST_CONFIG_BYTES, ConfigError))
@@ -71,21 +65,18 @@ def doctored(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path, tar
     _expose(tables, diagnosis.exposures, comments)
     found = diagnosis.synchronisation
     if found is not None:
-        tables["synchronisation"] = {
-            "latency_s": round(found.latency_s, 6),
-            "latency_error_s": round(found.latency_error_s, 6),
+        latency_s, error_s = round(found.latency_s, 6), round(found.latency_error_s, 6)
+        table: dict[str, Any] = {"latency_s": latency_s, "latency_error_s": error_s}
+        comments |= {
+            (_WAITS, "latency_s"): "measured by flashes: how much later than the projector says its light comes, on "
+            "average",
+            (_WAITS, "latency_error_s"): "and how much later than that it may come; scans wait for both",
         }
-        comments["synchronisation", "latency_s"] = (
-            "measured by flashes: how much later than the projector says its light comes, on average"
-        )
-        comments["synchronisation", "latency_error_s"] = "and how much later than that it may come; scans wait for both"
         if found.line_time_s:
-            lines = {name: round(seconds, 9) for name, seconds in found.line_time_s.items()}
-            tables["synchronisation"]["line_time_s"] = lines
-            for name in lines:
-                comments["synchronisation", "line_time_s", name] = (
-                    "measured: a rolling shutter exposes each row this much later than the row above it"
-                )
+            table["line_time_s"] = {name: round(seconds, 9) for name, seconds in found.line_time_s.items()}
+            rolling = "measured: a rolling shutter exposes each row this much later than the row above it"
+            comments |= dict.fromkeys(((_WAITS, "line_time_s", name) for name in found.line_time_s), rolling)
+        tables[_WAITS] = table
     return "\n".join([*_heading(diagnosis, source), *_table(tables, (), comments)]) + "\n"
 
 
@@ -95,25 +86,17 @@ def _expose(tables: dict[str, Any], exposures: Mapping[str, ExposureAdvice], com
         return
     if isinstance(tables.get("scan"), dict):
         tables["scan"].pop("exposure_s", None)
+    advised: list[tuple[Path_, dict[str, Any], ExposureAdvice]] = [
+        (("camera", number), camera, exposures[camera["name"]])
+        for number, camera in enumerate(tables.get("camera", ()))
+        if camera["name"] in exposures
+    ]
     if "head" in tables:
-        shortest = min(exposures.values(), key=lambda each: each.exposure_s)
-        tables["head"]["exposure_s"] = _exposure_s(shortest)
-        comments["head", "exposure_s"] = _why(shortest)
-        return
-    for number, camera in enumerate(tables["camera"]):
-        advice = exposures.get(camera["name"])
-        if advice is not None:
-            camera["exposure_s"] = _exposure_s(advice)
-            comments["camera", number, "exposure_s"] = _why(advice)
-
-
-def _exposure_s(advice: ExposureAdvice) -> float:
-    return float(f"{advice.exposure_s:.6g}")
-
-
-def _why(advice: ExposureAdvice) -> str:
-    shortest_s, longest_s = advice.usable_s
-    return f"{advice.reason}; usable are {ms(shortest_s)} to {ms(longest_s)}"
+        advised = [(("head",), tables["head"], min(exposures.values(), key=lambda each: each.exposure_s))]
+    for path, table, advice in advised:
+        shortest_s, longest_s = advice.usable_s
+        table["exposure_s"] = float(f"{advice.exposure_s:.6g}")
+        comments[(*path, "exposure_s")] = f"{advice.reason}; usable are {ms(shortest_s)} to {ms(longest_s)}"
 
 
 def _heading(diagnosis: Diagnosis, source: Path) -> Iterator[str]:
@@ -158,9 +141,9 @@ def _table(table: Mapping[str, Any], path: Path_, comments: Comments) -> Iterato
                 yield from _comment(comments[(*path, key)])
             yield f"{_key(key)} = {toml_value(value)}"
     for key, value in table.items():
-        for number, each in enumerate(value if isinstance(value, list) else [value] if _is_table(value) else []):
-            if not _is_table(value):
-                break
+        if not _is_table(value):
+            continue
+        for number, each in enumerate(value if isinstance(value, list) else [value]):
             inner: Path_ = (*path, key, number) if isinstance(value, list) else (*path, key)
             name = ".".join(_key(step) for step in inner if isinstance(step, str))
             yield ""

@@ -12,35 +12,22 @@ from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Frame, PatternSequence
 
 _TRIES = 3
+_LONGEST_FRAME_S = 2.0  # that a frame may take beyond its exposure
 _NS = 1e9
 
 
 class Viewer:
-    """Looks through one camera of a rig. One thread uses it.
+    """Looks through one camera of an open rig, and waits for its synchronisation, if it has one. One thread uses it.
 
-    Parameters
-    ----------
-    rig
-        Open devices; its synchronisation, if it has one, is waited for.
-    name
-        The camera.
-    wait_s
-        How much later than that a pattern may come all the same, where latency was not measured yet.
-    timeout_s
-        How long a frame may take beyond its exposure.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The camera can be triggered by wire only.
+    wait_s : how much later than that a pattern may come all the same, where latency was not measured yet. Raises
+    UnsupportedByDeviceError if the camera can be triggered by wire only.
     """
 
-    def __init__(self, rig: Rig, name: str, *, wait_s: float = 0.0, timeout_s: float = 2.0) -> None:
+    def __init__(self, rig: Rig, name: str, *, wait_s: float = 0.0) -> None:
         self.rig = rig
         self.name = name
         self.exposure_s = rig.settings[name].exposure_s
         self._wait_ns = round(wait_s * _NS)
-        self._timeout_s = timeout_s
         self._never = threading.Event()
         offered = self.camera.info.triggers
         possible = [trigger for trigger in (Trigger.SOFTWARE, Trigger.FREE) if trigger in offered]
@@ -110,7 +97,7 @@ class Viewer:
             if self.trigger is Trigger.SOFTWARE:
                 self.camera.trigger()
             try:
-                return self.camera.read(after_ns, self._timeout_s + self.exposure_s)
+                return self.camera.read(after_ns, _LONGEST_FRAME_S + self.exposure_s)
             except FrameTimeoutError:
                 if attempt == _TRIES - 1:
                     raise

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import Health, HealthState
-from slrig.calibration.health.verification import Verification, health_of_scan
+from slrig.calibration.health.verification import health_of_scan
 from slrig.devices import Rig
 from slrig.errors import CalibrationError, CalibrationStateError, UnsupportedByDeviceError
 from slrig.failure import disk_errors
@@ -103,14 +103,8 @@ class VerificationDesk:
         wait : stand in line while the rig is held. key : the idempotency key of the request, reserved.
         holder : whom a refusal names meanwhile; None the verification.
 
-        Raises
-        ------
-        CalibrationStateError
-            The rig has no calibration.
-        UnsupportedByDeviceError
-            The rig has no positioner, or not that position.
-        StorageError, RigBusyError, QueueFullError, DeviceError
-            As a scan.
+        Raises CalibrationStateError if the rig has no calibration; UnsupportedByDeviceError if it has no positioner, or
+        not that position; StorageError, RigBusyError, QueueFullError, DeviceError as a scan.
         """
         status = self._queue.status()
         plan = VerificationPlan(board, position, exposure_s)
@@ -156,11 +150,7 @@ class VerificationDesk:
         _, _, calibration = self.health()
         found = health_of_scan(report["redundancy"].get("residual_px") or ())
         if found is not None and calibration is not None:
-            self.note_scan(found, calibration)
-
-    def note_scan(self, found: Verification, calibration: Calibration) -> VerificationRecord:
-        """Put on record what a scan's own redundancy says of the calibration that it was measured by."""
-        return self.store.add(found, calibration=calibration.solve_id, at=self._clock())
+            self.store.add(found, calibration=calibration.solve_id, at=self._clock())
 
     def close(self) -> None:
         """Put on record what the disk refused before. Idempotent."""

@@ -53,13 +53,7 @@ class HealthStore:
         self.database = database
 
     def add(self, found: Verification, *, calibration: str, at: datetime) -> VerificationRecord:
-        """Judge a verification together with those before it since the calibration, and put it on record.
-
-        Raises
-        ------
-        StorageError
-            The disk refused.
-        """
+        """Judge a verification with those before it of its calibration, and put it on record. Raises StorageError."""
         with self.database.changing() as session:
             query = select(VerificationRow).where(VerificationRow.calibration == calibration)
             # The first few too: a trend starts from them.
@@ -104,14 +98,8 @@ class HealthStore:
 
 def _record(row: VerificationRow) -> VerificationRecord:
     health = Health(HealthState(row.state), tuple(row.reasons), row.remedy)
-    return VerificationRecord(
-        row.number,
-        UUID(row.id),
-        datetime.fromisoformat(row.at),
-        row.calibration,
-        verification_from_document(row.found),
-        health,
-    )
+    found, at = verification_from_document(row.found), datetime.fromisoformat(row.at)
+    return VerificationRecord(row.number, UUID(row.id), at, row.calibration, found, health)
 
 
 def _stamp(moment: datetime) -> str:

@@ -46,14 +46,8 @@ def verify_bundle(
 ) -> Verification:
     """Judge a calibration by a recorded pose of the board.
 
-    Raises
-    ------
-    PoseRefusedError
-        The board is not to be seen, or moved while it was shot.
-    CalibrationError
-        The calibration is of other cameras.
-    BundleError, PatternError
-        The frames are no sound capture.
+    Raises PoseRefusedError if the board is not to be seen, or moved while it was shot; CalibrationError if the
+    calibration is of other cameras; BundleError, PatternError if the frames are no sound capture.
     """
     used = VerificationTools() if tools is None else tools
     pose = used.read(folder, board, folder.name)
@@ -68,13 +62,7 @@ def verify_bundle(
 
 
 def require_healthy(health: Health, *, refuse_when_stale: bool) -> None:
-    """Refuse a scan with a stale calibration, if the rig file says so.
-
-    Raises
-    ------
-    CalibrationStateError
-        The calibration is stale; the message says why, and what to do.
-    """
+    """Refuse a scan with a stale calibration, if the rig file says so. Raises CalibrationStateError."""
     if refuse_when_stale and health.state is HealthState.STALE:
         message = (
             f"The calibration is stale, and this rig's file has scans refused then: {'; '.join(health.reasons)}. "

@@ -64,14 +64,8 @@ def passed(frequency_hz: float, exposure_s: float) -> float:
 def swings(t_s: FloatArray, samples: FloatArray, *, exposure_s: float) -> tuple[Swing, ...]:
     """Return the swings that samples of light show beyond doubt, the strongest first.
 
-    Parameters
-    ----------
-    t_s
-        (n,) float64, the middle of each sample's exposure.
-    samples
-        (n,) float64, brightness. At least 16 samples are needed to find anything.
-    exposure_s
-        Of every sample.
+    t_s : (n,) float64, the middle of each sample's exposure, which is `exposure_s` long. samples : (n,) float64,
+    brightness; 16 or more are needed to find anything.
     """
     # Half a second to import: whoever measures no flicker is spared it.
     from scipy.signal import lombscargle
