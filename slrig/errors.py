@@ -28,70 +28,56 @@ class SlrigError(Exception):
     """What it is called over HTTP and in records, whatever becomes of the class's name. A child without one of its own
     is told as its parent."""
 
+    def __init_subclass__(cls, *, code: str | None = None) -> None:
+        super().__init_subclass__()
+        if code is not None:
+            cls.code = code
 
-class InvalidInputError(SlrigError):
+
+class InvalidInputError(SlrigError, code="invalid-input"):
     """Something a person wrote or sent cannot be used as it is. Raise a child that says what kind of thing it was."""
 
-    code = "invalid-input"
 
-
-class ConfigError(InvalidInputError):
+class ConfigError(InvalidInputError, code="config"):
     """A rig file, scene file or setting is wrong. All its faults belong in one message."""
 
-    code = "config"
 
-
-class BundleError(InvalidInputError):
+class BundleError(InvalidInputError, code="bundle"):
     """A scan bundle's description or one of its frames is wrong: missing, cut, another size, an unknown key."""
 
-    code = "bundle"
 
-
-class CalibrationError(InvalidInputError):
+class CalibrationError(InvalidInputError, code="calibration"):
     """A calibration is missing, malformed, not finite, or made for devices of another size."""
 
-    code = "calibration"
 
-
-class PatternError(InvalidInputError):
+class PatternError(InvalidInputError, code="pattern"):
     """A pattern cannot be shown or decoded on this projector: too few bits, too small, an impossible period."""
 
-    code = "pattern"
 
-
-class ScheduleError(InvalidInputError):
+class ScheduleError(InvalidInputError, code="schedule"):
     """A schedule cannot be kept: cron text that means nothing or never comes, an unknown zone, a negative grace."""
 
-    code = "schedule"
 
-
-class ScheduleNotFoundError(SlrigError):
+class ScheduleNotFoundError(SlrigError, code="schedule-not-found"):
     """No schedule of this id is on record here."""
 
-    code = "schedule-not-found"
 
-
-class ScanEvidenceError(SlrigError):
+class ScanEvidenceError(SlrigError, code="scan-evidence"):
     """The frames themselves contradict what they should show: white not brighter than black, a repeated frame,
     a bit that equals its inverse. Raise it when showing the same patterns again might help.
     """
 
-    code = "scan-evidence"
 
-
-class NothingToReconstructError(SlrigError):
+class NothingToReconstructError(SlrigError, code="nothing-to-reconstruct"):
     """The frames are sound, and still hold no surface: nothing lit, nothing decoded, no stripe found."""
 
-    code = "nothing-to-reconstruct"
 
-
-class DeviceError(SlrigError):
+class DeviceError(SlrigError, code="device"):
     """A camera or projector did not do what it was told. Raise a child where one fits.
 
     place : the device and the call that it came of, told after the message; None where the message names them.
     """
 
-    code = "device"
     place: str | None = None
 
     def __str__(self) -> str:
@@ -99,72 +85,52 @@ class DeviceError(SlrigError):
         return text if self.place is None else f"{text} ({self.place})"
 
 
-class DeviceGoneError(DeviceError):
+class DeviceGoneError(DeviceError, code="device-gone"):
     """The device was there and is not any more: unplugged, powered off. Reopening is the only way on."""
 
-    code = "device-gone"
 
-
-class DeviceBusyError(DeviceError):
+class DeviceBusyError(DeviceError, code="device-busy"):
     """Another program holds the device. Name the device, and the other program where the system tells it."""
 
-    code = "device-busy"
 
-
-class DeviceStateError(DeviceError):
+class DeviceStateError(DeviceError, code="device-state"):
     """The call came in the wrong state: show before load, trigger before arm, anything after close.
     This is a fault of the caller, not of the device.
     """
 
-    code = "device-state"
 
-
-class UnsupportedByDeviceError(DeviceError):
+class UnsupportedByDeviceError(DeviceError, code="unsupported-by-device"):
     """The device understood the request and cannot do it (an exposure out of range, a pattern of another size)."""
 
-    code = "unsupported-by-device"
 
-
-class WrongSystemError(UnsupportedByDeviceError):
+class WrongSystemError(UnsupportedByDeviceError, code="wrong-system"):
     """A driver is installed and speaks to its devices by what only another operating system has. Name that system."""
 
-    code = "wrong-system"
 
-
-class FrameTimeoutError(DeviceError):
+class FrameTimeoutError(DeviceError, code="frame-timeout"):
     """No frame that qualifies came in time. The device may be well: a late frame is not a lost device."""
 
-    code = "frame-timeout"
 
-
-class DriverNotFoundError(ConfigError):
+class DriverNotFoundError(ConfigError, code="driver-not-found"):
     """A rig file names a driver that no installed package provides. Name those that are installed."""
 
-    code = "driver-not-found"
 
-
-class DriverBrokenError(DeviceError):
+class DriverBrokenError(DeviceError, code="driver-broken"):
     """A driver is installed and cannot be loaded. Name the package and the cause; other drivers keep working."""
 
-    code = "driver-broken"
 
-
-class LibraryMissingError(DriverBrokenError):
+class LibraryMissingError(DriverBrokenError, code="library-missing"):
     """A driver is installed and the library that it drives its devices with is not. Name the command that installs it:
     `install` is that command alone.
     """
-
-    code = "library-missing"
 
     def __init__(self, message: str, *, install: str) -> None:
         super().__init__(message)
         self.install = install
 
 
-class RigBusyError(SlrigError):
+class RigBusyError(SlrigError, code="rig-busy"):
     """The rig is held by another piece of work. Name the holder and since when."""
-
-    code = "rig-busy"
 
     def __init__(self, message: str, *, holder: str, since: str) -> None:
         super().__init__(message)
@@ -172,111 +138,77 @@ class RigBusyError(SlrigError):
         self.since = since
 
 
-class QueueFullError(SlrigError):
+class QueueFullError(SlrigError, code="queue-full"):
     """The rig is held, and as many scans as are allowed to wait are waiting already."""
 
-    code = "queue-full"
 
-
-class ScanCancelledError(SlrigError):
+class ScanCancelledError(SlrigError, code="scan-cancelled"):
     """Somebody asked for this scan to stop. Not a failure."""
 
-    code = "scan-cancelled"
 
-
-class CameraNotFoundError(SlrigError):
+class CameraNotFoundError(SlrigError, code="camera-not-found"):
     """The rig has no camera of this name. Name those that it has."""
 
-    code = "camera-not-found"
 
-
-class PoseRefusedError(SlrigError):
+class PoseRefusedError(SlrigError, code="pose-refused"):
     """A pose of the calibration board cannot be used: the board is not in view, is another one, moved, is too dark.
     Raise it when another pose, or the same one shot again, would do.
     """
 
-    code = "pose-refused"
 
-
-class SolveRefusedError(SlrigError):
+class SolveRefusedError(SlrigError, code="solve-refused"):
     """The poses are sound one by one, and together determine no calibration: too few, all parallel, contradictory.
     Name the poses, and what to shoot instead.
     """
 
-    code = "solve-refused"
 
-
-class CalibrationNotFoundError(SlrigError):
+class CalibrationNotFoundError(SlrigError, code="calibration-not-found"):
     """No calibration, or no pose of one, of this id is on record here."""
 
-    code = "calibration-not-found"
 
-
-class CalibrationStateError(SlrigError):
+class CalibrationStateError(SlrigError, code="calibration-state"):
     """The calibration exists and is in a state that forbids the call: activating one before it is solved, say."""
 
-    code = "calibration-state"
 
-
-class JobNotFoundError(SlrigError):
+class JobNotFoundError(SlrigError, code="job-not-found"):
     """No scan of this id is on record here."""
 
-    code = "job-not-found"
 
-
-class ArtefactNotReadyError(SlrigError):
+class ArtefactNotReadyError(SlrigError, code="artefact-not-ready"):
     """The scan exists, and the file asked for does not exist yet or never will (the scan failed)."""
 
-    code = "artefact-not-ready"
 
-
-class ScanStateError(SlrigError):
+class ScanStateError(SlrigError, code="scan-state"):
     """The scan exists and is in a state that forbids the call: deleting one that runs, for example."""
 
-    code = "scan-state"
 
-
-class IdempotencyError(SlrigError):
+class IdempotencyError(SlrigError, code="idempotency"):
     """An idempotency key came again with another request body, or while the first one is still being answered."""
 
-    code = "idempotency"
 
-
-class StorageError(SlrigError):
+class StorageError(SlrigError, code="storage"):
     """The disk refused: full, read-only, gone. What was being written has been removed."""
 
-    code = "storage"
 
-
-class ServiceError(SlrigError):
+class ServiceError(SlrigError, code="service"):
     """The slrig service, asked as a client, could not be reached or answered with an error of its own."""
 
-    code = "service"
 
-
-class WorkerLostError(SlrigError):
+class WorkerLostError(SlrigError, code="worker-lost"):
     """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
 
-    code = "worker-lost"
 
-
-class OutOfMemoryError(SlrigError):
+class OutOfMemoryError(SlrigError, code="out-of-memory"):
     """A computation asked for more memory than the machine gives."""
 
-    code = "out-of-memory"
 
-
-class ScanInterruptedError(SlrigError):
+class ScanInterruptedError(SlrigError, code="scan-interrupted"):
     """The service ended while this scan was under way: stopped, killed, or without power. Nobody asked for that scan
     to stop; where somebody did, it is a ScanCancelledError.
     """
 
-    code = "scan-interrupted"
 
-
-class KeyInFlightError(IdempotencyError):
+class KeyInFlightError(IdempotencyError, code="key-in-flight"):
     """The first request with this idempotency key is still being answered. Its sibling case, the same key with
     another body, is a plain IdempotencyError.
     """
-
-    code = "key-in-flight"

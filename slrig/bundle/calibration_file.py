@@ -65,11 +65,8 @@ class CalibrationEntry(Strict):
 
 def read_calibration(path: Path) -> Calibration:
     """Return the calibration in a file: slrig's JSON, or OpenCV FileStorage where the name ends in yml, yaml or xml.
-
-    Raises
-    ------
-    CalibrationError
-        The file is missing, cut, has an unknown key or a number that is not finite; all faults in one message.
+    Raises CalibrationError: the file is missing, cut, has an unknown key or a number that is not finite; all faults in
+    one message.
     """
     if path.suffix.lower() in {".yml", ".yaml", ".xml"}:
         return read_opencv_calibration(path)
@@ -90,13 +87,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration as slrig's JSON, whole or not at all.
-
-    Raises
-    ------
-    StorageError
-        The disk refused.
-    """
+    """Write a calibration as slrig's JSON, whole or not at all. Raises StorageError: the disk refused."""
     data: dict[str, Any] = {
         "format": "slrig-calibration",
         "version": 1,
@@ -117,11 +108,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 def check_calibration(calibration: Calibration, projector: Size, cameras: Mapping[str, Size], source: str) -> None:
     """Hold a calibration against the devices that it will be used for. `source` says where it came from.
-
-    Raises
-    ------
-    CalibrationError
-        It was made for devices of another size, or knows none of the cameras.
+    Raises CalibrationError: it was made for devices of another size, or knows none of the cameras.
     """
     faults = [
         f"cameras.{name}: expected {size} as the camera's frames are, found {calibration.cameras[name].size}"
@@ -140,11 +127,7 @@ def check_calibration(calibration: Calibration, projector: Size, cameras: Mappin
 
 def check_rays(calibration: Calibration, cameras: Collection[str], source: str) -> None:
     """See that with these cameras the calibration has two rays for each point. `source` says where it came from.
-
-    Raises
-    ------
-    CalibrationError
-        It has no projector, and one of the cameras.
+    Raises CalibrationError: it has no projector, and one of the cameras.
     """
     known = [name for name in cameras if name in calibration.cameras]
     if calibration.projector is None and len(known) < 2:

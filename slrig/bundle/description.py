@@ -176,11 +176,7 @@ class Description(Strict):
 
 def read_description(folder: Path) -> Description:
     """Return the checked description of the bundle in `folder`.
-
-    Raises
-    ------
-    BundleError
-        Every fault of bundle.json in one message.
+    Raises BundleError: every fault of bundle.json in one message.
     """
     path = folder / DESCRIPTION
     if not path.is_file():

@@ -33,11 +33,7 @@ Described = TypeVar("Described", bound=BaseModel)
 
 def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> str:
     """Return the text of a small UTF-8 file.
-
-    Raises
-    ------
-    InvalidInputError
-        Of the class `error`: the file is missing, larger than `most_bytes`, or not text.
+    Raises InvalidInputError, of the class `error`: the file is missing, larger than `most_bytes`, or not text.
     """
     try:
         with path.open("rb") as file:
@@ -60,11 +56,7 @@ def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> st
 
 def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
     """Return the data of a strict JSON text: no NaN, no infinity, no key twice.
-
-    Raises
-    ------
-    InvalidInputError
-        Of the class `error`, with the line where reading stopped.
+    Raises InvalidInputError, of the class `error`, with the line where reading stopped.
     """
 
     def refuse_constant(name: str) -> NoReturn:
@@ -107,13 +99,7 @@ def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
 
 
 def checked(model: type[Described], data: object, what: str, *, hint: str = "") -> Described:
-    """Return `data` as a `model`.
-
-    Raises
-    ------
-    ConfigError
-        Says `what` is wrong, lists every fault, and ends with `hint`.
-    """
+    """Return `data` as a `model`. Raises ConfigError: says `what` is wrong, lists every fault, and ends with `hint`."""
     try:
         return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
     except ValidationError as cause:

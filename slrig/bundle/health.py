@@ -22,11 +22,7 @@ def write_health(folder: Path, stamp: Mapping[str, Any]) -> None:
 
 def read_health(folder: Path) -> dict[str, Any] | None:
     """The stamp of a bundle, None where it has none.
-
-    Raises
-    ------
-    BundleError
-        The file cannot be read, or is no JSON object.
+    Raises BundleError: the file cannot be read, or is no JSON object.
     """
     path = folder / FILE
     if not path.exists():

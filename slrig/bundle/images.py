@@ -49,11 +49,7 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     """Return the wanted pages of a frame file, each (H, W) uint8 or uint16 of the camera's extent.
 
     Samples are right-aligned; colour becomes grey with the weights of Rec. 601.
-
-    Raises
-    ------
-    BundleError
-        The file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
+    Raises BundleError: the file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
     """
     data = _read_bytes(path)
     if data.startswith(PNG_SIGNATURE):

@@ -56,11 +56,8 @@ def read_opencv_calibration(path: Path) -> Calibration:
     """Return the calibration in an OpenCV FileStorage file.
 
     The map `projector` is the projector, `solved` what the calibration says of its own error, others are cameras.
-
-    Raises
-    ------
-    CalibrationError
-        The file is missing, cut, has an unknown key, a number that is not finite, or distortion terms beyond k3.
+    Raises CalibrationError: the file is missing, cut, has an unknown key, a number that is not finite, or distortion
+    terms beyond k3.
     """
     text = read_text(path, MOST_FILE_BYTES, CalibrationError)
     try:
@@ -87,13 +84,8 @@ def read_opencv_calibration(path: Path) -> Calibration:
 
 def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
     """Write a calibration as OpenCV FileStorage, whole or not at all; the name ends in yml, yaml or xml.
-
-    Raises
-    ------
-    CalibrationError
-        The ending is another one, or a camera has a name that FileStorage or this layout cannot hold.
-    StorageError
-        The disk refused.
+    Raises CalibrationError: the ending is another one, or a camera has a name that FileStorage or this layout cannot
+    hold; StorageError: the disk refused.
     """
     ending = path.suffix.lower()
     if ending not in {".yml", ".yaml", ".xml"}:

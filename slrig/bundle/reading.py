@@ -29,13 +29,8 @@ class Bundle:
 
 def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle:
     """Return the bundle in `folder`; `calibration_file` takes the place of the calibration.json beside the frames.
-
-    Raises
-    ------
-    BundleError
-        bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
-    CalibrationError
-        The calibration is malformed, not finite, or made for devices of another size.
+    Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key;
+    CalibrationError: the calibration is malformed, not finite, or made for devices of another size.
     """
     description = read_description(folder)
     path = calibration_file
@@ -50,11 +45,7 @@ def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle
 
 def read_capture(folder: Path) -> Capture:
     """Return the frames of the bundle in `folder`, whatever its calibration: what a calibration is solved from.
-
-    Raises
-    ------
-    BundleError
-        bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
+    Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
     """
     return _capture(folder, read_description(folder))
 

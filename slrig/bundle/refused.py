@@ -62,11 +62,7 @@ class RefusedList(Strict):
 
 def read_refused(folder: Path) -> tuple[Refused, ...]:
     """What was refused while the bundle in `folder` was captured, without the frames themselves; often nothing.
-
-    Raises
-    ------
-    BundleError
-        The list is there and is not as slrig wrote it.
+    Raises BundleError: the list is there and is not as slrig wrote it.
     """
     path = folder / FOLDER / LIST
     if not path.is_file():

@@ -36,11 +36,7 @@ def refusals_of(path: Path) -> Iterator[None]:
 
 def write_durably(path: Path, data: bytes) -> None:
     """Write a new file and bring it to disk; for a folder that is itself renamed into place later.
-
-    Raises
-    ------
-    OSError
-        The disk refused.
+    Raises OSError: the disk refused.
     """
     with path.open("xb") as file:
         file.write(data)
@@ -74,11 +70,7 @@ def staging_name(path: Path) -> Path:
 
 def write_file(path: Path, data: bytes) -> None:
     """Replace the file `path` by `data`, whole or not at all.
-
-    Raises
-    ------
-    StorageError
-        The disk refused; what was there before is still there.
+    Raises StorageError: the disk refused; what was there before is still there.
     """
     staging = staging_name(path)
     with refusals_of(path):

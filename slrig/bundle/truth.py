@@ -37,13 +37,7 @@ class BundleTruth:
 
 
 def write_truth(folder: Path, truth: Truth) -> None:
-    """Write the truth into a bundle's folder, each file whole or not at all.
-
-    Raises
-    ------
-    StorageError
-        The disk refused.
-    """
+    """Write the truth into a bundle's folder, each file whole or not at all. Raises StorageError: the disk refused."""
     import trimesh
 
     mesh = trimesh.Trimesh(truth.surface.vertices_mm, truth.surface.faces, process=False)
@@ -65,11 +59,7 @@ def write_truth(folder: Path, truth: Truth) -> None:
 
 def read_truth(folder: Path) -> BundleTruth | None:
     """Return the truth beside a bundle, or None where there is none.
-
-    Raises
-    ------
-    BundleError
-        One of its files is missing, cut, or of another shape.
+    Raises BundleError: one of its files is missing, cut, or of another shape.
     """
     if not (folder / SURFACE).exists() and not (folder / VISIBLE).exists():
         return None

@@ -40,13 +40,8 @@ class BundleWriter:
     The bundle grows in a hidden folder beside `folder`, which is renamed into place when the block ends well. Any
     error, in the block or on the disk, removes it: the folder is whole or absent. Only `keep` leaves a bundle of a
     capture that was cut short, and says so in it. captured_at : when the capture began, with the offset from UTC.
-
-    Raises
-    ------
-    BundleError
-        `folder` exists already, a camera's name cannot be a file's name, or no frame was added.
-    StorageError
-        The disk refused.
+    Raises BundleError: `folder` exists already, a camera's name cannot be a file's name, or no frame was added;
+    StorageError: the disk refused.
     """
 
     def __init__(
@@ -97,13 +92,8 @@ class BundleWriter:
 
     def add(self, shot: Shot) -> None:
         """Write one frame to disk now. One that takes the place of a refused frame is listed where that was.
-
-        Raises
-        ------
-        BundleError
-            The frame names an unknown pattern or camera, or is not as that camera's frames are.
-        StorageError
-            The disk refused.
+        Raises BundleError: the frame names an unknown pattern or camera, or is not as that camera's frames are;
+        StorageError: the disk refused.
         """
         self._check(shot)
         file = f"frames/{shot.camera}/{self._count[shot.camera]:03d}.png"
@@ -119,11 +109,7 @@ class BundleWriter:
 
     def refuse(self, refused: Refused) -> None:
         """Keep a refused frame apart: the one given, or the one that was added before, taken back.
-
-        Raises
-        ------
-        StorageError
-            The disk refused.
+        Raises StorageError: the disk refused.
         """
         file = f"{FOLDER}/{len(self._refused):03d}.png"
         entry: dict[str, Any] = {"pattern": refused.pattern, "camera": refused.camera, "attempt": refused.attempt}

@@ -82,13 +82,7 @@ class Evidence:
         self.forget()
 
     def add(self, shot: Shot) -> None:
-        """Take a frame in.
-
-        Raises
-        ------
-        ScanEvidenceError
-            The frames so far contradict what they should show.
-        """
+        """Take a frame in. Raises ScanEvidenceError: the frames so far contradict what they should show."""
         found = self.contradictions(shot)
         if found:
             raise ScanEvidenceError("; ".join(map(str, found)))

@@ -43,13 +43,8 @@ def hardware_triggered(session: Session, retries: RetryPolicy, refused: Callable
     """Play the sequence until every frame counts, three times at most.
 
     Frames are delivered as they come. Those of a play that failed are refused, and all come again.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        A camera has no exposure set.
-    FrameTimeoutError, ScanEvidenceError
-        The third play failed.
+    Raises UnsupportedByDeviceError: a camera has no exposure set; FrameTimeoutError, ScanEvidenceError: the third play
+    failed.
     """
     rig, count = session.rig, len(session.sequence)
     unset = sorted(set(rig.cameras) - set(session.applied))

@@ -162,11 +162,8 @@ class CameraLatency:
 
 def row_levels(camera: str, black: Sequence[Pixels], white: Sequence[Pixels], *, full_scale: int) -> RowLevels:
     """Return the levels of steady black and white frames, two or more (H, W) of each.
-
-    Raises
-    ------
-    ScanEvidenceError
-        White is not brighter than black, nearly everything that it lights is saturated, or too few rows are lit.
+    Raises ScanEvidenceError: white is not brighter than black, nearly everything that it lights is saturated, or too
+    few rows are lit.
     """
     dark, bright = np.stack(black).astype(np.float64), np.stack(white).astype(np.float64)
     mean, span = dark.mean(axis=0), bright.mean(axis=0) - dark.mean(axis=0)
@@ -230,11 +227,7 @@ def rows_of(flash: Flash, levels: RowLevels) -> FlashRows | None:
 
 def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLatency:
     """Return what the flashes tell: see the module.
-
-    Raises
-    ------
-    ScanEvidenceError
-        Too few flashes were seen while they happened.
+    Raises ScanEvidenceError: too few flashes were seen while they happened.
     """
     found = [(flash, rows) for flash in flashes if (rows := rows_of(flash, levels)) is not None]
     if len(found) < FEWEST_FLASHES:

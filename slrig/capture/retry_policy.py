@@ -73,11 +73,7 @@ class RetryPolicy:
 
     def took(self, index: int, frame: Frame, fault: str | None) -> Shot | None:
         """Judge a frame; return it if it counts. `fault` is what it says against itself.
-
-        Raises
-        ------
-        ScanEvidenceError
-            It was the third failure of a pattern.
+        Raises ScanEvidenceError: it was the third failure of a pattern.
         """
         shot = self.shot(index, frame)
         # Frames that are lost now and then say nothing against those that come.

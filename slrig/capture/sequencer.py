@@ -94,11 +94,8 @@ def capture(
 
 def choose_triggers(rig: Rig) -> dict[str, Trigger]:
     """Choose what starts each camera's exposures: hardware for all of them, or else the best that each can do.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The rig has no camera, or a camera can be triggered by wire only and the others or the projector cannot.
+    Raises UnsupportedByDeviceError: the rig has no camera, or a camera can be triggered by wire only and the others or
+    the projector cannot.
     """
     if not rig.cameras:
         message = f"rig '{rig.name}' has no camera; add a [[camera]] table to its rig file"

@@ -36,11 +36,7 @@ class Light:
 
     def level(self, image: Pixels) -> float:
         """How much of the projector's white is in a frame: 0 for black, 1 for white.
-
-        Raises
-        ------
-        ExpectationError
-            The frame has another shape than those before it.
+        Raises ExpectationError: the frame has another shape than those before it.
         """
         expect(
             image.shape == self.lit.shape,
@@ -53,11 +49,7 @@ class Light:
 
 def learn_light(white: list[Pixels], black: list[Pixels], *, full_scale: int) -> Light:
     """Find out which pixels the projector lights, from two or more frames of each; the last ones count.
-
-    Raises
-    ------
-    ExpectationError
-        White is not brighter than black anywhere.
+    Raises ExpectationError: white is not brighter than black anywhere.
     """
     shapes = {image.shape for image in (*white, *black)}
     expect(

@@ -62,13 +62,8 @@ class Camera(Protocol):
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         """Set exposure and gain, and return what the device reads back.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            The value is outside what the device can do.
-        DeviceStateError
-            The camera is armed or closed.
+        Raises UnsupportedByDeviceError: the value is outside what the device can do; DeviceStateError: the camera is
+        armed or closed.
         """
         ...
 

@@ -58,12 +58,7 @@ class CameraState:
 
         within : how far out of its range a value may be, as a share of it. hint : how a refusal ends.
 
-        Raises
-        ------
-        DeviceStateError
-            The camera is armed or closed.
-        UnsupportedByDeviceError
-            A value is out of range.
+        Raises DeviceStateError: the camera is armed or closed; UnsupportedByDeviceError: a value is out of range.
         """
         self.require_settable()
         for what, asked, (least, most) in (
@@ -80,12 +75,8 @@ class CameraState:
 
         hint : how a refusal ends.
 
-        Raises
-        ------
-        DeviceStateError
-            The camera is armed already, or closed.
-        UnsupportedByDeviceError
-            It has no such trigger, or no frame was asked for.
+        Raises DeviceStateError: the camera is armed already, or closed; UnsupportedByDeviceError: it has no such
+        trigger, or no frame was asked for.
         """
         self.require_open()
         if self.armed is not None:

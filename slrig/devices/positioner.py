@@ -16,13 +16,7 @@ class Positioner(Protocol):
 
     def move(self, index: int) -> None:
         """Take a pose and return when the object stands still.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            There is no such pose. Name those there are.
-        DeviceError
-            It did not get there.
+        Raises UnsupportedByDeviceError: there is no such pose. Name those there are; DeviceError: it did not get there.
         """
         ...
 

@@ -51,31 +51,19 @@ class Projector(Protocol):
 
     def load(self, sequence: PatternSequence) -> None:
         """Take a sequence. Shows nothing yet.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            The sequence is for a projector of another size, or too long.
+        Raises UnsupportedByDeviceError: the sequence is for a projector of another size, or too long.
         """
         ...
 
     def show(self, index: int) -> Shown:
         """Show one pattern of the loaded sequence and hold it; return once its light is on the scene.
-
-        Raises
-        ------
-        DeviceStateError
-            Nothing is loaded, or the projector is closed.
+        Raises DeviceStateError: nothing is loaded, or the projector is closed.
         """
         ...
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """Step once through the loaded sequence, one pattern per period, triggering the cameras by wire.
-
-        Raises
-        ------
-        UnsupportedByDeviceError
-            `info.plays` is False.
+        Raises UnsupportedByDeviceError: `info.plays` is False.
         """
         ...
 

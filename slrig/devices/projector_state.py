@@ -37,13 +37,8 @@ class ProjectorState:
 
     def require_pattern(self, index: int) -> PatternSequence:
         """Return the loaded sequence, which has a pattern of this index.
-
-        Raises
-        ------
-        DeviceStateError
-            Nothing is loaded, or the projector is closed.
-        UnsupportedByDeviceError
-            The sequence has no such pattern.
+        Raises DeviceStateError: nothing is loaded, or the projector is closed; UnsupportedByDeviceError: the sequence
+        has no such pattern.
         """
         sequence = self.require_loaded(f"show pattern {index}")
         if not 0 <= index < len(sequence):

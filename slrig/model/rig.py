@@ -60,10 +60,7 @@ class Pinhole:
     matrix : (3, 3) float64, pixels; distortion : (5,) float64; rotation : (3, 3) float64, world to device;
     translation_mm : (3,) float64.
 
-    Raises
-    ------
-    CalibrationError
-        A value is not finite, the rotation is no rotation, or a focal length is not positive.
+    Raises CalibrationError: a value is not finite, the rotation is no rotation, or a focal length is not positive.
     """
 
     size: Size
@@ -132,11 +129,7 @@ class Calibration:
     """The devices of a rig in one world frame. `projector` is None when only the cameras were calibrated.
 
     `solved` is None for a calibration that says nothing of its own error: written by hand, imported, or exact.
-
-    Raises
-    ------
-    CalibrationError
-        The covariance is for another number of devices.
+    Raises CalibrationError: the covariance is for another number of devices.
     """
 
     cameras: Mapping[str, Pinhole]

@@ -40,12 +40,8 @@ def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:
 
 def require_addressable(pattern: Gray, size: Size) -> None:
     """Refuse a code that does not fit its projector.
-
-    Raises
-    ------
-    PatternError
-        The code has too few words for the projector's cells, or the projector is so small that the most significant
-        bit never changes on it.
+    Raises PatternError: the code has too few words for the projector's cells, or the projector is so small that the
+    most significant bit never changes on it.
     """
     extent_px = size.along(pattern.axis)
     needed = gray_bits(extent_px, pattern.cell_px, pattern.offset_px)
@@ -68,11 +64,7 @@ def require_addressable(pattern: Gray, size: Size) -> None:
 
 def gray_profile(pattern: Gray, size: Size) -> NDArray[np.uint8]:
     """Light of one Gray bit: (1, Wp) uint8 for columns, (Hp, 1) for rows; 255 is lit, 0 dark.
-
-    Raises
-    ------
-    PatternError
-        The code does not fit the projector.
+    Raises PatternError: the code does not fit the projector.
     """
     require_addressable(pattern, size)
     words = to_gray((np.arange(size.along(pattern.axis)) + pattern.offset_px) // pattern.cell_px)

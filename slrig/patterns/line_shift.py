@@ -24,11 +24,7 @@ from slrig.patterns.gray import along_axis
 
 def line_profile(pattern: LineShift, size: Size) -> NDArray[np.uint8]:
     """Light of one line frame: (1, Wp) uint8 for columns, (Hp, 1) for rows; 255 is lit, 0 dark.
-
-    Raises
-    ------
-    PatternError
-        The projector is shorter than one period.
+    Raises PatternError: the projector is shorter than one period.
     """
     extent_px = size.along(pattern.axis)
     if extent_px < pattern.period_px:

@@ -98,11 +98,7 @@ def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
 
 def encode(patterns: Sequence[Pattern], size: Size) -> PatternSequence:
     """Turn patterns into light for a projector of this size; a few kilobytes, since each varies along one axis only.
-
-    Raises
-    ------
-    PatternError
-        The list is empty, or a pattern does not fit the projector.
+    Raises PatternError: the list is empty, or a pattern does not fit the projector.
     """
     if not patterns:
         message = "a sequence needs at least one pattern, found none; see scan_patterns"
