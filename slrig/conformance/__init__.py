@@ -3,10 +3,8 @@
 `slrig conform RIG` runs them on a rig; a driver's own tests call `run`, or `Examination.judge` check by check.
 """
 
-from slrig.conformance.catalogue import CHECKS
 from slrig.conformance.check import Check
 from slrig.conformance.expectation import Failure
-from slrig.conformance.report import Outcome, Report, Result
-from slrig.conformance.running import Examination, Progress, run
+from slrig.conformance.running import CHECKS, Examination, Outcome, Progress, Report, Result, run
 
 __all__ = ["CHECKS", "Check", "Examination", "Failure", "Outcome", "Progress", "Report", "Result", "run"]

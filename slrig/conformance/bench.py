@@ -1,4 +1,8 @@
-"""Where a rig stands to be examined: opened when needed, shared by the checks, and looked at through its cameras."""
+"""Where a rig stands to be examined: opened when needed, shared by the checks, and looked at through its cameras.
+
+How bright a camera sees the projector is told by its level: white is 1, black is 0, whatever the room, the noise and
+the sensor are.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +10,15 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.capture.latency import stable_from_ns
-from slrig.conformance.expectation import STEPPED, at, expect
-from slrig.conformance.light import DARK, LIT, Light, learn_light
+from slrig.conformance.expectation import STEPPED, at, expect, works
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Projector, Rig, Shown, Trigger
-from slrig.model import Frame, PatternSequence
+from slrig.model import Frame, PatternSequence, Pixels
 
 SHORT_S = 0.05
 """How long a frame is waited for that must not come."""
@@ -26,9 +31,44 @@ FRAMES = 256
 
 USUAL_EXPOSURE_S = 1 / 60
 
+LIT = 0.8
+"""From this level on, a frame shows white."""
+
+DARK = 0.2
+"""Up to this level, a frame shows black."""
+
+_LEAST_PIXELS = 16
+_LEAST_SHARE = 0.001
+_LEAST_OF_FULL_SCALE = 0.01
+_NOISES = 6.0
+
 _SETTLE_S = 0.1
 _MOST_LOOKS = 64
 _LEARNT_FROM = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What one camera sees of the projector, learnt from a white and a black frame.
+
+    lit : (H, W) bool, pixels that the projector lights. white, black : their mean in DN.
+    """
+
+    lit: NDArray[np.bool_]
+    white: float
+    black: float
+
+    def level(self, image: Pixels) -> float:
+        """How much of the projector's white is in a frame: 0 for black, 1 for white.
+        Raises ExpectationError: the frame has another shape than those before it.
+        """
+        expect(
+            image.shape == self.lit.shape,
+            asked=f"every frame of a camera has one shape, {self.lit.shape}",
+            found=image.shape,
+            do="deliver frames of the extent that info.format declares",
+        )
+        return (float(image[self.lit].mean()) - self.black) / (self.white - self.black)
 
 
 class RigBench:
@@ -45,7 +85,7 @@ class RigBench:
     def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence) -> None:
         self._open_rig = open_rig
         self._rig: Rig | None = None
-        self._lights: dict[str, Light] = {}
+        self.lights: dict[str, Light] = {}
         self.sequence = sequence
         self.now_ns = 0
 
@@ -63,6 +103,15 @@ class RigBench:
         """The first patterns of the sequence, where a few are enough."""
         few = min(len(self.sequence), 4)
         return PatternSequence(self.sequence.projector, self.sequence.patterns[:few], self.sequence.profiles[:few])
+
+    def opened_again(self) -> Rig:
+        """Return the rig, opened if it was closed. Raises ExpectationError where it does not open."""
+        with works(
+            asked="a rig opens again after it was closed",
+            do="close lets the device go entirely: handles, threads, locks",
+        ):
+            _ = self.rig
+        return self.rig
 
     def close(self) -> None:
         """Close the rig, whatever state it is in. Idempotent."""
@@ -110,15 +159,6 @@ class RigBench:
                     camera.disarm()
                 raise
             camera.disarm()
-
-    def light(self, view: View) -> Light:
-        """What the camera sees of the projector, learnt once. Raises ExpectationError where it sees nothing of it."""
-        known = self._lights.get(view.name)
-        if known is None:
-            white, black = ([view.expose(index).image for _ in range(_LEARNT_FROM)] for index in (0, 1))
-            known = learn_light(white, black, full_scale=view.camera.info.format.full_scale)
-            self._lights[view.name] = known
-        return known
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,12 +220,17 @@ class View:
         return self.read(self.bench.now_ns if self.trigger is Trigger.FREE else 0)
 
     def learn(self) -> Light:
-        """Find out how white and black look, if nobody has yet: shows both. Raises ExpectationError."""
-        return self.bench.light(self)
+        """Find out how white and black look, once for each camera: shows both. Raises ExpectationError."""
+        known = self.bench.lights.get(self.name)
+        if known is None:
+            white, black = ([self.expose(index).image for _ in range(_LEARNT_FROM)] for index in (0, 1))
+            known = learn_light(white, black, full_scale=self.camera.info.format.full_scale)
+            self.bench.lights[self.name] = known
+        return known
 
     def level(self, frame: Frame) -> float:
         """How much of the projector's white is in a frame. Call `learn` first, before what is to be looked at."""
-        return self.bench.light(self).level(frame.image)
+        return self.learn().level(frame.image)
 
     def expect_level(self, frame: Frame, index: int, *, asked: str, do: str) -> None:
         """Expect a frame of pattern 0 to be white, one of pattern 1 to be black. Raises ExpectationError."""
@@ -212,6 +257,16 @@ class View:
             level = min(level, self.level(last))
         return level
 
+    def expect_dark(self, when: str) -> None:
+        """Expect that the projector is dark now. Raises ExpectationError."""
+        level = self.darkest()
+        expect(
+            level <= DARK,
+            asked=f"the projector is dark {when}",
+            found=f"{level:.0%} of white's light",
+            do="go dark before the call returns, in whatever state; a device that cannot shows a black picture",
+        )
+
     def let_frames_pile_up(self) -> None:
         """Let time pass in which nobody reads, so that a camera that runs by itself fills its driver's buffers."""
         clock = self.bench.rig.clock
@@ -224,3 +279,38 @@ def usual_settings(camera: Camera) -> CameraSettings:
     least_s, most_s = camera.info.exposure_range_s
     least, most = camera.info.gain_range
     return CameraSettings(min(max(USUAL_EXPOSURE_S, least_s), most_s), min(max(1.0, least), most))
+
+
+def learn_light(white: list[Pixels], black: list[Pixels], *, full_scale: int) -> Light:
+    """Find out which pixels the projector lights, from two or more frames of each; the last ones count.
+    Raises ExpectationError: white is not brighter than black anywhere.
+    """
+    shapes = {image.shape for image in (*white, *black)}
+    expect(
+        len(shapes) == 1,
+        asked="every frame of a camera has one shape",
+        found=sorted(shapes),
+        do="deliver frames of the extent that info.format declares",
+    )
+    difference = _signed(white[-1]) - _signed(black[-1])
+    threshold = max(_NOISES * _noise(white[-2:]), _LEAST_OF_FULL_SCALE * full_scale, 2.0)
+    lit = difference > threshold
+    expect(
+        np.count_nonzero(lit) >= max(_LEAST_PIXELS, _LEAST_SHARE * lit.size),
+        asked="the white pattern makes the camera's image brighter than the black one",
+        found=f"{np.count_nonzero(lit)} of {lit.size} pixels brighter by {threshold:.1f} DN of {full_scale}, means "
+        f"{white[-1].mean():.1f} and {black[-1].mean():.1f} DN",
+        do="point the camera at what the projector lights, switch the lamp on, open the aperture, and shade the room; "
+        "if the picture is right, the driver delivers frames of an earlier pattern",
+    )
+    return Light(lit, float(white[-1][lit].mean()), float(black[-1][lit].mean()))
+
+
+def _signed(image: NDArray[Any]) -> NDArray[np.float32]:
+    return image.astype(np.float32)
+
+
+def _noise(images: list[Pixels]) -> float:
+    """Standard deviation of one frame, DN, from two of the same pattern; robust against what moves."""
+    off = _signed(images[-1]) - _signed(images[0])
+    return 1.4826 * float(np.median(np.abs(off - np.median(off)))) / float(np.sqrt(2))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from functools import wraps
 
-from slrig.conformance.bench import RigBench
-from slrig.conformance.expectation import STEPPED
+from slrig.conformance.bench import RigBench, View
+from slrig.conformance.expectation import STEPPED, NotApplicableError
 from slrig.devices import Rig, Trigger
 from slrig.model import Black, PatternSequence, White
 
@@ -46,28 +47,50 @@ class Need(Enum):
 class Check:
     """One thing that the contract asks of the devices of a rig.
 
-    title : in plain words. asks : the members of the protocols that it is about, as "Camera.read". needs : what the
-    rig must have. fresh : whether it wants a rig that was opened just now, and is closed afterwards; the others share
-    one. function : raises ExpectationError or NotApplicableError.
+    title : in plain words. needs : what the rig must have. fresh : whether it wants a rig that was opened just now, and
+    is closed afterwards; the others share one. function : raises ExpectationError or NotApplicableError.
     """
 
     name: str
     title: str
-    asks: tuple[str, ...]
     needs: tuple[Need, ...]
     fresh: bool
     function: Callable[[RigBench], None]
 
 
-def check(
-    *, asks: tuple[str, ...], needs: tuple[Need, ...] = (), fresh: bool = False
-) -> Callable[[Callable[[RigBench], None]], Check]:
+def check(*needs: Need, fresh: bool = False) -> Callable[[Callable[[RigBench], None]], Check]:
     """Make a check of the function below: its name is the check's, its docstring's first line the title."""
 
     def made(function: Callable[[RigBench], None]) -> Check:
         name = function.__name__
         # Python may be told to leave docstrings out.
         title = (function.__doc__ or name.replace("_", " ")).splitlines()[0].removesuffix(".")
-        return Check(name, title, asks, needs, fresh, function)
+        return Check(name, title, needs, fresh, function)
+
+    return made
+
+
+def view_check(*needs: Need, every: bool = False) -> Callable[[Callable[[View], None]], Check]:
+    """Make a check of what the function below asks of one camera before the projector: each of `RigBench.ways`.
+
+    It applies where it does to one of them.
+    """
+
+    def made(function: Callable[[View], None]) -> Check:
+        @wraps(function)
+        def of_each(bench: RigBench) -> None:
+            reasons: list[str] = []
+            applies = False
+            for name, trigger in bench.ways(every=every):
+                with bench.view(name, trigger) as view:
+                    try:
+                        function(view)
+                        applies = True
+                    except NotApplicableError as reason:
+                        reasons.append(f"camera '{name}' {reason}")
+            if not applies:
+                raise NotApplicableError("; ".join(reasons))
+
+        return check(Need.STEPPED, *needs)(of_each)
 
     return made

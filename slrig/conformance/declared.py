@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 
 from slrig.conformance.bench import RigBench
-from slrig.conformance.check import Check, check
+from slrig.conformance.check import check
 from slrig.conformance.expectation import at, expect, refused
 from slrig.devices import Camera, Head, Projector, Trigger
 from slrig.errors import UnsupportedByDeviceError
@@ -16,9 +16,7 @@ from slrig.model import Size
 _INFO = "keep what info declares in the driver's own memory, and ask the device once, when it is opened"
 
 
-@check(
-    asks=("Head.cameras", "Head.projector", "Camera.info"),
-)
+@check()
 def devices_implement_the_protocols(bench: RigBench) -> None:
     """The devices have every method of their protocol, and the cameras their names."""
     rig = bench.rig
@@ -62,10 +60,7 @@ def devices_implement_the_protocols(bench: RigBench) -> None:
         )
 
 
-@check(
-    asks=("Camera.info", "Projector.info"),
-    fresh=True,
-)
+@check(fresh=True)
 def info_is_readable_in_every_state(bench: RigBench) -> None:
     """What is declared can be read in every state, and does not change."""
     rig = bench.rig
@@ -96,7 +91,7 @@ def info_is_readable_in_every_state(bench: RigBench) -> None:
     unchanged("after close")
 
 
-@check(asks=("Camera.info", "Projector.info"))
+@check()
 def declared_ranges_are_sound(bench: RigBench) -> None:
     """The ranges that are declared make sense."""
     for name, camera in bench.rig.cameras.items():
@@ -131,9 +126,7 @@ def declared_ranges_are_sound(bench: RigBench) -> None:
     )
 
 
-@check(
-    asks=("Head.calibration", "Head.truth"),
-)
+@check()
 def calibration_and_truth_fit_the_devices(bench: RigBench) -> None:
     """A calibration or truth that the rig carries fits its devices."""
     rig = bench.rig
@@ -167,9 +160,7 @@ def calibration_and_truth_fit_the_devices(bench: RigBench) -> None:
         )
 
 
-@check(
-    asks=("Camera.arm",),
-)
+@check()
 def triggers_that_are_not_declared_are_refused(bench: RigBench) -> None:
     """Triggers that a camera does not declare are refused, and no frames as well."""
     for name, camera in bench.rig.cameras.items():
@@ -195,12 +186,3 @@ def _arm_refused(camera: Camera, count: int, trigger: Trigger) -> AbstractContex
 
 def _extents(sizes: Mapping[str, Size]) -> str:
     return ", ".join(f"'{name}' {size}" for name, size in sorted(sizes.items())) or "no camera"
-
-
-CHECKS: tuple[Check, ...] = (
-    devices_implement_the_protocols,
-    info_is_readable_in_every_state,
-    declared_ranges_are_sound,
-    calibration_and_truth_fit_the_devices,
-    triggers_that_are_not_declared_are_refused,
-)

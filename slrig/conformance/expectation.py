@@ -63,6 +63,15 @@ def refused(error: type[SlrigError], *, asked: str, do: str) -> Iterator[None]:
 
 
 @contextmanager
+def works(*, asked: str, do: str) -> Iterator[None]:
+    """Expect that the block raises nothing. Raises ExpectationError."""
+    try:
+        yield
+    except Exception as error:
+        raise ExpectationError(Failure(asked, _named(error), do)) from error
+
+
+@contextmanager
 def at(where: str) -> Iterator[None]:
     """Name the device in whatever goes wrong within the block; errors of a driver become failures of the check."""
     try:

@@ -4,140 +4,116 @@ from __future__ import annotations
 
 import numpy as np
 
-from slrig.conformance.bench import RigBench
-from slrig.conformance.check import Check, Need, check
+from slrig.conformance.bench import View
+from slrig.conformance.check import Need, view_check
 from slrig.conformance.expectation import expect, near
 from slrig.devices import AppliedSettings, CameraInfo
 from slrig.model import Frame
 
 _ALTERNATIONS = 12
 _IDLE_BEFORE = (4, 9)
-_STEPPED = (Need.STEPPED,)
-_SEEN = (Need.STEPPED, Need.WHITE_AND_BLACK)
+"""Once before white, once before black."""
+
+_ON_CLOCK = "convert the device's clock to CLOCK_MONOTONIC (time.monotonic_ns), and state the error in t_err_ns"
 
 
-@check(
-    asks=("Camera.info", "Camera.read", "Projector.show"),
-    needs=_STEPPED,
-)
-def frames_are_as_declared(bench: RigBench) -> None:
+@view_check()
+def frames_are_as_declared(view: View) -> None:
     """Frames have the name, extent, type and range that the camera declares."""
-    for name, trigger in bench.ways():
-        with bench.view(name, trigger) as view:
-            for index in range(len(bench.opening)):
-                expect_declared(view.expose(index), view.camera.info)
+    for index in range(len(view.bench.opening)):
+        expect_declared(view.expose(index), view.camera.info)
 
 
-@check(
-    asks=("Camera.configure", "Camera.read"),
-    needs=_STEPPED,
-)
-def frames_tell_their_exposure(bench: RigBench) -> None:
+@view_check()
+def frames_tell_their_exposure(view: View) -> None:
     """Frames tell the exposure and gain that were set, and lasted as long."""
-    for name, trigger in bench.ways():
-        with bench.view(name, trigger) as view:
-            for index in range(len(bench.opening)):
-                expect_exposed(view.expose(index), view.applied)
+    for index in range(len(view.bench.opening)):
+        expect_exposed(view.expose(index), view.applied)
 
 
-@check(asks=("Camera.read",), needs=_STEPPED)
-def frame_numbers_and_times_rise(bench: RigBench) -> None:
+@view_check()
+def frame_numbers_and_times_rise(view: View) -> None:
     """Frame numbers and times only rise."""
-    for name, trigger in bench.ways():
-        with bench.view(name, trigger) as view:
-            last = view.expose(0)
-            for index in range(6):
-                frame = view.expose(index % len(bench.sequence))
-                expect(
-                    frame.sequence_number > last.sequence_number,
-                    asked=f"a frame number is above {last.sequence_number}, that of the frame before",
-                    found=frame.sequence_number,
-                    do="count every frame that the sensor made, unroll the device's counter, and return none twice",
-                )
-                expect(
-                    frame.t_start_ns + frame.t_err_ns >= last.t_end_ns - last.t_err_ns,
-                    asked=f"a frame begins after the end of the one before, {last.t_end_ns} ± {last.t_err_ns} ns",
-                    found=f"{frame.t_start_ns} ± {frame.t_err_ns} ns",
-                    do="take time stamps from the device, and return each frame once",
-                )
-                expect(
-                    frame.dropped_count >= last.dropped_count >= 0,
-                    asked=f"dropped_count goes on from {last.dropped_count} while the camera is armed",
-                    found=frame.dropped_count,
-                    do="count lost and corrupt frames since arm",
-                )
-                last = frame
+    last = view.expose(0)
+    for index in range(6):
+        frame = view.expose(index % len(view.bench.sequence))
+        expect(
+            frame.sequence_number > last.sequence_number,
+            asked=f"a frame number is above {last.sequence_number}, that of the frame before",
+            found=frame.sequence_number,
+            do="count every frame that the sensor made, unroll the device's counter, and return none twice",
+        )
+        expect(
+            frame.t_start_ns + frame.t_err_ns >= last.t_end_ns - last.t_err_ns,
+            asked=f"a frame begins after the end of the one before, {last.t_end_ns} ± {last.t_err_ns} ns",
+            found=f"{frame.t_start_ns} ± {frame.t_err_ns} ns",
+            do="take time stamps from the device, and return each frame once",
+        )
+        expect(
+            frame.dropped_count >= last.dropped_count >= 0,
+            asked=f"dropped_count goes on from {last.dropped_count} while the camera is armed",
+            found=frame.dropped_count,
+            do="count lost and corrupt frames since arm",
+        )
+        last = frame
 
 
-@check(
-    asks=("Camera.read", "Projector.show"),
-    needs=_STEPPED,
-)
-def frame_times_lie_on_the_projectors_clock(bench: RigBench) -> None:
+@view_check()
+def frame_times_lie_on_the_projectors_clock(view: View) -> None:
     """Times of frames lie on the projector's clock."""
-    do = "convert the device's clock to CLOCK_MONOTONIC (time.monotonic_ns), and state the error in t_err_ns"
-    for name, trigger in bench.ways():
-        with bench.view(name, trigger) as view:
-            before = view.show(0)
-            for index in (1, 0, 1):
-                view.start()
-                frame = view.read(view.stable_ns(before))
-                expect(frame.t_err_ns >= 0, asked="t_err_ns is 0 or more", found=frame.t_err_ns, do=do)
-                after = view.show(index % len(bench.sequence))
-                expect(
-                    frame.t_start_ns >= view.stable_ns(before),
-                    asked=f"a frame read after {view.stable_ns(before)} ns begins after that",
-                    found=f"{frame.t_start_ns} ns",
-                    do=do,
-                )
-                expect(
-                    frame.t_end_ns - frame.t_err_ns <= view.stable_ns(after),
-                    asked=f"a frame that was in hand before a pattern lit at {after.t_visible_ns} ns ended before that",
-                    found=f"{frame.t_end_ns} ± {frame.t_err_ns} ns",
-                    do=do,
-                )
-                before = after
+    before = view.show(0)
+    for index in (1, 0, 1):
+        view.start()
+        frame = view.read(view.stable_ns(before))
+        expect(frame.t_err_ns >= 0, asked="t_err_ns is 0 or more", found=frame.t_err_ns, do=_ON_CLOCK)
+        after = view.show(index % len(view.bench.sequence))
+        expect(
+            frame.t_start_ns >= view.stable_ns(before),
+            asked=f"a frame read after {view.stable_ns(before)} ns begins after that",
+            found=f"{frame.t_start_ns} ns",
+            do=_ON_CLOCK,
+        )
+        expect(
+            frame.t_end_ns - frame.t_err_ns <= view.stable_ns(after),
+            asked=f"a frame that was in hand before a pattern lit at {after.t_visible_ns} ns ended before that",
+            found=f"{frame.t_end_ns} ± {frame.t_err_ns} ns",
+            do=_ON_CLOCK,
+        )
+        before = after
 
 
-@check(
-    asks=("Camera.read", "Camera.trigger", "Projector.show"),
-    needs=_SEEN,
-)
-def a_frame_lies_wholly_in_its_pattern(bench: RigBench) -> None:
+@view_check(Need.WHITE_AND_BLACK, every=True)
+def a_frame_lies_wholly_in_its_pattern(view: View) -> None:
     """Every frame shows its pattern and no other's light, at once and after a pause."""
-    for name, trigger in bench.ways(every=True):
-        with bench.view(name, trigger) as view:
-            view.learn()
-            for turn in range(_ALTERNATIONS):
-                index = turn % 2
-                if turn in _IDLE_BEFORE:
-                    view.show(1 - index)
-                    view.let_frames_pile_up()
-                view.expect_level(
-                    view.expose(index),
-                    index,
-                    asked="a frame that was read after a pattern became visible shows that pattern alone",
-                    do="read returns frames whose whole exposure, all rows, lies after after_ns; show returns once its "
-                    "light is on the scene",
-                )
+    view.learn()
+    for turn in range(_ALTERNATIONS):
+        index = turn % 2
+        if turn in _IDLE_BEFORE:
+            view.show(1 - index)
+            view.let_frames_pile_up()
+        view.expect_level(
+            view.expose(index),
+            index,
+            asked="a frame that was read after a pattern became visible shows that pattern alone",
+            do="read returns frames whose whole exposure, all rows, lies after after_ns; show returns once its "
+            "light is on the scene",
+        )
 
 
-@check(asks=("Camera.read",), needs=_SEEN)
-def a_frame_keeps_its_pixels(bench: RigBench) -> None:
+@view_check(Need.WHITE_AND_BLACK)
+def a_frame_keeps_its_pixels(view: View) -> None:
     """A frame keeps its pixels when the next ones come."""
-    for name, trigger in bench.ways():
-        with bench.view(name, trigger) as view:
-            frame = view.expose(0)
-            kept = frame.image.copy()
-            for index in (1, 1, 1, 1, 1, 1, 1, 1):
-                view.expose(index)
-            changed = int(np.count_nonzero(frame.image != kept))
-            expect(
-                changed == 0,
-                asked="a frame's image is its own after eight more frames",
-                found=f"{changed} of {kept.size} pixels changed",
-                do="copy the image out of the driver's buffer before the buffer is used again",
-            )
+    frame = view.expose(0)
+    kept = frame.image.copy()
+    for _ in range(8):
+        view.expose(1)
+    changed = int(np.count_nonzero(frame.image != kept))
+    expect(
+        changed == 0,
+        asked="a frame's image is its own after eight more frames",
+        found=f"{changed} of {kept.size} pixels changed",
+        do="copy the image out of the driver's buffer before the buffer is used again",
+    )
 
 
 def expect_declared(frame: Frame, info: CameraInfo) -> None:
@@ -190,13 +166,3 @@ def expect_exposed(frame: Frame, applied: AppliedSettings) -> None:
         found=f"{lasted_s:.6g} s, with what t_err_ns allows",
         do="t_start_ns is when the first row begins, t_end_ns when the last row ends",
     )
-
-
-CHECKS: tuple[Check, ...] = (
-    frames_are_as_declared,
-    frames_tell_their_exposure,
-    frame_numbers_and_times_rise,
-    frame_times_lie_on_the_projectors_clock,
-    a_frame_lies_wholly_in_its_pattern,
-    a_frame_keeps_its_pixels,
-)

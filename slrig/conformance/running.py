@@ -1,29 +1,109 @@
-"""An examination: one thread that owns the rig's devices, and a limit to how long each check may take."""
+"""An examination: one thread that owns the rig's devices, a limit of time for each check, and a scored report."""
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, TypeVar
 
+from slrig.conformance import declared, frames, freshness, sequences, settings, shutdown, states
 from slrig.conformance.bench import RigBench
-from slrig.conformance.catalogue import CHECKS
 from slrig.conformance.check import Check
-from slrig.conformance.expectation import Failure, NotApplicableError, failure_of
-from slrig.conformance.report import Outcome, Report, Result
+from slrig.conformance.expectation import ExpectationError, Failure, NotApplicableError, failure_of
 from slrig.devices import Rig
 from slrig.errors import DeviceError
 from slrig.model import PatternSequence
 
+CHECKS = tuple(
+    each
+    for module in (declared, states, settings, frames, freshness, sequences, shutdown)
+    for each in vars(module).values()
+    if isinstance(each, Check)
+)
+"""Every check, in the order in which a rig is examined: what is declared first, whole sequences and ways out last."""
+
 OPENING_LIMIT_S = 120.0
 CHECK_LIMIT_S = 60.0
 _CLOSING_LIMIT_S = 10.0
-_EXPOSURES_PER_PATTERN = 8
+_EXPOSURES_PER_PATTERN = 8  # more than any check makes
+
+_Answer = TypeVar("_Answer")
+
+
+class Outcome(StrEnum):
+    """How a check ended. Not run: the examination was stopped before; it counts against the rig."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    NOT_APPLICABLE = "not applicable"
+    NOT_RUN = "not run"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One check's outcome. `failure` says what is wrong; `reason` why it does not apply or was not run."""
+
+    name: str
+    title: str
+    outcome: Outcome
+    seconds: float
+    failure: Failure | None = None
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Every check's result, in order, and how long all took. `stopped` says why the examination ended early, if so."""
+
+    rig: str
+    results: tuple[Result, ...]
+    seconds: float
+    stopped: str | None = None
+
+    def count(self, outcome: Outcome) -> int:
+        """How many checks ended so."""
+        return sum(result.outcome is outcome for result in self.results)
+
+    @property
+    def applicable(self) -> int:
+        """How many checks ask something of this rig."""
+        return len(self.results) - self.count(Outcome.NOT_APPLICABLE)
+
+    @property
+    def score(self) -> float:
+        """Passed checks over applicable ones, 0 to 1."""
+        return self.count(Outcome.PASSED) / self.applicable if self.applicable else 0.0
+
+    @property
+    def percent(self) -> int:
+        """The score in whole percent, rounded down: 100 only if every check that applies has passed."""
+        return math.floor(100 * self.score)
+
+    @property
+    def conforms(self) -> bool:
+        """Whether every check that applies has passed."""
+        return self.applicable > 0 and self.count(Outcome.PASSED) == self.applicable
+
+    def document(self) -> dict[str, Any]:
+        """The report as JSON can hold it."""
+        return {
+            "rig": self.rig,
+            "conforms": self.conforms,
+            "score": self.score,
+            "passed": self.count(Outcome.PASSED),
+            "applicable": self.applicable,
+            "seconds": self.seconds,
+            "stopped": self.stopped,
+            "checks": [asdict(result) for result in self.results],
+        }
 
 
 class Progress(Protocol):
@@ -70,16 +150,6 @@ def run(
         return Report(examination.name, tuple(results), time.monotonic() - begun_s, examination.stopped)
 
 
-@dataclass(slots=True)
-class _Job:
-    """Work for the owner thread, and what came of it."""
-
-    work: Callable[[], Any]
-    done: threading.Event = field(default_factory=threading.Event)
-    value: Any = None
-    error: Exception | None = None
-
-
 class Examination:
     """A rig under examination. A context manager: entering it opens the rig, leaving it closes the rig.
 
@@ -88,11 +158,11 @@ class Examination:
     """
 
     def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence, *, limit_s: float | None = None) -> None:
-        self._stand = RigBench(open_rig, sequence)
+        self._bench = RigBench(open_rig, sequence)
         self._limit_s = limit_s
-        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
+        self._work: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
         # A device that never answers must not keep the program from ending.
-        self._owner = threading.Thread(target=self._work, name="conformance", daemon=True)
+        self._owner = threading.Thread(target=self._do_work, name="conformance", daemon=True)
         self._stuck = False
         self.name = ""
         self.stopped: str | None = None
@@ -102,19 +172,19 @@ class Examination:
         try:
             rig = self._opened()
         except BaseException:
-            self._jobs.put(None)
+            self._work.put(None)
             raise
         self.name = rig.name
         if self._limit_s is None:
             longest_s = max((settings.exposure_s for settings in rig.settings.values()), default=0.0)
-            exposures = _EXPOSURES_PER_PATTERN * max(len(self._stand.sequence), 16) * max(len(rig.cameras), 1)
+            exposures = _EXPOSURES_PER_PATTERN * max(len(self._bench.sequence), 16) * max(len(rig.cameras), 1)
             self._limit_s = CHECK_LIMIT_S + exposures * longest_s
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._jobs.put(None)
+        self._work.put(None)
         if not self._stuck:
             self._owner.join(_CLOSING_LIMIT_S)
 
@@ -123,11 +193,9 @@ class Examination:
         if self.stopped is not None:
             return Result(check.name, check.title, Outcome.NOT_RUN, 0.0, reason=self.stopped)
         begun_s = time.monotonic()
-        job = _Job(lambda: self._judged(check))
-        if self._done(job, self._limit_s):
-            if job.error is not None:
-                raise job.error
-            outcome, failure, reason = job.value
+        judged = self._done(lambda: self._judged(check), self._limit_s)
+        if judged.done():
+            outcome, failure, reason = judged.result()
             return Result(check.name, check.title, outcome, time.monotonic() - begun_s, failure, reason)
         self._stuck = True
         self.stopped = (
@@ -143,53 +211,44 @@ class Examination:
         return Result(check.name, check.title, Outcome.FAILED, time.monotonic() - begun_s, failure)
 
     def _opened(self) -> Rig:
-        opening = _Job(lambda: self._stand.rig)
-        if not self._done(opening, OPENING_LIMIT_S):
+        opening = self._done(lambda: self._bench.rig, OPENING_LIMIT_S)
+        if not opening.done():
             message = (
                 f"asked the rig to open, and it did not in {OPENING_LIMIT_S:g} s; check its devices' power and cables, "
                 "and that no other program holds them"
             )
             raise DeviceError(message)
-        if opening.error is not None:
-            raise opening.error
-        rig: Rig = opening.value
-        return rig
+        return opening.result()
 
-    def _opened_again(self) -> Failure | None:
-        try:
-            _ = self._stand.rig
-        except Exception as error:  # noqa: BLE001 - a driver may raise anything, and without a rig there is no more to do
-            self.stopped = f"the rig does not open again: {error}"
-            return Failure(
-                "a rig opens again after it was closed",
-                f"{type(error).__name__}: {error}",
-                "close lets the device go entirely: handles, threads, locks",
-            )
-        return None
+    def _done(self, work: Callable[[], _Answer], limit_s: float | None) -> Future[_Answer]:
+        """Have the owner thread do something; what came of it, if that was in time."""
+        answer: Future[_Answer] = Future()
+        self._work.put((work, answer))
+        wait([answer], limit_s)
+        return answer
 
-    def _done(self, job: _Job, limit_s: float | None) -> bool:
-        self._jobs.put(job)
-        return job.done.wait(limit_s)
-
-    def _work(self) -> None:
-        """What the owner thread does: jobs until there are no more, then close the rig."""
-        while (job := self._jobs.get()) is not None:
+    def _do_work(self) -> None:
+        """What the owner thread does: work until there is no more, then close the rig."""
+        while (next_one := self._work.get()) is not None:
+            work, answer = next_one
             try:
-                job.value = job.work()
+                answer.set_result(work())
             except Exception as error:  # noqa: BLE001 - a driver may raise anything; the asking thread tells it
-                job.error = error
-            job.done.set()
+                answer.set_exception(error)
         with suppress(Exception):
-            self._stand.close()
+            self._bench.close()
 
     def _judged(self, check: Check) -> tuple[Outcome, Failure | None, str | None]:
-        bench = self._stand
+        bench = self._bench
         try:
             if check.fresh:
                 bench.close()
-            if (failure := self._opened_again()) is not None:
-                return Outcome.FAILED, failure, None
-            unmet = [why for need in check.needs if (why := need.unmet(bench.rig, bench.sequence)) is not None]
+            try:
+                rig = bench.opened_again()
+            except ExpectationError as error:
+                self.stopped = f"the rig does not open again: {error.__cause__}"
+                return Outcome.FAILED, error.failure, None
+            unmet = [why for need in check.needs if (why := need.unmet(rig, bench.sequence)) is not None]
             if unmet:
                 return Outcome.NOT_APPLICABLE, None, "; ".join(unmet)
             check.function(bench)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from slrig.conformance.bench import FRAMES, RigBench, View
-from slrig.conformance.check import Check, Need, check
+from slrig.conformance.check import Need, check, view_check
 from slrig.conformance.expectation import NotApplicableError, at, expect, near, refused
 from slrig.devices import Camera, CameraSettings
 from slrig.errors import UnsupportedByDeviceError
@@ -15,15 +15,13 @@ from slrig.model import Pixels
 
 _READ_BACK = "set the device, read it back, and return what it says; declare the range that it really takes"
 _REFUSE = "compare with the declared range, and read back: a device that bends a value in silence took another one"
-_APART = 1.6
-_BRIGHTER = 1.1
-_SATURATED = 0.98
+_APART = 1.6  # of two exposures, so that light tells them apart
+_BRIGHTER = 1.1  # at least, of exposures so far apart
+_SATURATED = 0.98  # of full scale: some sensors saturate a little below it
 _LEAST_PIXELS = 16
 
 
-@check(
-    asks=("Camera.configure", "Camera.info"),
-)
+@check()
 def settings_are_read_back(bench: RigBench) -> None:
     """Both ends of the declared ranges can be set, and are read back."""
     # Set, never exposed: the longest exposure may be a minute.
@@ -42,9 +40,7 @@ def settings_are_read_back(bench: RigBench) -> None:
                 )
 
 
-@check(
-    asks=("Camera.configure",),
-)
+@check()
 def settings_out_of_range_are_refused(bench: RigBench) -> None:
     """Settings out of range are refused, and change nothing."""
     for name, camera in bench.rig.cameras.items():
@@ -76,27 +72,9 @@ def settings_out_of_range_are_refused(bench: RigBench) -> None:
             )
 
 
-@check(
-    asks=("Camera.configure", "Camera.read"),
-    needs=(Need.STEPPED, Need.WHITE_AND_BLACK),
-)
-def a_longer_exposure_is_brighter(bench: RigBench) -> None:
+@view_check(Need.WHITE_AND_BLACK)
+def a_longer_exposure_is_brighter(view: View) -> None:
     """A longer exposure makes a brighter frame."""
-    reasons: list[str] = []
-    judged = False
-    for name, trigger in bench.ways():
-        with bench.view(name, trigger) as view:
-            try:
-                _expect_brighter(view)
-                judged = True
-            except NotApplicableError as reason:
-                reasons.append(f"camera '{name}' {reason}")
-    if not judged:
-        message = "; ".join(reasons)
-        raise NotApplicableError(message)
-
-
-def _expect_brighter(view: View) -> None:
     lit = view.learn().lit
     usual = view.bench.settings(view.name)
     other_s = _another_exposure(view.camera, usual.exposure_s)
@@ -145,13 +123,5 @@ def _impossible(camera: Camera, usual: CameraSettings) -> list[CameraSettings]:
     low_s, high_s = camera.info.exposure_range_s
     exposures_s = [low_s / 2, 0.0, -1.0, *([high_s * 2] if math.isfinite(high_s * 2) else [])]
     gains = [camera.info.gain_range[1] * 2 + 1, -1.0]
-    return [CameraSettings(exposure_s, usual.gain) for exposure_s in exposures_s] + [
-        CameraSettings(usual.exposure_s, gain) for gain in gains
-    ]
-
-
-CHECKS: tuple[Check, ...] = (
-    settings_are_read_back,
-    settings_out_of_range_are_refused,
-    a_longer_exposure_is_brighter,
-)
+    wrong = [CameraSettings(exposure_s, usual.gain) for exposure_s in exposures_s]
+    return wrong + [CameraSettings(usual.exposure_s, gain) for gain in gains]

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from slrig.conformance import CHECKS, Examination, Failure, Outcome, Report, Result, run
-from slrig.conformance.bench import RigBench
+from slrig.conformance.bench import RigBench, learn_light
 from slrig.conformance.check import check
 from slrig.conformance.expectation import ExpectationError, NotApplicableError
-from slrig.conformance.light import learn_light
-from slrig.devices import Camera, Projector, Rig
+from slrig.devices import Rig
 from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import Pixels
 from tests.unit.conformance.broken_cameras import DeliversStale, Hangs
@@ -113,7 +112,7 @@ def test_progress_is_told_before_and_after_each_check() -> None:
 def test_one_thread_owns_the_devices() -> None:
     owners: set[int] = set()
 
-    @check(asks=())
+    @check()
     def remember_the_thread(bench: RigBench) -> None:
         """Nothing."""
         assert bench.rig.cameras
@@ -149,7 +148,7 @@ def test_checks_share_a_rig_unless_they_want_a_fresh_one_or_the_last_one_failed(
 
 
 def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
-    @check(asks=())
+    @check()
     def raises(bench: RigBench) -> None:
         """A driver fails."""
         with bench.view(*next(bench.ways())):
@@ -167,7 +166,7 @@ def test_what_a_driver_raises_is_a_failure_that_names_the_device() -> None:
 
 
 def test_a_check_may_find_out_that_it_has_nothing_to_ask() -> None:
-    @check(asks=())
+    @check()
     def has_nothing_to_ask(_stand: RigBench) -> None:
         """Nothing to ask."""
         message = "it has one exposure"
@@ -199,15 +198,11 @@ def test_a_report_can_be_written_as_json() -> None:
     assert {"asked", "found", "do", "where"} == set(failed[0]["failure"])
 
 
-def test_the_checks_are_named_once_and_ask_for_members_that_there_are() -> None:
+def test_the_checks_are_named_once() -> None:
     names = [each.name for each in CHECKS]
     assert len(set(names)) == len(names)
     titles = [each.title for each in CHECKS]
     assert len(set(titles)) == len(titles)
-    for each in CHECKS:
-        for member in each.asks:
-            protocol, name = member.split(".")
-            assert protocol == "Head" or name in vars({"Camera": Camera, "Projector": Projector}[protocol]), member
 
 
 def images(*levels: float, noise_dn: float = 0.0) -> list[Pixels]:
