@@ -10,12 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypedDict
 
 from slrig.bundle.refused import Refused
+from slrig.capture.checks import Contradiction, place
 from slrig.capture.frame_verifier import FrameVerifier
-from slrig.capture.identity import Contradiction, place
-from slrig.errors import ScanEvidenceError
 from slrig.model import Black, CameraFormat, Capture, Pattern, Shot, White
 
 
@@ -44,34 +42,21 @@ class EvidenceSummary:
         again = f", {self.shot_again} frame{'s' * (self.shot_again != 1)} shot again" if self.shot_again else ""
         return f"{self.verified}/{self.patterns} patterns verified{again}"
 
-
-class Again(TypedDict):
-    """The members of `EvidenceSummary` that tell of refused exposures."""
-
-    shot_again: int
-    causes: tuple[str, ...]
-    left_out: tuple[str, ...]
-
-
-def again(refused: Sequence[Refused], patterns: Sequence[Pattern]) -> Again:
-    """What refused exposures come to."""
-    shot = [each for each in refused if not each.left_out]
-    return {
-        "shot_again": len(shot),
-        "causes": tuple(dict.fromkeys(f"{place(r.camera, r.pattern, patterns[r.pattern])}: {r.cause}" for r in shot)),
-        "left_out": tuple(dict.fromkeys(each.cause for each in refused if each.left_out)),
-    }
+    def with_refused(self, refused: Sequence[Refused], patterns: Sequence[Pattern]) -> EvidenceSummary:
+        """The summary with what refused exposures come to."""
+        shot = [each for each in refused if not each.left_out]
+        return replace(
+            self,
+            shot_again=len(shot),
+            causes=tuple(dict.fromkeys(f"{place(r.camera, r.pattern, patterns[r.pattern])}: {r.cause}" for r in shot)),
+            left_out=tuple(dict.fromkeys(each.cause for each in refused if each.left_out)),
+        )
 
 
 class Evidence:
     """The evidence of one sequence: feed it every frame, in any order; white and black first is cheapest.
 
-    Parameters
-    ----------
-    patterns
-        The whole sequence.
-    cameras
-        Every camera by name.
+    patterns : the whole sequence. cameras : every camera by name.
     """
 
     def __init__(self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat]) -> None:
@@ -80,12 +65,6 @@ class Evidence:
         self._refused: list[Refused] = []
         self._verifiers: dict[str, FrameVerifier] = {}
         self.forget()
-
-    def add(self, shot: Shot) -> None:
-        """Take a frame in. Raises ScanEvidenceError: the frames so far contradict what they should show."""
-        found = self.contradictions(shot)
-        if found:
-            raise ScanEvidenceError("; ".join(map(str, found)))
 
     def contradictions(self, shot: Shot) -> tuple[Contradiction, ...]:
         """Take a frame in; return the contradictions that it brings to light."""
@@ -107,26 +86,21 @@ class Evidence:
         """Put on record that an exposure was refused."""
         self._refused.append(replace(refused, shot=None))
 
-    @property
-    def refused_count(self) -> int:
-        """How many exposures were refused."""
-        return len(self._refused)
-
     def summary(self) -> EvidenceSummary:
         """Sum up what was found so far."""
         verifiers = self._verifiers.values()
-        seen = {index for verifier in verifiers for index in verifier.seen}
-        unproven = {index for verifier in verifiers for index in verifier.seen - verifier.verified}
-        noises = {w.name: w.measured_noise_dn for w in verifiers}
-        return EvidenceSummary(
+        seen = {index for each in verifiers for index in each.seen}
+        unproven = {index for each in verifiers for index in each.seen - each.found.verified}
+        found = {each.name: each.found for each in verifiers}
+        summary = EvidenceSummary(
             patterns=len(seen),
             verified=len(seen - unproven),
-            lit={w.name: w.lighting.lit for w in verifiers if w.lighting is not None},
-            light_drift={w.name: w.light_drift for w in verifiers if w.light_drift is not None},
-            noise_dn={name: noise for name, noise in noises.items() if noise is not None},
-            faults=tuple(str(told) for w in verifiers for told in w.told),
-            **again(self._refused, self._patterns),
+            lit={each.name: each.lighting.lit for each in verifiers if each.lighting is not None},
+            light_drift={name: each.light_drift for name, each in found.items() if each.light_drift is not None},
+            noise_dn={name: each.noise_dn for name, each in found.items() if each.noise_dn is not None},
+            faults=tuple(str(told) for each in verifiers for told in each.told),
         )
+        return summary.with_refused(self._refused, self._patterns)
 
 
 def check_capture(capture: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:

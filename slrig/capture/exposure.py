@@ -17,9 +17,8 @@ from enum import StrEnum
 import numpy as np
 
 from slrig.bundle.refused import Refused
-from slrig.capture.checks import NOISE_FLOOR_DN, Samples
-from slrig.capture.evidence import EvidenceSummary, again, check_capture
-from slrig.capture.identity import named
+from slrig.capture.checks import NOISE_FLOOR_DN, Samples, named
+from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.capture.sampling import Sampler
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
@@ -151,15 +150,8 @@ def bracket_summary(
     for _, part in parts:
         for camera, each in part.light_drift.items():
             drift[camera] = max(drift.get(camera, 0.0), each, key=abs)
-    return EvidenceSummary(
-        patterns=best.patterns,
-        verified=best.verified,
-        lit=best.lit,
-        light_drift=drift,
-        noise_dn=best.noise_dn,
-        faults=(*(f"at {time_s:g} s, {fault}" for time_s, part in parts for fault in part.faults), *faults),
-        **again(refused, patterns),
-    )
+    told = [f"at {time_s:g} s, {fault}" for time_s, part in parts for fault in part.faults]
+    return replace(best, light_drift=drift, faults=(*told, *faults)).with_refused(refused, patterns)
 
 
 def check_exposures(recorded: Capture, refused: Sequence[Refused] = ()) -> EvidenceSummary:

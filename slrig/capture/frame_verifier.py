@@ -8,20 +8,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.capture import checks, code_checks, pair_checks
-from slrig.capture.checks import Lighting, Reference, Samples
+from slrig.capture import checks, code_checks
+from slrig.capture.checks import Contradiction, Lighting, Reference, Samples, named, place
 from slrig.capture.code_checks import Code
-from slrig.capture.identity import Contradiction, named, place
 from slrig.capture.sampling import Sampler
 from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, White
 
 
 @dataclass(slots=True)
-class _Findings:
+class Findings:
     """What the frames told so far: all of it follows from the frames, and is found again when one is taken back.
 
-    sums : of the last pair of a bit and its inverse. sound : a pair of a bit and its inverse has added up to white and
-    black, which vouches for these two.
+    verified : the patterns whose frames passed a test that another pattern would fail. light_drift : largest change of
+    the light between two frames of one pattern, as a share of white. sums : of the last pair of a bit and its inverse.
+    sound : a pair of a bit and its inverse has added up to white and black, which vouches for these two.
     lined : axes of which a line frame lay where the Gray code says, which vouches for the code.
     """
 
@@ -35,6 +35,14 @@ class _Findings:
     sound: bool = False
     lined: set[Axis] = field(default_factory=set)
 
+    @property
+    def noise_dn(self) -> float | None:
+        """Noise of a frame, DN; None where no pair told.
+
+        The least that a pair told: behind a scaler finer bits do not add up, and by more than noise.
+        """
+        return min(self.noises, default=None)
+
 
 class FrameVerifier:
     """One camera's frames so far: whole until white and black tell what is lit, then at sampled lit pixels."""
@@ -47,7 +55,7 @@ class FrameVerifier:
         self._format = form
         self._patterns = patterns
         self._anywhere = Sampler.of(form.size)
-        self._found = _Findings()
+        self.found = Findings()
         self._waiting: dict[int, Pixels] = {}
         self._overview: dict[int, Samples] = {}
         self._frames: dict[int, Samples] = {}
@@ -58,26 +66,8 @@ class FrameVerifier:
         self._untold: list[Contradiction] = []
 
     @property
-    def verified(self) -> frozenset[int]:
-        """The patterns whose frames passed a test that another pattern would fail."""
-        return frozenset(self._found.verified)
-
-    @property
-    def light_drift(self) -> float | None:
-        """Largest change of the light between two frames of one pattern, as a share of white."""
-        return self._found.light_drift
-
-    @property
-    def measured_noise_dn(self) -> float | None:
-        """Noise of a frame, DN; None where no pair told.
-
-        The least that a pair told: behind a scaler finer bits do not add up, and by more than noise.
-        """
-        return min(self._found.noises, default=None)
-
-    @property
     def _noise(self) -> float:
-        measured = self.measured_noise_dn
+        measured = self.found.noise_dn
         return checks.NOISE_FLOOR_DN if measured is None else measured
 
     def judge(self, shot: Shot) -> list[Contradiction]:
@@ -116,22 +106,22 @@ class FrameVerifier:
     def _again_from_start(self) -> list[Contradiction]:
         """Judge the frames that are left as if they came now, in the order in which they came."""
         waiting, frames = self._waiting, self._frames
-        self._found, self._waiting, self._frames = _Findings(), {}, {}
+        self.found, self._waiting, self._frames = Findings(), {}, {}
         found: list[Contradiction] = []
         for index in [*waiting, *frames]:
-            self._found.firsts.setdefault(self._patterns[index], index)
+            self.found.firsts.setdefault(self._patterns[index], index)
             if index in waiting:
                 self._waiting[index] = waiting[index]
             else:
                 self._frames[index] = frames[index]
                 if index in self._referees:
-                    self._found.verified.add(index)
+                    self.found.verified.add(index)
                 found += self._against_reference(index)
         return found
 
     def _admit(self, index: int, image: Pixels) -> list[Contradiction]:
         pattern = self._patterns[index]
-        self._found.firsts.setdefault(pattern, index)
+        self.found.firsts.setdefault(pattern, index)
         if isinstance(pattern, White | Black):
             self._overview[index] = self._anywhere.take(image)
         if self._sampler is None:
@@ -163,11 +153,11 @@ class FrameVerifier:
     @property
     def _unproven_reference(self) -> tuple[int, ...]:
         """White and black, until a pair has vouched for them."""
-        return () if self._found.sound else self._referees
+        return () if self.found.sound else self._referees
 
     def _refer(self) -> list[Contradiction]:
         """Once white and black are in: find what is lit, and judge the frames that waited."""
-        first_white, first_black = self._found.firsts.get(White()), self._found.firsts.get(Black())
+        first_white, first_black = self.found.firsts.get(White()), self.found.firsts.get(Black())
         if first_white is None or first_black is None:
             return []
         white, black = self._waiting[first_white], self._waiting[first_black]
@@ -185,7 +175,7 @@ class FrameVerifier:
         self._reference = checks.reference(
             sampler.take(white), sampler.take(black), threshold_dn=threshold, full_scale=full_scale, row=sampler.row
         )
-        self._found.verified |= {first_white, first_black}
+        self.found.verified |= {first_white, first_black}
         self._frames = {index: sampler.take(image) for index, image in self._waiting.items()}
         waited, self._waiting = list(self._waiting), {}
         return [each for index in waited for each in self._against_reference(index)]
@@ -194,7 +184,7 @@ class FrameVerifier:
         ref, pattern = self._reference, self._patterns[index]
         if ref is None:
             return []
-        first = self._found.firsts[pattern]
+        first = self.found.firsts[pattern]
         if first != index:
             return self._again(index, first, ref)
         if isinstance(pattern, White | Black):
@@ -207,16 +197,16 @@ class FrameVerifier:
         return found
 
     def _again(self, index: int, first: int, ref: Reference) -> list[Contradiction]:
-        noise = self.measured_noise_dn
+        noise = self.found.noise_dn
         seen = checks.drift(self._frames[first], self._frames[index], ref, noise=noise)
-        if self.light_drift is None or abs(seen.light) > abs(self.light_drift):
-            self._found.light_drift = seen.light
+        if self.found.light_drift is None or abs(seen.light) > abs(self.found.light_drift):
+            self.found.light_drift = seen.light
         fault = checks.drift_fault(seen) or self._changed(index, first)
         if fault is not None:
             # Never the first one: shot again after a change, it would hide it.
             return [self._says(index, fault, [index])]
-        if first in self._found.verified:
-            self._found.verified.add(index)
+        if first in self.found.verified:
+            self.found.verified.add(index)
         return []
 
     def _changed(self, index: int, first: int) -> str | None:
@@ -230,30 +220,30 @@ class FrameVerifier:
             again,
             (white - black, brighter),
             threshold_dn=self.lighting.threshold_dn,
-            noise=self.measured_noise_dn,
+            noise=self.found.noise_dn,
             row=self._anywhere.row,
         )
 
     def _range(self, indices: Sequence[int], ref: Reference) -> list[Contradiction]:
-        noise, beyond = self.measured_noise_dn, self._unproven_reference
+        noise, beyond = self.found.noise_dn, self._unproven_reference
         judged = ((index, checks.range_fault(self._frames[index], ref, noise=noise)) for index in indices)
         return [self._says(index, fault, [index], beyond) for index, fault in judged if fault is not None]
 
     def _gray(self, index: int, pattern: Gray, ref: Reference) -> list[Contradiction]:
-        partner = self._found.firsts.get(_inverse(pattern))
+        partner = self.found.firsts.get(_inverse(pattern))
         # A pair tells the noise, which the other tests need: the first of a pair waits for the second.
         if partner is not None:
             bit, inverse = self._frames[index], self._frames[partner]
-            fault = pair_checks.pair_fault(bit, inverse, ref, noise=self._noise, run_px=_run_px(pattern))
+            fault = code_checks.pair_fault(bit, inverse, ref, noise=self._noise, run_px=_run_px(pattern))
             if fault is not None:
                 words = f"beside {named(partner, self._patterns[partner])}, {fault}"
                 return [self._says(index, words, [index, partner], self._unproven_reference)]
-            self._found.noises.append(checks.noise_dn(bit, inverse, ref, sums=self._found.sums))
-            self._found.sums = [bit + inverse]
+            self.found.noises.append(checks.noise_dn(bit, inverse, ref, sums=self.found.sums))
+            self.found.sums = [bit + inverse]
             found = self._range([partner, index], ref)
             if not found:
-                self._found.verified |= {index, partner}
-                self._found.sound = True
+                self.found.verified |= {index, partner}
+                self.found.sound = True
         else:
             found = [] if _inverse(pattern) in self._patterns else self._range([index], ref)
         return found or self._complete_code(pattern, ref)
@@ -264,9 +254,9 @@ class FrameVerifier:
 
     def _complete_code(self, pattern: Gray, ref: Reference) -> list[Contradiction]:
         """Decode once the last frame of a code is in, and judge the line frames that waited for it."""
-        if pattern.axis in self._found.codes:
+        if pattern.axis in self.found.codes:
             return []
-        family, firsts = self._family(pattern), self._found.firsts
+        family, firsts = self._family(pattern), self.found.firsts
         if {p.bit for p in family} != set(range(pattern.bits)) or any(p not in firsts for p in family):
             return []
         differences = [self._difference(bit, family, ref) for bit in range(pattern.bits)]
@@ -279,8 +269,8 @@ class FrameVerifier:
             )
             pair = [firsts[p] for p in family if p.bit == exchanged]
             return [self._says(pair[0], fault, pair, [firsts[p] for p in family])]
-        self._found.codes[pattern.axis] = (code, pattern)
-        waited, self._found.waiting_lines = self._found.waiting_lines, []
+        self.found.codes[pattern.axis] = (code, pattern)
+        waited, self.found.waiting_lines = self.found.waiting_lines, []
         found: list[Contradiction] = []
         for index in waited:
             line = self._patterns[index]
@@ -289,7 +279,7 @@ class FrameVerifier:
         return found
 
     def _difference(self, bit: int, family: Sequence[Gray], ref: Reference) -> Samples:
-        frames = {p.inverted: self._frames[self._found.firsts[p]] for p in family if p.bit == bit}
+        frames = {p.inverted: self._frames[self.found.firsts[p]] for p in family if p.bit == bit}
         half = (ref.white + ref.black) / 2
         return np.asarray(frames.get(False, half) - frames.get(True, half)) * (1 if len(frames) == 2 else 2)
 
@@ -310,9 +300,9 @@ class FrameVerifier:
         return [self._says(index, fault, [index], [twin, *self._unproven_reference])]
 
     def _line(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
-        known = self._found.codes.get(pattern.axis)
+        known = self.found.codes.get(pattern.axis)
         if known is None:
-            self._found.waiting_lines.append(index)
+            self.found.waiting_lines.append(index)
             return []
         code, gray = known
         expected = code_checks.expect_lines(
@@ -326,7 +316,7 @@ class FrameVerifier:
         )
         others = [
             self._frames[i]
-            for p, i in self._found.firsts.items()
+            for p, i in self.found.firsts.items()
             if isinstance(p, LineShift) and p.axis is pattern.axis and i != index
         ]
         duty = pattern.line_width_px / pattern.period_px
@@ -334,19 +324,17 @@ class FrameVerifier:
             self._frames[index], others, ref, expected, noise=self._noise, duty=duty
         )
         if fault is not None:
-            code_frames = (
-                [] if pattern.axis in self._found.lined else [self._found.firsts[p] for p in self._family(gray)]
-            )
+            code_frames = [] if pattern.axis in self.found.lined else [self.found.firsts[p] for p in self._family(gray)]
             return [self._says(index, fault, [index], code_frames)]
         if compared:
-            self._found.verified.add(index)
-            self._found.lined.add(pattern.axis)
+            self.found.verified.add(index)
+            self.found.lined.add(pattern.axis)
         return self._line_order(index, pattern, ref)
 
     def _line_order(self, index: int, pattern: LineShift, ref: Reference) -> list[Contradiction]:
         """Judge the sum and the order of the line frames once the last one is in."""
         family = [replace(pattern, shift=shift) for shift in range(pattern.period_px)]
-        firsts = self._found.firsts
+        firsts = self.found.firsts
         if any(firsts.get(line) not in self._frames for line in family):
             return []
         frames = [self._frames[firsts[line]] for line in family]
@@ -358,8 +346,8 @@ class FrameVerifier:
         shows, shift = code_checks.line_order(frames, ref, noise=self._noise)
         if shift is None:
             # One frame that lies where the code says, and the right order, place them all.
-            if shows and set(members) & self._found.verified:
-                self._found.verified |= set(members)
+            if shows and set(members) & self.found.verified:
+                self.found.verified |= set(members)
             return []
         fault = (
             f"the {pattern.axis} line frames are out of order at shift {shift}: its lines overlap those of the frame "

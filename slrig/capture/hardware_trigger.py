@@ -6,14 +6,13 @@ patterns, numbered without a gap, that agree with one another. One that does not
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from slrig.bundle.refused import Refused
-from slrig.capture.evidence import Evidence
-from slrig.capture.identity import place
+from slrig.capture.checks import place
 from slrig.capture.latency import shutter_skew_s
 from slrig.capture.retry_policy import RetryPolicy, in_words
 from slrig.capture.session import Session
@@ -23,23 +22,22 @@ from slrig.model import Frame, Gray, PatternSequence, Shot
 
 MOST_PLAYS = 3
 
-_ALIKE = 0.9
-_BETTER = 0.05
+_ALIKE = 0.9  # correlation of brightness that tells a shift: few cameras are linear
+_BETTER = 0.05  # than without a shift
 
 
 @dataclass(slots=True)
 class _Play:
     """One play: what was delivered of it, each camera's frames by their brightness, and what is wrong with it."""
 
-    number: int
+    levels: dict[str, list[float]]
     delivered: list[tuple[int, str]] = field(default_factory=list)
     withheld: list[Shot] = field(default_factory=list)
-    levels: dict[str, list[float]] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     missing: int = 0
 
 
-def hardware_triggered(session: Session, retries: RetryPolicy, refused: Callable[[Refused], None]) -> Iterator[Shot]:
+def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
     """Play the sequence until every frame counts, three times at most.
 
     Frames are delivered as they come. Those of a play that failed are refused, and all come again.
@@ -62,7 +60,7 @@ def hardware_triggered(session: Session, retries: RetryPolicy, refused: Callable
         for camera in rig.cameras.values():
             # Room for one more than there should be: it would tell.
             camera.arm(count + 1, Trigger.HARDWARE)
-        play = _Play(number, levels={name: [] for name in rig.cameras})
+        play = _Play({name: [] for name in rig.cameras})
         yield from _frames(session, retries, play, last)
         rig.projector.stop()
         if not play.faults:
@@ -71,7 +69,11 @@ def hardware_triggered(session: Session, retries: RetryPolicy, refused: Callable
             camera.disarm()
         causes.append(_cause(play, session.sequence))
         timed_out += play.missing == len(play.faults)
-        _refuse(play, retries.evidence, causes[-1], refused)
+        retries.evidence.forget()
+        for index, name in play.delivered:
+            retries.refuse(Refused(index, name, number, causes[-1], delivered=True))
+        for shot in play.withheld:
+            retries.refuse(Refused(shot.pattern, shot.camera, number, causes[-1], shot))
     message = f"the sequence was played {MOST_PLAYS} times by wire: {in_words(causes)}"
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
 
@@ -183,13 +185,3 @@ def frame_shift(levels: Sequence[float], sequence: PatternSequence) -> int:
         agreement[shift] = float(np.corrcoef(frames, shown)[0, 1]) if apart else 0.0
     best = max(agreement, key=lambda shift: agreement[shift])
     return best if agreement[best] > _ALIKE and agreement[best] > agreement[0] + _BETTER else 0
-
-
-def _refuse(play: _Play, evidence: Evidence, cause: str, refused: Callable[[Refused], None]) -> None:
-    """Take back every frame of a play."""
-    gone = [Refused(index, name, play.number, cause, delivered=True) for index, name in play.delivered]
-    gone += [Refused(shot.pattern, shot.camera, play.number, cause, shot) for shot in play.withheld]
-    evidence.forget()
-    for each in gone:
-        evidence.note(each)
-        refused(each)

@@ -14,10 +14,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from slrig.capture.latency_fit import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels, rows_of
+from slrig.capture.latency_fit import CameraLatency, Flash, RowLevels, fitted, row_levels, rows_of
 from slrig.devices import Camera, CameraSettings, Rig, Shown, Synchronisation, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError, UnsupportedByDeviceError
-from slrig.model import Black, Frame, PatternSequence, Pixels, Size, White
+from slrig.model import Black, FloatArray, Frame, PatternSequence, Pixels, Size, White
 
 USUAL_TRIALS = 40
 USUAL_SEARCH_S = 0.5
@@ -208,9 +208,9 @@ class _FlashTest:
         self._wait(waiting_ns)
         shown = self._show(_WHITE if to_white else _BLACK)
         until_ns = shown.t_visible_ns + round(self.search_s * 1e9)
-        frames: list[FlashFrame] = []
+        frames: list[tuple[int, float, FloatArray]] = []
         after = 0
-        while after < _FRAMES_AFTER and not (frames and frames[-1].t_start_ns > until_ns):
+        while after < _FRAMES_AFTER and not (frames and frames[-1][0] > until_ns):
             if pending:
                 pending = False
                 # The exposures after this one follow each other at a period of their own: again anywhere in it.
@@ -224,10 +224,10 @@ class _FlashTest:
             else:
                 frame = self._next(after_ns=0)
             shares = levels.shares(frame.image)
-            frames.append(FlashFrame(frame.t_start_ns, frame.exposure_s, shares))
+            frames.append((frame.t_start_ns, frame.exposure_s, shares))
             share = float(np.nanmedian(shares))
             after += (share if to_white else 1 - share) > _GONE
-        return Flash(to_white, shown, tuple(frames))
+        return Flash.of(to_white, shown, frames)
 
     def _show(self, index: int) -> Shown:
         if self.cancelled():

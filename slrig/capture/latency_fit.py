@@ -73,37 +73,24 @@ class RowLevels:
 
 
 @dataclass(frozen=True, slots=True)
-class FlashFrame:
-    """One frame near a flash. shares : (H,) float64, of `RowLevels.shares`."""
-
-    t_start_ns: int
-    exposure_s: float
-    shares: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
 class Flash:
-    """One change of light, to white or to black, and the frames around it in the order of their exposure."""
+    """One change of light, to white or to black, and the n frames around it in the order of their exposure.
+
+    since_s : (n,) float64, the start of each frame's first row, from the instant that the projector stated.
+    exposures_s : (n,) float64. passed : (n, H) float64, the share of the way to the new light that each row has gone.
+    """
 
     to_white: bool
-    shown: Shown
-    frames: tuple[FlashFrame, ...]
+    since_s: FloatArray
+    exposures_s: FloatArray
+    passed: FloatArray
 
-    @property
-    def passed(self) -> FloatArray:
-        """(n, H) float64: the share of the way to the new light that each row of each frame has gone."""
-        shares = np.array([frame.shares for frame in self.frames])
-        return shares if self.to_white else 1 - shares
-
-    @property
-    def since_s(self) -> FloatArray:
-        """(n,) float64: the start of each frame's first row, from the instant that the projector stated."""
-        return np.array([(frame.t_start_ns - self.shown.t_visible_ns) / 1e9 for frame in self.frames])
-
-    @property
-    def exposures_s(self) -> FloatArray:
-        """(n,) float64."""
-        return np.array([frame.exposure_s for frame in self.frames])
+    @classmethod
+    def of(cls, to_white: bool, shown: Shown, frames: Sequence[tuple[int, float, FloatArray]]) -> Flash:
+        """Of each frame: t_start_ns, exposure_s, and the `RowLevels.shares` of its rows."""
+        since_s = np.array([(t_start_ns - shown.t_visible_ns) / 1e9 for t_start_ns, _, _ in frames])
+        shares = np.array([shares for _, _, shares in frames])
+        return cls(to_white, since_s, np.array([e for _, e, _ in frames]), shares if to_white else 1 - shares)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,10 +280,10 @@ def _end(latencies_s: FloatArray) -> float:
 
 def _settle_s(flashes: Sequence[Flash], changed_s: Sequence[float], line_time_s: float, flicker: float) -> float:
     """How long after each change rows that begin then still miss light: the end of the last such slice of time."""
-    width_s = max(float(flashes[0].frames[0].exposure_s) / 10, 5e-4)
+    width_s = max(float(flashes[0].exposures_s[0]) / 10, 5e-4)
     slices: dict[int, list[float]] = {}
     for flash, at_s in zip(flashes, changed_s, strict=True):
-        row_s = line_time_s * np.arange(len(flash.frames[0].shares))
+        row_s = line_time_s * np.arange(flash.passed.shape[1])
         for start_s, passed in zip(flash.since_s, flash.passed, strict=True):
             number = np.floor((start_s + row_s - at_s) / width_s)
             counted = (number >= 0) & np.isfinite(passed)
@@ -325,7 +312,7 @@ def _missed(camera: str, flashes: Sequence[Flash], used: int) -> str:
             "longer, and see that nothing else drives the projector (screen saver, desktop, another input)"
         )
     low_s, high_s = np.median(np.array(bounds), axis=0)
-    exposure_s = flashes[0].frames[0].exposure_s
+    exposure_s = float(flashes[0].exposures_s[0])
     return (
         f"{head}; in the others the light changed between two exposures ({low_s * 1e3:.1f} to {high_s * 1e3:.1f} ms "
         f"after the instant that the projector states), or for longer than the exposure of {exposure_s * 1e3:.3g} ms: "
@@ -342,5 +329,5 @@ def _between(flash: Flash) -> tuple[float, float] | None:
     first = int(np.argmax(gone))
     start_s = float(flash.since_s[first])
     if first == 0:
-        return start_s - flash.frames[0].exposure_s, start_s
-    return float(flash.since_s[first - 1]) + flash.frames[first - 1].exposure_s, start_s
+        return start_s - float(flash.exposures_s[0]), start_s
+    return float(flash.since_s[first - 1] + flash.exposures_s[first - 1]), start_s

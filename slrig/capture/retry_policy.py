@@ -11,8 +11,8 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 
 from slrig.bundle.refused import Refused
+from slrig.capture.checks import Contradiction, place
 from slrig.capture.evidence import Evidence
-from slrig.capture.identity import Contradiction, place
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.model import Frame, PatternSequence, Shot
 
@@ -80,7 +80,7 @@ class RetryPolicy:
         self._missing[shot.camera, index].clear()
         if fault is not None:
             self._causes[shot.camera, index].append(fault)
-            self._refuse(Refused(index, shot.camera, self._shots[shot.camera, index], fault, shot))
+            self._shoot_again(Refused(index, shot.camera, self._shots[shot.camera, index], fault, shot))
             self._end_at_third(shot.camera, [index])
             return None
         found = self.evidence.contradictions(shot)
@@ -90,7 +90,7 @@ class RetryPolicy:
         """Take note that no frame came. Raises FrameTimeoutError when none came three times running."""
         missing = self._missing[camera, index]
         missing.append(cause)
-        self._refuse(Refused(index, camera, self._shots[camera, index], cause))
+        self._shoot_again(Refused(index, camera, self._shots[camera, index], cause))
         if len(missing) >= MOST_FAILURES:
             raise FrameTimeoutError(self._failed(camera, index, missing))
 
@@ -114,17 +114,21 @@ class RetryPolicy:
             cause = accused.get(pattern) or beyond.get(pattern) or found[0].cause
             own = pattern == shot.pattern
             attempt = self._shots[camera, pattern]
-            self._refuse(Refused(pattern, camera, attempt, cause, shot if own else None, delivered=not own))
+            self._shoot_again(Refused(pattern, camera, attempt, cause, shot if own else None, delivered=not own))
         self._end_at_third(camera, accused)
         return frozenset(gone)
 
-    def _refuse(self, refused: Refused) -> None:
+    def refuse(self, refused: Refused) -> None:
+        """Put an exposure on record as one that does not count, and tell of it."""
+        self.evidence.note(refused)
+        self._tell(refused)
+
+    def _shoot_again(self, refused: Refused) -> None:
         cameras = self.again.setdefault(refused.pattern, [])
         if refused.camera not in cameras:
             cameras.append(refused.camera)
         self._last_cause = refused.cause
-        self.evidence.note(refused)
-        self._tell(refused)
+        self.refuse(refused)
 
     def _end_at_third(self, camera: str, patterns: Iterable[int]) -> None:
         for index in patterns:

@@ -85,7 +85,7 @@ def capture(
         retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns)
         if Trigger.HARDWARE in triggers.values():
             leaving.callback(_whatever_happens, rig.projector.stop)
-            yield from hardware_triggered(session, retries, refused)
+            yield from hardware_triggered(session, retries)
         else:
             yield from software_triggered(session, retries)
         # Here a projector that will not go dark is an error of its own, not a footnote to another one.
@@ -122,10 +122,7 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
 
 def _configure(rig: Rig) -> dict[str, AppliedSettings]:
     """Set every camera that has settings, and compare what it reads back."""
-    applied: dict[str, AppliedSettings] = {}
-    for name, settings in rig.settings.items():
-        applied[name] = _apply(rig.cameras[name], name, settings)
-    return applied
+    return {name: _apply(rig.cameras[name], name, settings) for name, settings in rig.settings.items()}
 
 
 def _apply(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettings:

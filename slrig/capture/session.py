@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from slrig.capture.identity import named
+from slrig.capture.checks import named
 from slrig.capture.latency import stable_from_ns
 from slrig.devices import AppliedSettings, Rig, Shown, Trigger
 from slrig.errors import ScanCancelledError
@@ -34,10 +34,6 @@ class Session:
     def patience_s(self, name: str) -> float:
         """How long to wait for a frame of this camera."""
         return self.timeout_s + self.applied[name].exposure_s if name in self.applied else self.timeout_s
-
-    def computed(self, name: str) -> bool:
-        """Whether this camera's frames are rendered or replayed: it has no cable."""
-        return self.rig.cameras[name].info.limits.computed
 
     def stop_if_cancelled(self, index: int) -> None:
         """Raise ScanCancelledError if somebody asked for it."""

@@ -12,7 +12,6 @@ and of the switch, a few milliseconds. For a measured rig what the latency test 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from slrig.capture.retry_policy import RetryPolicy
 from slrig.capture.session import Session
@@ -20,15 +19,8 @@ from slrig.devices import Shown, Trigger
 from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Shot
 
-
-@dataclass(frozen=True, slots=True)
-class _Taken:
-    """What one camera gave for one pattern. `frame` None: nothing in time. `fault` : what speaks against it."""
-
-    index: int
-    camera: str
-    frame: Frame | None
-    fault: str | None
+_Taken = tuple[int, str, Frame | str, str | None]
+"""Pattern and camera, what it gave or why nothing came in time, and what the frame says against itself."""
 
 
 def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
@@ -41,14 +33,18 @@ def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
     last: dict[str, Frame] = {}
     waiting: list[_Taken] = []
     while True:
-        turn = _next_turn(retries, ahead, list(rig.cameras))
-        if turn is None:
-            if not waiting:
-                return
+        if retries.again:
+            # First what failed, in order.
+            index = min(retries.again)
+            names = retries.again.pop(index)
+        elif (index := next(ahead, -1)) >= 0:
+            names = list(rig.cameras)
+        elif waiting:
             yield from _judged(retries, waiting)
             waiting = []
             continue
-        index, names = turn
+        else:
+            return
         session.stop_if_cancelled(index)
         shown = rig.projector.show(index)
         stable_ns = session.settled_ns(shown)
@@ -61,22 +57,11 @@ def software_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
         waiting = [_taken(session, name, shown, stable_ns, last) for name in names]
 
 
-def _next_turn(retries: RetryPolicy, ahead: Iterator[int], cameras: list[str]) -> tuple[int, list[str]] | None:
-    """What is to be shot next: first what failed, in order."""
-    if retries.again:
-        index = min(retries.again)
-        return index, retries.again.pop(index)
-    ahead_index = next(ahead, None)
-    return None if ahead_index is None else (ahead_index, cameras)
-
-
 def _judged(retries: RetryPolicy, taken: list[_Taken]) -> Iterator[Shot]:
-    for each in taken:
-        if each.frame is None:
-            retries.missed(each.camera, each.index, each.fault or "no frame came")
-            continue
-        shot = retries.took(each.index, each.frame, each.fault)
-        if shot is not None:
+    for index, name, frame, fault in taken:
+        if isinstance(frame, str):
+            retries.missed(name, index, frame)
+        elif (shot := retries.took(index, frame, fault)) is not None:
             yield shot
 
 
@@ -86,12 +71,14 @@ def _taken(session: Session, name: str, shown: Shown, after_ns: int, last: dict[
     try:
         frame = session.read(name, after_ns, timeout_s)
     except FrameTimeoutError as error:
+        # Frames that are rendered or replayed have no cable.
+        computed = session.rig.cameras[name].info.limits.computed
         cause = (
             f"no frame came within {timeout_s:.3f} s of its light, visible since {shown.t_visible_ns} ns "
             f"± {shown.t_err_ns} ns ({error}); "
-            + ("is the machine busy?" if session.computed(name) else "check the camera's cable, bandwidth and trigger")
+            + ("is the machine busy?" if computed else "check the camera's cable, bandwidth and trigger")
         )
-        return _Taken(shown.index, name, None, cause)
+        return shown.index, name, cause, None
     fault = session.own_fault(frame, after_ns, last.get(name))
     last[name] = frame
-    return _Taken(shown.index, name, frame, fault)
+    return shown.index, name, frame, fault

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence
-from slrig.capture.identity import Contradiction
+from slrig.capture.checks import Contradiction
 from slrig.capture.sequencer import capture
 from slrig.devices import Head, Projector, ProjectorInfo, Rig, Shown
 from slrig.errors import FrameTimeoutError, ScanEvidenceError

@@ -14,8 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from slrig.capture.evidence import Evidence
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
-from slrig.errors import DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.errors import (
+    DeviceGoneError,
+    DeviceStateError,
+    FrameTimeoutError,
+    ScanEvidenceError,
+    UnsupportedByDeviceError,
+)
 from slrig.model import CameraFormat, Frame, Pattern, PatternSequence, Pixels, Shot, Size
 from slrig.patterns.sequence import encode, scan_patterns
 
@@ -350,6 +357,13 @@ class FakeRig:
     @property
     def at_rest(self) -> bool:
         return not self.projector.lit and all(camera.armed is None for camera in self.cameras.values())
+
+
+def add(evidence: Evidence, shot: Shot) -> None:
+    """Feed a frame that must contradict nothing."""
+    found = evidence.contradictions(shot)
+    if found:
+        raise ScanEvidenceError("; ".join(map(str, found)))
 
 
 def fake_rig(

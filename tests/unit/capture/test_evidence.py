@@ -11,7 +11,7 @@ import pytest
 from slrig.capture.evidence import Evidence, check_capture
 from slrig.errors import ScanEvidenceError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, Shot, Size, White
-from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
+from tests.unit.capture.fake_rig import PROJECTOR, Scene, add, patterns_for
 
 PATTERNS = patterns_for()
 FIRST_LINE = next(i for i, pattern in enumerate(PATTERNS) if isinstance(pattern, LineShift))
@@ -20,7 +20,7 @@ FIRST_LINE = next(i for i, pattern in enumerate(PATTERNS) if isinstance(pattern,
 def judged(scene: Scene, shots: Sequence[Shot], patterns: Sequence[Pattern] = PATTERNS) -> Evidence:
     evidence = Evidence(patterns, {"left": scene.format})
     for shot in shots:
-        evidence.add(shot)
+        add(evidence, shot)
     return evidence
 
 

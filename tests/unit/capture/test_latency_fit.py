@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.capture.latency_fit import CameraLatency, Flash, FlashFrame, RowLevels, fitted, row_levels
+from slrig.capture.latency_fit import CameraLatency, Flash, RowLevels, fitted, row_levels
 from slrig.devices import Shown
 from slrig.errors import ScanEvidenceError
 from slrig.model import FloatArray, Pixels
@@ -81,8 +81,8 @@ class World:
             for start_s in first_s + self.period_s * np.arange(10):
                 image = self.image(self.shares(light, start_s), rng)
                 stamp_ns = STATED_NS + round((start_s + self.stamp_offset_s) * 1e9)
-                frames.append(FlashFrame(stamp_ns, self.exposure_s, levels.shares(image)))
-            made.append(Flash(to_white, Shown(0, STATED_NS, 500_000), tuple(frames)))
+                frames.append((stamp_ns, self.exposure_s, levels.shares(image)))
+            made.append(Flash.of(to_white, Shown(0, STATED_NS, 500_000), frames))
         return made
 
     def measured(self, *, count: int = 60, seed: int = 0) -> CameraLatency:

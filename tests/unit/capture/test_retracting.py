@@ -11,7 +11,7 @@ import pytest
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence, EvidenceSummary, check_capture
 from slrig.model import Capture, Pattern, Pixels, Shot
-from tests.unit.capture.fake_rig import PROJECTOR, Scene, patterns_for
+from tests.unit.capture.fake_rig import PROJECTOR, Scene, add, patterns_for
 
 PATTERNS = patterns_for()
 COUNT = len(PATTERNS)
@@ -65,10 +65,10 @@ def test_a_wrong_frame_that_is_retracted_and_replaced_leaves_no_trace(wrong: int
 def test_a_right_frame_may_be_retracted_and_taken_again(index: int) -> None:
     evidence = evidence_of()
     for shot in SHOTS:
-        evidence.add(shot)
+        add(evidence, shot)
     assert evidence.retract("left", [index]) == (index,)
     assert evidence.summary().patterns == COUNT - 1
-    evidence.add(SHOTS[index])
+    add(evidence, SHOTS[index])
     assert alike(evidence.summary(), clean())
 
 
@@ -76,42 +76,42 @@ def test_a_right_frame_may_be_retracted_and_taken_again(index: int) -> None:
 def test_everything_rests_on_the_frames_that_tell_what_is_lit(index: int) -> None:
     evidence = evidence_of()
     for shot in SHOTS[:6]:
-        evidence.add(shot)
+        add(evidence, shot)
     assert evidence.retract("left", [index]) == (0, 1, 2, 3, 4, 5)
     assert evidence.summary().patterns == 0
     for shot in SHOTS:
-        evidence.add(shot)
+        add(evidence, shot)
     assert alike(evidence.summary(), clean())
 
 
 def test_what_was_never_there_can_be_retracted() -> None:
     evidence = evidence_of()
     assert evidence.retract("left", [3]) == ()
-    evidence.add(SHOTS[0])
+    add(evidence, SHOTS[0])
     assert evidence.retract("left", [0, 7]) == (0,)
 
 
 def test_frames_that_come_while_white_and_black_are_refused_are_judged_later() -> None:
     evidence = evidence_of()
-    evidence.add(replace(SHOTS[0], image=SHOTS[1].image))
+    add(evidence, replace(SHOTS[0], image=SHOTS[1].image))
     (found,) = evidence.contradictions(SHOTS[1])
     assert found.suspects == (0, 1)
-    evidence.add(SHOTS[2])
+    add(evidence, SHOTS[2])
     evidence.retract("left", found.suspects)
     for shot in (*SHOTS[:2], *SHOTS[3:]):
-        evidence.add(shot)
+        add(evidence, shot)
     assert alike(evidence.summary(), clean())
 
 
 def test_one_of_two_suspects_may_be_enough() -> None:
     evidence = evidence_of()
     for shot in SHOTS[:4]:
-        evidence.add(shot)
-    evidence.add(replace(SHOTS[4], image=damaged(SHOTS[4].image)))
+        add(evidence, shot)
+    add(evidence, replace(SHOTS[4], image=damaged(SHOTS[4].image)))
     found = evidence.contradictions(SHOTS[5])
     assert [each.suspects for each in found] == [(4, 5)]
     evidence.retract("left", [4])
-    evidence.add(SHOTS[4])
+    add(evidence, SHOTS[4])
     assert evidence.summary().faults == ()
 
 
@@ -121,7 +121,7 @@ def test_what_the_frames_left_contradict_is_told_with_the_next_one() -> None:
     evidence = evidence_of(patterns)
     shots = SCENE.shots(patterns)
     for shot in shots[:4]:
-        evidence.add(shot)
+        add(evidence, shot)
     (found,) = evidence.contradictions(replace(shots[4], image=damaged(shots[4].image)))
     assert found.suspects == (4,)
     evidence.retract("left", [2])
@@ -134,13 +134,13 @@ def test_what_the_frames_left_contradict_is_told_with_the_next_one() -> None:
 def test_a_contradiction_names_what_it_rests_on_until_something_has_vouched_for_it() -> None:
     evidence = evidence_of()
     for shot in SHOTS[:3]:
-        evidence.add(shot)
+        add(evidence, shot)
     (early,) = evidence.contradictions(replace(SHOTS[3], image=damaged(SHOTS[3].image)))
     assert (early.suspects, early.beyond) == ((2, 3), (0, 1))
     assert str(early).startswith("camera 'left', pattern 3 (column Gray bit 0 of 5, inverse): beside pattern 2 ")
     evidence.retract("left", [3])
     for shot in SHOTS[3:5]:
-        evidence.add(shot)
+        add(evidence, shot)
     (late,) = evidence.contradictions(replace(SHOTS[5], image=damaged(SHOTS[5].image)))
     assert (late.suspects, late.beyond) == ((4, 5), ())
 
@@ -149,20 +149,20 @@ def test_lines_accuse_the_code_until_one_of_them_agrees_with_it() -> None:
     first = 12
     evidence = evidence_of()
     for shot in SHOTS[:first]:
-        evidence.add(shot)
+        add(evidence, shot)
     # The light is that of a line frame, and not where the code says.
     wrong = replace(SHOTS[first], image=SHOTS[first + 4].image)
     (found,) = evidence.contradictions(wrong)
     assert (found.suspects, found.beyond) == ((first,), tuple(range(2, first)))
     evidence.retract("left", [first])
-    evidence.add(SHOTS[first])
+    add(evidence, SHOTS[first])
     (found,) = evidence.contradictions(replace(SHOTS[first + 1], image=SHOTS[first + 5].image))
     assert (found.suspects, found.beyond) == ((first + 1,), ())
 
 
 def test_what_was_refused_stays_on_record_when_all_frames_are_forgotten() -> None:
     evidence = evidence_of()
-    evidence.add(SHOTS[0])
+    add(evidence, SHOTS[0])
     evidence.note(Refused(3, "left", 1, "stale", SHOTS[3]))
     evidence.note(Refused(3, "left", 2, "stale", SHOTS[3]))
     evidence.forget()

@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.capture.checks import NOISE_FLOOR_DN, Reference, Samples, noise_dn, reference, repeated
-from slrig.capture.code_checks import line_sum
-from slrig.capture.pair_checks import rougher
+from slrig.capture.code_checks import line_sum, rougher
 from slrig.capture.sampling import Sampler
 from slrig.model import Size
 
