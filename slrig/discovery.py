@@ -142,18 +142,10 @@ def open_rig(config: RigConfig) -> Rig:
     What is wrong with the rig file is told of all devices together. The calibration is that of the rig file, else that
     which the head carries.
 
-    Raises
-    ------
-    DriverNotFoundError
-        No installed package provides a driver of that name.
-    DriverBrokenError
-        A driver cannot be loaded, or fails with an error of no known kind.
-    ConfigError
-        A driver does not take the options of the rig file. Several faults, unknown drivers among them, are one message.
-    CalibrationError
-        The calibration is malformed, or made for devices of another size.
-    DeviceError
-        A device cannot be opened.
+    Raises DriverNotFoundError: no installed package provides a driver of that name; DriverBrokenError: a driver cannot
+    be loaded, or fails with an error of no known kind; ConfigError: a driver does not take the options of the rig file
+    (several faults, unknown drivers among them, are one message); CalibrationError: the calibration is malformed, or
+    made for devices of another size; DeviceError: a device cannot be opened.
     """
     with ExitStack() as opened:
         head: Head | None = None

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from slrig.bundle.description import CameraName, Extent
-from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.bundle.faults import Strict, read_description_of
 from slrig.bundle.opencv_calibration import read_opencv_calibration
-from slrig.bundle.storage import write_file
+from slrig.bundle.storage import json_bytes, write_file
 from slrig.errors import CalibrationError
 from slrig.model import DEVICE_PARAMETERS, Calibration, Pinhole, Size, Solved
 
@@ -70,13 +70,9 @@ def read_calibration(path: Path) -> Calibration:
     """
     if path.suffix.lower() in {".yml", ".yaml", ".xml"}:
         return read_opencv_calibration(path)
-    text = read_text(path, MOST_CALIBRATION_BYTES, CalibrationError)
-    data = read_json(text, path, CalibrationError)
-    try:
-        entry = CalibrationEntry.model_validate_json(text)
-    except ValidationError as cause:
-        message = f"{path} is not a valid calibration:\n{explain(cause, data, keys_of(CalibrationEntry))}"
-        raise CalibrationError(message) from cause
+    entry = read_description_of(
+        path, CalibrationEntry, "calibration", most_bytes=MOST_CALIBRATION_BYTES, error=CalibrationError
+    )
     cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
     projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
     try:
@@ -96,14 +92,9 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     if calibration.projector is not None:
         data["projector"] = _device(calibration.projector)
     if calibration.solved is not None:
-        data["solved"] = {
-            "id": calibration.solved.id,
-            "solved_at": calibration.solved.solved_at,
-            "covariance": calibration.solved.covariance.tolist(),
-            "volume_mm": calibration.solved.volume_mm.tolist(),
-            "expected_error_mm": calibration.solved.expected_error_mm,
-        }
-    write_file(path, (json.dumps(data, indent=1, allow_nan=False) + "\n").encode())
+        solved = asdict(calibration.solved)
+        data["solved"] = {key: each.tolist() if isinstance(each, np.ndarray) else each for key, each in solved.items()}
+    write_file(path, json_bytes(data))
 
 
 def check_calibration(calibration: Calibration, projector: Size, cameras: Mapping[str, Size], source: str) -> None:
@@ -143,34 +134,19 @@ def check_rays(calibration: Calibration, cameras: Collection[str], source: str) 
 def _solved(entry: SolvedEntry | None) -> Solved | None:
     if entry is None:
         return None
-    return Solved(
-        entry.id,
-        entry.solved_at.isoformat(),
-        np.array(entry.covariance, dtype=np.float64),
-        np.array(entry.volume_mm, dtype=np.float64),
-        entry.expected_error_mm,
-    )
+    covariance, volume_mm = (np.array(each, dtype=np.float64) for each in (entry.covariance, entry.volume_mm))
+    return Solved(entry.id, entry.solved_at.isoformat(), covariance, volume_mm, entry.expected_error_mm)
 
 
 def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
+    numbers = (device.matrix, device.distortion, device.rotation, device.translation_mm)
     try:
-        return Pinhole(
-            Size(*device.size_px),
-            np.array(device.matrix, dtype=np.float64),
-            np.array(device.distortion, dtype=np.float64),
-            np.array(device.rotation, dtype=np.float64),
-            np.array(device.translation_mm, dtype=np.float64),
-        )
+        return Pinhole(Size(*device.size_px), *(np.array(each, dtype=np.float64) for each in numbers))
     except CalibrationError as cause:
         message = f"{path}: {place}.{cause}"
         raise CalibrationError(message) from cause
 
 
 def _device(pinhole: Pinhole) -> dict[str, Any]:
-    return {
-        "size_px": [pinhole.size.width_px, pinhole.size.height_px],
-        "matrix": pinhole.matrix.tolist(),
-        "distortion": pinhole.distortion.tolist(),
-        "rotation": pinhole.rotation.tolist(),
-        "translation_mm": pinhole.translation_mm.tolist(),
-    }
+    numbers = {key: getattr(pinhole, key).tolist() for key in ("matrix", "distortion", "rotation", "translation_mm")}
+    return {"size_px": [pinhole.size.width_px, pinhole.size.height_px], **numbers}

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field, ValidationError, field_validator, model_validator
+from pydantic import AwareDatetime, Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
 
-from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.bundle.faults import MOST_FAULTS, Strict, read_description_of
 from slrig.errors import BundleError, PatternError
-from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Size, White
+from slrig.model import CameraFormat, Pattern, Size
 
 DESCRIPTION = "bundle.json"
 MOST_DESCRIPTION_BYTES = 16 * 2**20
@@ -22,7 +22,6 @@ CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
 Extent = Annotated[list[Side], Field(min_length=2, max_length=2)]
 CameraName = Annotated[str, Field(pattern=CAMERA_NAME)]
-AxisName = Literal["column", "row"]
 
 
 class ProjectorEntry(Strict):
@@ -52,71 +51,15 @@ class CameraEntry(Strict):
         return size_px
 
 
-class WhiteEntry(Strict):
-    """Every projector pixel lit."""
-
-    kind: Literal["white"]
-
-    def pattern(self) -> White:
-        """The pattern described."""
-        return White()
-
-
-class BlackEntry(Strict):
-    """No projector pixel lit."""
-
-    kind: Literal["black"]
-
-    def pattern(self) -> Black:
-        """The pattern described."""
-        return Black()
-
-
-class GrayEntry(Strict):
-    """One bit of a Gray code."""
-
-    kind: Literal["gray"]
-    axis: AxisName
-    bit: int
-    bits: int
-    cell_px: int = 1
-    offset_px: int = 0
-    inverted: bool = False
-
-    def pattern(self) -> Gray:
-        """The pattern described."""
-        return Gray(Axis(self.axis), self.bit, self.bits, self.cell_px, self.offset_px, self.inverted)
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        _check_possible(self)
-        return self
-
-
-class LineShiftEntry(Strict):
-    """One frame of shifted lines."""
-
-    kind: Literal["line_shift"]
-    axis: AxisName
-    shift: int
-    period_px: int
-    line_width_px: int = 1
-
-    def pattern(self) -> LineShift:
-        """The pattern described."""
-        return LineShift(Axis(self.axis), self.shift, self.period_px, self.line_width_px)
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        _check_possible(self)
-        return self
-
-
-def _check_possible(entry: GrayEntry | LineShiftEntry) -> None:
+def _possible(data: object, checked: ValidatorFunctionWrapHandler) -> Pattern:
     try:
-        entry.pattern()
+        pattern: Pattern = checked(data)
     except PatternError as cause:
         raise ValueError(str(cause)) from cause
+    return pattern
+
+
+PatternEntry = Annotated[Pattern, Field(discriminator="kind"), WrapValidator(_possible)]
 
 
 class FrameEntry(Strict):
@@ -140,9 +83,6 @@ class FrameEntry(Strict):
             )
             raise ValueError(message)
         return file
-
-
-PatternEntry = Annotated[WhiteEntry | BlackEntry | GrayEntry | LineShiftEntry, Field(discriminator="kind")]
 
 
 class Description(Strict):
@@ -171,7 +111,7 @@ class Description(Strict):
 
     def pattern_list(self) -> tuple[Pattern, ...]:
         """The patterns in order."""
-        return tuple(entry.pattern() for entry in self.patterns)
+        return tuple(self.patterns)
 
 
 def read_description(folder: Path) -> Description:
@@ -183,16 +123,11 @@ def read_description(folder: Path) -> Description:
         found = "no such folder" if not folder.is_dir() else "a folder without it"
         message = f"{path}: expected the description of a scan bundle, found {found}; give the folder that holds it"
         raise BundleError(message)
-    text = read_text(path, MOST_DESCRIPTION_BYTES, BundleError)
-    data = read_json(text, path, BundleError)
-    try:
-        description = Description.model_validate_json(text)
-    except ValidationError as cause:
-        message = f"{path} is not a valid bundle description:\n{explain(cause, data, keys_of(Description))}"
-        raise BundleError(message) from cause
+    what = "bundle description"
+    description = read_description_of(path, Description, what, most_bytes=MOST_DESCRIPTION_BYTES, error=BundleError)
     faults = _cross_faults(description)
     if faults:
-        message = f"{path} is not a valid bundle description:\n" + "\n".join(f"  {fault}" for fault in faults[:20])
+        message = f"{path} is not a valid {what}:\n" + "\n".join(f"  {fault}" for fault in faults[:MOST_FAULTS])
         raise BundleError(message)
     return description
 

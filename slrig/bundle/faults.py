@@ -107,6 +107,22 @@ def checked(model: type[Described], data: object, what: str, *, hint: str = "") 
         raise ConfigError(message) from cause
 
 
+def read_description_of(
+    path: Path, model: type[Described], what: str, *, most_bytes: int, error: type[InvalidInputError]
+) -> Described:
+    """Return what a file of JSON describes, as a `model`.
+    Raises InvalidInputError, of the class `error`: see `read_text` and `read_json`; or it is not a valid `what`, with
+    every fault in one message.
+    """
+    text = read_text(path, most_bytes, error)
+    data = read_json(text, path, error)
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as cause:
+        message = f"{path} is not a valid {what}:\n{explain(cause, data, keys_of(model))}"
+        raise error(message) from cause
+
+
 def explain(cause: ValidationError, data: object, known: Sequence[str]) -> str:
     """Return one line per fault; `known` are the keys to propose when one is misspelt."""
     lines = [f"  {_line(fault, data, known)}" for fault in cause.errors(include_url=False)]
@@ -135,7 +151,7 @@ def _properties(schema: object) -> Iterator[str]:
 
 def _line(fault: ErrorDetails, data: object, known: Sequence[str]) -> str:
     path = _path(fault["loc"], data, keep_last=fault["type"] == "missing")
-    if fault["type"] == "extra_forbidden":
+    if fault["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         near = difflib.get_close_matches(str(fault["loc"][-1]), known, n=1)
         remedy = f"did you mean '{near[0]}'?" if near else "remove it"
         return f"{path}: unknown key; {remedy}"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from slrig.bundle.faults import read_json, read_text
-from slrig.bundle.storage import write_file
+from slrig.bundle.storage import json_bytes, write_file
 from slrig.errors import BundleError
 
 FILE = "health.json"
@@ -17,7 +16,7 @@ MOST_BYTES = 2**20
 
 def write_health(folder: Path, stamp: Mapping[str, Any]) -> None:
     """Put a stamp beside the frames. Raises StorageError."""
-    write_file(folder / FILE, (json.dumps(stamp, indent=1, allow_nan=False) + "\n").encode())
+    write_file(folder / FILE, json_bytes(stamp))
 
 
 def read_health(folder: Path) -> dict[str, Any] | None:

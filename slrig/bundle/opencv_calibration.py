@@ -26,6 +26,7 @@ Its devices are numbered in the order of their maps, the projector last.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -104,7 +105,7 @@ def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
     if calibration.projector is not None:
         _write_device(storage, PROJECTOR, calibration.projector)
     if calibration.solved is not None:
-        _write_solved(storage, calibration.solved)
+        _write_map(storage, SOLVED, {key: getattr(calibration.solved, key) for key in SOLVED_KEYS})
     text: str = storage.releaseAndGetString()
     write_file(path, text.encode())
 
@@ -114,12 +115,16 @@ def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
     raise CalibrationError(message)
 
 
-def _read_device(node: Any, path: Path, name: str) -> Pinhole:
+def _require_keys(node: Any, wanted: tuple[str, ...], path: Path, name: str, remedy: str) -> None:
     keys = set(node.keys()) if node.isMap() else set()
-    if keys != set(DEVICE_KEYS):
-        wrong = [f"no {key}" for key in DEVICE_KEYS if key not in keys]
-        wrong += [f"the unknown key {key}" for key in sorted(keys - set(DEVICE_KEYS))]
-        _refuse(path, f"{', '.join(DEVICE_KEYS)} in '{name}'", ", ".join(wrong), "write one map per device")
+    if keys != set(wanted):
+        wrong = [f"no {key}" for key in wanted if key not in keys]
+        wrong += [f"the unknown key {key}" for key in sorted(keys - set(wanted))]
+        _refuse(path, f"{', '.join(wanted)} in '{name}'", ", ".join(wrong), remedy)
+
+
+def _read_device(node: Any, path: Path, name: str) -> Pinhole:
+    _require_keys(node, DEVICE_KEYS, path, name, "write one map per device")
     extent = [node.getNode(key) for key in ("image_width", "image_height")]
     if not all(part.isInt() and part.real() >= 1 for part in extent):
         _refuse(path, f"whole numbers as extent of '{name}'", "something else", "correct image_width and image_height")
@@ -147,11 +152,7 @@ def _read_device(node: Any, path: Path, name: str) -> Pinhole:
 
 
 def _read_solved(node: Any, path: Path) -> Solved:
-    keys = set(node.keys()) if node.isMap() else set()
-    if keys != set(SOLVED_KEYS):
-        wrong = [f"no {key}" for key in SOLVED_KEYS if key not in keys]
-        wrong += [f"the unknown key {key}" for key in sorted(keys - set(SOLVED_KEYS))]
-        _refuse(path, f"{', '.join(SOLVED_KEYS)} in '{SOLVED}'", ", ".join(wrong), "leave the whole map out")
+    _require_keys(node, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
     words = [node.getNode(key) for key in ("id", "solved_at")]
     number = node.getNode("expected_error_mm")
     if not all(each.isString() and each.string() for each in words) or not (number.isReal() or number.isInt()):
@@ -169,16 +170,6 @@ def _read_solved(node: Any, path: Path) -> Solved:
         raise CalibrationError(message) from cause
 
 
-def _write_solved(storage: Any, solved: Solved) -> None:
-    storage.startWriteStruct(SOLVED, cv2.FileNode_MAP)
-    storage.write("id", solved.id)
-    storage.write("solved_at", solved.solved_at)
-    storage.write("covariance", solved.covariance)
-    storage.write("volume_mm", solved.volume_mm)
-    storage.write("expected_error_mm", solved.expected_error_mm)
-    storage.endWriteStruct()
-
-
 def _matrix(node: Any, key: str, path: Path, name: str) -> FloatArray:
     try:
         found = node.getNode(key).mat()
@@ -190,12 +181,14 @@ def _matrix(node: Any, key: str, path: Path, name: str) -> FloatArray:
     return np.asarray(found, dtype=np.float64)
 
 
-def _write_device(storage: Any, name: str, pinhole: Pinhole) -> None:
+def _write_device(storage: Any, name: str, device: Pinhole) -> None:
+    extent = (device.size.width_px, device.size.height_px)
+    numbers = (*extent, device.matrix, device.distortion, device.rotation, device.translation_mm)
+    _write_map(storage, name, dict(zip(DEVICE_KEYS, numbers, strict=True)))
+
+
+def _write_map(storage: Any, name: str, values: Mapping[str, Any]) -> None:
     storage.startWriteStruct(name, cv2.FileNode_MAP)
-    storage.write("image_width", pinhole.size.width_px)
-    storage.write("image_height", pinhole.size.height_px)
-    storage.write("camera_matrix", pinhole.matrix)
-    storage.write("distortion_coefficients", pinhole.distortion)
-    storage.write("rotation", pinhole.rotation)
-    storage.write("translation_mm", pinhole.translation_mm)
+    for key, value in values.items():
+        storage.write(key, value)
     storage.endWriteStruct()

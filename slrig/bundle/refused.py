@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from slrig.bundle.description import CameraName
-from slrig.bundle.faults import Strict, explain, keys_of, read_json, read_text
+from slrig.bundle.faults import Strict, read_description_of
 from slrig.errors import BundleError
 from slrig.model import Shot
 
@@ -67,13 +67,7 @@ def read_refused(folder: Path) -> tuple[Refused, ...]:
     path = folder / FOLDER / LIST
     if not path.is_file():
         return ()
-    text = read_text(path, _MOST_BYTES, BundleError)
-    data = read_json(text, path, BundleError)
-    try:
-        listed = RefusedList.model_validate_json(text)
-    except ValidationError as cause:
-        message = f"{path} is not a valid list of refused frames:\n{explain(cause, data, keys_of(RefusedList))}"
-        raise BundleError(message) from cause
+    listed = read_description_of(path, RefusedList, "list of refused frames", most_bytes=_MOST_BYTES, error=BundleError)
     return tuple(
         Refused(entry.pattern, entry.camera, entry.attempt, entry.cause, left_out=bool(entry.left_out))
         for entry in listed.frames

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import uuid
 from collections.abc import Iterator
@@ -66,6 +67,11 @@ def _sync(path: Path, flags: int) -> None:
 def staging_name(path: Path) -> Path:
     """A hidden sibling of `path` that nobody else uses."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.part")
+
+
+def json_bytes(data: object) -> bytes:
+    """A JSON text as slrig writes it: a line for each value, and no number that is not finite."""
+    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()
 
 
 def write_file(path: Path, data: bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import shutil
@@ -21,7 +20,7 @@ from slrig.bundle.calibration_file import write_calibration
 from slrig.bundle.description import CAMERA_NAME, DESCRIPTION
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import FOLDER, LIST, Refused, RefusedEntry, RefusedList
-from slrig.bundle.storage import refusals_of, staging_name, sync_folder, write_durably
+from slrig.bundle.storage import json_bytes, refusals_of, staging_name, sync_folder, write_durably
 from slrig.errors import BundleError, CalibrationError, StorageError
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Pixels, Shot, Size
 
@@ -171,7 +170,7 @@ class BundleWriter:
         with refusals_of(self.folder):
             if frames:
                 # Without a frame it would be no bundle; what was refused is kept all the same.
-                write_durably(self._staging / DESCRIPTION, _json(data))
+                write_durably(self._staging / DESCRIPTION, json_bytes(data))
             self._write_refused()
             for name in self._cameras:
                 sync_folder(self._staging / "frames" / name)
@@ -191,7 +190,7 @@ class BundleWriter:
             folder = self._staging / FOLDER
             folder.mkdir(exist_ok=True)
             listed = RefusedList(ended=self._ended, frames=self._refused)
-            write_durably(folder / LIST, _json(listed.model_dump(exclude_none=True)))
+            write_durably(folder / LIST, json_bytes(listed.model_dump(exclude_none=True)))
             sync_folder(folder)
 
     def _discard(self) -> None:
@@ -240,10 +239,6 @@ def _png(image: Pixels, file: str) -> bytes:
         message = f"{file}: expected an image that PNG can hold, found {image.shape} {image.dtype}"
         raise BundleError(message)
     return bytes(data)
-
-
-def _json(data: Mapping[str, Any]) -> bytes:
-    return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _times(shot: Shot) -> dict[str, float]:

@@ -87,27 +87,14 @@ def measure_latency(
 
     However it ends, the projector is dark and the cameras are disarmed afterwards.
 
-    Parameters
-    ----------
-    trials
-        How many flashes each camera must see while they happen.
-    search_s
-        How late light may be, from the instant that the projector states.
-    exposure_s
-        Exposure for the test; that of the rig's settings if absent. Longer exposures see more flashes as they happen.
-    trigger
-        How exposures are started; absent, freely running cameras are preferred: they watch while the projector works.
+    trials : how many flashes each camera must see while they happen. search_s : how late light may be, from the instant
+    that the projector states. exposure_s : for the test; None is that of the rig's settings; longer exposures see more
+    flashes as they happen. trigger : how exposures are started; None prefers freely running cameras: they watch while
+    the projector works.
 
-    Raises
-    ------
-    ScanEvidenceError
-        No flash was seen, everything is saturated, or the light never changed during an exposure.
-    UnsupportedByDeviceError
-        A camera can be triggered by wire only, or not in the way or with the exposure asked for.
-    ScanCancelledError
-        `cancelled` said so.
-    FrameTimeoutError, DeviceError
-        A device failed or is gone.
+    Raises ScanEvidenceError: no flash was seen, everything is saturated, or the light never changed during an exposure;
+    UnsupportedByDeviceError: a camera can be triggered by wire only, or not in the way or with the exposure asked for;
+    ScanCancelledError: `cancelled` said so; FrameTimeoutError, DeviceError: a device failed or is gone.
     """
     measured: dict[str, CameraLatency] = {}
     errors_s: list[float] = []

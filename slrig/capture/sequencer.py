@@ -37,41 +37,16 @@ def capture(
     Wire triggers are preferred to software triggers, these to free-running cameras, among what all devices declare.
     What the consumer does with a frame takes place while the next one is exposed.
 
-    Parameters
-    ----------
-    rig
-        Open devices. Cameras without settings are left as they are.
-    sequence
-        Patterns for this projector.
-    cancelled
-        Asked before every pattern and every frame.
-    timeout_s
-        How long a frame may take beyond its exposure.
-    evidence
-        Where the frames are judged; give one to read its summary afterwards.
-    refused
-        Told of every exposure that does not count, before another one takes its place.
-    since_ns
-        When times count from, by the rig's clock: for one sequence of several.
+    rig : open devices; cameras without settings are left as they are. cancelled : asked before every pattern and every
+    frame. timeout_s : how long a frame may take beyond its exposure. evidence : where the frames are judged; give one
+    to read its summary afterwards. refused : told of every exposure that does not count, before another one takes its
+    place. since_ns : when times count from, by the rig's clock, for one sequence of several; None is the start of the
+    first frame's exposure.
 
-    Yields
-    ------
-    Shot
-        `time_s` counts from `since_ns`, by default from the start of the first frame's exposure.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        A device cannot do what is asked: settings, size, no trigger in common.
-    FrameTimeoutError
-        A frame did not come, three times. Names pattern, camera, times.
-    ScanEvidenceError
-        The frame of a pattern failed three times: it was exposed too early, came twice, or contradicts the others.
-        Tells all three causes.
-    ScanCancelledError
-        `cancelled` said so.
-    DeviceError
-        A device failed or is gone.
+    Raises UnsupportedByDeviceError: a device cannot do what is asked (settings, size, no trigger in common);
+    FrameTimeoutError: a frame did not come, three times (names pattern, camera, times); ScanEvidenceError: the frame of
+    a pattern failed three times (it was exposed too early, came twice, or contradicts the others; tells all three
+    causes); ScanCancelledError: `cancelled` said so; DeviceError: a device failed or is gone.
     """
     if evidence is None:
         evidence = Evidence(sequence.patterns, {name: camera.info.format for name, camera in rig.cameras.items()})

@@ -74,12 +74,8 @@ class Light:
 class RigBench:
     """A rig under examination. One thread uses it.
 
-    Parameters
-    ----------
-    open_rig
-        Opens the rig afresh; called again after `close`.
-    sequence
-        Patterns that its projector can show; most checks want white and black first.
+    open_rig : opens the rig afresh; called again after `close`. sequence : patterns that its projector can show; most
+    checks want white and black first.
     """
 
     def __init__(self, open_rig: Callable[[], Rig], sequence: PatternSequence) -> None:

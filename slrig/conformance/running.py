@@ -124,21 +124,11 @@ def run(
 ) -> Report:
     """Examine a rig by every check.
 
-    Parameters
-    ----------
-    open_rig
-        Opens the rig afresh; called several times, each time after the rig was closed.
-    sequence
-        Patterns that its projector can show, white and black first.
-    progress
-        Told about each check before and after it, in the caller's thread.
-    limit_s
-        How long a check may take. Default: a minute, and more for long exposures.
+    open_rig : opens the rig afresh; called several times, each time after the rig was closed. sequence : patterns that
+    its projector can show, white and black first. progress : told about each check before and after it, in the caller's
+    thread. limit_s : how long a check may take; None is a minute, and more for long exposures.
 
-    Raises
-    ------
-    Exception
-        What opening the rig for the first time raises: a rig that does not open cannot be examined.
+    Raises what opening the rig for the first time raises: a rig that does not open cannot be examined.
     """
     begun_s = time.monotonic()
     results: list[Result] = []

@@ -80,14 +80,8 @@ class Camera(Protocol):
 
         Frames that began earlier are stale and are passed over; they never come back.
 
-        Raises
-        ------
-        FrameTimeoutError
-            No such frame came in `timeout_s`.
-        DeviceGoneError
-            The device was unplugged.
-        DeviceStateError
-            The camera is not armed.
+        Raises FrameTimeoutError: no such frame came in `timeout_s`; DeviceGoneError: the device was unplugged;
+        DeviceStateError: the camera is not armed.
         """
         ...
 

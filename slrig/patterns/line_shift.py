@@ -43,14 +43,9 @@ def line_number(code_centre_px: ArrayLike, pattern: LineShift) -> NDArray[np.int
     Right as long as the cell that was read lies nearer than n/2 to the line: with cells of ⌊n/2⌋ a code edge may be
     off by n/4.
 
-    Parameters
-    ----------
-    code_centre_px
-        Middle of the decoded cell, cell·i + (cell − 1)/2 − offset (`gray.cell_centre_px`); any shape, finite.
-
-    Returns
-    -------
-    Integers of the same shape; −1 or `line_count` and above mean a line that the projector cuts or does not have.
+    code_centre_px : middle of the decoded cell, cell·i + (cell − 1)/2 − offset (`gray.cell_centre_px`); any shape,
+    finite. Returns integers of the same shape; −1 or `line_count` and above mean a line that the projector cuts or does
+    not have.
 
     >>> from slrig.model import Axis, LineShift
     >>> line_number([1.5, 9.5], LineShift(Axis.COLUMN, 1, 8))

@@ -35,25 +35,13 @@ def scan_patterns(
     followed by its inverse, and the n line frames; white, black again. The two pairs of white and black bracket
     everything that can drift.
 
-    Parameters
-    ----------
-    size
-        The projector.
-    line_shift
-        False leaves the line frames out: a Gray-only scan.
-    period_px, line_width_px
-        n and the width of a line.
-    gray_cell_px
-        None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line shift.
-    gray_offset_px
-        Added to a position before it is cut into cells: moves the cell edges.
-    rows, columns
-        The axes to play.
+    size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px, line_width_px : n
+    and the width of a line. gray_cell_px : None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line shift.
+    gray_offset_px : added to a position before it is cut into cells: moves the cell edges. rows, columns : the axes to
+    play.
 
-    Raises
-    ------
-    PatternError
-        A code that cannot tell the lines of one frame apart, or a pattern that does not fit the projector.
+    Raises PatternError: a code that cannot tell the lines of one frame apart, or a pattern that does not fit the
+    projector.
 
     >>> options = dict(line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False)
     >>> patterns = scan_patterns(Size(1280, 800), line_shift=True, period_px=8, **options)
