@@ -24,11 +24,9 @@ from slrig.devices import (
     Camera,
     CameraInfo,
     CameraSettings,
-    Clock,
     FoundDevice,
     Head,
     KeepsTime,
-    Positioner,
     Positions,
     Projector,
     Rig,
@@ -153,7 +151,8 @@ def open_rig(config: RigConfig) -> Rig:
         if config.head is not None:
             head = _open("head", config.head, Head, config.folder)
             projector, cameras = head.projector, dict(head.cameras)
-            _close_later(opened, projector, cameras)
+            for device in (projector, *cameras.values()):
+                opened.callback(_close_quietly, device)
             asked = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
         else:
             if config.projector is None:
@@ -174,8 +173,8 @@ def open_rig(config: RigConfig) -> Rig:
             calibration,
             head,
             _synchronisation(config, cameras),
-            _clock(head),
-            _positioner(head),
+            head.clock if isinstance(head, KeepsTime) else SystemClock(),
+            head.positioner if isinstance(head, Positions) else None,
         )
         opened.pop_all()
         return rig
@@ -220,25 +219,16 @@ def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) ->
     return min(max(USUAL_EXPOSURE_S, least_s), most_s)
 
 
-def _clock(head: object) -> Clock:
-    return head.clock if isinstance(head, KeepsTime) else SystemClock()
-
-
-def _positioner(head: object) -> Positioner | None:
-    return head.positioner if isinstance(head, Positions) else None
-
-
 def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchronisation | None:
     table = config.synchronisation
     if table is None:
         return None
     unknown = sorted(set(table.line_time_s) - set(cameras))
     if unknown:
-        message = (
+        raise ConfigError(
             f"rig '{config.name}': synchronisation.line_time_s names {', '.join(unknown)}, the rig's cameras are "
             f"{', '.join(sorted(cameras))}; correct it, or measure again: slrig latency"
         )
-        raise ConfigError(message)
     return Synchronisation(table.latency_s, table.latency_error_s, dict(table.line_time_s))
 
 
@@ -258,12 +248,6 @@ def _calibration(
     return calibration
 
 
-def _close_later(opened: ExitStack, projector: Projector, cameras: Mapping[str, Camera]) -> None:
-    opened.callback(_close_quietly, projector)
-    for camera in cameras.values():
-        opened.callback(_close_quietly, camera)
-
-
 def _close_quietly(device: Camera | Projector) -> None:
     # The error that made us close is the one to tell, whatever a driver raises on the way out.
     with suppress(Exception):
@@ -275,11 +259,10 @@ def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *nam
     if not entries:
         names = sorted({entry.name for entry in importlib.metadata.entry_points(group=GROUPS[kind])})
         installed = ", ".join(names) or "none"
-        message = (
+        raise DriverNotFoundError(
             f"no installed package provides the {kind} driver '{table.driver}' (group {GROUPS[kind]}); installed: "
             f"{installed}; correct the name or install the driver's package"
         )
-        raise DriverNotFoundError(message)
     if len(entries) > 1:
         packages = ", ".join(sorted(_package(entry)[0] for entry in entries))
         message = f"{kind} driver '{table.driver}' is provided by several packages: {packages}; uninstall all but one"
@@ -288,10 +271,9 @@ def _open(kind: str, table: DriverTable, protocol: type[Any], folder: Path, *nam
     with _told(kind, table.driver, table.options), _refusals(kind, table.driver):
         device = factory(*name, table.options, folder)
         if not isinstance(device, protocol):
-            message = (
+            raise DriverBrokenError(
                 f"{kind} driver '{table.driver}' returned {type(device).__name__}, which is no {protocol.__name__}"
             )
-            raise DriverBrokenError(message)
         return device
 
 
@@ -300,16 +282,14 @@ def _load(kind: str, entry: importlib.metadata.EntryPoint) -> Callable[..., Any]
     try:
         factory = entry.load()
     except (Exception, SystemExit) as cause:  # a package must not end the service, whatever it does at import
-        message = (
+        raise DriverBrokenError(
             f"{kind} driver '{entry.name}' of {package} {version} cannot be loaded ({entry.value}): "
             f"{type(cause).__name__}: {cause}; install what it needs or uninstall it"
-        )
-        raise DriverBrokenError(message) from cause
+        ) from cause
     if not callable(factory):
-        message = (
+        raise DriverBrokenError(
             f"{kind} driver '{entry.name}' of {package} {version}: {entry.value} cannot be called; report it there"
         )
-        raise DriverBrokenError(message)
     loaded: Callable[..., Any] = factory
     return loaded
 
@@ -320,11 +300,10 @@ def _refusals(kind: str, name: str) -> Iterator[None]:
     try:
         yield
     except OSError as cause:
-        message = (
+        raise DeviceError(
             f"{kind} driver '{name}' failed to open its device: {cause}; check cable, power and permissions, and that "
             "no other program holds it"
-        )
-        raise DeviceError(message) from cause
+        ) from cause
 
 
 @contextmanager
@@ -346,10 +325,9 @@ def _devices(name: str, found: Any) -> tuple[FoundDevice, ...]:
     devices = tuple(found)
     strange = sorted({type(each).__name__ for each in devices if not isinstance(each, FoundDevice)})
     if strange:
-        message = (
+        raise DriverBrokenError(
             f"finder '{name}' returned {', '.join(strange)}, which is no FoundDevice; report it to the driver's package"
         )
-        raise DriverBrokenError(message)
     return devices
 
 

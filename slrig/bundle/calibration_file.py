@@ -78,8 +78,7 @@ def read_calibration(path: Path) -> Calibration:
     try:
         return Calibration(cameras, projector, _solved(entry.solved))
     except (CalibrationError, ValueError) as cause:
-        message = f"{path}: solved.{cause}"
-        raise CalibrationError(message) from cause
+        raise CalibrationError(f"{path}: solved.{cause}") from cause
 
 
 def write_calibration(path: Path, calibration: Calibration) -> None:
@@ -123,12 +122,11 @@ def check_rays(calibration: Calibration, cameras: Collection[str], source: str) 
     known = [name for name in cameras if name in calibration.cameras]
     if calibration.projector is None and len(known) < 2:
         whose = f"camera '{known[0]}'" if known else "none of these cameras"
-        message = (
+        raise CalibrationError(
             f"{source}: expected a calibration with two rays for each point, found that of {whose} alone, without a "
             "projector: it tells no depth, and cannot scan; calibrate the camera together with the projector or with a "
             "second camera"
         )
-        raise CalibrationError(message)
 
 
 def _solved(entry: SolvedEntry | None) -> Solved | None:
@@ -143,8 +141,7 @@ def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:
     try:
         return Pinhole(Size(*device.size_px), *(np.array(each, dtype=np.float64) for each in numbers))
     except CalibrationError as cause:
-        message = f"{path}: {place}.{cause}"
-        raise CalibrationError(message) from cause
+        raise CalibrationError(f"{path}: {place}.{cause}") from cause
 
 
 def _device(pinhole: Pinhole) -> dict[str, Any]:

@@ -43,11 +43,10 @@ class CameraEntry(Strict):
     @classmethod
     def _fits_memory(cls, size_px: list[int]) -> list[int]:
         if size_px[0] * size_px[1] > MOST_CAMERA_PX:
-            message = (
+            raise ValueError(
                 f"expected at most {MOST_CAMERA_PX} pixels per frame, found {size_px[0]} x {size_px[1]}; "
                 "crop or bin the frames"
             )
-            raise ValueError(message)
         return size_px
 
 
@@ -77,11 +76,10 @@ class FrameEntry(Strict):
     def _inside(cls, file: str) -> str:
         path = PurePosixPath(file)
         if not path.parts or path.is_absolute() or ".." in path.parts or "\\" in file or ":" in file or "\0" in file:
-            message = (
+            raise ValueError(
                 f"expected a path inside the bundle with forward slashes, found {file!r}; "
                 "copy the frame into the bundle and write its path relative to bundle.json"
             )
-            raise ValueError(message)
         return file
 
 

@@ -39,14 +39,12 @@ def read_text(path: Path, most_bytes: int, error: type[InvalidInputError]) -> st
         with path.open("rb") as file:
             data = file.read(most_bytes + 1)
     except OSError as cause:
-        message = f"{path}: expected a readable file, found: {cause.strerror}; check the path"
-        raise error(message) from cause
+        raise error(f"{path}: expected a readable file, found: {cause.strerror}; check the path") from cause
     if len(data) > most_bytes:
-        message = (
+        raise error(
             f"{path}: expected at most {most_bytes} bytes, found a larger file; "
             "a description is short: check that this is the right file"
         )
-        raise error(message)
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as cause:
@@ -60,32 +58,28 @@ def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
     """
 
     def refuse_constant(name: str) -> NoReturn:
-        message = f"found {name}, which is not JSON; every number must be finite, leave an unknown value out"
-        raise ValueError(message)
+        raise ValueError(f"found {name}, which is not JSON; every number must be finite, leave an unknown value out")
 
     def refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         data = dict(pairs)
         if len(data) != len(pairs):
             keys = [key for key, _ in pairs]
             twice = sorted({key for key in keys if keys.count(key) > 1})
-            message = f"found the key {', '.join(map(repr, twice))} twice in one object; keep one of them"
-            raise ValueError(message)
+            raise ValueError(f"found the key {', '.join(map(repr, twice))} twice in one object; keep one of them")
         return data
 
     try:
         return json.loads(text, parse_constant=refuse_constant, object_pairs_hook=refuse_twice)
     except json.JSONDecodeError as cause:
-        message = (
+        raise error(
             f"{source}: expected JSON, found a fault at line {cause.lineno} column {cause.colno} ({cause.msg}); "
             "the file may be cut: copy it again or correct that line"
-        )
-        raise error(message) from cause
+        ) from cause
     except RecursionError as cause:
         message = f"{source}: expected a description, found JSON nested too deeply; check that this is the right file"
         raise error(message) from cause
     except ValueError as cause:
-        message = f"{source}: {cause}"
-        raise error(message) from cause
+        raise error(f"{source}: {cause}") from cause
 
 
 def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
@@ -94,8 +88,7 @@ def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as cause:
-        message = f"{path}: expected TOML, found a fault: {cause}; correct that line"
-        raise ConfigError(message) from cause
+        raise ConfigError(f"{path}: expected TOML, found a fault: {cause}; correct that line") from cause
 
 
 def checked(model: type[Described], data: object, what: str, *, hint: str = "") -> Described:
@@ -103,8 +96,7 @@ def checked(model: type[Described], data: object, what: str, *, hint: str = "") 
     try:
         return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
     except ValidationError as cause:
-        message = f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}"
-        raise ConfigError(message) from cause
+        raise ConfigError(f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}") from cause
 
 
 def read_description_of(
@@ -119,8 +111,7 @@ def read_description_of(
     try:
         return model.model_validate_json(text)
     except ValidationError as cause:
-        message = f"{path} is not a valid {what}:\n{explain(cause, data, keys_of(model))}"
-        raise error(message) from cause
+        raise error(f"{path} is not a valid {what}:\n{explain(cause, data, keys_of(model))}") from cause
 
 
 def explain(cause: ValidationError, data: object, known: Sequence[str]) -> str:

@@ -19,9 +19,7 @@ import cv2
 import numpy as np
 import tifffile
 
-from slrig.bundle import bitmaps, jpegs
-from slrig.bundle.bitmaps import Bitmap
-from slrig.bundle.jpegs import Jpeg
+from slrig.bundle.frame_headers import BMP_SIGNATURE, JPEG_SIGNATURE, Bitmap, Jpeg
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Pixels
 
@@ -52,18 +50,15 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     Raises BundleError: the file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
     """
     data = _read_bytes(path)
-    if data.startswith(PNG_SIGNATURE):
-        if set(pages) != {0}:
-            _refuse(path, "page 0 only, for a PNG holds one image", f"page {max(pages)}", "write page 0 or use a TIFF")
-        _check_png(path, data, camera)
-        images = {0: cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)}
-    elif data.startswith(TIFF_SIGNATURES):
+    readers = {PNG_SIGNATURE: _png, BMP_SIGNATURE: _bitmap, JPEG_SIGNATURE: _jpeg}
+    read = next((each for signature, each in readers.items() if data.startswith(signature)), None)
+    if data.startswith(TIFF_SIGNATURES):
         _check_tiff(path, data, pages, camera)
         images = {page: _tiff_page(data, page) for page in dict.fromkeys(pages)}
-    elif data.startswith((bitmaps.SIGNATURE, jpegs.SIGNATURE)):
+    elif read is not None:
         if set(pages) != {0}:
             _refuse(path, "page 0 only, for it holds one image", f"page {max(pages)}", "write page 0 or use a TIFF")
-        images = {0: (_bitmap if data.startswith(bitmaps.SIGNATURE) else _jpeg)(path, data, camera)}
+        images = {0: read(path, data, camera)}
     else:
         found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
         _refuse(path, "a PNG, TIFF, BMP or JPEG file", found, "save the frame as PNG")
@@ -77,7 +72,7 @@ def compression_dn(path: Path) -> float:
     """
     try:
         with path.open("rb") as file:
-            if file.read(len(jpegs.SIGNATURE)) != jpegs.SIGNATURE:
+            if file.read(len(JPEG_SIGNATURE)) != JPEG_SIGNATURE:
                 return 0.0
         return Jpeg.of(path.read_bytes()).noise_dn
     except (OSError, ValueError):
@@ -85,8 +80,7 @@ def compression_dn(path: Path) -> float:
 
 
 def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
-    message = f"{path}: expected {expected}, found {found}; {remedy}"
-    raise BundleError(message)
+    raise BundleError(f"{path}: expected {expected}, found {found}; {remedy}")
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -96,11 +90,10 @@ def _read_bytes(path: Path) -> bytes:
             _refuse(path, f"at most {MOST_FILE_BYTES} bytes", f"{size_bytes}", "split the frames over several files")
         return path.read_bytes()
     except OSError as cause:
-        message = (
+        raise BundleError(
             f"{path}: expected a frame file, found: {cause.strerror}; "
             "copy the file into the bundle or remove its entry from bundle.json"
-        )
-        raise BundleError(message) from cause
+        ) from cause
 
 
 def _check_header(path: Path, width: int, height: int, bits: int, camera: CameraFormat) -> None:
@@ -122,7 +115,7 @@ def _check_header(path: Path, width: int, height: int, bits: int, camera: Camera
         )
 
 
-def _check_png(path: Path, data: bytes, camera: CameraFormat) -> None:
+def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
     width, height, bits, colour = struct.unpack(">IIBB", data[16:26])
@@ -140,7 +133,7 @@ def _check_png(path: Path, data: bytes, camera: CameraFormat) -> None:
         if zlib.crc32(view[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             _refuse(path, "a sound PNG file", f"a wrong checksum at byte {end - 4}", "copy the frame again")
         if kind_of_chunk == b"IEND":
-            return
+            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         place = end
 
 

@@ -79,8 +79,7 @@ def read_opencv_calibration(path: Path) -> Calibration:
     try:
         return Calibration(cameras, devices.get(PROJECTOR), solved)
     except CalibrationError as cause:
-        message = f"{path}: {SOLVED}.{cause}"
-        raise CalibrationError(message) from cause
+        raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 
 
 def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
@@ -111,8 +110,7 @@ def write_opencv_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
-    message = f"{path}: expected {expected}, found {found}; {remedy}"
-    raise CalibrationError(message)
+    raise CalibrationError(f"{path}: expected {expected}, found {found}; {remedy}")
 
 
 def _require_keys(node: Any, wanted: tuple[str, ...], path: Path, name: str, remedy: str) -> None:
@@ -147,8 +145,7 @@ def _read_device(node: Any, path: Path, name: str) -> Pinhole:
             _matrix(node, "translation_mm", path, name).ravel(),
         )
     except CalibrationError as cause:
-        message = f"{path}: {name}.{cause}"
-        raise CalibrationError(message) from cause
+        raise CalibrationError(f"{path}: {name}.{cause}") from cause
 
 
 def _read_solved(node: Any, path: Path) -> Solved:
@@ -166,8 +163,7 @@ def _read_solved(node: Any, path: Path) -> Solved:
     try:
         return Solved(words[0].string(), words[1].string(), covariance, volume_mm, error_mm)
     except (CalibrationError, ValueError) as cause:
-        message = f"{path}: {SOLVED}.{cause}"
-        raise CalibrationError(message) from cause
+        raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 
 
 def _matrix(node: Any, key: str, path: Path, name: str) -> FloatArray:

@@ -78,8 +78,7 @@ def _capture(folder: Path, description: Description) -> Capture:
 def _inside(folder: Path, file: str) -> Path:
     path = folder / file
     if not path.resolve().is_relative_to(folder.resolve()):
-        message = (
+        raise BundleError(
             f"{path}: expected a file inside the bundle, found a link that leads out; copy the frame into the bundle"
         )
-        raise BundleError(message)
     return path

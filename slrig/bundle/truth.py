@@ -89,6 +89,5 @@ def read_truth(folder: Path) -> BundleTruth | None:
 def _points(array: FloatArray) -> FloatArray:
     points = np.asarray(array, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        message = f"an array {points.shape} where (n, 3) was expected"
-        raise ValueError(message)
+        raise ValueError(f"an array {points.shape} where (n, 3) was expected")
     return points

@@ -55,12 +55,11 @@ class BundleWriter:
     ) -> None:
         wrong = [name for name in cameras if not re.fullmatch(CAMERA_NAME, name)]
         if wrong:
-            message = (
+            raise BundleError(
                 f"{folder}: expected camera names of letters, digits, '_' and '-', "
                 f"found {', '.join(map(repr, wrong))}; "
                 "rename the camera: its name becomes the name of a folder"
             )
-            raise BundleError(message)
         self.folder = folder
         self._staging = staging_name(folder)
         self._projector = projector_size
@@ -75,11 +74,10 @@ class BundleWriter:
 
     def __enter__(self) -> Self:
         if self.folder.exists():
-            message = (
+            raise BundleError(
                 f"{self.folder}: expected a new folder, found one that exists; "
                 "a bundle is never overwritten: remove it or choose another name"
             )
-            raise BundleError(message)
         with refusals_of(self.folder):
             try:
                 for name in self._cameras:
@@ -149,8 +147,7 @@ class BundleWriter:
     def _commit(self) -> None:
         frames = [place.frame for place in self._places if not place.vacant]
         if not frames and self._ended is None:
-            message = f"{self.folder}: expected frames, found none; a bundle holds at least one frame"
-            raise BundleError(message)
+            raise BundleError(f"{self.folder}: expected frames, found none; a bundle holds at least one frame")
         data: dict[str, Any] = {
             "format": "slrig-bundle",
             "version": 1,
@@ -199,30 +196,27 @@ class BundleWriter:
     def _check(self, shot: Shot) -> None:
         camera = self._cameras.get(shot.camera)
         if camera is None or not 0 <= shot.pattern < len(self._patterns):
-            message = (
+            raise BundleError(
                 f"{self.folder}: expected a frame of {', '.join(self._cameras)} and pattern 0 to "
                 f"{len(self._patterns) - 1}, found camera '{shot.camera}' and pattern {shot.pattern}"
             )
-            raise BundleError(message)
         if (
             not math.isfinite(shot.time_s or 0)
             or not 0 < (1 if shot.exposure_s is None else shot.exposure_s) < math.inf
         ):
-            message = (
+            raise BundleError(
                 f"{self.folder}: expected a finite time and a positive exposure, found time {shot.time_s} s and "
                 f"exposure {shot.exposure_s} s; leave unknown ones out"
             )
-            raise BundleError(message)
         wanted = "uint8" if camera.bit_depth <= 8 else "uint16"
         brightest = int(shot.image.max(initial=0))
         if shot.image.shape != camera.size.shape or shot.image.dtype != wanted or brightest > camera.full_scale:
             rows, columns = shot.image.shape
-            message = (
+            raise BundleError(
                 f"{self.folder}: expected {camera.size} {wanted} samples up to {camera.full_scale} from camera "
                 f"'{shot.camera}', found {columns} x {rows} {shot.image.dtype} up to {brightest}; "
                 "describe the camera's format as it delivers frames"
             )
-            raise BundleError(message)
 
 
 def write_bundle(folder: Path, capture: Capture, calibration: Calibration | None = None) -> None:
@@ -236,8 +230,7 @@ def _png(image: Pixels, file: str) -> bytes:
     # imencode, and not imwrite: on a full disk imwrite returns False and leaves a cut file.
     encoded, data = cv2.imencode(".png", image)
     if not encoded:
-        message = f"{file}: expected an image that PNG can hold, found {image.shape} {image.dtype}"
-        raise BundleError(message)
+        raise BundleError(f"{file}: expected an image that PNG can hold, found {image.shape} {image.dtype}")
     return bytes(data)
 
 

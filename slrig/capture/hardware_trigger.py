@@ -47,11 +47,10 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
     rig, count = session.rig, len(session.sequence)
     unset = sorted(set(rig.cameras) - set(session.applied))
     if unset:
-        message = (
+        raise UnsupportedByDeviceError(
             f"cameras {unset} have no exposure set, and the projector must know how long to show each pattern; "
             "write exposure_s into their tables of the rig file"
         )
-        raise UnsupportedByDeviceError(message)
     rig.projector.load(session.sequence)
     last: dict[str, Frame] = {}
     causes: list[str] = []

@@ -16,7 +16,7 @@ import numpy as np
 
 from slrig.capture.latency_fit import CameraLatency, Flash, RowLevels, fitted, row_levels, rows_of
 from slrig.devices import Camera, CameraSettings, Rig, Shown, Synchronisation, Trigger
-from slrig.errors import FrameTimeoutError, ScanCancelledError, UnsupportedByDeviceError
+from slrig.errors import FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Black, FloatArray, Frame, PatternSequence, Pixels, Size, White
 
 USUAL_TRIALS = 40
@@ -80,7 +80,6 @@ def measure_latency(
     search_s: float = USUAL_SEARCH_S,
     exposure_s: float | None = None,
     trigger: Trigger | None = None,
-    cancelled: Callable[[], bool] = lambda: False,
     told: Callable[[str, float, str], None] = lambda _stage, _fraction, _detail: None,
 ) -> LatencyMeasurement:
     """Flash the projector before each camera in turn, at random moments of its frame period, and time the light.
@@ -94,7 +93,7 @@ def measure_latency(
 
     Raises ScanEvidenceError: no flash was seen, everything is saturated, or the light never changed during an exposure;
     UnsupportedByDeviceError: a camera can be triggered by wire only, or not in the way or with the exposure asked for;
-    ScanCancelledError: `cancelled` said so; FrameTimeoutError, DeviceError: a device failed or is gone.
+    FrameTimeoutError, DeviceError: a device failed or is gone.
     """
     measured: dict[str, CameraLatency] = {}
     errors_s: list[float] = []
@@ -107,7 +106,7 @@ def measure_latency(
                 camera.configure(settings if exposure_s is None else replace(settings, exposure_s=exposure_s))
             elif exposure_s is not None:
                 camera.configure(CameraSettings(exposure_s))
-            test = _FlashTest(rig, name, camera, _trigger(name, camera, trigger), search_s, cancelled)
+            test = _FlashTest(rig, name, camera, _trigger(name, camera, trigger), search_s)
             rng = np.random.default_rng((0, index))
             try:
                 measured[name] = test.run(trials, rng, told)
@@ -132,12 +131,11 @@ def _trigger(name: str, camera: Camera, asked: Trigger | None) -> Trigger:
     for trigger in (Trigger.FREE, Trigger.SOFTWARE):
         if trigger in offered and asked in (None, trigger):
             return trigger
-    message = (
+    raise UnsupportedByDeviceError(
         f"camera '{name}' can be triggered by: {', '.join(sorted(offered)) or 'none'}; latency is measured with "
         f"{'a free-running or software-triggered camera' if asked is None else f'{asked} trigger as asked'}, and a "
         "projector that triggers its cameras by wire needs no latency"
     )
-    raise UnsupportedByDeviceError(message)
 
 
 @dataclass
@@ -149,7 +147,6 @@ class _FlashTest:
     camera: Camera
     trigger: Trigger
     search_s: float
-    cancelled: Callable[[], bool]
     least_error_ns: int = 2**62
     period_ns: int = 0
     never: threading.Event = field(default_factory=threading.Event)
@@ -217,9 +214,6 @@ class _FlashTest:
         return Flash.of(to_white, shown, frames)
 
     def _show(self, index: int) -> Shown:
-        if self.cancelled():
-            message = f"the latency measurement was cancelled at camera '{self.name}'"
-            raise ScanCancelledError(message)
         shown = self.rig.projector.show(index)
         self.least_error_ns = min(self.least_error_ns, shown.t_err_ns)
         return shown

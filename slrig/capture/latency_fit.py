@@ -159,31 +159,28 @@ def row_levels(camera: str, black: Sequence[Pixels], white: Sequence[Pixels], *,
     typical = np.sqrt(np.median(variances.sum(axis=0)) / len(black))
     lit = span > 6 * typical
     if lit.mean() < 0.01:
-        message = (
+        raise ScanEvidenceError(
             f"camera '{camera}' sees no flash: white frames are brighter than black ones by {span.mean():.2f} of "
             f"{full_scale} on average, noise is {typical:.2f}; check that the lamp is on, its lens cap off, and the "
             "camera sees the projected picture; expose longer, or search longer for late light"
         )
-        raise ScanEvidenceError(message)
     saturated = lit & (bright.max(axis=0) >= full_scale)
     usable = lit & ~saturated & (span >= 0.25 * np.percentile(span[lit], 90))
     if saturated.sum() > 0.9 * lit.sum():
-        message = (
+        raise ScanEvidenceError(
             f"camera '{camera}': {saturated.sum() / lit.sum():.0%} of the pixels that the projector lights are "
             f"saturated, so when their light came cannot be told; expose shorter, or lower the gain"
         )
-        raise ScanEvidenceError(message)
     contrast = np.where(usable, span, 0).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         noise = np.sqrt(np.where(usable, variances, 0).sum(axis=2)) / contrast
         known = (usable.sum(axis=1) >= _FEWEST_PIXELS) & (noise.max(axis=0) <= _NOISIEST_SHARE)
         weight = np.where(known[:, None], usable / contrast[:, None], np.nan)
     if known.sum() < _FEWEST_ROWS:
-        message = (
+        raise ScanEvidenceError(
             f"camera '{camera}': only {known.sum()} of {len(known)} rows tell white from black well enough to time a "
             f"flash, {_FEWEST_ROWS} are needed; expose longer, or aim the camera at the projected picture"
         )
-        raise ScanEvidenceError(message)
     shares = np.array([((image - mean) * weight).sum(axis=1) for image in bright])[:, known]
     flicker = float(np.sqrt(max(np.mean(shares.var(axis=0, ddof=1) - noise[1, known] ** 2), 0.0)))
     return RowLevels(mean, weight, np.where(known, noise, np.nan), flicker)

@@ -58,11 +58,10 @@ class RetryPolicy:
         self._shots[camera, index] += 1
         self._made[camera] += 1
         if self._made[camera] > self.most_shots:
-            message = (
+            raise ScanEvidenceError(
                 f"camera '{camera}': {self.most_shots} exposures gave no {len(self._sequence)} frames that agree with "
                 f"one another; the last cause: {self._last_cause}"
             )
-            raise ScanEvidenceError(message)
 
     def shot(self, index: int, frame: Frame) -> Shot:
         """The frame as a shot; its time counts from the start of the first frame."""

@@ -73,8 +73,7 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
     the projector cannot.
     """
     if not rig.cameras:
-        message = f"rig '{rig.name}' has no camera; add a [[camera]] table to its rig file"
-        raise UnsupportedByDeviceError(message)
+        raise UnsupportedByDeviceError(f"rig '{rig.name}' has no camera; add a [[camera]] table to its rig file")
     declared = {name: camera.info.triggers for name, camera in rig.cameras.items()}
     if rig.projector.info.plays and all(Trigger.HARDWARE in triggers for triggers in declared.values()):
         return dict.fromkeys(declared, Trigger.HARDWARE)
@@ -86,12 +85,11 @@ def choose_triggers(rig: Rig) -> dict[str, Trigger]:
             chosen[name] = Trigger.FREE
         else:
             offered = ", ".join(sorted(triggers)) or "none"
-            message = (
+            raise UnsupportedByDeviceError(
                 f"camera '{name}' can be triggered by: {offered}; projector '{rig.projector.info.name}' "
                 f"{'plays' if rig.projector.info.plays else 'does not play'} sequences by wire, and every camera "
                 "must take part: use a camera with software trigger, or a projector and cameras with wire trigger"
             )
-            raise UnsupportedByDeviceError(message)
     return chosen
 
 
@@ -107,11 +105,10 @@ def _apply(camera: Camera, name: str, settings: CameraSettings) -> AppliedSettin
         ("gain", settings.gain, applied.gain, ""),
     ):
         if differ(got, asked):
-            message = (
+            raise UnsupportedByDeviceError(
                 f"camera '{name}': asked for {what} {asked:.6g}{unit}, it uses {got:.6g}{unit}; write a value that "
                 f"the camera can use into the rig file ({got:.6g}, for example)"
             )
-            raise UnsupportedByDeviceError(message)
     return applied
 
 

@@ -38,8 +38,7 @@ class Session:
     def stop_if_cancelled(self, index: int) -> None:
         """Raise ScanCancelledError if somebody asked for it."""
         if self.cancelled():
-            message = f"the scan was cancelled at {self.pattern(index)} of {len(self.sequence)}"
-            raise ScanCancelledError(message)
+            raise ScanCancelledError(f"the scan was cancelled at {self.pattern(index)} of {len(self.sequence)}")
 
     def settled_ns(self, shown: Shown) -> int:
         """Wait until a pattern's light is the only one, and return since when it is."""

@@ -203,11 +203,10 @@ class Examination:
     def _opened(self) -> Rig:
         opening = self._done(lambda: self._bench.rig, OPENING_LIMIT_S)
         if not opening.done():
-            message = (
+            raise DeviceError(
                 f"asked the rig to open, and it did not in {OPENING_LIMIT_S:g} s; check its devices' power and cables, "
                 "and that no other program holds them"
             )
-            raise DeviceError(message)
         return opening.result()
 
     def _done(self, work: Callable[[], _Answer], limit_s: float | None) -> Future[_Answer]:

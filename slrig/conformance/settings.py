@@ -79,8 +79,7 @@ def a_longer_exposure_is_brighter(view: View) -> None:
     usual = view.bench.settings(view.name)
     other_s = _another_exposure(view.camera, usual.exposure_s)
     if other_s is None:
-        message = "has one exposure, or none that it can set"
-        raise NotApplicableError(message)
+        raise NotApplicableError("has one exposure, or none that it can set")
     short_s, long_s = sorted((usual.exposure_s, other_s))
     light: dict[float, tuple[Pixels, Pixels]] = {}
     for exposure_s in (short_s, long_s):
@@ -88,14 +87,12 @@ def a_longer_exposure_is_brighter(view: View) -> None:
         try:
             view.camera.configure(CameraSettings(exposure_s, usual.gain))
         except UnsupportedByDeviceError:
-            message = f"takes certain exposures only, and not {exposure_s:.6g} s"
-            raise NotApplicableError(message) from None
+            raise NotApplicableError(f"takes certain exposures only, and not {exposure_s:.6g} s") from None
         view.camera.arm(FRAMES, view.trigger)
         light[exposure_s] = (view.expose(0).image, view.expose(1).image)
     unsaturated = lit & (light[long_s][0] < _SATURATED * view.camera.info.format.full_scale)
     if np.count_nonzero(unsaturated) < _LEAST_PIXELS:
-        message = f"is saturated by white at {long_s:.6g} s"
-        raise NotApplicableError(message)
+        raise NotApplicableError(f"is saturated by white at {long_s:.6g} s")
     short, long = (
         float(np.mean(light[each][0][unsaturated], dtype=np.float64) - np.mean(light[each][1][unsaturated]))
         for each in (short_s, long_s)

@@ -1,11 +1,13 @@
-"""What slrig asks of a projector."""
+"""What slrig asks of a projector, and which calls a driver's projector takes now, refused alike by all drivers."""
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NoReturn, Protocol, runtime_checkable
 
 from slrig.devices.limits import USUAL, CallLimits
+from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Pattern, PatternSequence, Size
 
 
@@ -78,3 +80,53 @@ class Projector(Protocol):
     def close(self) -> None:
         """Go dark and let the device go. Idempotent; works after an unplug and in every state."""
         ...
+
+
+class ProjectorState:
+    """Open or closed, and what is loaded. A driver's projector asks it before it touches the device.
+
+    label : what messages call the projector. loaded : the sequence, None if there is none; the driver sets it. closed :
+    set once the projector is, by any thread; whoever waits for light waits for this, too.
+    """
+
+    def __init__(self, label: str = "the projector") -> None:
+        self.label = label
+        self.loaded: PatternSequence | None = None
+        self.closed = threading.Event()
+
+    def require_open(self) -> None:
+        """Raise DeviceStateError once `closed` is set."""
+        if self.closed.is_set():
+            raise DeviceStateError(f"{self.label} is closed; open the rig again")
+
+    def require_loaded(self, doing: str) -> PatternSequence:
+        """Return the loaded sequence. Raises DeviceStateError, which says what was asked for."""
+        self.require_open()
+        if self.loaded is None:
+            raise DeviceStateError(f"asked to {doing}, no sequence is loaded; call load first")
+        return self.loaded
+
+    def require_pattern(self, index: int) -> PatternSequence:
+        """Return the loaded sequence, which has a pattern of this index.
+        Raises DeviceStateError: nothing is loaded, or the projector is closed; UnsupportedByDeviceError: the sequence
+        has no such pattern.
+        """
+        sequence = self.require_loaded(f"show pattern {index}")
+        if not 0 <= index < len(sequence):
+            message = f"asked to show pattern {index}, the loaded sequence has patterns 0 to {len(sequence) - 1}"
+            raise UnsupportedByDeviceError(message)
+        return sequence
+
+    def require_size(self, sequence: PatternSequence, size: Size) -> None:
+        """Raise UnsupportedByDeviceError unless a sequence is for a projector of this size: it would be scaled."""
+        if sequence.projector != size:
+            message = f"{self.label} shows {size}, the sequence was made for {sequence.projector}; encode it for {size}"
+            raise UnsupportedByDeviceError(message)
+
+    def refuse_to_play(self, exposure_s: float, period_s: float) -> NoReturn:
+        """Raise UnsupportedByDeviceError: this projector cannot trigger cameras."""
+        self.require_open()
+        raise UnsupportedByDeviceError(
+            f"asked to play {exposure_s} s patterns every {period_s} s, {self.label} has no trigger wire; show each "
+            "pattern, and trigger the cameras by software"
+        )

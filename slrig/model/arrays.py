@@ -21,5 +21,4 @@ def require(array: NDArray[Any], name: str, shape: tuple[int | None, ...], kind:
     )
     if not fits or array.dtype.kind not in kind:
         wanted = ", ".join("n" if want is None else str(want) for want in shape)
-        message = f"{name}: expected an array ({wanted}) of kind '{kind}', found {array.shape} {array.dtype}"
-        raise ValueError(message)
+        raise ValueError(f"{name}: expected an array ({wanted}) of kind '{kind}', found {array.shape} {array.dtype}")

@@ -50,8 +50,7 @@ class CameraFormat:
 
     def __post_init__(self) -> None:
         if not 1 <= self.bit_depth <= 16:
-            message = f"bit_depth: expected 1 to 16, found {self.bit_depth}"
-            raise BundleError(message)
+            raise BundleError(f"bit_depth: expected 1 to 16, found {self.bit_depth}")
 
     @property
     def full_scale(self) -> int:
@@ -90,8 +89,7 @@ class Capture:
             size = self.cameras[shot.camera].size
             if shot.image.shape != size.shape:
                 rows, columns = shot.image.shape
-                message = f"a frame of camera '{shot.camera}' is {columns} x {rows}, the camera is {size}"
-                raise BundleError(message)
+                raise BundleError(f"a frame of camera '{shot.camera}' is {columns} x {rows}, the camera is {size}")
 
 
 FEWEST_EXPOSURES, MOST_EXPOSURES = 2, 6

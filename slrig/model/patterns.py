@@ -40,11 +40,10 @@ class Gray:
 
     def __post_init__(self) -> None:
         if not 1 <= self.bits <= 24 or not 0 <= self.bit < self.bits or self.cell_px < 1 or self.offset_px < 0:
-            message = (
+            raise PatternError(
                 f"gray pattern: need 1 ≤ bits ≤ 24, 0 ≤ bit < bits, cell_px ≥ 1, offset_px ≥ 0; found bit {self.bit} "
                 f"of {self.bits}, cell {self.cell_px} px, offset {self.offset_px} px"
             )
-            raise PatternError(message)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +58,10 @@ class LineShift:
 
     def __post_init__(self) -> None:
         if self.period_px < 4 or not 0 <= self.shift < self.period_px or not 1 <= self.line_width_px < self.period_px:
-            message = (
+            raise PatternError(
                 "line shift pattern: need period ≥ 4, 0 ≤ shift < period, 1 ≤ line width < period; found shift "
                 f"{self.shift}, period {self.period_px}, width {self.line_width_px}"
             )
-            raise PatternError(message)
 
     @property
     def centre_px(self) -> float:

@@ -30,8 +30,7 @@ class Size:
 
     def __post_init__(self) -> None:
         if self.width_px < 1 or self.height_px < 1:
-            message = f"a size must be at least 1 x 1 pixels, found {self.width_px} x {self.height_px}"
-            raise ValueError(message)
+            raise ValueError(f"a size must be at least 1 x 1 pixels, found {self.width_px} x {self.height_px}")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -76,21 +75,18 @@ class Pinhole:
                 message = f"{name}: expected shape {shape}, found {array.shape}; see slrig.model.Pinhole for a device"
                 raise CalibrationError(message)
             if not np.isfinite(array).all():
-                message = f"{name}: every number must be finite, found {array.tolist()}; calibrate again"
-                raise CalibrationError(message)
+                raise CalibrationError(f"{name}: every number must be finite, found {array.tolist()}; calibrate again")
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0 or not np.allclose(self.matrix[2], (0, 0, 1)):
-            message = (
+            raise CalibrationError(
                 "matrix: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy, "
                 f"found {self.matrix.tolist()}"
             )
-            raise CalibrationError(message)
         handed = float(np.linalg.det(self.rotation))
         if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-4) or handed < 0:
-            message = (
+            raise CalibrationError(
                 f"rotation: expected an orthonormal right-handed 3 x 3 matrix, found determinant {handed:.4f}; "
                 "check the order of rows and columns"
             )
-            raise CalibrationError(message)
 
     @property
     def centre_mm(self) -> FloatArray:
@@ -139,11 +135,10 @@ class Calibration:
     def __post_init__(self) -> None:
         devices = len(self.cameras) + (self.projector is not None)
         if self.solved is not None and len(self.solved.covariance) != DEVICE_PARAMETERS * devices:
-            message = (
+            raise CalibrationError(
                 f"covariance: expected {DEVICE_PARAMETERS} rows for each of {devices} devices, found "
                 f"{len(self.solved.covariance)} rows; export the calibration again"
             )
-            raise CalibrationError(message)
 
     @property
     def triangulates(self) -> bool:

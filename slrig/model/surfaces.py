@@ -118,8 +118,7 @@ class PointCurves:
         require(self.source, "PointCurves.source", (count,), "u")
         require(self.grey, "PointCurves.grey", (count,), "u")
         if self.offsets[0] != 0 or self.offsets[-1] != count or (np.diff(self.offsets) < 0).any():
-            message = "PointCurves.offsets must rise from 0 to the number of points"
-            raise ValueError(message)
+            raise ValueError("PointCurves.offsets must rise from 0 to the number of points")
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,11 +30,10 @@ def gray_bits(extent_px: int, cell_px: int, offset_px: int) -> int:
     9
     """
     if extent_px < 1 or cell_px < 1 or offset_px < 0:
-        message = (
+        raise PatternError(
             "a Gray code needs extent_px ≥ 1, cell_px ≥ 1 and offset_px ≥ 0; found "
             f"{extent_px}, {cell_px} and {offset_px}"
         )
-        raise PatternError(message)
     return max(1, ((extent_px - 1 + offset_px) // cell_px).bit_length())
 
 
@@ -107,7 +106,6 @@ def edge_indices(bit: int, bits: int) -> tuple[int, int]:
     [(4, 8), (2, 4), (1, 2)]
     """
     if not 0 <= bit < bits:
-        message = f"a code of {bits} bits has bits 0 (most significant) to {bits - 1}; asked for bit {bit}"
-        raise PatternError(message)
+        raise PatternError(f"a code of {bits} bits has bits 0 (most significant) to {bits - 1}; asked for bit {bit}")
     first = int(2 ** (bits - 1 - bit))
     return first, 2 * first

@@ -28,11 +28,10 @@ def line_profile(pattern: LineShift, size: Size) -> NDArray[np.uint8]:
     """
     extent_px = size.along(pattern.axis)
     if extent_px < pattern.period_px:
-        message = (
+        raise PatternError(
             f"the projector is smaller than one period of the line shift: it has {extent_px} {pattern.axis}s ({size}), "
             f"the period is {pattern.period_px} px; choose a shorter period, or correct the projector's size"
         )
-        raise PatternError(message)
     lit = (np.arange(extent_px) - pattern.shift) % pattern.period_px < pattern.line_width_px
     return along_axis(lit, pattern.axis)
 

@@ -50,11 +50,10 @@ def scan_patterns(
     """
     cell_px = gray_cell_px if gray_cell_px is not None else (period_px // 2 if line_shift else GRAY_ONLY_CELL_PX)
     if line_shift and 2 * cell_px > period_px:
-        message = (
+        raise PatternError(
             f"a Gray cell of {cell_px} px cannot number lines that are {period_px} px apart: a cell edge that is "
             f"slightly off moves a stripe by a whole period; use gray_cell_px ≤ {period_px // 2} or a longer period"
         )
-        raise PatternError(message)
     bracket: tuple[Pattern, ...] = (White(), Black())
     middle: list[Pattern] = []
     for axis in [each for each, played in ((Axis.COLUMN, columns), (Axis.ROW, rows)) if played]:
@@ -89,6 +88,5 @@ def encode(patterns: Sequence[Pattern], size: Size) -> PatternSequence:
     Raises PatternError: the list is empty, or a pattern does not fit the projector.
     """
     if not patterns:
-        message = "a sequence needs at least one pattern, found none; see scan_patterns"
-        raise PatternError(message)
+        raise PatternError("a sequence needs at least one pattern, found none; see scan_patterns")
     return PatternSequence(size, tuple(patterns), tuple(profile(pattern, size) for pattern in patterns))

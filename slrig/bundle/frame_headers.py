@@ -1,0 +1,142 @@
+"""Headers of BMP and JPEG frames, as the programs of cameras, webcams and phones save them.
+
+BMP frames are uncompressed, of 8 bits with a palette or 24 bits of colour. JPEG frames (ITU-T T.81) are read with what
+their compression errs by: it rounds every coefficient of the cosine transform of 8 x 8 pixels to a multiple of its
+quantiser q. The transform keeps lengths, so that a block whose coefficients are all rounded errs by Σ q²/12 / 64 in
+each pixel, mean square. Most coefficients of smooth blocks are small and err by less than that.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from slrig.model import Pixels
+
+BMP_SIGNATURE = b"BM"
+_FILE_HEADER, _INFO_HEADER = 14, 40
+_BITS = {8: 1, 24: 3}
+"""Bytes of a sample, by bits."""
+
+JPEG_SIGNATURE = b"\xff\xd8\xff"
+_END = b"\xff\xd9"
+_FRAMES = {0xC0, 0xC1, 0xC2}
+"""Baseline, extended sequential and progressive, all with Huffman codes: what everybody writes."""
+_OTHER_FRAMES = {0xC3, *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0)}
+_TABLES, _SCAN = 0xDB, 0xDA
+_SHARE = 0.3
+"""Of the greatest error. With it, rendered scans by lines and by Gray code came out with errors of 0.76 to 1.18 times
+what was stated for them, at qualities from 95 to 50; without, up to four times.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Bitmap:
+    """A BMP's header. first_byte : of the rows, each of `stride` bytes; upside_down : the last row comes first, as is
+    usual. palette_entries : of 4 bytes each, behind the header.
+    """
+
+    width: int
+    height: int
+    bits: int
+    first_byte: int
+    stride: int
+    upside_down: bool
+    header_bytes: int
+    palette_entries: int
+
+    @classmethod
+    def of(cls, data: bytes) -> Bitmap:
+        """Read the header. Raises ValueError with words for what it is instead of a BMP that can be read."""
+        if len(data) < _FILE_HEADER + _INFO_HEADER:
+            raise ValueError(f"{len(data)} bytes without a header")
+        (first_byte,) = struct.unpack_from("<I", data, 10)
+        size, width, height, _, bits, compression, _, _, _, colours = struct.unpack_from("<IiiHHIIiiI", data, 14)
+        if size < _INFO_HEADER or width < 1 or height == 0:
+            raise ValueError(f"a header of {size} bytes for {width} x {height} pixels")
+        if bits not in _BITS or compression:
+            raise ValueError(f"{bits} bits, {'compressed' if compression else 'uncompressed'}")
+        entries = (colours or 256) if bits == 8 else 0
+        found = cls(
+            width, abs(height), bits, first_byte, -(-bits * width // 32) * 4, height > 0, _FILE_HEADER + size, entries
+        )
+        if found.header_bytes + 4 * entries > first_byte or entries > 256:
+            raise ValueError("a palette that overlaps its pixels")
+        if first_byte + found.stride * found.height > len(data):
+            raise ValueError(f"one cut after {len(data)} bytes")
+        return found
+
+    def decoded(self, data: bytes) -> Pixels:
+        """(H, W) or, in colour, (H, W, 3) uint8, blue, green, red. Raises ValueError for a sample without a colour."""
+        rows = np.frombuffer(data, np.uint8, self.stride * self.height, self.first_byte).reshape(self.height, -1)
+        rows = rows[:: -1 if self.upside_down else 1, : self.width * _BITS[self.bits]]
+        if self.bits == 24:
+            return np.ascontiguousarray(rows).reshape(self.height, self.width, 3)
+        if int(rows.max()) >= self.palette_entries:
+            raise ValueError(f"a sample of {int(rows.max())} and a palette of {self.palette_entries}")
+        colours = np.frombuffer(data, np.uint8, 4 * self.palette_entries, self.header_bytes).reshape(-1, 4)[:, :3]
+        grey = (colours == colours[:, :1]).all()
+        return np.ascontiguousarray(colours[rows, 0] if grey else colours[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class Jpeg:
+    """A JPEG's header. components : 1 or 3; noise_dn : standard deviation that its compression is taken to add."""
+
+    width: int
+    height: int
+    components: int
+    noise_dn: float
+
+    @classmethod
+    def of(cls, data: bytes) -> Jpeg:
+        """Read the header. Raises ValueError with words for what it is instead of a JPEG that can be read."""
+        tables: dict[int, float] = {}
+        frame: tuple[int, int, int, int] | None = None
+        place = 2
+        while True:
+            marker, length = struct.unpack(">HH", data[place : place + 4].ljust(4, b"\0"))
+            kind, segment = marker & 0xFF, data[place + 4 : place + 2 + length]
+            if marker >> 8 != 0xFF or length < 2 or len(segment) != length - 2:
+                raise ValueError(f"a header that breaks off at byte {place}")
+            if kind in _OTHER_FRAMES:
+                raise ValueError("a lossless, hierarchical or arithmetic one")
+            if kind in _FRAMES:
+                frame = _frame(segment)
+            elif kind == _TABLES:
+                tables |= _mean_squares(segment)
+            place += 2 + length
+            if kind == _SCAN:
+                break
+        if frame is None or frame[3] not in tables:
+            raise ValueError("a header without an image or its quantisers")
+        if not data.rstrip(b"\0").endswith(_END):
+            raise ValueError(f"one cut after {len(data)} bytes")
+        height, width, components, table = frame
+        return cls(width, height, components, _SHARE * (tables[table] / 12) ** 0.5)
+
+
+def _frame(segment: bytes) -> tuple[int, int, int, int]:
+    """Height, width, components, and the quantisers of the first one, which is the grey."""
+    if len(segment) < 9:
+        raise ValueError("a header without an image")
+    bits, height, width, components = struct.unpack_from(">BHHB", segment)
+    if bits != 8 or components not in (1, 3) or not height or not width:
+        raise ValueError(f"{width} x {height} samples of {bits} bits, {components} for each pixel")
+    return height, width, components, segment[8]
+
+
+def _mean_squares(segment: bytes) -> dict[int, float]:
+    """By the number of each table of quantisers, the mean of their squares."""
+    found, place = {}, 0
+    while place < len(segment):
+        wide, number = segment[place] >> 4, segment[place] & 15
+        size = 128 if wide else 64
+        values = np.frombuffer(segment[place + 1 : place + 1 + size], ">u2" if wide else np.uint8).astype(np.float64)
+        if len(values) != 64:
+            raise ValueError("a header with a part of a table")
+        found[number] = float(np.mean(values**2))
+        place += 1 + size
+    return found
