@@ -24,9 +24,11 @@ from slrig.devices import (
     Camera,
     CameraInfo,
     CameraSettings,
+    Clock,
     FoundDevice,
     Head,
     KeepsTime,
+    Positioner,
     Positions,
     Projector,
     Rig,
@@ -151,7 +153,8 @@ def open_rig(config: RigConfig) -> Rig:
         if config.head is not None:
             head = _open("head", config.head, Head, config.folder)
             projector, cameras = head.projector, dict(head.cameras)
-            for device in (projector, *cameras.values()):
+            devices: list[Camera | Projector] = [projector, *cameras.values()]
+            for device in devices:
                 opened.callback(_close_quietly, device)
             asked = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
         else:
@@ -173,8 +176,8 @@ def open_rig(config: RigConfig) -> Rig:
             calibration,
             head,
             _synchronisation(config, cameras),
-            head.clock if isinstance(head, KeepsTime) else SystemClock(),
-            head.positioner if isinstance(head, Positions) else None,
+            _clock(head),
+            _positioner(head),
         )
         opened.pop_all()
         return rig
@@ -217,6 +220,14 @@ def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) ->
             return exposure_s
     least_s, most_s = camera.exposure_range_s
     return min(max(USUAL_EXPOSURE_S, least_s), most_s)
+
+
+def _clock(head: object) -> Clock:
+    return head.clock if isinstance(head, KeepsTime) else SystemClock()
+
+
+def _positioner(head: object) -> Positioner | None:
+    return head.positioner if isinstance(head, Positions) else None
 
 
 def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchronisation | None:

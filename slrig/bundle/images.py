@@ -26,7 +26,7 @@ from slrig.model import CameraFormat, Pixels
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 PNG_GREY, PNG_COLOUR = 0, 2
-TIFF_ZLIB = (8, 32946)
+TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
 MOST_FILE_BYTES = 2**31
 TIFF_FAULTS = (
     tifffile.TiffFileError,

@@ -15,7 +15,7 @@ from slrig.errors import BundleError
 from slrig.model import Calibration, Capture, Pixels, Shot
 
 CALIBRATION = "calibration.json"
-MOST_READERS = 4
+MOST_READERS = 4  # threads, for files that are decoded at the same time
 
 
 @dataclass(frozen=True, slots=True)

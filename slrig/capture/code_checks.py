@@ -39,14 +39,14 @@ _NOISE_ROUGHNESS = 1.5
 _STEEPEST_GAMMA = 2.4
 """Of displays: ITU-R BT.1886."""
 
-_CROSSINGS = 12
-_SPAN_PERIODS = 3
-_BAND_LINES = 4
+_CROSSINGS = 12  # pairs across an edge, for a median of their steps
+_SPAN_PERIODS = 3  # between the 5th and the 95th percentile of the positions
+_BAND_LINES = 4  # of a band: where it is used says why
 
 _LEAST_SUM_OFF = 0.25
 """Of white: sums of line frames that differ by less are those of sharp lines on pixels as wide as theirs."""
 
-_AS_MUCH_TO_BLAME = 0.1
+_AS_MUCH_TO_BLAME = 0.1  # of the wrong pixels: frames that explain as many, less this
 
 
 def pair_fault(bit: Samples, inverse: Samples, ref: Reference, *, noise: float, run_px: int) -> str | None:

@@ -23,13 +23,13 @@ from slrig.capture.sampling import Sampler
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
 _NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
-_MOST_SATURATED = 0.9
-_LEAST_LIT = 40
-_LEAST_CLEAR = 12.0
-_LEAST_CLEAR_DN = 4.0
-_LEAST_COMPARED = 300
-_MOST_MOVED = 0.05
-_MOVED = 0.3
+_MOST_SATURATED = 0.9  # of what is lit, as `checks.lighting` has it
+_LEAST_LIT = 40  # samples, as `checks` has it
+_LEAST_CLEAR = 12.0  # noises that white lies above black
+_LEAST_CLEAR_DN = 4.0  # rounding hides the shares of less
+_LEAST_COMPARED = 300  # samples, as many as a band needs to be judged
+_MOST_MOVED = 0.05  # of the pixels, as `checks.drift_fault` has it
+_MOVED = 0.3  # of white, as `checks.drift` has it
 
 
 def whole_refreshes_s(exposure_s: float, refresh_s: float | None) -> float:

@@ -23,11 +23,11 @@ USUAL_TRIALS = 40
 USUAL_SEARCH_S = 0.5
 
 _WHITE, _BLACK = 0, 1
-_STEADY_FRAMES = 8
-_FRAMES_AFTER = 3
-_GONE = 0.9
-_FLASHES_PER_TRIAL = 8
-_TRIES = 3
+_STEADY_FRAMES = 8  # of white and of black: mean, noise and period are taken from them
+_FRAMES_AFTER = 3  # in the new light, before a flash is over
+_GONE = 0.9  # of the way to the new light
+_FLASHES_PER_TRIAL = 8  # at most: a flash counts only if it comes during an exposure
+_TRIES = 3  # for one frame that is lost
 _TIMEOUT_S = 2.0  # of one frame
 
 

@@ -39,12 +39,12 @@ FEWEST_FLASHES = 8
 STEADY = 0.02
 """Light counts as steady when no more of the row's way from black to white is missing than this."""
 
-_FEWEST_PIXELS = 4
-_FEWEST_ROWS = 8
-_NOISIEST_SHARE = 0.05
-_STAMP_NOISE_S = 2e-5
-_LEAST_SKEW_S = 1e-4
-_ONE_SIDED = 0.999
+_FEWEST_PIXELS = 4  # usable ones of a row, for its mean
+_FEWEST_ROWS = 8  # of a camera, and of one flash
+_NOISIEST_SHARE = 0.05  # standard deviation of a row's share, 1 is white less black
+_STAMP_NOISE_S = 2e-5  # standard deviation that time stamps are taken to have
+_LEAST_SKEW_S = 1e-4  # of a whole shutter that counts as rolling
+_ONE_SIDED = 0.999  # level of the t test for a line time
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from slrig.capture.checks import Samples
 from slrig.model import Pixels, Size
 
 _SAMPLES = 12_000
-_BESIDE_PX = 3
+_BESIDE_PX = 3  # along rows and along columns
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ LONG_S = 5.0
 FRAMES = 256
 """Room for as many frames as any check takes from a camera that it armed once."""
 
-USUAL_EXPOSURE_S = 1 / 60
+USUAL_EXPOSURE_S = 1 / 60  # one period of a usual projector
 
 LIT = 0.8
 """From this level on, a frame shows white."""
@@ -40,11 +40,11 @@ DARK = 0.2
 _LEAST_PIXELS = 16
 _LEAST_SHARE = 0.001
 _LEAST_OF_FULL_SCALE = 0.01
-_NOISES = 6.0
+_NOISES = 6.0  # so far above it lies no pixel by chance
 
-_SETTLE_S = 0.1
-_MOST_LOOKS = 64
-_LEARNT_FROM = 3
+_SETTLE_S = 0.1  # beyond the latency that is declared and measured
+_MOST_LOOKS = 64  # where the times of frames do not tell that it is over
+_LEARNT_FROM = 3  # frames of each: the last two tell the noise
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,7 +96,7 @@ FEWEST_EXPOSURES, MOST_EXPOSURES = 2, 6
 """How many exposures a bracket has."""
 
 _LEAST_STEP = 1.1
-_SAME_EXPOSURE = 1.05
+_SAME_EXPOSURE = 1.05  # exposures that a camera reads back differ by less
 
 
 def bracket_fault(exposures_s: Sequence[float]) -> str | None:
