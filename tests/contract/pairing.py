@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle.refused import Refused
-from slrig.capture.evidence import Evidence
 from slrig.capture.checks import Contradiction
+from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture
 from slrig.devices import Head, Projector, ProjectorInfo, Rig, Shown
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
