@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from slrig.calibrate.solving import ReadPose
-from slrig.calibration.observations import BoardView, Correspondences, PoseObservation
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import StorageError
 
 _PARTS: Mapping[str, type[Any]] = {"view": BoardView, "light": Correspondences, "figures": ViewFigures}

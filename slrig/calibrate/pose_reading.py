@@ -16,8 +16,7 @@ from slrig.calibrate.pose_movement import differ, moved_px
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board
 from slrig.calibration.boards.detection import blur_sigma_px, board_region, find_board, light_squares, square_interior
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import PatternError, PoseRefusedError
 from slrig.model import Axis, Capture, Size
 from slrig.patterns.positions import (

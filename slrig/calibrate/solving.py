@@ -8,11 +8,10 @@ from datetime import UTC, datetime
 from uuid import uuid4
 
 from slrig.calibration.board import Board, BoardShape
-from slrig.calibration.judging.scale_check import check_scale
+from slrig.calibration.judging.comparison import check_scale
 from slrig.calibration.judging.verdict import Verdict, verdict
-from slrig.calibration.observations import Observations, PoseObservation
+from slrig.calibration.observations import Observations, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import Coverage, coverage
-from slrig.calibration.poses.figures import ViewFigures
 from slrig.calibration.solution import PROJECTOR, ExpectedError, Solution
 from slrig.errors import CalibrationError, SolveRefusedError
 from slrig.jobs.records import utc_now

@@ -88,6 +88,14 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
     return Moved(by_parameter, np.stack(noises, axis=2), light.inside & (total > 0), sight[:, None])
 
 
+def cell_centres(box_mm: FloatArray, counts: Sequence[int], /) -> FloatArray:
+    """(n, 3) float64: the middles of equal cells, so many along each axis, of a box (2, 3), mm."""
+    axes = [
+        low + (high - low) * (np.arange(count) + 0.5) / count for low, high, count in zip(*box_mm, counts, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
 def rigid_free(points_mm: FloatArray, fields: FloatArray, /) -> FloatArray:
     """(n, 3, k): fields of displacement (n, 3, k), each without the rigid motion that is nearest to it.
 

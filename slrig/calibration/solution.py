@@ -11,30 +11,42 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from slrig.model import Calibration, FloatArray, IntArray
+import numpy as np
 
-PARAMETERS = (
-    "fx",
-    "fy",
-    "cx",
-    "cy",
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-    "k3",
-    "turn_x",
-    "turn_y",
-    "turn_z",
-    "x_mm",
-    "y_mm",
-    "z_mm",
-)
+from slrig.model import Calibration, FloatArray, IntArray, Pinhole
+from slrig.model.lens import LENS_TERMS
+
+PARAMETERS = ("fx", "fy", "cx", "cy", *LENS_TERMS, "turn_x", "turn_y", "turn_z", "x_mm", "y_mm", "z_mm")
 CELLS = 6
 """Residual maps have 6 x 6 cells over the image."""
 
 PROJECTOR = "projector"
 """The projector's name among devices."""
+
+
+def device_title(name: str) -> str:
+    """A device's name as a sentence has it.
+
+    >>> device_title("left"), device_title("projector")
+    ("camera 'left'", 'the projector')
+    """
+    return "the projector" if name == PROJECTOR else f"camera '{name}'"
+
+
+def devices_of(calibration: Calibration, /) -> dict[str, Pinhole]:
+    """Cameras in order, then the projector where there is one: the order of the covariance."""
+    light = {} if calibration.projector is None else {PROJECTOR: calibration.projector}
+    return {**calibration.cameras, **light}
+
+
+def covariance_of(calibration: Calibration, /, *names: str) -> FloatArray:
+    """(15 k, 15 k) float64: the covariance of the named devices, of all without names; zeros where none is stated."""
+    order = list(devices_of(calibration))
+    if calibration.solved is None:
+        return np.zeros((len(PARAMETERS) * len(names or order),) * 2)
+    indices = np.arange(len(PARAMETERS) * len(order)).reshape(len(order), -1)
+    rows = indices[[order.index(name) for name in names or order]].ravel()
+    return np.asarray(calibration.solved.covariance[np.ix_(rows, rows)], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +55,10 @@ class BoardPose:
 
     rotation: FloatArray
     translation_mm: FloatArray
+
+    def placed(self, points_mm: FloatArray) -> FloatArray:
+        """(n, 3) float64: points of the board (n, 3) where they lie."""
+        return np.asarray(points_mm @ self.rotation.T + self.translation_mm)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import Board
 from slrig.calibration.displacement import modes_of
-from slrig.calibration.health.devices import EACH, covariance_of, devices_of
 from slrig.calibration.observations import Observations, PoseObservation
-from slrig.calibration.solution import BoardPose
+from slrig.calibration.solution import BoardPose, covariance_of, devices_of
+from slrig.calibration.solving.adjustment import corner_terms, match_terms
 from slrig.calibration.solving.measurements import Measurements, groups, measured
-from slrig.calibration.solving.parameters import device_row, pose_row, to_board_pose, turned
-from slrig.calibration.solving.projection import BEND, POSE, corner_rows, match_rows
+from slrig.calibration.solving.parameters import Geometry, device_row, pose_row, to_board_pose
+from slrig.calibration.solving.problem import flat_geometry
+from slrig.calibration.solving.projection import DEVICE as EACH
+from slrig.calibration.solving.projection import POSE
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, IntArray
 
@@ -40,6 +42,9 @@ _OUTLYING = 6.0
 _PER_MEDIAN = 1.4826
 _TURNS = 4
 _SETTLED = 1e-5  # rad, mm
+
+_Part = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""n equations of one camera, pose and axis: what is left (n,), by_device, by_pose, the surface (n, 6), deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,30 +83,24 @@ def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calib
             "check the calibration against the rig that shot the board"
         )
         raise CalibrationError(message)
-    devices = np.stack(
-        [
-            device_row(each.matrix, each.distortion, each.rotation, each.translation_mm)
-            for each in devices_of(calibration).values()
-        ]
-    )
-    bench = _Bench(everything, devices, board, np.stack([_standing(pose, board, calibration) for pose in poses]))
+    devices = np.stack([
+        device_row(each.matrix, each.distortion, each.rotation, each.translation_mm)
+        for each in devices_of(calibration).values()
+    ])  # fmt: skip
+    geometry = flat_geometry(board, devices, np.stack([_standing(pose, board, calibration) for pose in poses]))
     modes = modes_of(covariance_of(calibration))
-    found = bench.linear(modes)
+    found = _linear(everything, geometry, modes)
     for _ in range(_TURNS):
-        step = posterior_step(found)
-        rows = step[: POSE * len(poses)].reshape(-1, POSE)
-        bench.poses[:, :9] = turned(bench.poses[:, :9], rows[:, :3])
-        bench.poses[:, 9:] += rows[:, 3:]
-        found = bench.linear(modes)
-        if np.abs(rows).max() < _SETTLED:
+        # The most likely board poses, modes and shared errors, with no change of the devices.
+        solved = np.linalg.lstsq(design(found), padded(found, found.left), rcond=None)[0][: POSE * len(poses)]
+        step = np.zeros(geometry.layout.count)
+        step[geometry.layout.first_pose : geometry.layout.first_offset] = solved
+        geometry = geometry.moved(step)
+        found = _linear(everything, geometry, modes)
+        if np.abs(solved).max() < _SETTLED:
             break
-    standing = {pose.name: to_board_pose(row) for pose, row in zip(poses, bench.poses, strict=True)}
+    standing = {pose.name: to_board_pose(row) for pose, row in zip(poses, geometry.poses, strict=True)}
     return replace(found, standing=standing)
-
-
-def posterior_step(found: Equations, /) -> FloatArray:
-    """The most likely board poses, modes and shared errors, with no change of the devices."""
-    return np.asarray(np.linalg.lstsq(design(found), padded(found, found.left), rcond=None)[0])
 
 
 def design(found: Equations, /) -> FloatArray:
@@ -117,93 +116,68 @@ def padded(found: Equations, values: FloatArray, /) -> FloatArray:
     return np.concatenate([values, np.zeros((below, *values.shape[1:]))])
 
 
-class _Bench:
-    """Observations about a pose, in cells."""
+def _linear(m: Measurements, geometry: Geometry, modes: FloatArray) -> Equations:
+    """The equations about the poses of a geometry."""
+    parts = _corners(m, geometry) + _light(m, geometry)
+    shared = np.zeros((sum(len(part[0]) for part in parts), 6 * len(parts)))
+    start = 0
+    for number, (left, _, _, surface, sigma) in enumerate(parts):
+        shared[start : start + len(left), 6 * number : 6 * number + 6] = SHARED_PX * surface / sigma[:, None]
+        start += len(left)
+    left, by_device, by_pose, _, scale = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Equations(left / scale, by_device / scale[:, None], by_pose / scale[:, None], shared, modes, {})
 
-    def __init__(self, everything: Measurements, devices: FloatArray, board: Board, poses: FloatArray) -> None:
-        self._all = everything
-        self._devices = devices
-        self._points = np.ascontiguousarray(board.points_mm[:, :2])
-        least, most = self._points.min(axis=0), self._points.max(axis=0)
-        middle = (least + most) / 2
-        self._half = float((most - least).max()) / 2
-        self._frame = np.array([*middle, self._half])
-        self._middle = middle
-        self._bend = np.zeros(BEND)
-        self.poses = poses
 
-    def linear(self, modes: FloatArray) -> Equations:
-        corners = self._corners()
-        light = self._light() if len(self._all.match_px) else []
-        parts = corners + light
-        blocks = np.zeros((sum(len(part[0]) for part in parts), 6 * len(parts)))
-        start = 0
-        for number, part in enumerate(parts):
-            blocks[start : start + len(part[0]), 6 * number : 6 * number + 6] = SHARED_PX * part[3] / part[4][:, None]
-            start += len(part[0])
-        scale = np.concatenate([part[4] for part in parts])
-        return Equations(
-            left=np.concatenate([part[0] for part in parts]) / scale,
-            by_device=np.concatenate([part[1] for part in parts]) / scale[:, None],
-            by_pose=np.concatenate([part[2] for part in parts]) / scale[:, None],
-            shared=blocks,
-            modes=modes,
-            standing={},
-        )
+def _corners(m: Measurements, geometry: Geometry) -> list[_Part]:
+    residual, rows = corner_terms(geometry, m, jacobian=True)
+    parts: list[_Part] = []
+    for run in groups(m.corner_where, columns=2):
+        camera, pose = m.corner_where[run][0, :2]
+        surface = _surface(geometry, geometry.points[m.corner_where[run][:, 2]])
+        for axis in (0, 1):
+            left = -residual[run, axis]
+            sigma, kept = _sigma(left, m.corner_sigma[run], surface)
+            by_device = _spread(rows[run, axis, :EACH], camera, len(geometry.devices))
+            by_pose = _spread(rows[run, axis, EACH : EACH + POSE], pose, len(geometry.poses))
+            parts.append((left[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
+    return parts
 
-    def _corners(self) -> list[tuple[FloatArray, ...]]:
-        m = self._all
-        residual, rows = corner_rows(
-            self._devices, self.poses, self._points, self._bend, self._frame, m.corner_where, m.corner_px
-        )
-        parts: list[tuple[FloatArray, ...]] = []
-        for run in groups(m.corner_where, columns=2):
-            camera, pose = m.corner_where[run][0, :2]
-            surface = self._surface(self._points[m.corner_where[run][:, 2]])
-            for axis in (0, 1):
-                left = -residual[run, axis]
-                sigma, kept = _sigma(left, m.corner_sigma[run], surface)
-                by_device = np.zeros((len(left), EACH * len(self._devices)))
-                by_device[:, EACH * camera : EACH * (camera + 1)] = rows[run, axis, :EACH]
-                by_pose = self._pose_columns(pose, rows[run, axis, EACH : EACH + POSE])
-                parts.append((left[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
-        return parts
 
-    def _light(self) -> list[tuple[FloatArray, ...]]:
-        m, lamp = self._all, len(self._devices) - 1
-        left = -match_rows(
-            self._devices, self.poses, self._bend, self._frame, m.match_where, m.match_pixel, m.match_px, jacobian=False
-        )[0]
-        parts: list[tuple[FloatArray, ...]] = []
-        for run in groups(m.match_where):
-            good = np.flatnonzero(np.isfinite(left[run])) + run.start
-            if len(good) < _CELLS:
-                continue
-            pixels, value, sigma = _cells(m.match_pixel[good], left[good], m.match_sigma[good])
-            where = np.repeat(m.match_where[good[:1]], len(value), axis=0)
-            camera, pose = where[0, :2]
-            _, rows = match_rows(
-                self._devices, self.poses, self._bend, self._frame, where, pixels, np.zeros(len(value))
-            )
-            surface = self._surface((pixels - pixels.mean(axis=0)) / np.ptp(pixels) * 2 * self._half + self._middle)
-            sigma, kept = _sigma(value, sigma, surface)
-            kept = kept & np.isfinite(rows).all(axis=1)
-            by_device = np.zeros((len(value), EACH * len(self._devices)))
-            by_device[:, EACH * camera : EACH * (camera + 1)] = rows[:, :EACH]
-            by_device[:, EACH * lamp :] += rows[:, EACH : 2 * EACH]
-            by_pose = self._pose_columns(pose, rows[:, 2 * EACH : 2 * EACH + POSE])
-            parts.append((value[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
-        return parts
+def _light(m: Measurements, geometry: Geometry) -> list[_Part]:
+    left = -match_terms(geometry, m, jacobian=False)[0]
+    devices = len(geometry.devices)
+    parts: list[_Part] = []
+    for run in groups(m.match_where):
+        good = np.flatnonzero(np.isfinite(left[run])) + run.start
+        if len(good) < _CELLS:
+            continue
+        pixels, value, sigma = _cells(m.match_pixel[good], left[good], m.match_sigma[good])
+        where = np.repeat(m.match_where[good[:1]], len(value), axis=0)
+        camera, pose = where[0, :2]
+        cells = replace(m, match_where=where, match_pixel=pixels, match_px=np.zeros(len(value)))
+        _, rows = match_terms(geometry, cells, jacobian=True)
+        on_board = (pixels - pixels.mean(axis=0)) / np.ptp(pixels) * 2 * geometry.frame[2] + geometry.frame[:2]
+        surface = _surface(geometry, on_board)
+        sigma, kept = _sigma(value, sigma, surface)
+        kept = kept & np.isfinite(rows).all(axis=1)
+        by_device = _spread(rows[:, :EACH], camera, devices) + _spread(rows[:, EACH : 2 * EACH], devices - 1, devices)
+        by_pose = _spread(rows[:, 2 * EACH : 2 * EACH + POSE], pose, len(geometry.poses))
+        parts.append((value[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
+    return parts
 
-    def _pose_columns(self, pose: int, rows: FloatArray) -> FloatArray:
-        columns = np.zeros((len(rows), POSE * len(self.poses)))
-        columns[:, POSE * pose : POSE * (pose + 1)] = rows
-        return columns
 
-    def _surface(self, points_mm: FloatArray) -> FloatArray:
-        """(n, 6): the terms of a quadratic surface over the board."""
-        x, y = ((points_mm - self._middle) / self._half).T
-        return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+def _spread(rows: FloatArray, index: int, count: int) -> FloatArray:
+    """(n, k count): rows (n, k) in their place among `count` such blocks, zeros elsewhere."""
+    width = rows.shape[1]
+    columns = np.zeros((len(rows), width * count))
+    columns[:, width * index : width * (index + 1)] = rows
+    return columns
+
+
+def _surface(geometry: Geometry, points_mm: FloatArray) -> FloatArray:
+    """(n, 6): the terms of a quadratic surface over the board."""
+    x, y = ((points_mm - geometry.frame[:2]) / geometry.frame[2]).T
+    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 def _sigma(left: FloatArray, stated: FloatArray, surface: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

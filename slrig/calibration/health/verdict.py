@@ -7,15 +7,15 @@ median of the last three verifications; but a verification that is far beyond ch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 from scipy.special import stdtr
 
-from slrig.calibration.health.devices import device_words
 from slrig.calibration.health.verification import PairFigures, Verification
+from slrig.calibration.solution import device_title
 
 
 class HealthState(StrEnum):
@@ -70,58 +70,50 @@ class Health:
     remedy: str | None = None
 
 
-def judged(verifications: Sequence[Verification], /, *, thresholds: Thresholds = THRESHOLDS) -> Health:
+_Told = list[tuple[HealthState, str]]
+
+
+def judged(verifications: Sequence[Verification], /) -> Health:
     """Judge a rig by every verification since its calibration, oldest first."""
     if not verifications:
         return Health(
             HealthState.UNKNOWN, ("nothing was verified since the calibration",), "shoot a verification of the board"
         )
-    latest = verifications[-1]
-    told: list[tuple[HealthState, str]] = []
-    told += _of_error(verifications, thresholds)
-    told += _of_means(verifications, thresholds)
-    told += _of_rms(verifications, thresholds)
-    told += _of_change(verifications, thresholds)
-    told += _of_trend(verifications, thresholds)
-    state = HealthState.GOOD
-    for found, _ in told:
-        state = found if found is HealthState.STALE or state is HealthState.GOOD else state
-    reasons = tuple(words for found, words in sorted(told, key=lambda each: each[0] is not HealthState.STALE))
-    if state is HealthState.GOOD:
-        return Health(state, (_good_words(latest),))
-    measured = [verification for verification in verifications if verification.kind == "board"]
-    named = measured[-1] if measured else latest
+    told = _of_error(verifications)
+    pairs = {}
+    for key in _pairs(verifications):
+        pairs[key] = [pair for each in verifications for pair in each.pairs if (pair.first, pair.second) == key]
+    told += [found for each in pairs.values() for found in _of_mean(each)]
+    told += [found for each in pairs.values() for found in _of_rms(each)]
+    board = [each for each in verifications if each.kind == "board"]
+    if len(board) >= _TREND and _middle([each.evidence for each in board]) >= THRESHOLDS.watch_evidence:
+        told.append((HealthState.WATCH, "the last verifications agree that a device changed"))
+    told += _of_trend([each.scale_percent for each in verifications if each.scale_percent is not None], pairs)
+    if not told:
+        return Health(HealthState.GOOD, (_good_words(verifications[-1]),))
+    told.sort(key=lambda each: each[0] is not HealthState.STALE)
+    state, reasons = told[0][0], [words for _, words in told]
+    named = board[-1] if board else verifications[-1]
     if named.drifts:
-        reasons = (*reasons, named.drifts[0].words, *([named.open] if named.open else []))
-    reasons = (*reasons, *_unseen_words(named))
+        reasons += [named.drifts[0].words, *([named.open] if named.open else [])]
+    reasons += _unseen_words(named)
     if state is HealthState.STALE:
         remedy = named.remedy or "shoot a verification of the board to learn which device changed, and calibrate again"
     else:
         remedy = "verify again soon; calibrate again before it gets worse"
-    return Health(state, reasons, remedy)
+    return Health(state, tuple(reasons), remedy)
 
 
-def _of_error(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
-    known = [
-        verification
-        for verification in verifications
-        if verification.expected_mm is not None and verification.stated_mm
-    ]
+def _of_error(verifications: Sequence[Verification]) -> _Told:
+    at, known = THRESHOLDS, [each for each in verifications if each.expected_mm is not None and each.stated_mm]
     if not known:
         return []
-    ratio, jumped = _trend(known, _error_ratio, lambda verification: verification.evidence > at.jump_evidence)
-    evidence = (
-        known[-1].evidence if jumped else float(np.median([verification.evidence for verification in known[-_TREND:]]))
-    )
-    sigmas = (
-        known[-1].significance
-        if jumped
-        else float(np.median([verification.significance for verification in known[-_TREND:]]))
-    )
+    ratio, jumped = _trend([_error_ratio(each) for each in known], jumps=known[-1].evidence > at.jump_evidence)
+    counted = known[-1:] if jumped else known
+    evidence, sigmas = _middle([each.evidence for each in counted]), _middle([each.significance for each in counted])
     now, stated = known[-1].expected_mm, known[-1].stated_mm
     words = f"scans are now expected to be wrong by {now:.3g} mm, {ratio:.1f} times the {stated:.3g} mm that is stated"
-    sure = sigmas > at.sure_sigmas
-    likely = evidence > at.watch_evidence
+    likely, sure = evidence > at.watch_evidence, sigmas > at.sure_sigmas
     if (ratio > at.stale_error_ratio and likely) or (ratio > at.sure_error_ratio and sure):
         return [(HealthState.STALE, words)]
     # A ratio alone may come of explanations none of which is likelier than that nothing changed.
@@ -129,69 +121,36 @@ def _of_error(verifications: Sequence[Verification], at: Thresholds) -> list[tup
     return [(HealthState.WATCH, words)] if ratio > at.watch_error_ratio and changed else []
 
 
-def _of_means(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
-    told = []
-    for first, second in _pairs(verifications):
-        known = [verification for verification in verifications if _pair(verification, first, second) is not None]
-
-        def mean(verification: Verification, first: str = first, second: str = second) -> float:
-            found = _pair(verification, first, second)
-            return abs(found.mean_px) if found is not None else 0.0
-
-        def jump(verification: Verification, first: str = first, second: str = second) -> bool:
-            found = _pair(verification, first, second)
-            return found is not None and abs(found.mean_px) > at.jump_mean_sigmas * found.mean_sigma_px
-
-        value, _ = _trend(known, mean, jump)
-        last = _pair(known[-1], first, second)
-        sigma = 0.0 if last is None else last.mean_sigma_px
-        if value > max(at.watch_mean_px, _CHANCE * sigma):
-            state = HealthState.STALE if value > at.stale_mean_px else HealthState.WATCH
-            told.append((state, f"'{first}' and '{second}' disagree by {value:.2f} px in the mean, expected about 0"))
-    return told
-
-
-def _of_rms(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
-    told = []
-    for first, second in _pairs(verifications):
-        found = [pair for verification in verifications if (pair := _pair(verification, first, second)) is not None]
-        after = max(found[0].predicted_px, min(pair.rms_px for pair in found[:_TREND]))
-        value = float(np.median([pair.rms_px for pair in found[-_TREND:]]))
-        if value > at.watch_rms_ratio * after:
-            state = HealthState.STALE if value > at.stale_rms_ratio * after else HealthState.WATCH
-            words = f"'{first}' and '{second}' disagree by {value:.2f} px rms, {after:.2f} px after the calibration"
-            told.append((state, words))
-    return told
-
-
-def _of_change(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
-    board = [verification for verification in verifications if verification.kind == "board"][-_TREND:]
-    if len(board) < _TREND or float(np.median([verification.evidence for verification in board])) < at.watch_evidence:
+def _of_mean(found: Sequence[PairFigures]) -> _Told:
+    at, last = THRESHOLDS, found[-1]
+    jumps = abs(last.mean_px) > at.jump_mean_sigmas * last.mean_sigma_px
+    value, _ = _trend([abs(pair.mean_px) for pair in found], jumps=jumps)
+    if value <= max(at.watch_mean_px, _CHANCE * last.mean_sigma_px):
         return []
-    return [(HealthState.WATCH, "the last verifications agree that a device changed")]
+    state = HealthState.STALE if value > at.stale_mean_px else HealthState.WATCH
+    return [(state, f"'{last.first}' and '{last.second}' disagree by {value:.2f} px in the mean, expected about 0")]
 
 
-def _of_trend(verifications: Sequence[Verification], at: Thresholds) -> list[tuple[HealthState, str]]:
+def _of_rms(found: Sequence[PairFigures]) -> _Told:
+    at, last = THRESHOLDS, found[-1]
+    after = max(found[0].predicted_px, min(pair.rms_px for pair in found[:_TREND]))
+    value = _middle([pair.rms_px for pair in found])
+    if value <= at.watch_rms_ratio * after:
+        return []
+    words = f"'{last.first}' and '{last.second}' disagree by {value:.2f} px rms, {after:.2f} px after the calibration"
+    return [(HealthState.STALE if value > at.stale_rms_ratio * after else HealthState.WATCH, words)]
+
+
+def _of_trend(sizes: Sequence[float], pairs: Mapping[tuple[str, str], Sequence[PairFigures]]) -> _Told:
     told = []
-    sizes = [verification.scale_percent for verification in verifications if verification.scale_percent is not None]
     crept, chance = _crept(sizes)
-    if chance < at.trend_chance:
-        words = (
-            f"the board's measured size has crept by {crept:+.3f} % since the first verifications, and not by chance"
-        )
-        told.append((HealthState.WATCH, words))
-    for first, second in _pairs(verifications):
-        means = [
-            pair.mean_px for verification in verifications if (pair := _pair(verification, first, second)) is not None
-        ]
-        crept, chance = _crept(means)
-        if chance < at.trend_chance and abs(crept) > _CREPT_PX:
-            words = (
-                f"'{first}' and '{second}' have crept apart by {crept:+.3f} px since the first verifications, and not "
-                "by chance"
-            )
-            told.append((HealthState.WATCH, words))
-    return told
+    if chance < THRESHOLDS.trend_chance:
+        told.append(f"the board's measured size has crept by {crept:+.3f} %")
+    for (first, second), found in pairs.items():
+        crept, chance = _crept([pair.mean_px for pair in found])
+        if chance < THRESHOLDS.trend_chance and abs(crept) > _CREPT_PX:
+            told.append(f"'{first}' and '{second}' have crept apart by {crept:+.3f} px")
+    return [(HealthState.WATCH, f"{each} since the first verifications, and not by chance") for each in told]
 
 
 def _crept(values: Sequence[float]) -> tuple[float, float]:
@@ -210,33 +169,25 @@ def _crept(values: Sequence[float]) -> tuple[float, float]:
     return crept, float(2 * stdtr(2 * (len(values) - 1) / 3, -size))
 
 
-def _trend(
-    verifications: Sequence[Verification], value: Callable[[Verification], float], jumps: Callable[[Verification], bool]
-) -> tuple[float, bool]:
+def _middle(values: Sequence[float]) -> float:
+    """The median of the last three."""
+    return float(np.median(values[-_TREND:]))
+
+
+def _trend(values: Sequence[float], *, jumps: bool) -> tuple[float, bool]:
     """The median of the last three, or the last alone where it is beyond chance; and whether it was that."""
-    last = value(verifications[-1])
-    middle = float(np.median([value(verification) for verification in verifications[-_TREND:]]))
-    return (last, True) if last > middle and jumps(verifications[-1]) else (middle, False)
+    middle = _middle(values)
+    return (values[-1], True) if values[-1] > middle and jumps else (middle, False)
 
 
 def _error_ratio(verification: Verification) -> float:
-    return (
-        verification.expected_mm / verification.stated_mm
-        if verification.expected_mm is not None and verification.stated_mm
-        else 0.0
-    )
+    now, stated = verification.expected_mm, verification.stated_mm
+    return now / stated if now is not None and stated else 0.0
 
 
-def _pair(verification: Verification, first: str, second: str) -> PairFigures | None:
-    return next((pair for pair in verification.pairs if (pair.first, pair.second) == (first, second)), None)
-
-
-def _pairs(verifications: Sequence[Verification]) -> list[tuple[str, str]]:
-    return list(
-        dict.fromkeys(
-            (pair.first, pair.second) for verification in verifications[-_TREND:] for pair in verification.pairs
-        )
-    )
+def _pairs(verifications: Sequence[Verification]) -> dict[tuple[str, str], None]:
+    """The pairs of the last three verifications, in order."""
+    return dict.fromkeys((pair.first, pair.second) for each in verifications[-_TREND:] for pair in each.pairs)
 
 
 def _good_words(verification: Verification) -> str:
@@ -249,6 +200,6 @@ def _good_words(verification: Verification) -> str:
 
 def _unseen_words(verification: Verification) -> list[str]:
     return [
-        f"{device_words(name)} did not take part in the last verification, which says nothing of it"
+        f"{device_title(name)} did not take part in the last verification, which says nothing of it"
         for name in verification.unseen
     ]

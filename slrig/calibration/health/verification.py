@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 
@@ -62,10 +62,10 @@ class Verification:
     drift_mm: float | None = None
     significance: float = 0.0
     evidence: float = 0.0
-    drifts: Sequence[Drift] = field(default=())
+    drifts: Sequence[Drift] = ()
     open: str | None = None
     remedy: str | None = None
-    unseen: Sequence[str] = field(default=())
+    unseen: Sequence[str] = ()
 
     def document(self) -> dict[str, Any]:
         """As JSON values."""

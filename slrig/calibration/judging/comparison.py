@@ -1,16 +1,20 @@
-"""Two calibrations of one rig, compared: what changed of each device, in its σ, and by how much points move for it."""
+"""Two calibrations of one rig, compared: what changed of each device, in its σ, and by how much points move for it; and
+whether a new one has the scale of an earlier one, since a wrong square size shows nowhere else.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
 
-from slrig.calibration.solution import PROJECTOR
+from slrig.calibration.board import Board
+from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution, covariance_of, device_title, devices_of
 from slrig.errors import CalibrationError
-from slrig.model import DEVICE_PARAMETERS, Calibration, FloatArray, Pinhole
+from slrig.model import Calibration, FloatArray, Pinhole
 
 SAME_SIGMA = 3.0
 """A difference of up to so many of its own standard deviations may be chance."""
@@ -18,6 +22,11 @@ SAME_SIGMA = 3.0
 _GRID = 4
 _TURNS = 10
 _STEP_MM = 1e-3
+_OFF = 0.01
+_ALIKE = 0.005
+_TURNED_DEG = 1.0
+_SURE = 3.0
+_SHIFT = PARAMETERS.index("x_mm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,16 +84,16 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
         They have no camera in common, or a device of another size: they are of two rigs.
     """
     _refuse_other_rigs(first, second)
-    names = [name for name in _devices(first) if name in _devices(second)]
+    names = [name for name in devices_of(first) if name in devices_of(second)]
     origin = names[0]
     here, there = _seen_from(first, origin), _seen_from(second, origin)
     devices = {
-        name: _device(name, here[name], there[name], _spread(first, name), _spread(second, name), name == origin)
+        name: _device(name, here[name], there[name], _spread(first, name) + _spread(second, name), name == origin)
         for name in names
     }
     moved_mm = _moves(here, there, names, _volume(first, second, origin))
     rms, most = (float(np.sqrt((moved_mm**2).mean())), float(moved_mm.max())) if len(moved_mm) else (np.nan, np.nan)
-    missing = tuple(sorted(set(_devices(first)) ^ set(_devices(second))))
+    missing = tuple(sorted(set(devices_of(first)) ^ set(devices_of(second))))
     words = [_move_words(rms, most, shared=len(names))]
     words += [f"Only one of them has {name}; it is not compared." for name in missing]
     for each in devices.values():
@@ -93,24 +102,64 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
     return Comparison(devices, missing, rms, most, tuple(words))
 
 
-def _devices(calibration: Calibration) -> dict[str, Pinhole]:
-    projector = {} if calibration.projector is None else {PROJECTOR: calibration.projector}
-    return {**calibration.cameras, **projector}
+def check_scale(solution: Solution, earlier: Calibration, board: Board) -> tuple[str, ...]:
+    """Return in words what is wrong with the scale, nothing where it is that of the earlier calibration.
+
+    The distance of two devices is compared with what it was. All distances off by one ratio, by more than 1 % and more
+    than their own uncertainty, while the devices look in the same directions: the board's squares are not as large as
+    they were said to be. Off otherwise: the rig was rebuilt. Devices that are not in both are left out. Fewer than two
+    in both have no distance, and that is said.
+    """
+    now, before = devices_of(solution.calibration), devices_of(earlier)
+    common = [name for name in now if name in before]
+    if len(common) < 2:
+        shared = ", ".join(device_title(name) for name in common) or "no device"
+        return (
+            f"the scale is not checked: that takes two devices which the earlier calibration has too, found {shared}; "
+            "measure the printed ruler of the board",
+        )
+    order = list(now)
+    ratios: list[float] = []
+    changed: list[str] = []
+    turned = False
+    for first, second in combinations(common, 2):
+        new_mm, old_mm = _distance_mm(now, first, second), _distance_mm(before, first, second)
+        if old_mm <= 0 or new_mm <= 0:
+            continue
+        ratio = new_mm / old_mm
+        sigma = _sigma_mm(solution.covariance, order.index(first), order.index(second)) / old_mm
+        if abs(ratio - 1) > max(_OFF, _SURE * sigma):
+            ratios.append(ratio)
+            changed.append(f"{device_title(first)} to {device_title(second)}: {new_mm:.1f} mm, before {old_mm:.1f} mm")
+        angle = max(_angle_deg(now, before, first, second), _leaning_deg(now, before, first, second))
+        turned = turned or angle > _TURNED_DEG
+    if not ratios:
+        return ()
+    pairs = len(common) * (len(common) - 1) // 2
+    told = "; ".join(changed)
+    if len(ratios) == pairs and max(ratios) - min(ratios) < _ALIKE * min(ratios) and not turned:
+        ratio = float(np.mean(ratios))
+        side_mm = board.square_mm / ratio
+        return (
+            f"everything is {abs(ratio - 1):.1%} {'larger' if ratio > 1 else 'smaller'} than in the earlier "
+            f"calibration ({told}): the board's squares measure {side_mm:.4g} mm instead of {board.square_mm:.4g} mm, "
+            "or the rig was rebuilt; measure the printed ruler, and say the size that it has",
+        )
+    return (
+        f"the devices do not stand as in the earlier calibration ({told}): the rig was rebuilt, or a device was "
+        "bumped. If neither is so, measure the printed ruler of the board, and calibrate again",
+    )
 
 
 def _refuse_other_rigs(first: Calibration, second: Calibration) -> None:
-    if not set(first.cameras) & set(second.cameras):
-        message = (
-            f"the calibrations are of two rigs: one has {', '.join(first.cameras)}, the other "
-            f"{', '.join(second.cameras)}; compare two of one rig"
-        )
-        raise CalibrationError(message)
-    here, there = _devices(first), _devices(second)
+    here, there = devices_of(first), devices_of(second)
     faults = [
         f"{name} has {here[name].size} pixels in one and {there[name].size} in the other"
         for name in here
         if name in there and here[name].size != there[name].size
     ]
+    if not set(first.cameras) & set(second.cameras):
+        faults = [f"one has {', '.join(first.cameras)}, the other {', '.join(second.cameras)}"]
     if faults:
         message = f"the calibrations are of two rigs: {'; '.join(faults)}; compare two of one rig"
         raise CalibrationError(message)
@@ -120,27 +169,20 @@ def _seen_from(calibration: Calibration, origin: str) -> dict[str, Pinhole]:
     """Every device with the frame of one camera as the world."""
     base = calibration.cameras[origin]
     found = {}
-    for name, device in _devices(calibration).items():
+    for name, device in devices_of(calibration).items():
         rotation = device.rotation @ base.rotation.T
         shift = device.translation_mm - rotation @ base.translation_mm
-        found[name] = Pinhole(device.size, device.matrix, device.distortion, rotation, shift)
+        found[name] = replace(device, rotation=rotation, translation_mm=shift)
     return found
 
 
 def _spread(calibration: Calibration, name: str) -> FloatArray:
     """(15, 15) float64: the covariance of one device, NaN where the calibration says nothing of its own error."""
-    if calibration.solved is None:
-        return np.full((DEVICE_PARAMETERS, DEVICE_PARAMETERS), np.nan)
-    start = DEVICE_PARAMETERS * list(_devices(calibration)).index(name)
-    block = slice(start, start + DEVICE_PARAMETERS)
-    return calibration.solved.covariance[block, block]
+    return np.where(calibration.solved is None, np.nan, covariance_of(calibration, name))
 
 
-def _device(
-    name: str, here: Pinhole, there: Pinhole, spread_here: FloatArray, spread_there: FloatArray, is_origin: bool
-) -> DeviceDifference:
-    spread = spread_here + spread_there
-    title = "the projector" if name == PROJECTOR else f"camera '{name}'"
+def _device(name: str, here: Pinhole, there: Pinhole, spread: FloatArray, is_origin: bool) -> DeviceDifference:
+    title = device_title(name)
     focal_here, focal_there = (float(each.matrix[[0, 1], [0, 1]].mean()) for each in (here, there))
     share = 100 / focal_here
     focal = _difference(
@@ -245,3 +287,31 @@ def _move_words(rms_mm: float, most_mm: float, *, shared: int) -> str:
     if not np.isfinite(rms_mm):
         return "By how much points move is not known: neither calibration names a working volume."
     return f"Points in the working volume move by {rms_mm:.3g} mm rms, by {most_mm:.3g} mm at most."
+
+
+def _distance_mm(devices: Mapping[str, Pinhole], first: str, second: str) -> float:
+    return float(np.linalg.norm(devices[second].centre_mm - devices[first].centre_mm))
+
+
+def _angle_deg(now: Mapping[str, Pinhole], before: Mapping[str, Pinhole], first: str, second: str) -> float:
+    """Return by how much one device turned as the other sees it, degrees."""
+    new = now[second].rotation @ now[first].rotation.T
+    old = before[second].rotation @ before[first].rotation.T
+    return float(np.degrees(np.arccos(np.clip((np.trace(new @ old.T) - 1) / 2, -1, 1))))
+
+
+def _leaning_deg(now: Mapping[str, Pinhole], before: Mapping[str, Pinhole], first: str, second: str) -> float:
+    """Return by how much the direction to one device changed as the other sees it, degrees."""
+    ways = []
+    for devices in (now, before):
+        way = devices[first].rotation @ (devices[second].centre_mm - devices[first].centre_mm)
+        ways.append(way / np.linalg.norm(way))
+    return float(np.degrees(np.arccos(np.clip(ways[0] @ ways[1], -1, 1))))
+
+
+def _sigma_mm(covariance: FloatArray, first: int, second: int) -> float:
+    """Return a bound on the deviation of two devices' distance: that of both translations together."""
+    each = len(PARAMETERS)
+    starts = [each * index + _SHIFT for index in (first, second)]
+    blocks = [covariance[start : start + 3, start : start + 3] for start in starts]
+    return float(np.sqrt(sum(np.linalg.eigvalsh(block)[-1] for block in blocks)))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from slrig.calibration.displacement import Moved, modes_of, moved_points, rigid_free, stated_deviation
+from slrig.calibration.displacement import Moved, cell_centres, modes_of, moved_points, rigid_free, stated_deviation
 from slrig.calibration.observations import COLUMN, ROW, Observations
 from slrig.calibration.solution import ExpectedError, Solution
 from slrig.errors import CalibrationError
@@ -61,9 +61,8 @@ def expected_error(
         noise_px = _light_sigma_px(observations, calibration)
     noise_mm = _rms(noise_px * stated_deviation(moved.stated, moved.by_noise))
     calibration_mm = _rms(point_mm)
-    length_share = float("nan")
-    if calibration.triangulates:
-        length_share = _length_share(places, fields, float(np.linalg.norm(volume_mm[1] - volume_mm[0])))
+    diagonal_mm = float(np.linalg.norm(volume_mm[1] - volume_mm[0]))
+    length_share = _length_share(places, fields, diagonal_mm) if calibration.triangulates else float("nan")
     return ExpectedError(
         volume_mm=volume_mm,
         point_mm=calibration_mm,
@@ -102,10 +101,7 @@ def volume_of(solution: Solution, observations: Observations, /) -> tuple[FloatA
     while True:
         step = max(float(np.cbrt(extent.prod() / wanted)), float(extent.max()) / _MOST_STEPS)
         counts = np.maximum(np.ceil(extent / step).astype(int), 1)
-        axes = [
-            low + size * (np.arange(n) + 0.5) / n for low, size, n in zip(volume_mm[0], extent, counts, strict=True)
-        ]
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        nodes = cell_centres(volume_mm, counts.tolist())
         nodes = nodes[hull.find_simplex(nodes) >= 0]
         places = nodes[_seen(solution.calibration, nodes)] if len(nodes) else nodes
         if len(places) >= _PLACES // 3 or wanted > _MOST_NODES:
@@ -139,7 +135,7 @@ def _board_corners(solution: Solution, observations: Observations) -> FloatArray
     board = observations.board.points_mm
     if solution.board_shape_mm is not None:
         board = board + solution.board_shape_mm
-    return np.concatenate([board @ pose.rotation.T + pose.translation_mm for pose in solution.poses.values()])
+    return np.concatenate([pose.placed(board) for pose in solution.poses.values()])
 
 
 def _light_sigma_px(observations: Observations, calibration: Calibration) -> float:
@@ -168,12 +164,7 @@ def _length_share(places: FloatArray, fields: FloatArray, diagonal_mm: float) ->
     first, second, length = first[taken], second[taken], length[taken]
     direction = (places[second] - places[first]) / length[:, None]
     changes = np.einsum("ni,nik->nk", direction, fields[second] - fields[first])
-    return _rms(_deviation(changes) / length)
-
-
-def _deviation(parts: FloatArray) -> FloatArray:
-    """(n,): root of the sum of squares of (n, k) independent parts."""
-    return np.asarray(np.sqrt((parts**2).sum(axis=1)))
+    return _rms(np.sqrt((changes**2).sum(axis=1)) / length)
 
 
 def _rms(values: FloatArray) -> float:

@@ -9,8 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.poses.coverage import Coverage, device_title
-from slrig.calibration.poses.move_words import place_words
+from slrig.calibration.poses.coverage import Coverage, place_words
 from slrig.calibration.solution import (
     CELLS,
     PARAMETERS,
@@ -18,8 +17,10 @@ from slrig.calibration.solution import (
     DeviceResiduals,
     ExpectedError,
     Solution,
+    device_title,
+    devices_of,
 )
-from slrig.model import FloatArray, Pinhole
+from slrig.model import FloatArray
 
 
 class Grade(StrEnum):
@@ -146,107 +147,100 @@ def _diagonal_mm(expected: ExpectedError) -> float:
     return float(np.linalg.norm(expected.volume_mm[1] - expected.volume_mm[0]))
 
 
+def _judged(
+    figure: str, device: str | None, value: float, what: str, usual: str, cure: str, *, grade: Grade | None = None
+) -> Judgement:
+    """By the limit of the figure, unless a grade is given. usual : with {good} where the limit is to stand."""
+    grade = LIMITS[figure].grade(value) if grade is None else grade
+    usual = usual.format(good=LIMITS[figure].good) if figure in LIMITS else usual
+    words = f"{what} ({usual})" if grade is Grade.GOOD else f"{what}, {usual}: {cure}"
+    return Judgement(grade, figure, device, value, words)
+
+
 def _expected_error(expected: ExpectedError | None) -> Iterator[Judgement]:
-    limit, figure = LIMITS["error_share"], "error_share"
+    figure = "error_share"
     if expected is None or not np.isfinite(expected.point_mm):
         words = "the error of a scan could not be told: add poses that all devices see, at three distances"
         yield Judgement(Grade.USABLE, figure, None, float("nan"), words)
         return
     diagonal_mm = _diagonal_mm(expected)
-    usual = f"a good calibration has at most 1 in {1 / limit.good:,.0f}"
+    usual = f"a good calibration has at most 1 in {1 / LIMITS[figure].good:,.0f}"
     cure = "add poses where the map of the expected error is worst, tilted and at several distances"
     length = expected.length_share / 2
     noisy = f" ({expected.total_mm:.2g} mm with the noise of the light)" if np.isfinite(expected.total_mm) else ""
+    point = f"{expected.point_words} is expected {expected.point_mm:.2g} mm off{expected.way_words} by the calibration"
     for share, what in (
-        (
-            expected.point_mm / diagonal_mm,
-            f"{expected.point_words} is expected {expected.point_mm:.2g} mm off{expected.way_words} by the "
-            f"calibration{noisy}",
-        ),
+        (expected.point_mm / diagonal_mm, f"{point}{noisy}"),
         (length, f"a length of half the volume's diagonal is expected {length * diagonal_mm:.2g} mm wrong"),
     ):
         if np.isfinite(share):
-            grade = limit.grade(share)
             fraction = (
                 f"1 in {1 / share:,.0f} of the volume's diagonal of {diagonal_mm:.0f} mm" if share > 0 else "none"
             )
-            yield Judgement(grade, figure, None, share, _told(grade, f"{what}, {fraction}", usual, cure))
+            yield _judged(figure, None, share, f"{what}, {fraction}", usual, cure)
 
 
 def _poses(solution: Solution) -> Iterator[Judgement]:
     used, left_out = len(solution.poses), len(solution.outliers)
     good, usable = POSES
     grade = Grade.GOOD if used >= good else Grade.USABLE if used >= usable else Grade.DO_NOT_USE
-    what = f"{used} pose{'s' if used != 1 else ''} used"
-    yield Judgement(
-        grade, "poses", None, used, _told(grade, what, f"20 to 30 are usual, {good} the least", "add poses")
-    )
+    what, usual = f"{used} pose{'s' if used != 1 else ''} used", f"20 to 30 are usual, {good} the least"
+    yield _judged("poses", None, used, what, usual, "add poses", grade=grade)
     if left_out:
         share = left_out / (used + left_out)
-        limit = LIMITS["outlier_poses"]
         named = "; ".join(f"{name}: {why}" for name, why in solution.outliers.items())
         words = f"{left_out} of {used + left_out} poses left out ({named}): shoot them again, and let nothing move"
-        yield Judgement(limit.grade(share), "outlier_poses", None, share, words)
+        yield Judgement(LIMITS["outlier_poses"].grade(share), "outlier_poses", None, share, words)
 
 
 def _rms(name: str, residuals: DeviceResiduals) -> Iterator[Judgement]:
-    projector = name == PROJECTOR
+    projector, title = name == PROJECTOR, device_title(name)
     figure = "projector_rms_px" if projector else "camera_rms_px"
-    limit, title = LIMITS[figure], device_title(name)
-    worst, usual_px = _worst_pose(residuals), limit.good
-    usual = f"usual is {'0.1–0.3' if projector else '0.05–0.2'}"
-    first = f"look at {worst[0]} first ({worst[1]:.2g} px)" if worst else "all poses are alike: look at the focus"
-    if projector and not worst:
-        first = "all poses are alike: check that the exposure is a multiple of the refresh period, and the focus"
-    grade = limit.grade(residuals.rms_px)
-    yield Judgement(
-        grade, figure, name, residuals.rms_px, _told(grade, f"{title} has {residuals.rms_px:.2g} px rms", usual, first)
-    )
-    if worst and grade is Grade.GOOD:
+    worst, usual_px = _worst_pose(residuals), LIMITS[figure].good
+    if worst:
+        cure = f"look at {worst[0]} first ({worst[1]:.2g} px)"
+    elif projector:
+        cure = "all poses are alike: check that the exposure is a multiple of the refresh period, and the focus"
+    else:
+        cure = "all poses are alike: look at the focus"
+    what, usual = f"{title} has {residuals.rms_px:.2g} px rms", f"usual is {'0.1–0.3' if projector else '0.05–0.2'}"
+    yield (whole := _judged(figure, name, residuals.rms_px, what, usual, cure))
+    if worst and whole.grade is Grade.GOOD:
         words = (
             f"{title}: {worst[0]} stands out, {worst[1]:.2g} px rms, {residuals.rms_px:.2g} px in all: shoot it again"
         )
         yield Judgement(Grade.GOOD, figure, name, worst[1], words)
-    limit = LIMITS["held_out"]
     ratio = residuals.held_out_rms_px / residuals.rms_px if residuals.rms_px > 0 else float("nan")
-    grade = limit.grade(ratio)
-    if residuals.held_out_rms_px <= usual_px:
-        grade = min(grade, Grade.USABLE, key=_ORDER.index)  # poor beside the rest, and still no more than is usual
     if np.isnan(ratio):
         words = f"{title}: too few poses to keep some from the solve and test it with them: add poses"
+        yield Judgement(Grade.USABLE, "held_out", name, ratio, words)
     else:
+        grade = LIMITS["held_out"].grade(ratio)
+        if residuals.held_out_rms_px <= usual_px:
+            grade = min(grade, Grade.USABLE, key=_ORDER.index)  # poor beside the rest, and still no more than is usual
         what = f"{title} has {residuals.held_out_rms_px:.2g} px rms at poses kept from the solve, {ratio:.2f} × its own"
-        words = _told(
-            grade, what, f"at most {limit.good:g} × is well", "the lens is fitted to too few poses: add poses"
-        )
-    yield Judgement(grade, "held_out", name, ratio, words)
-    limit = LIMITS["stated_ratio"]
+        cure = "the lens is fitted to too few poses: add poses"
+        yield _judged("held_out", name, ratio, what, "at most {good:g} × is well", cure, grade=grade)
     ratio = residuals.rms_px / residuals.stated_rms_px if residuals.stated_rms_px > 0 else float("nan")
     if not np.isnan(ratio):
         # Corners are found to a few thousandths of a pixel; a board printed on paper is not as good as that.
-        grade = limit.grade(ratio) if residuals.rms_px > usual_px / 2 else Grade.GOOD
+        grade = LIMITS["stated_ratio"].grade(ratio) if residuals.rms_px > usual_px / 2 else Grade.GOOD
         what = f"{title} is {ratio:.1f} × as far off as the noise of its observations says"
         cure = (
             "look for light that the wall or the board's gloss throws back, a late frame, or a gamma that is not flat"
             if projector
             else "look for a bent board, a board or camera that moved, or a lens that the model does not fit"
         )
-        yield Judgement(
-            grade, "stated_ratio", name, ratio, _told(grade, what, f"up to {limit.good:g} × is usual", cure)
-        )
+        yield _judged("stated_ratio", name, ratio, what, "up to {good:g} × is usual", cure, grade=grade)
 
 
 def _residual_shape(name: str, residuals: DeviceResiduals) -> Iterator[Judgement]:
     title, count = device_title(name), residuals.count
     share = residuals.outlying / count if count else float("nan")
-    limit = LIMITS["outlying_share"]
     if share > 0:
-        grade = limit.grade(share)
         what = f"{title}: {share:.1%} of {count} observations are outlying"
         cure = "look for reflections, shadows on the board, and wrongly decoded light"
-        yield Judgement(
-            grade, "outlying_share", name, share, _told(grade, what, f"up to {limit.good:.0%} is usual", cure)
-        )
+        yield _judged("outlying_share", name, share, what, "up to {good:.0%} is usual", cure)
     length = np.linalg.norm(residuals.map_mean_px, axis=2)
     length = np.where(residuals.map_count >= _LEAST_SEEN, length, np.nan)
     if np.isfinite(length).any() and residuals.rms_px > 0:
@@ -264,44 +258,31 @@ def _residual_shape(name: str, residuals: DeviceResiduals) -> Iterator[Judgement
 
 
 def _knowledge(solution: Solution) -> Iterator[Judgement]:
-    devices: dict[str, Pinhole] = dict(solution.calibration.cameras)
-    if solution.calibration.projector is not None:
-        devices[PROJECTOR] = solution.calibration.projector
     each = len(PARAMETERS)
-    for index, (name, device) in enumerate(devices.items()):
+    for index, (name, device) in enumerate(devices_of(solution.calibration).items()):
         block = solution.covariance[index * each : (index + 1) * each, index * each : (index + 1) * each]
         sigma = np.sqrt(np.clip(np.diag(block), 0, None))
-        title = device_title(name)
-        limit = LIMITS["principal_sigma_px"]
-        axis = 2 + int(np.argmax(sigma[2:4]))
-        value, place = float(sigma[axis]), float(device.matrix[axis - 2, 2])
-        grade = limit.grade(value)
-        where = "column" if axis == 2 else "row"
-        what = f"{title}: the principal {where} is {place:.1f} ± {value:.2g} px"
-        cure = (
-            f"add poses tilted by 30–45° about the {'vertical' if axis == 2 else 'horizontal'} axis, and turned by 90°"
-        )
-        yield Judgement(
-            grade, "principal_sigma_px", name, value, _told(grade, what, f"±{limit.good:g} px is well", cure)
-        )
-        limit = LIMITS["focal_sigma_share"]
+        title, focal_px = device_title(name), float(device.matrix[0, 0])
+        axis = int(np.argmax(sigma[2:4]))
+        value, place = float(sigma[2 + axis]), float(device.matrix[axis, 2])
+        what = f"{title}: the principal {('column', 'row')[axis]} is {place:.1f} ± {value:.2g} px"
+        way = ("vertical", "horizontal")[axis]
+        cure = f"add poses tilted by 30–45° about the {way} axis, and turned by 90°"
+        yield _judged("principal_sigma_px", name, value, what, "±{good:g} px is well", cure)
         share = max(float(sigma[0] / device.matrix[0, 0]), float(sigma[1] / device.matrix[1, 1]))
-        grade = limit.grade(share)
-        what = f"{title}: the focal length is {device.matrix[0, 0]:.1f} ± {share * device.matrix[0, 0]:.2g} px"
+        what = f"{title}: the focal length is {focal_px:.1f} ± {share * focal_px:.2g} px"
         cure = "add poses tilted by 30–45°, and at other distances"
-        yield Judgement(grade, "focal_sigma_share", name, share, _told(grade, what, f"±{limit.good:.1%} is well", cure))
+        yield _judged("focal_sigma_share", name, share, what, "±{good:.1%} is well", cure)
 
 
 def _bend(solution: Solution) -> Iterator[Judgement]:
     bow = solution.bow
-    if bow is None:
-        return
-    limit = LIMITS["bend_mm"]
-    # Where it was not solved for, the poses tell of no bow: what they leave open of it is in the covariance.
-    grade = limit.grade(bow.height_mm) if bow.solved else Grade.GOOD
-    cure = "that is taken into account, but glue the print to glass or aluminium"
-    words = _told(grade, board_words(solution), f"up to {limit.good:g} mm is well", cure)
-    yield Judgement(grade, "bend_mm", None, bow.height_mm, words)
+    if bow is not None:
+        # Where it was not solved for, the poses tell of no bow: what they leave open of it is in the covariance.
+        grade = None if bow.solved else Grade.GOOD
+        cure = "that is taken into account, but glue the print to glass or aluminium"
+        what, usual = board_words(solution), "up to {good:g} mm is well"
+        yield _judged("bend_mm", None, bow.height_mm, what, usual, cure, grade=grade)
 
 
 def board_words(solution: Solution) -> str:
@@ -332,18 +313,16 @@ def _figure(value: float, sigma: float) -> str:
 def _border(covered: Coverage) -> Iterator[Judgement]:
     ring = np.ones((CELLS, CELLS), dtype=bool)
     ring[1:-1, 1:-1] = False
-    limit = LIMITS["border"]
     for name, one in covered.devices.items():
         wanted = ring & one.reachable
         empty = wanted & (one.cells == 0)
         share = float(empty.sum() / max(int(wanted.sum()), 1))
-        grade = limit.grade(share)
-        what = f"{device_title(name)}: {share:.0%} of the cells along the image's border held no corner in any pose"
+        what = "along the image's border held no corner in any pose"
         if name == PROJECTOR:
-            what = f"{device_title(name)}: {share:.0%} of the cells along its border never lit the board"
-        usual = f"at most {limit.good:.0%} is well"
+            what = "along its border never lit the board"
+        what = f"{device_title(name)}: {share:.0%} of the cells {what}"
         cure = f"the lens's distortion is not determined there; hold the board in the {_emptiest(empty)}"
-        yield Judgement(grade, "border", name, share, _told(grade, what, usual, cure))
+        yield _judged("border", name, share, what, "at most {good:.0%} is well", cure)
 
 
 def _emptiest(empty: NDArray[np.bool_]) -> str:
@@ -361,7 +340,3 @@ def _worst_pose(residuals: DeviceResiduals) -> tuple[str, float] | None:
         return None
     name = max(found, key=lambda each: found[each])
     return (name, found[name]) if found[name] > _POSE_STANDS_OUT * float(np.median(list(found.values()))) else None
-
-
-def _told(grade: Grade, what: str, usual: str, cure: str) -> str:
-    return f"{what} ({usual})" if grade is Grade.GOOD else f"{what}, {usual}: {cure}"

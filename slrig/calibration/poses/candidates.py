@@ -1,8 +1,11 @@
-"""Poses that a person could hold the board in next: places in one camera's picture, tilts, turns and distances."""
+"""Moves of the board: poses that a person could hold it in next, the open goals that each brings nearer, and the words.
+
+Poses are places in one camera's picture, tilts, turns and distances.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -10,9 +13,22 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.poses.coverage import (
+    GOALS,
+    Attitude,
+    Coverage,
+    around,
+    attitude,
+    cells_of,
+    depth_groups,
+    full_turn_deg,
+    place_words,
+    tilted,
+    turn_groups,
+)
 from slrig.calibration.poses.light_view import within
-from slrig.calibration.poses.rough import DeviceGuess
-from slrig.calibration.solution import BoardPose
+from slrig.calibration.poses.rough import DeviceGuess, RigGuess
+from slrig.calibration.solution import PROJECTOR, BoardPose, device_title
 from slrig.model import FloatArray
 from slrig.model.lens import distorted
 
@@ -28,6 +44,12 @@ _FILLED = 0.55
 """Share of the picture's width that a first pose should fill."""
 
 _SETTLING = 4
+_NEW_CELLS = 2
+_SAME_DISTANCE = 0.04
+_SAME_TURN_DEG = 10.0
+_LEAST_TILT_DEG = 5.0
+_TELLING_PX = 10.0
+_MOST_REASONS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,3 +158,109 @@ def _placed(guess: DeviceGuess, board: Board, distances_mm: Sequence[float], upr
         for index, kind in enumerate(kinds)
         if fits[index]
     ]
+
+
+def goals_met(
+    option: Candidate,
+    guess: RigGuess,
+    found: Coverage,
+    ways: Mapping[str, BoardPose],
+    seen_px: Mapping[str, FloatArray],
+) -> dict[str, list[str]]:
+    """By device, which of its open goals a candidate brings nearer: cells, tilt, distance, turn.
+
+    ways : from the frame of the candidate's camera to each device's; seen_px : the corners that each would see.
+    """
+    met: dict[str, list[str]] = {}
+    for name, points_px in seen_px.items():
+        one, mine = found.devices[name], met.setdefault(name, [])
+        if not len(points_px):
+            continue
+        fresh = (cells_of(points_px, guess.devices[name].size) > 0) & (one.cells == 0) & one.reachable
+        if one.share < GOALS.cell_share and fresh.sum() >= _NEW_CELLS:
+            mine.append("cells")
+        if name == PROJECTOR:
+            continue
+        way, pose = ways[name], option.board_pose
+        there = BoardPose(way.rotation @ pose.rotation, way.rotation @ pose.translation_mm + way.translation_mm)
+        then, now = attitude(there, guess.board.points_mm.mean(axis=0)), list(one.attitudes.values())
+        leaning = tilted([then])
+        if any(one.tilted[axis] < GOALS.tilted and leaning[axis] for axis in (0, 1)):
+            mine.append("tilt")
+        distances = [each.distance_mm for each in (*now, then)]
+        if one.depths < GOALS.depths and len(depth_groups(distances)) > one.depths:
+            mine.append("distance")
+        turns = [each.turn_deg for each in (*now, then)]
+        if one.turns < GOALS.turns and len(turn_groups(turns, full_turn_deg(guess.board))) > one.turns:
+            mine.append("turn")
+    return met
+
+
+def move_words(option: Candidate, camera: str, last: Attitude, upright_deg: float, round_deg: float) -> str:
+    """Return what to do, as one clause.
+
+    last : how the board stands now; upright_deg : how it usually does; round_deg : after which turn it looks the same.
+    """
+    parts = [f"move the board to the {place_words(option.place)} of camera '{camera}'"]
+    about_x, about_y = option.tilt_deg
+    if abs(about_x) >= _LEAST_TILT_DEG:
+        parts.append(f"tilt its {'top' if about_x > 0 else 'bottom'} edge {abs(about_x):.0f}° towards the camera")
+    if abs(about_y) >= _LEAST_TILT_DEG:
+        parts.append(f"tilt its {'right' if about_y > 0 else 'left'} edge {abs(about_y):.0f}° towards the camera")
+    if max(abs(about_x), abs(about_y)) < _LEAST_TILT_DEG:
+        parts.append("let it face the camera")
+    turn = 5 * round(around(option.turn_deg - last.turn_deg, round_deg) / 5)
+    if abs(turn) > _SAME_TURN_DEG:
+        parts.append(f"turn it {abs(turn):.0f}° {'clockwise' if turn > 0 else 'anticlockwise'} in its plane")
+    elif abs(around(option.turn_deg - upright_deg, round_deg)) > _SAME_TURN_DEG:
+        parts.append("leave it turned in its plane as it is")
+    share = option.distance_mm / last.distance_mm - 1
+    if abs(share) > _SAME_DISTANCE:
+        parts.append(f"bring it {abs(share):.0%} {'farther away' if share > 0 else 'nearer'}")
+    return ", ".join(parts)
+
+
+def reasons(
+    camera: str, met: Mapping[str, Sequence[str]], worst: Mapping[str, float], expected: Mapping[str, float],
+    place: tuple[str, tuple[int, int]],
+) -> str:  # fmt: skip
+    """Return why. met : by device, as of `goals_met`. place : the least sure device and where in its image it is so."""
+    parts = ["parts of the picture there are not covered yet"] if "cells" in met.get(camera, []) else []
+    for name in (name for name, goals in met.items() if "cells" in goals and name != camera):
+        image = "the projector's image" if name == PROJECTOR else f"the picture of camera '{name}'"
+        parts.append(f"it covers new parts of {image}")
+    for goal, words in (
+        ("tilt", "too few poses are tilted that way"),
+        ("distance", "the poses so far lie at too few distances"),
+        ("turn", "the board was not yet turned in its plane like this"),
+    ):
+        if any(goal in goals for goals in met.values()):
+            parts.append(words)
+    parts = parts[:_MOST_REASONS]
+    name, where = place
+    if worst[name] < _TELLING_PX and expected[name] < worst[name]:
+        parts.append(
+            f"{device_title(name)} is least sure at its {place_words(where)}, ±{worst[name]:.2g} px at the worst, "
+            f"and about ±{expected[name]:.2g} px after this pose"
+        )
+    return "; ".join(parts) if parts else "it is the pose that tells most now"
+
+
+def first_words(cameras: Sequence[str], *, lit: bool) -> str:
+    """Return what to do before there is any pose. lit : whether a projector is calibrated too."""
+    several = " and seen by the others as well" if len(cameras) > 1 else ""
+    light = ", lit by the projector" if lit else ""
+    return (
+        f"hold the board in the middle of the picture of camera '{cameras[0]}', facing it{several}{light}, near enough "
+        "to fill about half of the picture: the first pose shows how large and how far it is"
+    )
+
+
+def enough_words(found: Coverage, worst: Mapping[str, float]) -> str:
+    """Return that the set will do, or why no more poses are asked for."""
+    count = len(found.poses)
+    told = ", ".join(f"{device_title(name)} to ±{sigma:.2g} px" for name, sigma in worst.items())
+    if found.missing:
+        return f"{count} poses are as many as help. Still open: {'; '.join(found.missing)}. Solve, and read the verdict"
+    hardly = "" if max(worst.values(), default=np.inf) <= GOALS.sigma_px else ", and another would hardly help"
+    return f"enough: {count} poses tell {told} in its worst place{hardly}; solve now"

@@ -9,16 +9,13 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board
-from slrig.calibration.observations import BoardView, PoseObservation
-from slrig.calibration.poses.coverage import GOALS, Coverage, Goals, coverage, device_title
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
+from slrig.calibration.poses.coverage import FOCAL_KNOWN, Attitude, Coverage, attitude, coverage
 from slrig.calibration.poses.next_move import Advice, next_move
 from slrig.calibration.poses.rough import RigGuess, rig_guess
-from slrig.calibration.solution import PROJECTOR
+from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.errors import CalibrationError
 from slrig.model import FloatArray, Size
-
-_FOCAL_KNOWN = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,33 +76,27 @@ class PoseAnswer:
 
 
 def judge_pose(
-    pose: PoseObservation,
-    figures: Mapping[str, ViewFigures],
-    earlier: Sequence[PoseObservation],
-    board: Board,
+    pose: PoseObservation, figures: Mapping[str, ViewFigures], earlier: Sequence[PoseObservation], board: Board,
     sizes: Mapping[str, Size],
-    *,
-    limits: PoseLimits = LIMITS,
-    goals: Goals = GOALS,
-) -> PoseAnswer:
+) -> PoseAnswer:  # fmt: skip
     """Return the answer to one pose.
 
     figures : by camera, of this pose. earlier : the poses that were accepted before. sizes : cameras by name, and
     PROJECTOR where one is calibrated.
     """
-    cameras = [name for name in sizes if name != PROJECTOR]
     known = rig_guess([*earlier, pose], board, sizes)
-    judging = _Judging(pose, board, limits, [], [])
-    for camera in cameras:
-        view = pose.views.get(camera)
-        if view is None or not len(view.corner):
-            if len(pose.views) > (camera in pose.views):
-                judging.warn(camera, "does not see the board", "a pose that all cameras see also ties them together")
-            continue
-        judging.view(camera, view, sizes[camera], _steep(known, camera, pose, board))
-        if camera in figures:
-            judging.figures(camera, figures[camera], view)
-    if not any(len(view.corner) for view in pose.views.values()):
+    seen = {name: view for name, view in pose.views.items() if len(view.corner)}
+    stood = {name: _attitude(known, name, pose, board) for name in seen}
+    steep = {name: _foreshortened_deg(seen[name], board) if at is None else at.steep_deg for name, at in stood.items()}
+    judging = _Judging(pose, board, [], [])
+    for camera in (name for name in sizes if name != PROJECTOR):
+        if camera in seen:
+            judging.view(camera, seen[camera], sizes[camera], steep[camera])
+            if camera in figures:
+                judging.figures(camera, figures[camera], seen[camera])
+        elif len(pose.views) > (camera in pose.views):
+            judging.warn(camera, "does not see the board", "a pose that all cameras see also ties them together")
+    if not seen:
         judging.refusals.append("no camera sees the board: move it into the picture, and shoot again")
     if PROJECTOR in sizes and not pose.correspondences:
         judging.refusals.append(
@@ -117,24 +108,26 @@ def judge_pose(
     accepted = not judging.refusals
     counted = [*earlier, pose] if accepted else list(earlier)
     guess = known if accepted else rig_guess(counted, board, sizes)
-    covered = coverage(counted, board, sizes, guess=guess, goals=goals)
-    seen = {name: view for name, view in pose.views.items() if len(view.corner)}
-    nan = float("nan")
+    covered = coverage(counted, board, sizes, guess=guess)
+
+    def figure(field: str) -> dict[str, float]:
+        return {name: getattr(figures[name], field) if name in figures else np.nan for name in seen}
+
     return PoseAnswer(
-        pose.name,
-        accepted,
-        tuple(judging.refusals),
-        tuple(judging.warnings),
-        {name: len(view.corner) for name, view in pose.views.items()},
-        board.corner_count,
-        {name: filled(view.points_px, sizes[name]) for name, view in seen.items()},
-        {name: _steep(known, name, pose, board) for name in seen},
-        {name: _distance(known, name, pose, board) for name in seen},
-        {name: figures[name].sharpness_px if name in figures else nan for name in seen},
-        {name: figures[name].saturated if name in figures else nan for name in seen},
-        {name: figures[name].moved_px if name in figures else nan for name in seen},
-        covered,
-        next_move(counted, board, sizes, guess=guess, covered=covered, goals=goals),
+        name=pose.name,
+        accepted=accepted,
+        refusals=tuple(judging.refusals),
+        warnings=tuple(judging.warnings),
+        corners_found={name: len(view.corner) for name, view in pose.views.items()},
+        corners_expected=board.corner_count,
+        filled={name: _filled(view.points_px, sizes[name]) for name, view in seen.items()},
+        tilt_deg=steep,
+        distance_mm={name: np.nan if at is None else at.distance_mm for name, at in stood.items()},
+        sharpness_px=figure("sharpness_px"),
+        saturated=figure("saturated"),
+        moved_px=figure("moved_px"),
+        coverage=covered,
+        advice=next_move(counted, board, sizes, guess=guess, covered=covered),
     )
 
 
@@ -158,12 +151,13 @@ def check_same_devices(capture: str, found: Mapping[str, Size], expected: Mappin
         raise CalibrationError(message)
 
 
-def filled(points_px: FloatArray, size: Size) -> float:
+def _filled(points_px: FloatArray, size: Size) -> float:
     """Return the share of an image that lies inside the hull of some points."""
-    if len(points_px) < 3:
-        return 0.0
-    hull = cv2.convexHull(points_px.astype(np.float32))
-    return float(cv2.contourArea(hull)) / (size.width_px * size.height_px)
+    return _hull_area(points_px) / (size.width_px * size.height_px)
+
+
+def _hull_area(points: FloatArray) -> float:
+    return float(cv2.contourArea(cv2.convexHull(points.astype(np.float32)))) if len(points) > 2 else 0.0
 
 
 @dataclass
@@ -172,7 +166,6 @@ class _Judging:
 
     pose: PoseObservation
     board: Board
-    limits: PoseLimits
     refusals: list[str]
     warnings: list[str]
 
@@ -182,21 +175,21 @@ class _Judging:
     def judge(self, value: float, pair: tuple[float, float], camera: str, what: str, do: str) -> None:
         """Warn or refuse where a value lies past a limit; which side is bad, the order of the pair tells."""
         warn, refuse = pair
-        side = 1 if refuse > warn else -1
+        side = 1 if refuse >= warn else -1
         if side * value > side * refuse:
             self.refusals.append(f"camera '{camera}' {what}: {do}")
         elif side * value > side * warn:
             self.warn(camera, what, do)
 
     def view(self, camera: str, view: BoardView, size: Size, steep_deg: float) -> None:
-        limits, board = self.limits, self.board
+        limits, board = LIMITS, self.board
         count, whole = len(view.corner), board.corner_count
         found = f"sees {count} of the board's {whole} corners"
         if count < min(limits.fewest_corners, whole):
             self.refusals.append(f"camera '{camera}' {found}, too few: show more of the board")
         else:
             self.judge(count / whole, limits.corners, camera, found, "show more of the board")
-        share = filled(view.points_px, size) * whole / max(count, 1)
+        share = _filled(view.points_px, size) * whole / max(count, 1)
         self.judge(
             share, limits.filled, camera, f"sees the board small, on {share:.1%} of its picture", "bring it nearer"
         )
@@ -206,7 +199,7 @@ class _Judging:
         )  # fmt: skip
 
     def figures(self, camera: str, figures: ViewFigures, view: BoardView) -> None:
-        limits, blur_px, moved_px = self.limits, figures.sharpness_px, figures.moved_px
+        limits, blur_px, moved_px = LIMITS, figures.sharpness_px, figures.moved_px
         still = f"at most {limits.moved_px[1]:g} px: rest the board on something, let go of it, and shoot again"
         what = f"saw the board move by {moved_px:.2g} px while the pose was shot"
         self.judge(moved_px, limits.moved_px, camera, what, still)
@@ -220,41 +213,34 @@ class _Judging:
             "expose for a longer time, dim the room's light, or move the board into the projector's light",
         )  # fmt: skip
         square_px = self._square_px(view)
-        sharp = self.judge_blur(blur_px, square_px)
-        if sharp is not None:
-            refuse, what = sharp
-            do = "bring it nearer to where the lens is focused, or focus the camera"
-            (self.refusals if refuse else self.warnings).append(f"camera '{camera}' {what}: {do}")
+        # Both limits hold, that in pixels and that in squares: the stricter one counts.
+        warn, refuse = (
+            np.fmin(px, share * square_px) for px, share in zip(limits.sharpness_px, limits.blur_share, strict=True)
+        )
+        self.judge(
+            blur_px, (warn, refuse), camera,
+            f"sees the board too blurred, {blur_px:.1f} px across an edge with squares of {square_px:.0f} px",
+            "bring it nearer to where the lens is focused, or focus the camera",
+        )  # fmt: skip
         self.judge(
             figures.decoded, limits.decoded, camera, f"decoded light on only {figures.decoded:.0%} of the lit board",
             "light it more evenly, dim the room's light, focus the projector on it, or tilt it out of a reflection",
         )  # fmt: skip
-
-    def judge_blur(self, blur_px: float, square_px: float) -> tuple[bool, str] | None:
-        """Return whether a blur is refused, and the words, or None where it does no harm."""
-        limits = self.limits
-        what = f"sees the board too blurred, {blur_px:.1f} px across an edge with squares of {square_px:.0f} px"
-        if blur_px > limits.sharpness_px[1] or blur_px > limits.blur_share[1] * square_px:
-            return True, what
-        if blur_px > limits.sharpness_px[0] or blur_px > limits.blur_share[0] * square_px:
-            return False, what
-        return None
 
     def same(self, earlier: Sequence[PoseObservation], sizes: Mapping[str, Size]) -> None:
         """Refuse a pose in which every camera that can tell sees the board where it was in one earlier pose."""
         for other in earlier:
             shares = []
             for camera, view in self.pose.views.items():
-                if camera in other.views:
-                    share = _displacement(view, other.views[camera], sizes[camera])
-                    if share is not None:
-                        shares.append(share)
-            if shares and max(shares) <= self.limits.same[1]:
+                share = _displacement(view, other.views[camera], sizes[camera]) if camera in other.views else None
+                if share is not None:
+                    shares.append(share)
+            if shares and max(shares) <= LIMITS.same[1]:
                 self.refusals.append(
                     f"the pose adds nothing: it is the same as {other.name}. Move the board, and shoot"
                 )
                 return
-            if shares and max(shares) <= self.limits.same[0]:
+            if shares and max(shares) <= LIMITS.same[0]:
                 self.warnings.append(
                     f"the pose adds little: it is nearly the same as {other.name}; move the board more"
                 )
@@ -269,7 +255,7 @@ class _Judging:
             normal = device.poses[self.pose.name].rotation[:, 2]
             angles = [np.degrees(np.arccos(min(1.0, abs(float(normal @ each.rotation[:, 2]))))) for each in others]
             which = f"all {len(others)} earlier poses" if len(others) > 1 else "the earlier pose"
-            if max(angles) < self.limits.parallel_deg:
+            if max(angles) < LIMITS.parallel_deg:
                 self.warn(
                     name, f"sees the board parallel to {which}, within {max(angles):.0f}°",
                     "parallel poses alone do not determine the lens, and none is solved from them; tilt it by 30°",
@@ -278,9 +264,7 @@ class _Judging:
 
     def _square_px(self, view: BoardView) -> float:
         """Return the side of a square in the picture, px, from the areas that the corners span in both."""
-        flat = self.board.points_mm[view.corner, :2].astype(np.float32)
-        area_mm = float(cv2.contourArea(cv2.convexHull(flat))) if len(flat) > 2 else 0.0
-        area_px = float(cv2.contourArea(cv2.convexHull(view.points_px.astype(np.float32)))) if len(flat) > 2 else 0.0
+        area_mm, area_px = _hull_area(self.board.points_mm[view.corner, :2]), _hull_area(view.points_px)
         return self.board.square_mm * float(np.sqrt(area_px / area_mm)) if area_mm > 0 else float("nan")
 
 
@@ -293,32 +277,23 @@ def _displacement(view: BoardView, other: BoardView, size: Size) -> float | None
     return float(np.sqrt((off**2).sum(axis=1).mean()) / np.hypot(size.width_px, size.height_px))
 
 
-def _steep(known: RigGuess, camera: str, pose: PoseObservation, board: Board) -> float:
-    """Return the angle between the board's normal and the line of sight, degrees; NaN where nothing tells.
+def _attitude(known: RigGuess, camera: str, pose: PoseObservation, board: Board) -> Attitude | None:
+    """Return how the board stands before a camera; None while the focal length is not known, or no pose was found."""
+    device = known.devices[camera]
+    if pose.name not in device.poses or device.focal_sigma > FOCAL_KNOWN:
+        return None
+    return attitude(device.poses[pose.name], board.points_mm.mean(axis=0))
 
-    From the guess where it knows the focal length; before, from how much the board is foreshortened at its middle.
+
+def _foreshortened_deg(view: BoardView, board: Board) -> float:
+    """Return the angle between the board's normal and the line of sight, from how much it is foreshortened at its
+    middle, degrees; NaN where nothing tells.
     """
-    device, view = known.devices[camera], pose.views.get(camera)
-    if pose.name in device.poses and device.focal_sigma <= _FOCAL_KNOWN:
-        board_pose = device.poses[pose.name]
-        centre = board_pose.rotation @ board.points_mm.mean(axis=0) + board_pose.translation_mm
-        sight = abs(float(board_pose.rotation[:, 2] @ centre)) / float(np.linalg.norm(centre))
-        return float(np.degrees(np.arccos(min(1.0, sight))))
-    if view is None or len(view.corner) < 4:
-        return float("nan")
     flat = board.points_mm[view.corner, :2]
-    plane, _ = cv2.findHomography(flat, view.points_px)
+    plane = cv2.findHomography(flat, view.points_px)[0] if len(view.corner) >= 4 else None
     if plane is None:
         return float("nan")
     x, y, w = plane @ np.append(flat.mean(axis=0), 1.0)
     affine = (plane[:2, :2] - np.outer([x / w, y / w], plane[2, :2])) / w
     wide, narrow = np.linalg.svd(affine, compute_uv=False)
     return float(np.degrees(np.arccos(min(1.0, narrow / wide))))
-
-
-def _distance(known: RigGuess, camera: str, pose: PoseObservation, board: Board) -> float:
-    device = known.devices[camera]
-    if pose.name not in device.poses or device.focal_sigma > _FOCAL_KNOWN:
-        return float("nan")
-    board_pose = device.poses[pose.name]
-    return float((board_pose.rotation @ board.points_mm.mean(axis=0) + board_pose.translation_mm)[2])

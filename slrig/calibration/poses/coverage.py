@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import PoseObservation
 from slrig.calibration.poses.rough import RigGuess, rig_guess
-from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
+from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose, device_title
 from slrig.model import FloatArray, IntArray, Size
 
 BoolArray = NDArray[np.bool_]
 
-_FOCAL_KNOWN = 0.15
+FOCAL_KNOWN = 0.15
 """Distances are told once the focal length is known to this share; before, they are NaN."""
 
 _FEWEST_LIT = 3
@@ -94,12 +94,7 @@ class Coverage:
 
 
 def coverage(
-    poses: Sequence[PoseObservation],
-    board: Board,
-    sizes: Mapping[str, Size],
-    *,
-    guess: RigGuess | None = None,
-    goals: Goals = GOALS,
+    poses: Sequence[PoseObservation], board: Board, sizes: Mapping[str, Size], *, guess: RigGuess | None = None
 ) -> Coverage:
     """Return what the poses cover in each device of `sizes` (cameras by name, and PROJECTOR where there is one)."""
     known = rig_guess(poses, board, sizes) if guess is None else guess
@@ -114,19 +109,19 @@ def coverage(
         attitudes = {each: attitude(board_pose, middle_mm) for each, board_pose in device.poses.items()}
         distances = [each.distance_mm for each in attitudes.values()]
         turns = [each.turn_deg for each in attitudes.values()]
-        told = bool(distances) and device.focal_sigma <= _FOCAL_KNOWN
+        told = bool(distances) and device.focal_sigma <= FOCAL_KNOWN
         devices[name] = DeviceCoverage(
             cells,
             reachable,
             attitudes,
-            len(depth_groups(distances, goals.depth_step)),
-            tilted(attitudes.values(), goals),
-            len(turn_groups(turns, goals.turn_step_deg, round_deg=full_turn_deg(board))),
+            len(depth_groups(distances)),
+            tilted(attitudes.values()),
+            len(turn_groups(turns, full_turn_deg(board))),
             (min(distances), max(distances)) if told else (float("nan"), float("nan")),
             float((cells > 0)[reachable].mean()),
         )
     names = tuple(pose.name for pose in poses)
-    return Coverage(names, devices, tuple(_missing(len(names), devices, goals)))
+    return Coverage(names, devices, tuple(_missing(len(names), devices)))
 
 
 def cells_of(points_px: FloatArray, size: Size) -> IntArray:
@@ -152,30 +147,30 @@ def attitude(board_pose: BoardPose, middle_mm: FloatArray) -> Attitude:
     )
 
 
-def depth_groups(distances_mm: Sequence[float], step: float) -> list[float]:
-    """Return the distances that differ by at least a share, from near to far, each the nearest of its group.
+def depth_groups(distances_mm: Sequence[float]) -> list[float]:
+    """Return the distances that differ by at least `Goals.depth_step`, from near to far, each the nearest of its group.
 
-    >>> depth_groups([600.0, 505.0, 500.0, 610.0, 700.0], 0.05)
+    >>> depth_groups([600.0, 505.0, 500.0, 610.0, 700.0])
     [500.0, 600.0, 700.0]
     """
     groups: list[float] = []
     for distance in sorted(distances_mm):
-        if not groups or distance >= (1 + step) * groups[-1]:
+        if not groups or distance >= (1 + GOALS.depth_step) * groups[-1]:
             groups.append(distance)
     return groups
 
 
-def turn_groups(turns_deg: Sequence[float], step_deg: float, *, round_deg: float = 360.0) -> list[float]:
-    """Return angles that lie at least a step from each other on the circle, in the order in which they came.
+def turn_groups(turns_deg: Sequence[float], round_deg: float) -> list[float]:
+    """Return angles at least `Goals.turn_step_deg` from each other on the circle, in the order in which they came.
 
     round_deg : after which angle the board looks as before.
 
-    >>> turn_groups([0.0, 178.0, 30.0, -175.0, 355.0], 20.0)
+    >>> turn_groups([0.0, 178.0, 30.0, -175.0, 355.0], 360.0)
     [0.0, 178.0, 30.0]
     """
     groups: list[float] = []
     for turn in turns_deg:
-        if all(abs(around(turn - other, round_deg)) >= step_deg for other in groups):
+        if all(abs(around(turn - other, round_deg)) >= GOALS.turn_step_deg for other in groups):
             groups.append(turn)
     return groups
 
@@ -195,23 +190,25 @@ def full_turn_deg(board: Board) -> float:
     return 180.0 if board.kind is BoardKind.CHESSBOARD and even else 360.0
 
 
-def tilted(attitudes: Iterable[Attitude], goals: Goals = GOALS) -> tuple[int, int]:
+def tilted(attitudes: Iterable[Attitude]) -> tuple[int, int]:
     """Return how many poses are tilted as wanted about the horizontal, and about the vertical axis of the picture."""
-    low, high = goals.tilt_deg
-    counts = [0, 0]
-    for each in attitudes:
-        for axis in (0, 1):
-            counts[axis] += low <= abs(each.tilt_deg[axis]) <= high
-    return counts[0], counts[1]
+    low, high = GOALS.tilt_deg
+    tilts = [each.tilt_deg for each in attitudes]
+    return sum(low <= abs(x) <= high for x, _ in tilts), sum(low <= abs(y) <= high for _, y in tilts)
 
 
-def device_title(name: str) -> str:
-    """Return a device's name as a sentence has it.
+def place_words(place: tuple[int, int]) -> str:
+    """Return a place in a picture.
 
-    >>> device_title("left"), device_title("projector")
-    ("camera 'left'", 'the projector')
+    >>> place_words((-1, 1)), place_words((0, 0)), place_words((1, 0))
+    ('lower left corner', 'middle', 'right edge')
     """
-    return "the projector" if name == PROJECTOR else f"camera '{name}'"
+    across, down = {-1: "left", 0: "", 1: "right"}[place[0]], {-1: "upper", 0: "", 1: "lower"}[place[1]]
+    if across and down:
+        return f"{down} {across} corner"
+    if across or down:
+        return f"{across or down} edge"
+    return "middle"
 
 
 def _cells_of(pose: PoseObservation, name: str, size: Size, guess: RigGuess) -> IntArray:
@@ -250,9 +247,9 @@ def _reachable(guess: RigGuess, name: str) -> BoolArray:
     return np.asarray(cells > 0, dtype=np.bool_) if cells.any() else everywhere
 
 
-def _missing(count: int, devices: Mapping[str, DeviceCoverage], goals: Goals) -> list[str]:
+def _missing(count: int, devices: Mapping[str, DeviceCoverage]) -> list[str]:
     """Name the open goals. Tilts, turns and depths are asked of cameras only: the projector sees the same board."""
-    words = []
+    words, goals = [], GOALS
     for name, one in devices.items():
         title = device_title(name)
         if one.share < goals.cell_share:

@@ -18,10 +18,20 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import PoseObservation
-from slrig.calibration.poses.candidates import Candidate, candidates, first_distance_mm, projected, sample_corners
-from slrig.calibration.poses.coverage import GOALS, Coverage, Goals, coverage, full_turn_deg
+from slrig.calibration.poses.candidates import (
+    Candidate,
+    candidates,
+    enough_words,
+    first_distance_mm,
+    first_words,
+    goals_met,
+    move_words,
+    projected,
+    reasons,
+    sample_corners,
+)
+from slrig.calibration.poses.coverage import GOALS, Coverage, coverage, full_turn_deg
 from slrig.calibration.poses.light_view import LEAST_SIGMA_PX, within
-from slrig.calibration.poses.move_words import Gain, enough_words, first_words, move_words, reasons
 from slrig.calibration.poses.rough import FEWEST_CORNERS, LENS, DeviceGuess, RigGuess, gained, lens_rows, rig_guess
 from slrig.calibration.solution import CELLS, PROJECTOR, BoardPose
 from slrig.model import FloatArray, Size
@@ -59,48 +69,46 @@ def next_move(
     *,
     guess: RigGuess | None = None,
     covered: Coverage | None = None,
-    goals: Goals = GOALS,
 ) -> Advice:
     """Return the pose to shoot next.
 
     guess, covered : `rig_guess` and `coverage` of the same poses, where they are at hand already.
     """
     known = rig_guess(poses, board, sizes) if guess is None else guess
-    found = coverage(poses, board, sizes, guess=known, goals=goals) if covered is None else covered
+    found = coverage(poses, board, sizes, guess=known) if covered is None else covered
     seeing = [name for name in sizes if name != PROJECTOR and known.devices[name].poses]
     if not seeing:
         words = first_words([name for name in sizes if name != PROJECTOR], lit=PROJECTOR in sizes)
         return Advice(words, False, None, np.zeros((0, 2)), None, {}, {})
     reaches = {name: _reach(device) for name, device in known.devices.items() if device.poses}
     worst = {name: float(_worst(known.devices[name].information[None], reaches[name])[0]) for name in reaches}
-    sure = not found.missing and max(worst.values()) <= goals.sigma_px
-    if sure or len(poses) >= goals.most:
-        return _enough(found, worst, goals)
+    sure = not found.missing and max(worst.values()) <= GOALS.sigma_px
+    if sure or len(poses) >= GOALS.most:
+        return _enough(found, worst)
     camera = _least_sure(seeing, known, found, worst)
     device = known.devices[camera]
     board_pose = found.devices[camera].attitudes
     distance_mm = float(np.median([each.distance_mm for each in board_pose.values()]))
     upright_deg = 90.0 * round(next(iter(board_pose.values())).turn_deg / 90.0)
-    options = candidates(device, board, distance_mm=distance_mm, upright_deg=upright_deg)
+    options: list[Candidate] = []
+    for distance in (distance_mm, first_distance_mm(device, board)):
+        options = options or candidates(device, board, distance_mm=distance, upright_deg=upright_deg)
     if not options:
-        options = candidates(device, board, distance_mm=first_distance_mm(device, board), upright_deg=upright_deg)
-    if not options:
-        return _enough(found, worst, goals)
+        return _enough(found, worst)
     lasting = _informed(options, camera, known, board)
     after = {name: _worst(lasting.information[name], reaches[name]) for name in reaches}
-    gains = [
-        Gain(option, camera, known, found, goals, lasting.ways, lasting.seen_px(index))
-        for index, option in enumerate(options)
+    met = [
+        goals_met(option, known, found, lasting.ways, lasting.seen_px(index)) for index, option in enumerate(options)
     ]
     total = np.sum([(after[name] / known.devices[name].matrix[0, 0]) ** 2 for name in reaches], axis=0)
-    chosen = _chosen(gains, total, lasting.seeing)
+    chosen = _chosen(met, total, lasting.seeing)
     now = float(np.sum([(worst[name] / known.devices[name].matrix[0, 0]) ** 2 for name in reaches]))
     if not found.missing and float(np.sqrt(total[chosen] / now)) > 1 - _LEAST_GAIN:
-        return _enough(found, worst, goals)
+        return _enough(found, worst)
     expected = {name: float(after[name][chosen]) for name in reaches}
     last = list(board_pose.values())[-1]
-    why = reasons(gains[chosen], worst, expected, _worst_place(known.devices, reaches, worst))
-    words = f"{move_words(options[chosen], camera, last, upright_deg, round_deg=full_turn_deg(board))}: {why}"
+    why = reasons(camera, met[chosen], worst, expected, _worst_place(known.devices, reaches, worst))
+    words = f"{move_words(options[chosen], camera, last, upright_deg, full_turn_deg(board))}: {why}"
     return Advice(words, False, camera, options[chosen].outline_px, options[chosen], worst, expected)
 
 
@@ -201,15 +209,14 @@ def _least_sure(seeing: Sequence[str], known: RigGuess, found: Coverage, worst: 
     return max(seeing, key=rank)
 
 
-def _chosen(gains: Sequence[Gain], total: FloatArray, seeing: NDArray[np.int64]) -> int:
+def _chosen(met: Sequence[Mapping[str, Sequence[str]]], total: FloatArray, seeing: NDArray[np.int64]) -> int:
     """Return the candidate that lowers the worst cells the most, of those that meet an open goal if any does.
 
     Candidates that more devices see go before those that fewer see.
     """
-    serving = np.array([gain.goals_met > 0 for gain in gains])
-    allowed = serving if serving.any() else np.ones(len(gains), dtype=bool)
-    most = seeing[allowed].max()
-    allowed = allowed & (seeing == most)
+    serving = np.array([any(goals.values()) for goals in met])
+    allowed = serving if serving.any() else np.ones(len(met), dtype=bool)
+    allowed = allowed & (seeing == seeing[allowed].max())
     return int(np.argmin(np.where(allowed, total, np.inf)))
 
 
@@ -224,5 +231,5 @@ def _worst_place(
     return name, (int(column) // third - 1, int(row) // third - 1)
 
 
-def _enough(found: Coverage, worst: Mapping[str, float], goals: Goals) -> Advice:
-    return Advice(enough_words(found, worst, goals), True, None, np.zeros((0, 2)), None, worst, {})
+def _enough(found: Coverage, worst: Mapping[str, float]) -> Advice:
+    return Advice(enough_words(found, worst), True, None, np.zeros((0, 2)), None, worst, {})

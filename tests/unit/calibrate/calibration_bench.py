@@ -19,8 +19,7 @@ from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.tools import CalibrationTools, Judgement, Setting, Standing
 from slrig.calibration.board import Board, BoardKind, BoardShape
 from slrig.calibration.judging.comparison import comparison
-from slrig.calibration.observations import BoardView, PoseObservation
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import PoseRefusedError, ScanCancelledError
 from slrig.jobs.records import JobKind

@@ -12,9 +12,8 @@ import numpy as np
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.judging.verdict import verdict
-from slrig.calibration.observations import BoardView, Correspondences, PoseObservation
+from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import coverage
-from slrig.calibration.poses.figures import ViewFigures
 from slrig.calibration.solution import (
     CELLS,
     PARAMETERS,

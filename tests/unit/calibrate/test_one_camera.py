@@ -21,7 +21,7 @@ from slrig.calibrate.tools import Setting
 from slrig.calibration.board import BoardShape
 from slrig.calibration.health.verifying import verify_by_board
 from slrig.calibration.judging.comparison import comparison
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import ViewFigures
 from slrig.cli.calibration_screen import tell_result
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, Size

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import COLUMN, ROW, BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.solution import PROJECTOR, BoardPose
 from slrig.model import FloatArray, Pinhole, Size
 

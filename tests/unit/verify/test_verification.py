@@ -17,8 +17,7 @@ from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.health.verdict import Health, HealthState
 from slrig.calibration.health.verification import Verification
-from slrig.calibration.observations import PoseObservation
-from slrig.calibration.poses.figures import ViewFigures
+from slrig.calibration.observations import PoseObservation, ViewFigures
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationStateError,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.judging.scale_check import check_scale
+from slrig.calibration.judging.comparison import check_scale
 from slrig.calibration.judging.verdict import LIMITS, Grade, Verdict, verdict
 from slrig.calibration.poses.coverage import coverage
 from slrig.calibration.solution import (

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.observations import BoardView, PoseObservation
+from slrig.calibration.observations import BoardView, PoseObservation, ViewFigures
 from slrig.calibration.poses.checks import PoseAnswer, check_same_devices, judge_pose
-from slrig.calibration.poses.figures import ViewFigures
 from slrig.calibration.solution import PROJECTOR
 from slrig.errors import CalibrationError
 from slrig.model import Size
