@@ -96,13 +96,8 @@ class Board:
     @property
     def print_mm(self) -> FloatArray:
         """(2, 2) float64: the least and the greatest (x, y) of what is printed, in the board's frame."""
-        if self.kind is BoardKind.CIRCLES:
-            least = np.array([-1.0, -1.0])
-            most = np.array([2.0 * self.columns, float(self.rows)])
-        else:
-            least = np.array([-1.0, -1.0])
-            most = np.array([float(self.columns), float(self.rows)])
-        return np.stack([least, most]) * self.square_mm
+        across = 2 * self.columns if self.kind is BoardKind.CIRCLES else self.columns
+        return np.array([(-1.0, -1.0), (across, self.rows)]) * self.square_mm
 
     @property
     def title(self) -> str:

@@ -12,7 +12,7 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.artwork import artwork
 from slrig.calibration.boards.board_map import BoardMap, fitted_map
 from slrig.calibration.boards.circles import circle_blur_px
-from slrig.calibration.boards.grid_fit import placed_corners
+from slrig.calibration.boards.corner_fit import placed_corners
 from slrig.calibration.observations import BoardView
 from slrig.model import FloatArray
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.blobs import neighbours_in_steps
 from slrig.calibration.boards.board_map import BoardMap, fitted_map
+from slrig.calibration.boards.corner_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.grid_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.lattice import Lattice, levels_at
 from slrig.model import FloatArray, IntArray
 

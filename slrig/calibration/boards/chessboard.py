@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from slrig.calibration.board import Board
 from slrig.calibration.boards.board_map import fitted_map
 from slrig.calibration.boards.chess_lattice import chessboard_lattice, grown_lattice, holds_markers
+from slrig.calibration.boards.corner_fit import placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.grid_fit import placed_corners
 from slrig.calibration.boards.lattice import Lattice, right_handed
 from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
 from slrig.calibration.boards.sightings import MarkersSeen, describe_other, markers_seen

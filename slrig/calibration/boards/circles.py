@@ -17,9 +17,8 @@ import numpy as np
 from slrig.calibration.board import Board
 from slrig.calibration.boards.blobs import Blobs, dark_blobs, lattice_of, of_circles
 from slrig.calibration.boards.board_map import BoardMap, fitted_map
-from slrig.calibration.boards.corner_fit import FittedPlaces, fitted_circles, patch_offsets
+from slrig.calibration.boards.corner_fit import FLOOR_PX, FittedPlaces, fitted_circles, patch_offsets
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.grid_fit import FLOOR_PX
 from slrig.calibration.boards.lattice import Lattice, right_handed
 from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
 from slrig.calibration.boards.sightings import describe_other

@@ -22,8 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from slrig.model import FloatArray
+from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.boards.board_map import BoardMap, fitted_map
+from slrig.calibration.observations import BoardView
+from slrig.model import FloatArray, IntArray
 
+FLOOR_PX = 0.003
+"""Least deviation of a coordinate: what remains on noiseless renderings of tilted, distorted, shaded boards."""
+
+WORST_SIGMA_PX = 0.5
+"""A place that is worse known than this was not found."""
+
+_LEAST_HALF_PX, _MOST_HALF_PX = 3, 12
+_SHARE = 0.45
+_LEAST_SIDE_PX = 4.0
+_ASIDE_PX = 1.5
 _TURNS = 20
 _SETTLED_PX = 1e-4
 _STUCK = 1e4
@@ -31,7 +44,7 @@ _LEAST_BLUR_PX, _MOST_BLUR_PX = 0.25, 20.0
 _ROOT_2 = float(np.sqrt(2))
 _SLOPE = float(np.sqrt(2 / np.pi))
 
-Model = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+_Model = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 """From parameters (n, k) and pixels (n, m, 2) to grey levels (n, m) and their derivatives (n, m, k)."""
 
 
@@ -44,6 +57,91 @@ class FittedPlaces:
     points_px: FloatArray
     sigma_px: FloatArray
     blur_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedCorners:
+    """Corners that were placed: the view, the map that they follow, and the blur at each, (n,) float64 px."""
+
+    view: BoardView
+    board_map: BoardMap
+    blur_px: FloatArray
+
+
+def placed_corners(
+    level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray, *, light_first: bool = False
+) -> PlacedCorners | None:
+    """Corners of a chessboard or ChArUco board from rough places: those that a fit could place. None if too few.
+
+    level : (H, W) float64; corner : (n,) int32, rising; rough_px : (n, 2) float64; light_first : as of `BoardView`.
+    """
+    squares = board.points_mm[:, :2] / board.square_mm
+    for again in (False, True):
+        board_map = fitted_map(squares[corner], rough_px)
+        if board_map is None:
+            return None
+        fit = _fit(level, board, corner, rough_px, board_map, light_first)
+        if fit is None:
+            return None
+        good = np.isfinite(fit.sigma_px) & (fit.sigma_px < WORST_SIGMA_PX)
+        corner, rough_px = corner[good], fit.points_px[good]
+        sigma, blur = fit.sigma_px[good], fit.blur_px[good]
+        if len(corner) < 4:
+            return None
+        keep = _on_the_map(squares[corner], rough_px)
+        corner, rough_px, sigma, blur = corner[keep], rough_px[keep], sigma[keep], blur[keep]
+        if keep.all() or again:
+            break
+    final = fitted_map(squares[corner], rough_px)
+    if final is None:
+        return None
+    view = BoardView(corner.astype(np.int32), rough_px, np.hypot(sigma, FLOOR_PX), light_first)
+    return PlacedCorners(view, final, blur)
+
+
+def _on_the_map(squares: FloatArray, points_px: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which points lie where their neighbours say, within a few times the usual distance."""
+    keep = np.ones(len(points_px), dtype=bool)
+    for _ in range(3):
+        board_map = fitted_map(squares[keep], points_px[keep])
+        if board_map is None:
+            break
+        aside = np.linalg.norm(points_px - board_map(squares), axis=1)
+        now = aside < max(_ASIDE_PX, 5 * float(np.median(aside[keep])))
+        if (now == keep).all():
+            break
+        keep = now
+    return keep
+
+
+def _fit(
+    level: FloatArray, board: Board, corner: IntArray, rough_px: FloatArray, board_map: BoardMap, light_first: bool
+) -> FittedPlaces | None:
+    """The fit at each corner; None where squares would be smaller than can be told, or the map has a fold in them."""
+    squares = board.points_mm[corner, :2] / board.square_mm
+    slope = board_map.jacobian(squares, step=0.05)
+    area = np.linalg.det(slope)
+    if not np.isfinite(slope).all() or np.median(np.abs(area)) < _LEAST_SIDE_PX**2:
+        return None
+    # A corner where the map is folded is none; any square stands in for its own.
+    folded = np.abs(area) < 0.1 * np.median(np.abs(area))
+    slope[folded] = slope[int(np.argmax(~folded))]
+    sides = np.linalg.norm(slope, axis=1)
+    half_px = int(np.clip(np.round(_SHARE * np.median(sides.min(axis=1))), _LEAST_HALF_PX, _MOST_HALF_PX))
+    offsets = patch_offsets(half_px) + (np.round(rough_px) - rough_px)[:, None]
+    # Places of the pixels from the corner, in squares; straight within so short a way.
+    local = np.einsum("nij,nmj->nmi", np.linalg.inv(slope), offsets)
+    usable = np.abs(local).max(axis=-1) < _SHARE
+    if board.kind is BoardKind.CHARUCO:
+        inset = (1 - float(board.marker_mm or 0) / board.square_mm) / 2
+        clear = (np.abs(local) - inset) * sides[:, None]
+        # Of the two squares on this diagonal, light or dark by the corner's number, only the light ones hold a marker.
+        row, column = np.divmod(corner, board.columns)
+        same_sign = (local[..., 0] > 0) == (local[..., 1] > 0)
+        light = same_sign == ((row + column) % 2 != int(light_first))[:, None]
+        usable &= ~(light & (clear.min(axis=-1) > -1.0))
+    edges = slope.transpose(0, 2, 1) / sides[..., None]
+    return fitted_corners(level, rough_px, edges, usable, half_px=half_px)
 
 
 def patch_offsets(half_px: int) -> NDArray[np.int64]:
@@ -62,14 +160,7 @@ def fitted_corners(
     directions of the two edges at each, rows; usable : (n, m) bool, which pixels of the patch of `half_px` about the
     nearest pixel belong to the four squares that meet there.
     """
-    pixels, grey, usable = _patches(image, start_px, usable, half_px)
-    normal = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-    angles = np.arctan2(normal[..., 1], normal[..., 0])
-    zero = np.zeros((len(start_px), 1))
-    level = _mean(grey, usable)[:, None]
-    start = np.hstack([zero, zero, angles, zero + 1.0, level, zero, zero, zero, zero, zero])
-    start[:, 8] = _amplitude(_corner_model, start, 8, pixels, grey, usable)
-    return _fitted(_corner_model, start, pixels, grey, usable, start_px, reach_px=0.5 * half_px)
+    return _fitted(_corner_model, np.arctan2(edges[..., 0], -edges[..., 1]), image, start_px, usable, half_px)[0]
 
 
 def fitted_circles(
@@ -81,68 +172,22 @@ def fitted_circles(
     `fitted_corners`. Returns the places and the fitted shapes, (n, 2, 2) float64. An ellipse's centre is not where the
     circle's centre is seen: see `slrig.calibration.boards.circles`.
     """
-    pixels, grey, usable = _patches(image, start_px, usable, half_px)
-    zero = np.zeros((len(start_px), 1))
-    level = _mean(grey, usable)[:, None]
-    upper = shape[:, [0, 0, 1], [0, 1, 1]]
-    start = np.hstack([zero, zero, upper, zero + 1.0, level, zero, zero, zero, zero, zero])
-    start[:, 9] = _amplitude(_circle_model, start, 9, pixels, grey, usable)
-    solved = _solved(_circle_model, start, pixels, grey, usable, blur=5)
-    places = _places(_circle_model, solved, pixels, grey, usable, start_px, blur=5, reach_px=0.5 * half_px)
-    q = solved
+    places, q = _fitted(_circle_model, shape[:, [0, 0, 1], [0, 1, 1]], image, start_px, usable, half_px)
     return places, np.stack([q[:, [2, 3]], q[:, [3, 4]]], axis=1)
-
-
-def _fitted(
-    model: Model,
-    start: FloatArray,
-    pixels: FloatArray,
-    grey: FloatArray,
-    usable: NDArray[np.bool_],
-    start_px: FloatArray,
-    *,
-    reach_px: float,
-) -> FittedPlaces:
-    solved = _solved(model, start, pixels, grey, usable, blur=4)
-    return _places(model, solved, pixels, grey, usable, start_px, blur=4, reach_px=reach_px)
 
 
 def _corner_model(given: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Parameters: x, y, two angles of the normals, blur, b, b'x, b'y, a, a'x, a'y."""
     x, y = pixels[..., 0], pixels[..., 1]
     off_x, off_y = x - given[:, :1], y - given[:, 1:2]
-    blur = given[:, 4:5]
-    rises, slopes, turned, distances, normals = [], [], [], [], []
-    for angle in (given[:, 2:3], given[:, 3:4]):
-        cosine, sine = np.cos(angle), np.sin(angle)
-        distance = cosine * off_x + sine * off_y
-        scaled = distance / blur
-        rises.append(erf(scaled / _ROOT_2))
-        slopes.append(_SLOPE / blur * np.exp(-0.5 * scaled**2))
-        turned.append(-sine * off_x + cosine * off_y)
-        distances.append(scaled)
-        normals.append((cosine, sine))
-    step = given[:, 8:9] + given[:, 9:10] * x + given[:, 10:11] * y
-    both = rises[0] * rises[1]
-    by_first, by_second = step * slopes[0] * rises[1], step * slopes[1] * rises[0]
-    one = np.ones_like(x)
-    derivative = np.stack(
-        [
-            -(by_first * normals[0][0] + by_second * normals[1][0]),
-            -(by_first * normals[0][1] + by_second * normals[1][1]),
-            by_first * turned[0],
-            by_second * turned[1],
-            -(by_first * distances[0] + by_second * distances[1]),
-            one,
-            x,
-            y,
-            both,
-            both * x,
-            both * y,
-        ],
-        axis=-1,
-    )
-    return given[:, 5:6] + given[:, 6:7] * x + given[:, 7:8] * y + step * both, derivative
+    blur, step = given[:, 4:5], given[:, 8:9] + given[:, 9:10] * x + given[:, 10:11] * y
+    cosine, sine = np.cos(given[:, 2:4]).T[..., None], np.sin(given[:, 2:4]).T[..., None]
+    scaled = (cosine * off_x + sine * off_y) / blur
+    rises = erf(scaled / _ROOT_2)
+    by = step * (_SLOPE / blur * np.exp(-0.5 * scaled**2)) * rises[::-1]
+    turned = by * (-sine * off_x + cosine * off_y)
+    by_shape = [-(by * cosine).sum(axis=0), -(by * sine).sum(axis=0), *turned, -(by * scaled).sum(axis=0)]
+    return _shaded(given[:, 5:8], x, y, step, rises[0] * rises[1], by_shape)
 
 
 def _circle_model(given: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -154,30 +199,23 @@ def _circle_model(given: FloatArray, pixels: FloatArray) -> tuple[FloatArray, Fl
     radius = np.maximum(np.hypot(across, down), 1e-6)
     slope_x, slope_y = (q_xx * across + q_xy * down) / radius, (q_xy * across + q_yy * down) / radius
     steep = np.maximum(np.hypot(slope_x, slope_y), 1e-9)
-    blur = given[:, 5:6]
+    blur, step = given[:, 5:6], given[:, 9:10] + given[:, 10:11] * x + given[:, 11:12] * y
     scaled = (radius - 1) / steep / blur
-    rise = erf(scaled / _ROOT_2)
-    step = given[:, 9:10] + given[:, 10:11] * x + given[:, 11:12] * y
     by_distance = step * _SLOPE / blur * np.exp(-0.5 * scaled**2)
-    one = np.ones_like(x)
-    derivative = np.stack(
-        [
-            -by_distance * slope_x / steep,
-            -by_distance * slope_y / steep,
-            by_distance * across * off_x / radius / steep,
-            by_distance * (across * off_y + down * off_x) / radius / steep,
-            by_distance * down * off_y / radius / steep,
-            -by_distance * scaled,
-            one,
-            x,
-            y,
-            rise,
-            rise * x,
-            rise * y,
-        ],
-        axis=-1,
-    )
-    return given[:, 6:7] + given[:, 7:8] * x + given[:, 8:9] * y + step * rise, derivative
+    by_shape = [
+        -by_distance * slope_x / steep, -by_distance * slope_y / steep, by_distance * across * off_x / radius / steep,
+        by_distance * (across * off_y + down * off_x) / radius / steep, by_distance * down * off_y / radius / steep,
+        -by_distance * scaled,
+    ]  # fmt: skip
+    return _shaded(given[:, 6:9], x, y, step, erf(scaled / _ROOT_2), by_shape)
+
+
+def _shaded(
+    base: FloatArray, x: FloatArray, y: FloatArray, step: FloatArray, rise: FloatArray, by_shape: list[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """I = base + step rise, and its derivatives: by the shape, then by b, b', a and a'. base : (n, 3), b and b'."""
+    level = base[:, :1] + base[:, 1:2] * x + base[:, 2:3] * y + step * rise
+    return level, np.stack([*by_shape, np.ones_like(x), x, y, rise, rise * x, rise * y], axis=-1)
 
 
 def _patches(
@@ -204,23 +242,23 @@ def _mean(grey: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
     return np.asarray((grey * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1))
 
 
-def _amplitude(
-    model: Model, start: FloatArray, which: int, pixels: FloatArray, grey: FloatArray, usable: NDArray[np.bool_]
-) -> FloatArray:
-    """The step's height that fits best while all else is as at the start."""
-    _, derivative = model(start, pixels)
-    unit = derivative[..., which] * usable
+def _fitted(
+    model: _Model, shape: FloatArray, image: FloatArray, start_px: FloatArray, usable: NDArray[np.bool_], half_px: int
+) -> tuple[FittedPlaces, FloatArray]:
+    """Places and parameters (n, k) after Levenberg and Marquardt, every patch with its own damping.
+
+    shape : (n, s) float64, the model's parameters between the place and the blur, at the start.
+    """
+    pixels, grey, usable = _patches(image, start_px, usable, half_px)
+    blur = 2 + shape.shape[1]
+    given = np.zeros((len(start_px), blur + 7))
+    given[:, 2:blur], given[:, blur], given[:, blur + 1] = shape, 1.0, _mean(grey, usable)
+    # The step's height that fits best while all else is as at the start.
+    unit = model(given, pixels)[1][..., blur + 4] * usable
     unit -= _mean(unit, usable)[:, None] * usable
-    return np.asarray((unit * grey).sum(axis=1) / np.maximum((unit**2).sum(axis=1), 1e-12))
-
-
-def _solved(
-    model: Model, start: FloatArray, pixels: FloatArray, grey: FloatArray, usable: NDArray[np.bool_], *, blur: int
-) -> FloatArray:
-    """Parameters (n, k) after Levenberg and Marquardt, every patch with its own damping."""
-    given = start.copy()
-    damping = np.full(len(start), 1e-3)
-    settled = np.zeros(len(start), dtype=bool)
+    given[:, blur + 4] = (unit * grey).sum(axis=1) / np.maximum((unit**2).sum(axis=1), 1e-12)
+    damping = np.full(len(given), 1e-3)
+    settled = np.zeros(len(given), dtype=bool)
     level, derivative = model(given, pixels)
     rest = (grey - level) * usable
     cost = (rest**2).sum(axis=1)
@@ -245,30 +283,15 @@ def _solved(
         settled |= (better & (np.abs(step[:, :2]) < _SETTLED_PX).all(axis=1)) | (damping > _STUCK)
         if settled.all():
             break
-    return given
-
-
-def _places(
-    model: Model,
-    solved: FloatArray,
-    pixels: FloatArray,
-    grey: FloatArray,
-    usable: NDArray[np.bool_],
-    start_px: FloatArray,
-    *,
-    blur: int,
-    reach_px: float,
-) -> FittedPlaces:
-    level, derivative = model(solved, pixels)
     weighted = derivative * usable[..., None]
-    freedom = usable.sum(axis=1) - solved.shape[1]
-    variance = (((grey - level) * usable) ** 2).sum(axis=1) / np.maximum(freedom, 1)
+    freedom = usable.sum(axis=1) - given.shape[1]
+    variance = cost / np.maximum(freedom, 1)
     normal = np.matmul(weighted.transpose(0, 2, 1), weighted)
     # Scaled, so that a grey level and a pixel do not have to share one unit.
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-30))
     inverse = np.linalg.pinv(normal / scale[:, :, None] / scale[:, None, :], hermitian=True)
     spread = np.einsum("nii->ni", inverse)[:, :2] / scale[:, :2] ** 2
     sigma = np.sqrt(variance * spread.mean(axis=1))
-    moved = np.hypot(solved[:, 0], solved[:, 1])
-    sigma = np.where((freedom > solved.shape[1]) & (moved <= reach_px), sigma, np.nan)
-    return FittedPlaces(start_px + solved[:, :2], sigma, solved[:, blur])
+    moved = np.hypot(given[:, 0], given[:, 1])
+    sigma = np.where((freedom > given.shape[1]) & (moved <= 0.5 * half_px), sigma, np.nan)
+    return FittedPlaces(start_px + given[:, :2], sigma, given[:, blur]), given

@@ -15,8 +15,8 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.board_masks import blur_sigma_px, board_region, light_squares, square_interior
 from slrig.calibration.boards.chessboard import chessboard_view
 from slrig.calibration.boards.circles import circles_again, circles_view
+from slrig.calibration.boards.corner_fit import placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.grid_fit import placed_corners
 from slrig.calibration.boards.markers import charuco_view
 from slrig.calibration.boards.numbering import equivalent_views, turned_half
 from slrig.calibration.observations import BoardView
@@ -66,7 +66,7 @@ def find_board(image: NDArray[Any], board: Board, /, *, full_scale: float) -> Bo
 
     A coordinate's deviation is sqrt(e^2 (J^T J)^-1 + floor^2), with e the rms residual of the corner's own fit and J
     the derivative of its model, so that noise, contrast, blur and size of the squares are all in it; the floor stands
-    for what a fit cannot see of itself (FLOOR_PX in `slrig.calibration.boards.grid_fit`).
+    for what a fit cannot see of itself (FLOOR_PX in `slrig.calibration.boards.corner_fit`).
 
     Raises
     ------

@@ -10,8 +10,8 @@ import numpy as np
 from slrig.calibration.board import Board
 from slrig.calibration.boards.artwork import charuco_board, marker_dictionary
 from slrig.calibration.boards.board_map import fitted_map
+from slrig.calibration.boards.corner_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.grid_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.marker_layout import fitting_width, rest_px, stands_light_first
 from slrig.calibration.boards.sightings import describe_other, marker_numbers, markers_seen
 from slrig.calibration.observations import BoardView
