@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.detection import blur_sigma_px, equivalent_views, find_board
+from slrig.calibration.boards.detection import blur_sigma_px, find_board
+from slrig.calibration.boards.lattice import equivalent_views
 
 pytestmark = pytest.mark.shared
 

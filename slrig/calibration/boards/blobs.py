@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from slrig.calibration.boards.board_map import BoardMap, fitted_map
+from slrig.calibration.boards.board_map import BoardMap
 from slrig.calibration.boards.grey import Grey
 from slrig.calibration.boards.lattice import Lattice, levels_at
 from slrig.model import FloatArray, IntArray
@@ -60,7 +60,7 @@ def of_circles(level: FloatArray, lattice: Lattice) -> bool:
     """Whether the spots of a lattice are circles between which it is light. Dark squares of a chessboard stand in the
     same lattice and are dark in their corners, too; spots of noise are not light between.
     """
-    board_map = fitted_map(lattice.places.astype(np.float64), lattice.points_px)
+    board_map = lattice.board_map()
     if board_map is None:
         return False
     centres = _about(level, board_map, lattice, np.zeros((1, 2)))

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.blobs import neighbours_in_steps
-from slrig.calibration.boards.board_map import BoardMap, fitted_map
+from slrig.calibration.boards.board_map import BoardMap
 from slrig.calibration.boards.corner_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.lattice import Lattice, levels_at
+from slrig.calibration.boards.lattice import Lattice, beside, levels_at
 from slrig.model import FloatArray, IntArray
 
 _SEARCHES_PX = (640, 1280)
@@ -83,10 +83,10 @@ def grown_lattice(level: FloatArray, points_px: FloatArray, steps: IntArray) -> 
         kept = strength > _ALTERNATES * usual
         if not usual > 0 or kept.sum() < max(_FEWEST, 0 if turn else _TRUE * len(points_px)):
             return None
-        beside = _beside(corner[kept])
-        guessed = placed.board_map(_places(beside))
-        more = (polarity * _crossing(level, placed.board_map, beside)).min(axis=1) > _ALTERNATES * usual
-        everything = np.concatenate([corner[kept], beside[more]])
+        near = beside(corner[kept], _SIDE, _SIDE)
+        guessed = placed.board_map(_places(near))
+        more = (polarity * _crossing(level, placed.board_map, near)).min(axis=1) > _ALTERNATES * usual
+        everything = np.concatenate([corner[kept], near[more]])
         rough = np.concatenate([points[kept], guessed[more]])
         order = np.argsort(everything)
         grown = placed_corners(level, _PLANE, everything[order], rough[order])
@@ -105,14 +105,6 @@ def _lattice(level: FloatArray, placed: PlacedCorners | None) -> Lattice | None:
     if min(columns, rows) < 3:
         return None
     return Lattice(columns, rows, placed.view.points_px, places)
-
-
-def _beside(corner: IntArray) -> IntArray:
-    """Numbers of the plane's corners that are the neighbours of these, and not among them."""
-    known = np.zeros((_SIDE, _SIDE), dtype=np.uint8)
-    known.ravel()[corner] = 1
-    near = np.asarray(cv2.dilate(known, np.ones((3, 3), dtype=np.uint8)))
-    return np.flatnonzero((near > known).ravel()).astype(np.int32)
 
 
 def _places(corner: IntArray) -> FloatArray:
@@ -148,7 +140,7 @@ def _round(level: FloatArray, board_map: BoardMap, corner: IntArray) -> bool:
 
 def holds_markers(level: FloatArray, lattice: Lattice) -> bool:
     """Whether grey levels vary within the light squares far more than within the dark ones, as where markers lie."""
-    board_map = fitted_map(lattice.places.astype(np.float64), lattice.points_px)
+    board_map = lattice.board_map()
     if board_map is None:
         return False
     x, y = np.meshgrid(np.arange(lattice.columns - 1) + 0.5, np.arange(lattice.rows - 1) + 0.5)

@@ -7,13 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.board import Board
-from slrig.calibration.boards.board_map import fitted_map
 from slrig.calibration.boards.chess_lattice import chessboard_lattice, grown_lattice, holds_markers
 from slrig.calibration.boards.corner_fit import placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.lattice import Lattice, right_handed
-from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
-from slrig.calibration.boards.sightings import MarkersSeen, describe_other, markers_seen
+from slrig.calibration.boards.lattice import Lattice, half_turn_looks_same, pointing_right, right_handed
+from slrig.calibration.boards.sightings import half_words, markers_seen, nothing_words, unclear_words
 from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray
@@ -28,16 +26,12 @@ def chessboard_view(grey: Grey, board: Board) -> BoardView:
     if lattice is None or not _is_all_of(lattice, board):
         raise PoseRefusedError(_cause(grey, board, lattice))
     if holds_markers(grey.level, lattice):
-        raise PoseRefusedError(_with_markers(board, markers_seen(grey)))
+        raise PoseRefusedError(_with_markers(grey, board))
     rough_px = _numbered(grey.level, board, lattice)
     placed = placed_corners(grey.level, board, np.arange(board.corner_count, dtype=np.int32), rough_px)
-    if placed is None or len(placed.view.corner) < _LEAST_FOUND * board.corner_count:
-        found = 0 if placed is None else len(placed.view.corner)
-        message = (
-            f"{board.title}: its grid is in view, but only {found} of its {board.corner_count} corners are clear "
-            f"enough to be placed: {grey.likely_cause()}"
-        )
-        raise PoseRefusedError(message)
+    found = 0 if placed is None else len(placed.view.corner)
+    if placed is None or found < _LEAST_FOUND * board.corner_count:
+        raise PoseRefusedError(unclear_words(grey, board, found, "corners"))
     return placed.view
 
 
@@ -81,7 +75,7 @@ def _is_all_of(lattice: Lattice, board: Board) -> bool:
 
 def _numbered(level: FloatArray, board: Board, lattice: Lattice) -> FloatArray:
     """(n, 2) float64: about where every corner of the board lies, in the board's own order."""
-    board_map = fitted_map(lattice.places.astype(np.float64), lattice.points_px)
+    board_map = lattice.board_map()
     if board_map is None:
         return np.full((board.corner_count, 2), np.nan)
     y, x = np.mgrid[: lattice.rows, : lattice.columns].astype(np.float64)
@@ -106,29 +100,14 @@ def _first_is_dark(level: FloatArray, grid: FloatArray) -> bool:
 
 def _cause(grey: Grey, board: Board, seen: Lattice | None) -> str:
     """Why this chessboard is not found, with the chessboard that is seen."""
-    if seen is not None:
-        if holds_markers(grey.level, seen):
-            return _with_markers(board, markers_seen(grey))
-        complete = seen.complete(grey.level)
-        sides = seen.cut_sides(grey.level.shape)
-        if not seen.fits_in(board) or (complete and not sides):
-            return _another(board, seen)
-        return _half(board, seen, sides)
-    other = describe_other(grey, board.kind)
-    if other:
-        return f"another board: expected a {board.title}, found {other}"
-    return f"no {board.title} found: {grey.likely_cause()}"
-
-
-def _with_markers(board: Board, markers: MarkersSeen | None) -> str:
-    found = f"the markers of a ChArUco board ({markers.dictionary})" if markers else "something printed in its squares"
-    return (
-        f"another board: expected a {board.title}, found a chessboard with {found}: give {setting('kind')} "
-        "charuco, or put the chessboard there"
-    )
-
-
-def _another(board: Board, seen: Lattice) -> str:
+    if seen is None:
+        return nothing_words(grey, board)
+    if holds_markers(grey.level, seen):
+        return _with_markers(grey, board)
+    sides = seen.cut_sides(grey.level.shape)
+    if seen.fits_in(board) and (sides or not seen.complete(grey.level)):
+        part = f"{len(seen.places)} of the {board.corner_count} corners, in a grid of {seen.columns} x {seen.rows},"
+        return half_words(part, sides)
     return (
         f"another board: expected {board.columns} x {board.rows} inner corners, found a chessboard of "
         f"{max(seen.columns, seen.rows)} x {min(seen.columns, seen.rows)}: take the other board, or give its corners "
@@ -136,15 +115,10 @@ def _another(board: Board, seen: Lattice) -> str:
     )
 
 
-def _half(board: Board, seen: Lattice, sides: list[str]) -> str:
-    part = f"{len(seen.places)} of the {board.corner_count} corners, in a grid of {seen.columns} x {seen.rows},"
-    if sides:
-        return (
-            f"half a board: only {part} are in view, the rest is beyond the image's {' and '.join(sides)} side: move "
-            "the board fully into view, or use a ChArUco board, which may reach out of it"
-        )
+def _with_markers(grey: Grey, board: Board) -> str:
+    markers = markers_seen(grey)
+    found = f"the markers of a ChArUco board ({markers.dictionary})" if markers else "something printed in its squares"
     return (
-        f"half a board: only {part} are found, though the image does not end there: take away what covers the "
-        "rest or throws a reflection on it; if nothing does, this is another board and "
-        f"{setting('corners')} is wrong"
+        f"another board: expected a {board.title}, found a chessboard with {found}: give {setting('kind')} "
+        "charuco, or put the chessboard there"
     )

@@ -17,11 +17,10 @@ import numpy as np
 from slrig.calibration.board import Board
 from slrig.calibration.boards.blobs import Blobs, dark_blobs, lattice_of, of_circles
 from slrig.calibration.boards.board_map import BoardMap, fitted_map
-from slrig.calibration.boards.corner_fit import FLOOR_PX, FittedPlaces, fitted_circles, patch_offsets
+from slrig.calibration.boards.corner_fit import FLOOR_PX, WORST_SIGMA_PX, FittedPlaces, fitted_circles, patch_offsets
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.lattice import Lattice, right_handed
-from slrig.calibration.boards.numbering import half_turn_looks_same, pointing_right
-from slrig.calibration.boards.sightings import describe_other
+from slrig.calibration.boards.lattice import Lattice, half_turn_looks_same, pointing_right, right_handed
+from slrig.calibration.boards.sightings import UNMIRRORED, half_words, other_words, unclear_words
 from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray
@@ -29,7 +28,6 @@ from slrig.model import FloatArray
 _TURNS = 3
 _RING_PX, _RING_BLURS = 4.0, 3.2
 _OUTLINE = 48
-_WORST_SIGMA_PX = 0.5
 _LEAST_FOUND = 0.8
 _SMALL_PX = 4.0
 _MOST_SPOTS = 2
@@ -47,11 +45,7 @@ def circles_view(grey: Grey, board: Board) -> BoardView:
     view = placed_circles(grey.level, board, rough_px, blobs)
     found = 0 if view is None else len(view.corner)
     if view is None or found < _LEAST_FOUND * board.corner_count:
-        message = (
-            f"{board.title}: its grid is in view, but only {found} of its {board.corner_count} circles are clear "
-            f"enough to be placed: {grey.likely_cause()}"
-        )
-        raise PoseRefusedError(message)
+        raise PoseRefusedError(unclear_words(grey, board, found, "circles"))
     return view
 
 
@@ -63,7 +57,7 @@ def placed_circles(level: FloatArray, board: Board, rough_px: FloatArray, blobs:
         return None
     radius = _first_radius(board_map, places, rough_px, blobs)
     fit, radius = _ellipses(level, board_map, places, rough_px, radius)
-    good = np.isfinite(fit.sigma_px) & (fit.sigma_px < _WORST_SIGMA_PX)
+    good = np.isfinite(fit.sigma_px) & (fit.sigma_px < WORST_SIGMA_PX)
     centres_px = fit.points_px.copy()
     for _ in range(_TURNS):
         board_map = fitted_map(places[good], centres_px[good])
@@ -112,7 +106,8 @@ def _grid(lattice: Lattice, board: Board) -> FloatArray | None:
         points_px = _by_opencv(lattice, board)
     if points_px is None:
         if _matched(lattice, board, mirrored=True) is not None:
-            raise PoseRefusedError(_mirrored(board))
+            message = f"a mirrored print: this {board.title} is in view, left and right changed over: {UNMIRRORED}"
+            raise PoseRefusedError(message)
         return None
     return pointing_right(points_px, board)
 
@@ -180,7 +175,7 @@ def _ellipses(
         # Half way to the nearest other circle, which stands a diagonal of `square_mm` away.
         usable = (out * radius < 0.95 * np.sqrt(0.5)) & (from_outline < ring_px)
         fit, shapes = fitted_circles(level, rough_px, shape, usable, half_px=half_px)
-        good = np.isfinite(fit.sigma_px) & (fit.sigma_px < _WORST_SIGMA_PX)
+        good = np.isfinite(fit.sigma_px) & (fit.sigma_px < WORST_SIGMA_PX)
         if not good.any():
             return fit, radius
         area = np.abs(np.linalg.det(shapes)) * np.abs(np.linalg.det(slope))
@@ -208,13 +203,6 @@ def _ellipse_shift(board_map: BoardMap, places: FloatArray, radius: float) -> Fl
     return np.asarray(centre * scale)
 
 
-def _mirrored(board: Board) -> str:
-    return (
-        f"a mirrored print: this {board.title} is in view, left and right changed over: print the file again without "
-        "mirroring, and look at it from its printed side, not through a mirror"
-    )
-
-
 def _another(board: Board, seen: Lattice) -> str:
     found, wanted = sorted((seen.columns, seen.rows)), sorted((2 * board.columns, board.rows))
     if found == sorted((2 * board.rows, board.columns)):
@@ -233,11 +221,9 @@ def _another(board: Board, seen: Lattice) -> str:
 
 def _cause(grey: Grey, board: Board, blobs: Blobs, seen: Lattice | None) -> str:
     """Why these circles are not found."""
-    other = describe_other(grey, board.kind)
-    if other:
-        return f"another board: expected {board.title}, found {other}"
-    if seen is None:
-        return f"no {board.title} found: {grey.likely_cause()}"
+    other = other_words(grey, board)
+    if other or seen is None:
+        return other or f"no {board.title} found: {grey.likely_cause()}"
     sides = seen.cut_sides(grey.level.shape)
     full = (seen.columns * seen.rows + 1) // 2
     extent = {seen.columns, seen.rows}
@@ -246,18 +232,10 @@ def _cause(grey: Grey, board: Board, blobs: Blobs, seen: Lattice | None) -> str:
     ):
         return _another(board, seen)
     part = f"{len(seen.places)} of {board.corner_count} circles"
-    if sides:
-        return (
-            f"half a board: only {part} are in view, the rest is beyond the image's {' and '.join(sides)} side: move "
-            "the board fully into view, or use a ChArUco board, which may reach out of it"
-        )
     radius = float(np.median(blobs.radius_px))
-    if radius < _SMALL_PX:
+    if radius < _SMALL_PX and not sides:
         return (
             f"{board.title}: only {part} are found, and they are {2 * radius:.0f} pixels wide: bring the board closer, "
             f"{2 * _SMALL_PX:.0f} pixels are the least"
         )
-    return (
-        f"half a board: only {part} are found, though the image does not end there: take away what covers the rest or "
-        f"throws a reflection on it; if nothing does, this is another board and {setting('corners')} is wrong"
-    )
+    return half_words(part, sides)

@@ -1,15 +1,33 @@
-"""A part of a grid that is in view, whatever its size: how far it reaches, and whether the image's border cuts it."""
+"""A grid of corners in view, whatever its size: how far it reaches, where the image cuts it, which corner is number 0.
+
+- A ChArUco board has one numbering: its markers say which.
+- A chessboard whose columns and rows of corners add up to an odd number (11 x 8) has one: the square up and left of
+  corner 0 is dark. If they add up to an even number (7 x 9), it looks the same after half a turn; with as many columns
+  as rows, and an even number of both, after every quarter turn.
+- Asymmetric circles have one numbering with an odd number of rows (4 x 11); with an even number they look the same
+  after half a turn.
+
+A mirrored chessboard is a chessboard, and mirrored circles with an odd number of rows are such circles: every corner
+has its place by the same numbers, and nothing goes wrong. Mirrored circles with an even number of rows, and a mirrored
+ChArUco board, are other boards and are refused.
+
+Where a print looks the same from two sides, an image alone cannot tell them apart. Poses of one camera do no harm by
+that: the board's own place is solved anew in each. Two cameras and a projector that see one pose must agree, though:
+the solve tries both ends of a view of every camera but the first and keeps what fits.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
-from slrig.calibration.boards.board_map import fitted_map
+from slrig.calibration.boards.board_map import BoardMap, fitted_map
+from slrig.calibration.observations import BoardView
 from slrig.model import FloatArray, IntArray
 
 _MARGIN = 1.3
@@ -35,53 +53,52 @@ class Lattice:
         seen = (self.columns, self.rows)
         return any(a <= wanted[0] and b <= wanted[1] for a, b in (seen, seen[::-1]))
 
+    def board_map(self) -> BoardMap | None:
+        """The map of places into the image; None where the points determine none."""
+        return fitted_map(self.places.astype(np.float64), self.points_px)
+
     def complete(self, level: FloatArray) -> bool:
         """Whether a chessboard ends on all four sides: beyond its outermost squares lies paper as light as its light
         squares. False where it cannot be told.
         """
-        board_map = fitted_map(self.places.astype(np.float64), self.points_px)
+        board_map = self.board_map()
         if board_map is None:
             return False
         inside = _line(np.arange(self.columns - 1) + 0.5, np.arange(self.rows - 1) + 0.5)
-        squares = levels_at(level, board_map(inside))
-        low, high = np.nanpercentile(squares, [10, 90])
+        low, high = np.nanpercentile(levels_at(level, board_map(inside)), [10, 90])
         x, y = np.arange(self.columns + 1) - 0.5, np.arange(self.rows + 1) - 0.5
-        lines = (
-            _line(np.array([-_MARGIN]), y),
-            _line(np.array([self.columns - 1 + _MARGIN]), y),
-            _line(x, np.array([-_MARGIN])),
-            _line(x, np.array([self.rows - 1 + _MARGIN])),
-        )
-        light = [levels_at(level, board_map(line)) > low + 0.7 * (high - low) for line in lines]
+        last = np.array([self.columns - 1, self.rows - 1])
+        light = [
+            levels_at(level, board_map(line)) > low + 0.7 * (high - low)
+            for line in _around(np.zeros(2) - _MARGIN, last + _MARGIN, x, y)
+        ]
         return all(float(side.mean()) > 0.85 for side in light)
 
     def cut_sides(self, shape: tuple[int, ...]) -> list[str]:
         """The sides of the image of this shape (H, W) beyond which the grid would go on: left, right, upper, lower."""
-        board_map = fitted_map(self.places.astype(np.float64), self.points_px)
+        board_map = self.board_map()
         if board_map is None:
             return []
         least, most = self.places.min(axis=0), self.places.max(axis=0)
         x, y = np.arange(least[0], most[0] + 1.0), np.arange(least[1], most[1] + 1.0)
-        lines = (
-            _line(np.array([least[0] - _BEYOND]), y),
-            _line(np.array([most[0] + _BEYOND]), y),
-            _line(x, np.array([least[1] - _BEYOND])),
-            _line(x, np.array([most[1] + _BEYOND])),
-        )
+        height, width = shape[:2]
         sides = []
-        for line in lines:
-            beyond = board_map(line)
-            height, width = shape[:2]
+        for line in _around(least - _BEYOND, most + _BEYOND, x, y):
+            beyond_x, beyond_y = board_map(line).T
             outside = {
-                "left": beyond[:, 0] < 0,
-                "right": beyond[:, 0] > width - 1,
-                "upper": beyond[:, 1] < 0,
-                "lower": beyond[:, 1] > height - 1,
-            }
+                "left": beyond_x < 0, "right": beyond_x > width - 1,
+                "upper": beyond_y < 0, "lower": beyond_y > height - 1,
+            }  # fmt: skip
             side = max(outside, key=lambda name: float(outside[name].mean()))
             if outside[side].mean() > 0.5 and side not in sides:
                 sides.append(side)
         return sides
+
+
+def _around(least: FloatArray, most: FloatArray, x: FloatArray, y: FloatArray) -> list[FloatArray]:
+    """Four lines of places (n, 2): at the least and the greatest x, then at the least and the greatest y."""
+    ends = np.stack([least, most])
+    return [_line(at, y) for at in ends[:, :1]] + [_line(x, at) for at in ends[:, 1:]]
 
 
 def _line(x: NDArray[Any], y: NDArray[Any]) -> FloatArray:
@@ -104,3 +121,71 @@ def levels_at(level: FloatArray, places_px: FloatArray) -> FloatArray:
     inside: NDArray[np.bool_] = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     found = level[np.where(inside, y, 0).astype(np.int64), np.where(inside, x, 0).astype(np.int64)]
     return np.asarray(np.where(inside, found, np.nan))
+
+
+def beside(corner: IntArray, columns: int, rows: int) -> IntArray:
+    """Numbers of the corners that are the neighbours of these on a board, diagonal ones too, and not among them."""
+    known = np.zeros((rows, columns), dtype=np.uint8)
+    known.ravel()[corner] = 1
+    near = np.asarray(cv2.dilate(known, np.ones((3, 3), dtype=np.uint8)))
+    return np.flatnonzero((near > known).ravel()).astype(np.int32)
+
+
+def half_turn_looks_same(board: Board) -> bool:
+    """Whether half a turn of the print changes nothing that can be seen."""
+    if board.kind is BoardKind.CHESSBOARD:
+        return (board.columns + board.rows) % 2 == 0
+    return board.kind is BoardKind.CIRCLES and board.rows % 2 == 0
+
+
+def turned_half(view: BoardView, board: Board) -> BoardView:
+    """The same corners numbered from the other end of the print: number k becomes n - 1 - k.
+
+    This turns the board's frame by half about the middle of its corners: what was at (x, y) in it is then at
+    (X - x, Y - y), X and Y the greatest coordinates of any corner. Light on the board has no numbers.
+
+    Raises
+    ------
+    ValueError
+        Half a turn of this board can be seen.
+    """
+    if not half_turn_looks_same(board):
+        message = f"{board.title} looks different after half a turn: it has one numbering"
+        raise ValueError(message)
+    return _renumbered(view, board.corner_count - 1 - view.corner)
+
+
+def equivalent_views(view: BoardView, board: Board) -> tuple[BoardView, ...]:
+    """Every numbering that the image allows, the given one first: 1, 2 or 4."""
+    views = [view]
+    if half_turn_looks_same(board):
+        views.append(turned_half(view, board))
+    if board.kind is BoardKind.CHESSBOARD and board.columns == board.rows and board.columns % 2 == 0:
+        row, column = np.divmod(view.corner, board.columns)
+        quarter = _renumbered(view, column * board.columns + (board.rows - 1 - row))
+        views += [quarter, turned_half(quarter, board)]
+    return tuple(views)
+
+
+def pointing_right(points_px: FloatArray, board: Board) -> FloatArray:
+    """All corners of a print that looks the same from several sides, (n, 2), in the order in which x points most to the
+    right in the image.
+    """
+    everything = np.arange(board.corner_count, dtype=np.int32)
+    whole = BoardView(everything, points_px, np.zeros(len(points_px)))
+    views = equivalent_views(whole, board)
+    across = [_towards(view.points_px, board) for view in views]
+    best = max(range(len(views)), key=lambda index: (round(float(across[index][0]), 9), float(across[index][1])))
+    return views[best].points_px
+
+
+def _towards(points_px: FloatArray, board: Board) -> FloatArray:
+    """(2,) float64: direction of the board's x axis in the image, of length 1."""
+    grid = points_px.reshape(board.rows, board.columns, 2)
+    towards = (grid[:, -1] - grid[:, 0]).mean(axis=0)
+    return np.asarray(towards / max(float(np.hypot(*towards)), 1e-12))
+
+
+def _renumbered(view: BoardView, corner: IntArray) -> BoardView:
+    order = np.argsort(corner)
+    return BoardView(corner[order].astype(np.int32), view.points_px[order], view.sigma_px[order], view.light_first)

@@ -8,12 +8,21 @@ import cv2
 import numpy as np
 
 from slrig.calibration.board import Board
-from slrig.calibration.boards.artwork import charuco_board, marker_dictionary
+from slrig.calibration.boards.artwork import charuco_board
 from slrig.calibration.boards.board_map import fitted_map
 from slrig.calibration.boards.corner_fit import PlacedCorners, placed_corners
 from slrig.calibration.boards.grey import Grey
-from slrig.calibration.boards.marker_layout import fitting_width, rest_px, stands_light_first
-from slrig.calibration.boards.sightings import describe_other, marker_numbers, markers_seen
+from slrig.calibration.boards.lattice import beside
+from slrig.calibration.boards.sightings import (
+    UNMIRRORED,
+    fitting_width,
+    markers_in,
+    markers_seen,
+    nothing_words,
+    rest_px,
+    side_px,
+    stands_light_first,
+)
 from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError, setting
 from slrig.model import FloatArray, IntArray
@@ -27,11 +36,7 @@ _SHARE_OFF = 0.06
 
 def charuco_view(grey: Grey, board: Board) -> BoardView:
     """See `slrig.calibration.boards.detection.find_board`."""
-    marker_corners, marker_ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(str(board.dictionary))).detectMarkers(
-        grey.eight
-    )
-    ids = np.zeros(0, dtype=int) if marker_ids is None else np.asarray(marker_ids).ravel()
-    outlines = np.asarray(marker_corners, dtype=np.float64).reshape(-1, 4, 2)
+    outlines, ids = markers_in(grey.eight, str(board.dictionary))
     if len(ids) < _FEWEST_MARKERS:
         raise PoseRefusedError(_nothing(grey, board))
     light_first = stands_light_first(board, ids, outlines)
@@ -40,10 +45,10 @@ def charuco_view(grey: Grey, board: Board) -> BoardView:
     printed = charuco_board(board, light_first=light_first)
     _refuse_another(board, printed, ids, outlines)
     corners, numbers, _, _ = cv2.aruco.CharucoDetector(printed).detectBoard(
-        grey.eight, markerCorners=marker_corners, markerIds=marker_ids
+        grey.eight, markerCorners=list(outlines.astype(np.float32)[:, None]), markerIds=ids[:, None]
     )
-    if numbers is None or len(numbers) < 4:
-        found = 0 if numbers is None else len(numbers)
+    found = 0 if numbers is None else len(numbers)
+    if found < 4:
         raise PoseRefusedError(_few(grey, board, found, len(ids)))
     corner = np.asarray(numbers).ravel().astype(np.int32)
     order = np.argsort(corner)
@@ -60,18 +65,13 @@ def charuco_view(grey: Grey, board: Board) -> BoardView:
 
 def _with_neighbours(level: FloatArray, board: Board, placed: PlacedCorners) -> PlacedCorners:
     """With those corners beside found ones whose own markers were cut off or unreadable, where a fit finds them."""
-    found = np.zeros((board.rows + 2, board.columns + 2), dtype=bool)
-    row, column = np.divmod(placed.view.corner, board.columns)
-    found[row + 1, column + 1] = True
-    near = np.asarray(cv2.dilate(found.astype(np.uint8), np.ones((3, 3), dtype=np.uint8)), dtype=bool)
-    beside = np.flatnonzero((near & ~found)[1:-1, 1:-1].ravel()).astype(np.int32)
-    squares = board.points_mm[:, :2] / board.square_mm
-    guessed = placed.board_map(squares[beside])
+    near = beside(placed.view.corner, board.columns, board.rows)
+    guessed = placed.board_map((board.points_mm[:, :2] / board.square_mm)[near])
     height, width = level.shape
     inside = ((guessed > 4) & (guessed < np.array([width, height]) - 5)).all(axis=1)
     if not inside.any():
         return placed
-    corner = np.concatenate([placed.view.corner, beside[inside]])
+    corner = np.concatenate([placed.view.corner, near[inside]])
     rough = np.concatenate([placed.view.points_px, guessed[inside]])
     order = np.argsort(corner)
     more = placed_corners(level, board, corner[order], rough[order], light_first=placed.view.light_first)
@@ -106,8 +106,7 @@ def _refuse_another(board: Board, printed: Any, ids: IntArray, outlines: FloatAr
     ids, outlines = ids[~foreign], outlines[~foreign]
     places = np.asarray(printed.getObjPoints(), dtype=np.float64)[ids, :, :2] / board.square_mm
     middles = outlines.mean(axis=1)
-    side = float(np.median(np.linalg.norm(np.roll(outlines, 1, axis=1) - outlines, axis=2)))
-    if rest_px(places.mean(axis=1), middles) > 0.3 * side:
+    if rest_px(places.mean(axis=1), middles) > 0.3 * side_px(outlines):
         width = fitting_width(ids, outlines)
         message = (
             f"another board: the markers of {board.dictionary} in view do not stand in the order of a {board.title}"
@@ -156,12 +155,12 @@ def _few(grey: Grey, board: Board, corners: int, markers: int) -> str:
 
 def _nothing(grey: Grey, board: Board) -> str:
     """Why this ChArUco board is not found."""
-    mirrored = np.unique(marker_numbers(np.ascontiguousarray(grey.eight[:, ::-1]), str(board.dictionary)))
-    if len(mirrored) >= _FEWEST_MARKERS:
+    _, mirrored = markers_in(np.ascontiguousarray(grey.eight[:, ::-1]), str(board.dictionary))
+    count = len(np.unique(mirrored))
+    if count >= _FEWEST_MARKERS:
         return (
-            f"a mirrored print: {len(mirrored)} markers of {board.dictionary} can be read only with left and right "
-            "changed over: print the file again without mirroring, and look at it from its printed side, not through "
-            "a mirror"
+            f"a mirrored print: {count} markers of {board.dictionary} can be read only with left and right changed "
+            f"over: {UNMIRRORED}"
         )
     markers = markers_seen(grey, but=board.dictionary)
     if markers is not None:
@@ -169,7 +168,4 @@ def _nothing(grey: Grey, board: Board) -> str:
             f"another board: expected markers of {board.dictionary}, found {markers.count} of {markers.dictionary} or "
             f"a smaller dictionary of its family: give that one as {setting('dictionary')}, or take the other board"
         )
-    other = describe_other(grey, board.kind)
-    if other:
-        return f"another board: expected a {board.title}, found {other}"
-    return f"no {board.title} found: {grey.likely_cause()}"
+    return nothing_words(grey, board)

@@ -8,7 +8,7 @@ import pytest
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.artwork import artwork, charuco_board
-from slrig.calibration.boards.numbering import equivalent_views, turned_half
+from slrig.calibration.boards.lattice import equivalent_views, turned_half
 from slrig.calibration.observations import BoardView
 from slrig.cli.board_options import board_option
 from slrig.errors import CalibrationError

@@ -14,12 +14,12 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.detection import (
     blur_sigma_px,
     board_region,
-    equivalent_views,
     find_board,
     light_squares,
     placed_again,
     square_interior,
 )
+from slrig.calibration.boards.lattice import equivalent_views
 from slrig.calibration.observations import BoardView
 from slrig.errors import PoseRefusedError
 from tests.unit.calibration.boards.painted import Eye, Print, as_8_bit, board_points, looking, painted
