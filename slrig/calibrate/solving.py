@@ -70,14 +70,14 @@ def solve_poses(
     """
     # Late: the service knows these values, and loads no compiled kernel before somebody solves.
     from slrig.calibration.judging.expected_error import expected_error
-    from slrig.calibration.solving.solve import SolveOptions, solve
+    from slrig.calibration.solving.solve import solve
 
     observed = tuple(pose.observation for pose in poses)
     observations = Observations(board, cameras, projector, observed)
     solution = solve(
         observations,
         progress=lambda stage, fraction, detail: progress(stage, _SOLVE_SHARE * fraction, detail),
-        options=SolveOptions(board_shape=board_shape),
+        board_shape=board_shape,
     )
     progress("expected error", _SOLVE_SHARE, "")
     try:

@@ -34,7 +34,7 @@ from slrig.calibration.displacement import modes_of, moved_points, rigid_free
 from slrig.calibration.judging.expected_error import expected_error
 from slrig.calibration.observations import Observations
 from slrig.calibration.solution import ExpectedError
-from slrig.calibration.solving.solve import SolveOptions, solve
+from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, FloatArray, Pinhole, Solved
@@ -221,7 +221,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
     # The rendered board is flat for certain. Of one that nobody vouches for the poses have to tell, which makes what is
     # stated somewhat larger: with that, this seed's draw, which is uncommonly small, is one of 0.09 % in place of the
     # 0.1 % that are allowed below.
-    solution = solve(observations, options=SolveOptions(board_shape=BoardShape.FLAT))
+    solution = solve(observations, board_shape=BoardShape.FLAT)
     stated = expected_error(solution, observations)
     solved = replace(
         solution.calibration,

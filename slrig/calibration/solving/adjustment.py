@@ -9,11 +9,11 @@ time.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.calibration.solving.linear import solved
 from slrig.calibration.solving.measurements import Measurements, groups
 from slrig.calibration.solving.parameters import Geometry, Layout
 from slrig.calibration.solving.projection import (
@@ -26,6 +26,7 @@ from slrig.calibration.solving.projection import (
     match_rows,
     weighed_blocks,
 )
+from slrig.kernels import kernel
 from slrig.model import FloatArray, IntArray
 
 CAUCHY = 2.385
@@ -82,20 +83,11 @@ class Prior:
 
 
 @dataclass(frozen=True, slots=True)
-class NormalEquations:
-    """matrix (N, N) = Jᵀ W J and gradient (N,) = Jᵀ W r over the whole vector, free or not."""
-
-    matrix: FloatArray
-    gradient: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
 class Adjustment:
-    """The end of an adjustment. steps : of Levenberg-Marquardt; settled : the cost no longer fell."""
+    """The end of an adjustment. settled : the cost no longer fell."""
 
     geometry: Geometry
     residuals: Residuals
-    steps: int
     settled: bool
 
 
@@ -169,11 +161,10 @@ def _adjusted(
 ) -> Adjustment:  # fmt: skip
     left = residuals_of(geometry, measurements)
     cost = _cost(geometry, left, deviations, kept, prior)
-    damping, steps, settled = _FIRST_DAMPING, 0, False
-    while steps < most_steps and not settled:
-        steps += 1
-        equations = normal_equations(geometry, measurements, weights_of(left, deviations, kept), prior=prior)
-        matrix, gradient = equations.matrix[np.ix_(free, free)], equations.gradient[free]
+    damping, settled = _FIRST_DAMPING, False
+    for _ in range(most_steps):
+        matrix, gradient = normal_equations(geometry, measurements, weights_of(left, deviations, kept), prior=prior)
+        matrix, gradient = matrix[np.ix_(free, free)], gradient[free]
         settled = True
         while damping < _MOST_DAMPING:
             step = np.zeros(len(free))
@@ -193,7 +184,9 @@ def _adjusted(
             if new - cost < _LEAST_GAIN:
                 break
             damping *= 10
-    return Adjustment(geometry, left, steps, settled)
+        if settled:
+            break
+    return Adjustment(geometry, left, settled)
 
 
 def _damped_step(matrix: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
@@ -207,8 +200,8 @@ def _damped_step(matrix: FloatArray, gradient: FloatArray, damping: float) -> Fl
 
 def normal_equations(
     geometry: Geometry, measurements: Measurements, weights: Weights, /, *, prior: Prior | None = None
-) -> NormalEquations:
-    """The normal equations at a geometry, for given weights (see `weights_of`)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Jᵀ W J, (N, N), and Jᵀ W r, (N,), over the whole vector, free or not, for given weights (see `weights_of`)."""
     layout = geometry.layout
     matrix, gradient = np.zeros((layout.count, layout.count)), np.zeros(layout.count)
     corners, corner_jacobian = corner_terms(geometry, measurements, jacobian=True)
@@ -220,7 +213,7 @@ def normal_equations(
     _add_matches(layout, measurements.match_where, matches, match_jacobian, weights[1], matrix, gradient)
     if prior is not None:
         _add_prior(geometry, prior, matrix, gradient)
-    return NormalEquations(matrix, gradient)
+    return matrix, gradient
 
 
 def _add_corners(
@@ -336,3 +329,41 @@ def match_terms(geometry: Geometry, m: Measurements, /, *, jacobian: bool) -> tu
         geometry.devices, geometry.poses, geometry.bend, geometry.frame, m.match_where, m.match_pixel, m.match_px,
         jacobian=jacobian,
     )  # fmt: skip
+
+
+def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """(n,) float64: x with matrix x = right, for a symmetric positive definite matrix (n, n); NaN where it is not that.
+
+    By Cholesky's factors UᵀU, in one thread: for a few hundred unknowns, solved a thousand times, a BLAS that spreads
+    its work over threads waits longer for them than it works.
+    """
+    factor = matrix.copy()
+    x = right.copy()
+    if not _solve_kernel(factor, x):
+        x[:] = np.nan
+    return x
+
+
+@kernel(in_every_scan=False)
+def _solve_kernel(a: Any, x: Any) -> bool:
+    """Leave U in the upper triangle of a, and the solution in x; False for a pivot that is not positive."""
+    count = len(x)
+    for k in range(count):
+        if not a[k, k] > 0:
+            return False
+        pivot = np.sqrt(a[k, k])
+        for j in range(k, count):
+            a[k, j] /= pivot
+        x[k] /= pivot
+        for i in range(k + 1, count):
+            share = a[k, i]
+            # Poses meet only through the devices: most of these are 0.
+            if share != 0:
+                for j in range(i, count):
+                    a[i, j] -= share * a[k, j]
+                x[i] -= share * x[k]
+    for k in range(count - 1, -1, -1):
+        for j in range(k + 1, count):
+            x[k] -= a[k, j] * x[j]
+        x[k] /= a[k, k]
+    return True

@@ -11,15 +11,12 @@ with H and G of all poses, and D, C and g of the later poses by the moved device
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from slrig.calibration.solution import PROJECTOR
+from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.calibration.solving.adjustment import Weights, normal_equations, sizes_of
-from slrig.calibration.solving.deviations import deviations_of
 from slrig.calibration.solving.measurements import groups
 from slrig.calibration.solving.problem import Fit, Problem
 from slrig.calibration.solving.projection import DEVICE
@@ -39,17 +36,6 @@ _MOST_LEFT_OUT = 1 / 3
 _MEDIAN = 0.6745
 
 
-@dataclass(frozen=True, slots=True)
-class Bump:
-    """devices : those of which one moved; pose : number of the first pose after it; share : of the rms that is left
-    when the later poses may have that device elsewhere.
-    """
-
-    devices: tuple[str, ...]
-    pose: int
-    share: float
-
-
 def refuse_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> None:
     """See that no device moved between two poses.
 
@@ -58,32 +44,33 @@ def refuse_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> None:
     SolveRefusedError
         One did: it is named, and the pose from which on it stands elsewhere.
     """
-    bump = found_bump(problem, fit, free)
+    bump = _bump(problem, fit, free)
     if bump is None:
         return
-    first = problem.pose_names[bump.pose]
-    before = problem.pose_names[int(np.flatnonzero(problem.used[: bump.pose])[-1])]
-    spoken = [_spoken(name) for name in bump.devices]
+    devices, pose, share = bump
+    first = problem.pose_names[pose]
+    before = problem.pose_names[int(np.flatnonzero(problem.used[:pose])[-1])]
+    spoken = [device_title(name) for name in devices]
     who = spoken[0] if len(spoken) == 1 else f"one of {' and '.join(spoken)} (or both)"
     message = (
         f"{who} moved between pose '{before}' and pose '{first}': from '{first}' on the board is seen elsewhere than "
-        f"the poses before say, and letting it stand elsewhere takes {1 - bump.share:.0%} off the residuals; fasten "
+        f"the poses before say, and letting it stand elsewhere takes {1 - share:.0%} off the residuals; fasten "
         f"it, and shoot the poses anew, or solve from those before or from those after alone"
     )
     raise SolveRefusedError(message)
 
 
-def _spoken(name: str) -> str:
-    return "the projector" if name == PROJECTOR else f"camera '{name}'"
+def _bump(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[list[str], int, float] | None:
+    """The move that explains most, or None where none explains enough.
 
-
-def found_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> Bump | None:
-    """The move that explains most, or None where none explains enough."""
+    The devices of which one moved, the number of the first pose after it, and the share of the rms that is left when
+    the later poses may have that device elsewhere.
+    """
     devices = len(problem.devices)
     used = np.flatnonzero(problem.used)
     if devices < 2 or len(used) < 2 * _LEAST_AFTER:
         return None
-    sigma = deviations_of(problem.measurements, fit.noise, problem.with_projector)
+    sigma = problem.deviations(fit.noise)
     kept = _within_groups(problem, fit)
     size = sizes_of(fit.residuals, sigma)
     weight = (kept[0] * sigma.corner_weight, kept[1] * sigma.match_weight)
@@ -95,9 +82,9 @@ def found_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> Bump |
         mask[pose] = True
         corners, matches = m.corner_where[:, 1] == pose, m.match_where[:, 1] == pose
         weights = ((weight[0] / sigma.corners**2)[corners], (weight[1] / sigma.matches**2)[matches])
-        equations = normal_equations(fit.geometry, m.of_poses(mask), weights)
-        matrices.append(equations.matrix)
-        gradients.append(equations.gradient)
+        matrix, gradient = normal_equations(fit.geometry, m.of_poses(mask), weights)
+        matrices.append(matrix)
+        gradients.append(gradient)
     gains = _gains(np.array(matrices), np.array(gradients), free, devices)
     device, after = np.unravel_index(int(np.argmax(gains)), gains.shape)
     best = float(gains[device, after])
@@ -105,8 +92,8 @@ def found_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> Bump |
     if share > _BUMP_SHARE:
         return None
     # Which of several devices explains it as well: of two, either.
-    correlated = tuple(name for k, name in enumerate(problem.devices) if gains[k, after] >= _ALIKE_GAIN * best)
-    return Bump(correlated, int(used[after]), share)
+    correlated = [name for k, name in enumerate(problem.devices) if gains[k, after] >= _ALIKE_GAIN * best]
+    return correlated, int(used[after]), share
 
 
 def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_], devices: int) -> FloatArray:
@@ -158,12 +145,12 @@ def _within_groups(problem: Problem, fit: Fit) -> Weights:
 def worst_pose(problem: Problem, fit: Fit, /) -> tuple[int, str] | None:
     """The pose that lies farthest from what the others say, and the reason in words; None where all agree."""
     names, m = problem.pose_names, problem.measurements
-    sigma = deviations_of(m, fit.noise, problem.with_projector)
+    sigma = problem.deviations(fit.noise)
     size = sizes_of(fit.residuals, sigma)
     pixels = (np.hypot(*fit.residuals.corners.T), np.abs(fit.residuals.matches))
     worst: tuple[float, int, str] | None = None
     for device, name in enumerate(problem.devices):
-        beam = problem.with_projector and device == len(problem.devices) - 1
+        beam = problem.beam(device)
         kind = 1 if beam else 0
         pose = m.match_where[:, 1] if beam else m.corner_where[:, 1]
         mine = np.ones(len(pose), dtype=np.bool_) if beam else m.corner_where[:, 0] == device
@@ -183,11 +170,8 @@ def worst_pose(problem: Problem, fit: Fit, /) -> tuple[int, str] | None:
         excess = np.where(median_px >= _LEAST_OFF_PX, np.nan_to_num(median / bound, nan=0.0), 0.0)
         number = int(np.argmax(excess))
         if excess[number] > 1 and (worst is None or excess[number] > worst[0]):
-            worst = (
-                float(excess[number]),
-                number,
-                _reason(name, float(median_px[number]), float(np.nanmedian(median_px))),
-            )
+            reason = _reason(name, float(median_px[number]), float(np.nanmedian(median_px)))
+            worst = (float(excess[number]), number, reason)
     return None if worst is None else (worst[1], worst[2])
 
 

@@ -1,7 +1,7 @@
 """How well each number of the devices is known: the inverse of the normal equations, poses and shape marginalised.
 
 Weights are those of the last adjustment, deviations those that residuals bear out and that allow for neighbours that
-err alike (`slrig.calibration.solving.deviations`). The robust weights lose about a tenth of the information of normal
+err alike (`slrig.calibration.solving.problem`). The robust weights lose about a tenth of the information of normal
 errors where the estimate itself loses a twentieth, so that deviations are rather a few per cent too large than too
 small.
 
@@ -16,7 +16,7 @@ and a covariance that comes from the former is too small. Poses that were held o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +24,9 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from slrig.calibration.solution import Bow, DeviceResiduals
 from slrig.calibration.solving.adjustment import Prior, adjusted, kept_of, normal_equations, weights_of
-from slrig.calibration.solving.deviations import deviations_of
-from slrig.calibration.solving.parameters import difference
+from slrig.calibration.solving.parameters import Geometry, difference
 from slrig.calibration.solving.problem import Fit, Problem, Terms, free_of
 from slrig.calibration.solving.projection import BEND, DEVICE
-from slrig.calibration.solving.shape import bow_of
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray
 from slrig.model.lens import LENS_TERMS
@@ -37,22 +35,10 @@ LEAST_KNOWN = 0.05
 """The greatest deviation of a focal length, over it, with which a calibration still is one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Known:
-    """How well a solve knows its numbers.
+def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, /) -> tuple[FloatArray, Bow | None]:
+    """Covariance of all devices' parameters, (15 d, 15 d), 0 for the world's pose; and the bow of the board.
 
-    devices : (15 d, 15 d) float64, covariance of all devices' parameters; 0 for the world's pose. bow : of the board,
-    None where it is known to be flat.
-    """
-
-    devices: FloatArray
-    bow: Bow | None
-
-
-def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, /) -> Known:
-    """How well the numbers are known.
-
-    bend : what is known beforehand of the board's bend; None if it is known to be flat.
+    bend : what is known beforehand of the board's bend; None if it is known to be flat, and the bow is None too.
 
     Raises
     ------
@@ -62,7 +48,7 @@ def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, 
     narrow, _ = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
     _refuse_open(problem, fit, narrow)
     all_terms = dict.fromkeys(problem.devices, LENS_TERMS)
-    sigma = deviations_of(problem.measurements, fit.noise, problem.with_projector)
+    sigma = problem.deviations(fit.noise)
     open_problem = problem if problem.prior is not None else replace(problem, prior=bend)
     free = free_of(open_problem, fit.geometry, all_terms)
     wide = adjusted(
@@ -71,8 +57,8 @@ def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, 
     shift = difference(wide.geometry.devices, fit.geometry.devices).ravel()
     devices, bent = _inverse(open_problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals), free)
     solved = problem.prior is not None
-    bow = None if bend is None else bow_of(fit.geometry if solved else wide.geometry, bent, solved=solved)
-    return Known(devices + np.outer(shift, shift), bow)
+    bow = None if bend is None else _bow_of(fit.geometry if solved else wide.geometry, bent, solved=solved)
+    return devices + np.outer(shift, shift), bow
 
 
 def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /) -> FloatArray:
@@ -88,10 +74,10 @@ def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /
 
 def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Covariance of the devices, (15 d, 15 d), and of the bend, (7, 7), which is 0 where it is held."""
-    sigma = deviations_of(problem.measurements, fit.noise, problem.with_projector)
+    sigma = problem.deviations(fit.noise)
     kept = kept_of(fit.residuals, sigma)
     weights = weights_of(fit.residuals, sigma, kept)
-    matrix = normal_equations(fit.geometry, problem.measurements, weights, prior=problem.prior).matrix
+    matrix = normal_equations(fit.geometry, problem.measurements, weights, prior=problem.prior)[0]
     # A pose of which everything is outlying has no say, and nothing to say.
     free = free & (np.diagonal(matrix) > 0)
     matrix = matrix[np.ix_(free, free)]
@@ -128,3 +114,16 @@ def _refuse_open(problem: Problem, fit: Fit, covariance: FloatArray) -> None:
                     "the left, to the right, up and down"
                 )
                 raise SolveRefusedError(message)
+
+
+def _bow_of(geometry: Geometry, covariance: FloatArray, /, *, solved: bool) -> Bow:
+    """How far the corners lie out of the plane that fits them best: from the lowest to the highest.
+
+    covariance : (7, 7) float64, of the bend, mm².
+    """
+    basis = geometry.bend_basis()
+    plane = np.column_stack([np.ones(len(basis)), geometry.points - geometry.frame[:2]])
+    basis = basis - plane @ np.linalg.lstsq(plane, basis, rcond=None)[0]
+    height = basis @ geometry.bend
+    across = basis[int(np.argmax(height))] - basis[int(np.argmin(height))]
+    return Bow(float(np.ptp(height)), float(np.sqrt(max(across @ covariance @ across, 0.0))), solved)

@@ -2,8 +2,13 @@
 
 The poses are dealt into folds. For each fold all others are adjusted; then the devices are held, the fold's board poses
 are fitted to the cameras' corners alone, and all residuals of the fold are taken. A term of a lens is kept when the
-loss over all folds falls by more than `margin` per term, in units of a squared deviation: a useless term lowers it by
+loss over all folds falls by more than MARGIN per term, in units of a squared deviation: a useless term lowers it by
 nothing, and one that is known to n of its own deviations by about n².
+
+A shape of the board is kept as a lens term is: all poses are of one board, so that what its shape takes off the
+residuals of some poses it takes off those of others, too. There are three, each a special case of the next: flat and as
+printed; bent; bent with every corner off its printed place. Lens and shape can be confused where the board always
+stands at one place of the image; how far is in the covariance.
 """
 
 from __future__ import annotations
@@ -14,8 +19,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.solving.adjustment import (
     Deviations,
+    Prior,
     Residuals,
     Weights,
     adjusted,
@@ -23,26 +30,41 @@ from slrig.calibration.solving.adjustment import (
     losses_of,
     residuals_of,
 )
-from slrig.calibration.solving.deviations import DeviceNoise, deviations_of
 from slrig.calibration.solving.measurements import Measurements
 from slrig.calibration.solving.parameters import Geometry
-from slrig.calibration.solving.problem import Fit, Problem, Terms, fitted, free_of, with_terms
-from slrig.model import FloatArray, IntArray
-
-LADDER: tuple[tuple[str, ...], ...] = (
-    (),
-    ("k1",),
-    ("k1", "k2"),
-    ("k1", "k2", "p1", "p2"),
-    ("k1", "k2", "p1", "p2", "k3"),
+from slrig.calibration.solving.problem import (
+    DeviceNoise,
+    Fit,
+    Problem,
+    Terms,
+    deviations_of,
+    fitted,
+    free_of,
+    with_terms,
 )
-TRIAL_STEPS = 15
+from slrig.calibration.solving.projection import BEND
+from slrig.model import FloatArray, IntArray
+from slrig.model.lens import LENS_TERMS
+
+LADDER: tuple[tuple[str, ...], ...] = tuple(LENS_TERMS[:count] for count in (0, 1, 2, 4, 5))
+FOLDS = 5
+MARGIN = 4.0
+"""What a lens term must take off the loss at held-out poses, in squared deviations."""
+_TRIAL_STEPS = 15
 """Of Levenberg-Marquardt, where a model is only tried."""
 _HOPELESS = 2.0
 """Where a lens leaves so many times the loss of the richest on the poses that it has seen, no others are tried."""
 
 LEAST_POSES = 4
 """With fewer poses none can be held out."""
+
+_BEND_SIGMA = 0.01
+"""Standard deviation of each number of a board's bend over half its extent: paper glued to a board bends less."""
+_OFFSET_SIGMA_MM = 0.2
+"""The same of a corner's offset along either axis: what printers and paper are off by within a page."""
+
+_WORTH = (0, BEND, 2 * BEND)
+"""How many terms each shape counts as. Offsets are many, and each is held near 0 by what is known of printers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +77,13 @@ class HeldOut:
     loss: Mapping[str, float]
 
 
-def folds_of(problem: Problem, count: int) -> list[NDArray[np.bool_]]:
+def folds_of(problem: Problem) -> list[NDArray[np.bool_]]:
     """(m,) bool per fold: the poses of that fold, each in one; empty where there are too few to hold any out."""
     used = np.flatnonzero(problem.used)
     if len(used) < LEAST_POSES:
         return []
     folds = []
-    parts = min(count, len(used))
+    parts = min(FOLDS, len(used))
     for part in range(parts):
         fold = np.zeros(len(problem.pose_names), dtype=np.bool_)
         fold[used[part::parts]] = True
@@ -83,7 +105,7 @@ def held_out(
     total = Residuals(np.full_like(m.corner_px, np.nan), np.full_like(m.match_px, np.nan))
     for fold in folds:
         rest = problem.without(fold)
-        sigma = deviations_of(rest.measurements, noise, problem.with_projector)
+        sigma = rest.deviations(noise)
         corners, matches = fold[trained_on.corner_where[:, 1]], fold[trained_on.match_where[:, 1]]
         trained = adjusted(
             geometry, rest.measurements, free_of(rest, geometry, terms), sigma, prior=problem.prior,
@@ -113,7 +135,7 @@ def _summed(problem: Problem, camera: IntArray, left: Residuals, kept: Weights, 
     corner_loss, match_loss = losses_of(left, sigma)
     rms, loss = {}, {}
     for device, name in enumerate(problem.devices):
-        if problem.with_projector and device == len(problem.devices) - 1:
+        if problem.beam(device):
             mine = (kept[1] > 0) & np.isfinite(match_loss)
             rms[name] = _rms(left.matches[mine])
             loss[name] = float(np.sum(match_loss[mine]))
@@ -129,16 +151,15 @@ def _rms(values: FloatArray) -> float:
 
 
 def chosen_terms(
-    problem: Problem, fit: Fit, /, *, margin: float, folds: int,
-    tell: Callable[[str, int], None] = lambda _device, _rung: None,
-) -> dict[str, tuple[str, ...]]:  # fmt: skip
+    problem: Problem, fit: Fit, /, *, tell: Callable[[str, int], None] = lambda _device, _rung: None
+) -> dict[str, tuple[str, ...]]:
     """The lens terms of each device that held-out poses are better with: cameras first, then the projector.
 
     The loss is that of all devices: light ties them, and a lens that is wrong in one shows in the others. While one
     device climbs the ladder, those that have not had their turn have four terms. With too few poses to hold any out: k1
     for all.
     """
-    dealt = folds_of(problem, folds)
+    dealt = folds_of(problem)
     if not dealt:
         return dict.fromkeys(problem.devices, LADDER[1])
     terms = dict.fromkeys(problem.devices, LADDER[-2])
@@ -146,7 +167,7 @@ def chosen_terms(
         richest = fitted(
             problem, fit.geometry, {**terms, device: LADDER[-1]}, rounds=2, correlated=True, noise=fit.noise
         )
-        sigma = deviations_of(problem.measurements, richest.noise, problem.with_projector)
+        sigma = problem.deviations(richest.noise)
         kept = kept_of(richest.residuals, sigma)
         least = loss_of(richest.residuals, sigma, kept)
         losses: list[float] = []
@@ -155,12 +176,12 @@ def chosen_terms(
             chosen = {**terms, device: trial}
             start = with_terms(richest.geometry, problem, chosen)
             free = free_of(problem, start, chosen)
-            tried = adjusted(start, problem.measurements, free, sigma, kept=kept, most_steps=TRIAL_STEPS)
+            tried = adjusted(start, problem.measurements, free, sigma, kept=kept, most_steps=_TRIAL_STEPS)
             if loss_of(tried.residuals, sigma, kept) > _HOPELESS * least:
                 losses.append(np.inf)
                 continue
             losses.append(sum(held_out(problem, tried.geometry, chosen, richest.noise, dealt, kept).loss.values()))
-        terms[device] = LADDER[climbed(losses, margin)]
+        terms[device] = LADDER[climbed(losses, MARGIN)]
         fit = replace(richest, geometry=with_terms(richest.geometry, problem, terms))
     return terms
 
@@ -177,3 +198,51 @@ def climbed(losses: Sequence[float], margin: float) -> int:
         if losses[best] - losses[rung] > margin * (len(LADDER[rung]) - len(LADDER[best])):
             best = rung
     return best
+
+
+def shapes_of(board: Board, asked: BoardShape) -> tuple[Prior | None, ...]:
+    """The shapes that may be chosen, the simplest first; None is flat."""
+    bend = bend_of(board, asked)
+    if bend is None:
+        return (None,)
+    bent = (bend, replace(bend, offset_sigma_mm=_OFFSET_SIGMA_MM))
+    return bent if asked is BoardShape.BOWED else (None, *bent)
+
+
+def bend_of(board: Board, asked: BoardShape) -> Prior | None:
+    """What is known beforehand of a board's bend; None where a person said that it is flat."""
+    if asked is BoardShape.FLAT:
+        return None
+    return Prior(_BEND_SIGMA * float(np.ptp(board.points_mm[:, :2], axis=0).max()) / 2)
+
+
+def chosen_shape(problem: Problem, fit: Fit, terms: Terms, shapes: Sequence[Prior | None], /) -> Prior | None:
+    """The shape that poses are better with by more than MARGIN per term, in squared deviations: both those that it is
+    fitted to and those held out. The simplest where none can be held out.
+
+    shapes : the simplest first. terms : lens terms of each device, the same for every shape.
+    """
+    dealt = folds_of(problem)
+    if len(shapes) == 1 or not dealt:
+        return shapes[0]
+    richest = fitted(
+        replace(problem, prior=shapes[-1]), fit.geometry, terms, rounds=2, correlated=True, noise=fit.noise
+    )
+    sigma = problem.deviations(richest.noise)
+    kept = kept_of(richest.residuals, sigma)
+    losses: list[float] = []
+    seen: list[float] = []
+    best = 0
+    for rung, shape in enumerate(shapes):
+        trial = replace(problem, prior=shape)
+        start = with_terms(richest.geometry, trial, terms)
+        free = free_of(trial, start, terms)
+        tried = adjusted(start, problem.measurements, free, sigma, prior=shape, kept=kept, most_steps=_TRIAL_STEPS)
+        seen.append(loss_of(tried.residuals, sigma, kept))
+        losses.append(sum(held_out(trial, tried.geometry, terms, richest.noise, dealt, kept).loss.values()))
+        # Of few poses, those held out lie far from what the others determine, and their loss is a matter of luck: a
+        # shape that is there is seen by the poses that it is fitted to as well.
+        enough = MARGIN * (_WORTH[rung] - _WORTH[best])
+        if min(losses[best] - losses[rung], seen[best] - seen[rung]) > enough:
+            best = rung
+    return shapes[best]

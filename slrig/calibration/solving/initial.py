@@ -4,11 +4,15 @@ Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, as 
 camera comes of its corners (IPPE, Collins and Bartoli 2014). Cameras that see the board in the same pose are tied by
 it; of all poses that two share, the tie that most agree with counts. A chessboard of which half a turn looks the same
 may be counted from either end: both are tried, and the one that agrees with the other poses is taken.
+
+Parallel boards have one vanishing line, and any lens turns one line into one normal: whatever the focal length, they
+look parallel, and no focal length follows. So tilts are judged by the lens that was found; where its focal length is
+all but open, by an ordinary one, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -18,13 +22,20 @@ from numpy.typing import NDArray
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import BoardView, Observations
 from slrig.calibration.solving.measurements import LEAST_CORNERS
-from slrig.calibration.solving.parallel import refuse_parallel
 from slrig.calibration.solving.parameters import device_row, pose_row
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray, Size
 
 LEAST_POSES = 3
 _MOST_SCATTER = 4.0
+_LEAST_TILT_DEG = 5.0
+"""The least turn of the board between some two poses, about one axis."""
+
+_ORDINARY_FOCAL = 1.3  # over the image's width
+_WELL_KNOWN = 0.01
+
+_Lens = tuple[FloatArray, FloatArray]
+"""Matrix (3, 3) and distortion (5,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +87,7 @@ def _spans(board: Board, view: BoardView) -> bool:
     return bool(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1] > 0.5 * board.square_mm)
 
 
-def _lens(
-    board: Board, name: str, size: Size, views: Mapping[int, BoardView], observations: Observations
-) -> tuple[FloatArray, FloatArray]:
+def _lens(board: Board, name: str, size: Size, views: Mapping[int, BoardView], observations: Observations) -> _Lens:
     """Matrix (3, 3) and distortion (5,) of one camera, its first radial term solved for."""
     if len(views) < LEAST_POSES:
         message = (
@@ -92,11 +101,11 @@ def _lens(
     flags = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     found = cv2.calibrateCamera(_single(objects), _single(images), shape, None, None, flags=flags)
     matrix, distortion = np.asarray(found[1], dtype=np.float64), np.concatenate([np.ravel(found[2]), np.zeros(5)])[:5]
-    refuse_parallel(name, size, (matrix, distortion), found[3:5], objects, images)
+    _refuse_parallel(name, size, (matrix, distortion), found[3:5], objects, images)
     return matrix, distortion
 
 
-def _seen_from(board: Board, lens: tuple[FloatArray, FloatArray], view: BoardView) -> FloatArray:
+def _seen_from(board: Board, lens: _Lens, view: BoardView) -> FloatArray:
     """(4, 4) float64: board to camera."""
     objects = board.points_mm[view.corner]
     _, turns, shifts, _ = cv2.solvePnPGeneric(
@@ -122,7 +131,7 @@ def _half_turn(board: Board) -> FloatArray | None:
 
 def _tied(
     observations: Observations,
-    lenses: list[tuple[FloatArray, FloatArray]],
+    lenses: list[_Lens],
     in_camera: Mapping[tuple[int, int], FloatArray],
 ) -> Start:
     names = list(observations.cameras)
@@ -195,3 +204,78 @@ def _apart(first: FloatArray, second: FloatArray, reach: float) -> float:
 def _single(arrays: list[FloatArray]) -> list[NDArray[np.float32]]:
     """As OpenCV wants points."""
     return [each.astype(np.float32) for each in arrays]
+
+
+def _refuse_parallel(
+    name: str, size: Size, lens: _Lens, found: tuple[Sequence[FloatArray], Sequence[FloatArray]],
+    objects: Sequence[FloatArray], images: Sequence[FloatArray], /,
+) -> None:  # fmt: skip
+    """Raise SolveRefusedError unless the boards of a camera's views are tilted to one another.
+
+    found : turns and shifts of the views with that lens; objects, images : corners on the board and in the image.
+    """
+    sideways, upright = _tilts_deg(lens, lens[0], objects, images)
+    if not _focal_deviation(lens, found, objects, images) <= _WELL_KNOWN * lens[0][0, 0]:
+        focal = _ORDINARY_FOCAL * size.width_px
+        ordinary = np.array([
+            [focal, 0, (size.width_px - 1) / 2], [0, focal, (size.height_px - 1) / 2], [0, 0, 1]
+        ])  # fmt: skip
+        by_ordinary = _tilts_deg(lens, ordinary, objects, images)
+        if max(by_ordinary) < max(sideways, upright):
+            sideways, upright = by_ordinary
+    if max(sideways, upright) >= _LEAST_TILT_DEG:
+        return
+    message = (
+        f"in camera '{name}' the board is all but parallel to itself in all {len(objects)} poses: between them "
+        f"it turns by {sideways:.1f}° sideways and nods by {upright:.1f}°, so that the focal length is not determined; "
+        "shoot poses turned by 20° to 40° to the left and to the right, and nodded as much up and down"
+    )
+    raise SolveRefusedError(message)
+
+
+def _tilts_deg(
+    lens: _Lens, matrix: FloatArray, objects: Sequence[FloatArray], images: Sequence[FloatArray]
+) -> tuple[float, float]:
+    """Between all views, by how many degrees the board's normal turns sideways, and up and down.
+
+    Distortion is taken off by the lens, directions are told by the matrix. The normal of a plane that vanishes in the
+    line l is Kᵀ l (Hartley and Zisserman, §8.6).
+    """
+    normals = []
+    for on_board, in_image in zip(objects, images, strict=True):
+        straight = cv2.undistortPoints(in_image.reshape(-1, 1, 2), lens[0], lens[1], P=lens[0]).reshape(-1, 2)
+        homography, _ = cv2.findHomography(on_board[:, :2], straight)
+        if homography is None:
+            continue
+        normal = matrix.T @ np.linalg.inv(homography).T @ np.array([0.0, 0.0, 1.0])
+        normals.append(normal / np.linalg.norm(normal) * (1 if normal[2] > 0 else -1))
+    spread = np.array(normals)
+    turned = np.degrees(np.arctan2(spread[:, 0], spread[:, 2]))
+    nodded = np.degrees(np.arctan2(spread[:, 1], spread[:, 2]))
+    return float(np.ptp(turned)), float(np.ptp(nodded))
+
+
+def _focal_deviation(
+    lens: _Lens, found: tuple[Sequence[FloatArray], Sequence[FloatArray]], objects: Sequence[FloatArray],
+    images: Sequence[FloatArray],
+) -> float:  # fmt: skip
+    """Standard deviation of the focal length (fx), px, the poses and one radial term open; infinite where it is open.
+
+    OpenCV states one of its own, and near a singular matrix that is far too small.
+    """
+    inner = 5
+    whole, squares, count = np.zeros((inner, inner)), 0.0, 0
+    for turn, shift, on_board, in_image in zip(*found, objects, images, strict=True):
+        projected, jacobian = cv2.projectPoints(on_board.astype(np.float64), turn, shift, lens[0], lens[1])
+        squares += float(np.sum((projected.reshape(-1, 2) - in_image) ** 2))
+        count += 2 * len(in_image) - 6
+        of_pose, of_lens = jacobian[:, :6], jacobian[:, 6 : 6 + inner]
+        held = np.linalg.lstsq(of_pose, of_lens, rcond=None)[0]
+        left = of_lens - of_pose @ held
+        whole += left.T @ left
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(whole), 1e-300))
+    values, vectors = np.linalg.eigh(whole * np.outer(scale, scale))
+    if values[0] <= 1e-12 or count <= inner:
+        return np.inf
+    variance = float(np.sum(vectors[0] ** 2 / values)) * scale[0] ** 2
+    return float(np.sqrt(variance * squares / (count - inner)))

@@ -3,63 +3,54 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.calibration.board import BoardShape
 from slrig.calibration.observations import Observations
-from slrig.calibration.solution import PROJECTOR, Solution
-from slrig.calibration.solving.adjustment import Prior, kept_of
+from slrig.calibration.solution import CELLS, PROJECTOR, DeviceResiduals, Solution
+from slrig.calibration.solving.adjustment import Prior, kept_of, match_terms
 from slrig.calibration.solving.consistency import most_left_out, refuse_bump, worst_pose
 from slrig.calibration.solving.covariance import allowing_for, covariance_of
-from slrig.calibration.solving.deviations import deviations_of
-from slrig.calibration.solving.held_out import LADDER, chosen_terms, folds_of, held_out
+from slrig.calibration.solving.held_out import (
+    LADDER,
+    bend_of,
+    chosen_shape,
+    chosen_terms,
+    folds_of,
+    held_out,
+    shapes_of,
+)
 from slrig.calibration.solving.held_out import LEAST_POSES as LEAST_HELD_OUT
 from slrig.calibration.solving.initial import LEAST_POSES, start_of
 from slrig.calibration.solving.initial_projector import projector_start
-from slrig.calibration.solving.leftovers import residuals_of_devices
 from slrig.calibration.solving.measurements import LEAST_CORNERS, measured
 from slrig.calibration.solving.parameters import Geometry, to_board_pose, to_pinhole
 from slrig.calibration.solving.problem import Fit, Problem, Terms, fitted, flat_geometry, free_of
-from slrig.calibration.solving.shape import bend_of, chosen_shape, shapes_of
 from slrig.errors import SolveRefusedError
-from slrig.model import Calibration, Size
+from slrig.model import Calibration, FloatArray, IntArray, Size
 
 Progress = Callable[[str, float, str], None]
 """Called with the stage's name, the share of the whole that is done (0 to 1), and words for a person."""
 
 
-@dataclass(frozen=True, slots=True)
-class SolveOptions:
-    """matches_per_view, trial_matches_per_view : at most as many correspondences of each camera, pose and axis, spread
-    over its image, go into the result, and into what is tried on the way. folds : of held-out poses. margin : what a
-    lens term must take off the loss at held-out poses, in squared deviations (`slrig.calibration.solving.held_out`).
-    board_shape : whether the board may be bent and its corners off their printed places
-    (`slrig.calibration.solving.shape`).
-    """
-
-    matches_per_view: int = 3000
-    trial_matches_per_view: int = 300
-    folds: int = 5
-    margin: float = 4.0
-    board_shape: BoardShape = BoardShape.AUTO
-
-
-_DEFAULT = SolveOptions()
+_MATCHES_PER_VIEW, _TRIAL_MATCHES_PER_VIEW = 3000, 300
+"""At most as many correspondences of each camera, pose and axis, spread over its image, go into the result, and into
+what is tried on the way."""
 _MOST_EXCESS_PX = 3.0
 
 
-def _silent(stage: str, share: float, words: str) -> None:
-    del stage, share, words
-
-
-def solve(observations: Observations, /, *, progress: Progress = _silent, options: SolveOptions = _DEFAULT) -> Solution:
+def solve(
+    observations: Observations, /, *, progress: Progress = lambda _stage, _share, _words: None,
+    board_shape: BoardShape = BoardShape.AUTO,
+) -> Solution:  # fmt: skip
     """Devices, the board's poses, and the covariance, by one bundle adjustment of all that was seen.
 
     The first camera's frame is the world. With enough poses the lens terms of each device are those that held-out poses
-    are better with; poses that contradict the others are left out, by name.
+    are better with; poses that contradict the others are left out, by name. board_shape : whether the board may be bent
+    and its corners off their printed places (`slrig.calibration.solving.held_out`).
 
     Raises
     ------
@@ -70,18 +61,19 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
     _refuse_few(observations)
     progress("cameras", 0.0, f"each of {len(names)} cameras from {len(observations.poses)} poses")
     start = start_of(observations)
-    measurements = measured(observations, start.flipped, matches_per_view=options.matches_per_view)
+    measurements = measured(observations, start.flipped, matches_per_view=_MATCHES_PER_VIEW)
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(start.poses).all(axis=1))
     poses = tuple(pose.name for pose in observations.poses)
-    outliers = {name: _unseen() for name, good in zip(poses, seen, strict=True) if not good}
+    unseen = f"no camera saw {LEAST_CORNERS} corners of the board or more; shoot it again with the board in view"
+    outliers = {name: unseen for name, good in zip(poses, seen, strict=True) if not good}
     everything = Problem((*names,), poses, False, measurements.of_poses(seen))
     corners_only = replace(everything, measurements=everything.measurements.of_poses(seen, matches=False))
     # Poses are compared under a lens that can be right: with one that cannot, those at the image's border are off.
     terms = dict.fromkeys([*names, PROJECTOR], LADDER[-2] if int(seen.sum()) >= LEAST_HELD_OUT else LADDER[1])
     geometry = flat_geometry(observations.board, start.devices, start.poses)
-    shapes = shapes_of(observations.board, options.board_shape)
+    shapes = shapes_of(observations.board, board_shape)
     if observations.projector is None:
-        corners_only, fit = _agreeing_in_shape(corners_only, geometry, terms, outliers, shapes, options)
+        corners_only, fit = _agreeing_in_shape(corners_only, geometry, terms, outliers, shapes)
     else:
         # Light tells which of two cameras moved; until then all poses stay in.
         fit = fitted(corners_only, geometry, terms)
@@ -93,10 +85,10 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
         sizes[PROJECTOR] = observations.projector
         matches = everything.measurements.of_poses(corners_only.used)
         problem = replace(everything, devices=(*names, PROJECTOR), with_projector=True, measurements=matches)
-        trial = replace(problem, measurements=matches.thinned(options.trial_matches_per_view))
+        trial = replace(problem, measurements=matches.thinned(_TRIAL_MATCHES_PER_VIEW))
         beam = projector_start(fit.geometry.devices, fit.geometry.poses, trial.measurements, observations.projector)
         joined = replace(fit.geometry, devices=np.vstack([fit.geometry.devices, beam]))
-        trial, fit = _agreeing_in_shape(trial, joined, terms, outliers, shapes, options)
+        trial, fit = _agreeing_in_shape(trial, joined, terms, outliers, shapes)
         problem = replace(problem.without(~trial.used), prior=trial.prior)
 
     def tell(device: str, rung: int) -> None:
@@ -104,62 +96,61 @@ def solve(observations: Observations, /, *, progress: Progress = _silent, option
         words = f"which lens terms {device!r} is better with at held-out poses ({rung + 1}/{len(LADDER)})"
         progress("lenses", 0.25 + 0.45 * done, words)
 
-    chosen = chosen_terms(trial, fit, margin=options.margin, folds=options.folds, tell=tell)
-    return _finished(observations, problem, fit, chosen, outliers, sizes, options, progress)
+    chosen = chosen_terms(trial, fit, tell=tell)
+    return _finished(observations, problem, fit, chosen, outliers, sizes, board_shape, progress)
 
 
 def _finished(
     observations: Observations, problem: Problem, fit: Fit, terms: Terms, outliers: dict[str, str],
-    sizes: dict[str, Size], options: SolveOptions, progress: Progress,
+    sizes: dict[str, Size], board_shape: BoardShape, progress: Progress,
 ) -> Solution:  # fmt: skip
     progress("adjustment", 0.7, "devices, poses and light together")
     fit = fitted(problem, fit.geometry, terms, correlated=True)
     refuse_bump(problem, fit, free_of(problem, fit.geometry, terms))
     progress("held out", 0.85, "poses that the solve has not seen")
-    held = _held_out_px(problem, fit, terms, options)
+    held = _held_out_px(problem, fit, terms)
     progress("covariance", 0.95, "how well each number is known")
-    known = covariance_of(problem, fit, terms, bend_of(observations.board, options.board_shape))
+    covariance, bow = covariance_of(problem, fit, terms, bend_of(observations.board, board_shape))
     devices = {
         name: to_pinhole(row, sizes[name]) for name, row in zip(problem.devices, fit.geometry.devices, strict=True)
     }
     used = [int(number) for number in np.flatnonzero(problem.used)]
-    residuals = residuals_of_devices(problem, fit, sizes, held)
+    residuals = _residuals(problem, fit, sizes, held)
     solution = Solution(
         calibration=Calibration({name: devices[name] for name in observations.cameras}, devices.get(PROJECTOR)),
-        covariance=allowing_for(known.devices, [residuals[name] for name in problem.devices]),
+        covariance=allowing_for(covariance, [residuals[name] for name in problem.devices]),
         distortion={name: terms[name] for name in problem.devices},
         poses={problem.pose_names[number]: to_board_pose(fit.geometry.poses[number]) for number in used},
         outliers=outliers,
         residuals=residuals,
         board_shape_mm=None if problem.prior is None else fit.geometry.shape_mm(),
-        bow=known.bow,
+        bow=bow,
     )
     progress("done", 1.0, f"{len(used)} poses used, {len(outliers)} left out")
     return solution
 
 
-def _held_out_px(problem: Problem, fit: Fit, terms: Terms, options: SolveOptions) -> dict[str, float]:
-    trial = replace(problem, measurements=problem.measurements.thinned(options.trial_matches_per_view))
-    dealt = folds_of(trial, options.folds)
+def _held_out_px(problem: Problem, fit: Fit, terms: Terms) -> dict[str, float]:
+    trial = replace(problem, measurements=problem.measurements.thinned(_TRIAL_MATCHES_PER_VIEW))
+    dealt = folds_of(trial)
     if not dealt:
         return {}
     start = fitted(trial, fit.geometry, terms, rounds=1, noise=fit.noise)
-    kept = kept_of(start.residuals, deviations_of(trial.measurements, fit.noise, trial.with_projector))
-    counted = kept_of(fit.residuals, deviations_of(problem.measurements, fit.noise, problem.with_projector))
+    kept = kept_of(start.residuals, trial.deviations(fit.noise))
+    counted = kept_of(fit.residuals, problem.deviations(fit.noise))
     judged = (problem.measurements, counted)
     return dict(held_out(trial, start.geometry, terms, fit.noise, dealt, kept, judged=judged).rms_px)
 
 
 def _agreeing_in_shape(
     problem: Problem, geometry: Geometry, terms: Terms, outliers: dict[str, str], shapes: Sequence[Prior | None],
-    options: SolveOptions,
 ) -> tuple[Problem, Fit]:  # fmt: skip
     """The same as `_agreeing`, of a board of the shape that held-out poses are best with."""
     chosen = {name: terms[name] for name in problem.devices}
     fit = None if len(shapes) == 1 else fitted(problem, geometry, chosen)
     while True:
         if fit is not None:
-            shape = chosen_shape(problem, fit, chosen, shapes, margin=options.margin, folds=options.folds)
+            shape = chosen_shape(problem, fit, chosen, shapes)
             problem = replace(problem, prior=shape)
         before = len(outliers)
         problem, fit = _agreeing(problem, geometry, terms, outliers)
@@ -219,5 +210,76 @@ def _refuse_few(observations: Observations) -> None:
         raise SolveRefusedError(message)
 
 
-def _unseen() -> str:
-    return f"no camera saw {LEAST_CORNERS} corners of the board or more; shoot it again with the board in view"
+def _residuals(
+    problem: Problem, fit: Fit, sizes: dict[str, Size], held_out_px: dict[str, float]
+) -> dict[str, DeviceResiduals]:
+    """What is left at each device, for people: figures, by pose, and maps over its image."""
+    m = problem.measurements
+    kept = kept_of(fit.residuals, problem.deviations(fit.noise))
+    found = {}
+    for device, name in enumerate(problem.devices):
+        held = held_out_px.get(name, np.nan)
+        if problem.beam(device):
+            good = kept[1] > 0
+            vectors = np.full((len(m.match_px), 2), np.nan)
+            axis = m.match_where[:, 2]
+            vectors[np.arange(len(axis)), axis] = fit.residuals.matches
+            places = np.column_stack([_shown(problem, fit, 0), _shown(problem, fit, 1)])
+            found[name] = _summed(
+                problem, places, vectors, m.match_sigma**2, m.match_where[:, 1], good, sizes[name], held
+            )
+        else:
+            mine = m.corner_where[:, 0] == device
+            good = kept[0][mine] > 0
+            found[name] = _summed(
+                problem, m.corner_px[mine], fit.residuals.corners[mine], 2 * m.corner_sigma[mine] ** 2,
+                m.corner_where[mine, 1], good, sizes[name], held,
+            )  # fmt: skip
+    return found
+
+
+def _shown(problem: Problem, fit: Fit, axis: int) -> FloatArray:
+    """(k,) float64: the projector coordinate that each lit pixel should show."""
+    m = problem.measurements
+    where = m.match_where.copy()
+    where[:, 2] = axis
+    return match_terms(fit.geometry, replace(m, match_where=where, match_px=np.zeros_like(m.match_px)), jacobian=False)[
+        0
+    ]
+
+
+def _summed(
+    problem: Problem, places: FloatArray, vectors: FloatArray, variance: FloatArray, pose: IntArray,
+    good: NDArray[np.bool_], size: Size, held_out_px: float,
+) -> DeviceResiduals:  # fmt: skip
+    square = np.nansum(vectors**2, axis=1)
+    by_pose = {
+        problem.pose_names[number]: float(np.sqrt(np.mean(square[good & (pose == number)])))
+        for number in np.unique(pose[good])
+    }
+    rms = np.full((CELLS, CELLS), np.nan)
+    mean = np.full((CELLS, CELLS, 2), np.nan)
+    count = np.zeros((CELLS, CELLS), dtype=np.int32)
+    extent = np.array([size.width_px, size.height_px])
+    cell = np.clip((np.nan_to_num(places) + 0.5) / extent * CELLS, 0, CELLS - 1).astype(np.int32)
+    for y in range(CELLS):
+        for x in range(CELLS):
+            here = good & (cell[:, 0] == x) & (cell[:, 1] == y)
+            count[y, x] = here.sum()
+            if count[y, x]:
+                rms[y, x] = np.sqrt(np.mean(square[here]))
+                for axis in (0, 1):
+                    values = vectors[here, axis]
+                    if np.isfinite(values).any():
+                        mean[y, x, axis] = np.nanmean(values)
+    return DeviceResiduals(
+        rms_px=float(np.sqrt(np.mean(square[good]))) if good.any() else np.nan,
+        stated_rms_px=float(np.sqrt(np.mean(variance[good]))) if good.any() else np.nan,
+        held_out_rms_px=held_out_px,
+        count=int(good.sum()),
+        outlying=int((~good).sum()),
+        pose_rms_px=by_pose,
+        map_rms_px=rms,
+        map_mean_px=mean,
+        map_count=count,
+    )

@@ -13,7 +13,7 @@ from slrig.calibration.displacement import modes_of, moved_points, rigid_free
 from slrig.calibration.judging.expected_error import expected_error, volume_of
 from slrig.calibration.observations import COLUMN, ROW, Correspondences, Observations, PoseObservation
 from slrig.calibration.solution import BoardPose, Solution
-from slrig.calibration.solving.solve import SolveOptions, solve
+from slrig.calibration.solving.solve import solve
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole
 from slrig.reconstruction.surface_fit import stencils
@@ -190,7 +190,7 @@ def test_solves_of_one_camera_are_as_far_off_as_they_state() -> None:
     ratios = []
     for seed in range(16):
         observations, truth = made(Recipe(poses=12, projector=False, seed=seed))
-        solution = solve(observations, options=SolveOptions(board_shape=BoardShape.FLAT))
+        solution = solve(observations, board_shape=BoardShape.FLAT)
         stated = expected_error(solution, observations)
         true, places = truth.cameras["left"], stated.grid_mm
         found = held_at_its_distance(solution.calibration.cameras["left"], pixels(true, places), places)

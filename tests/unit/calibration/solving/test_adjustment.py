@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from slrig.calibration.solving.adjustment import CAUCHY, Deviations, Prior, adjusted, kept_of, losses_of, residuals_of
-from slrig.calibration.solving.deviations import DeviceNoise, deviations_of, noise_of, with_design_effect
 from slrig.calibration.solving.measurements import Measurements, measured
 from slrig.calibration.solving.parameters import Geometry, difference, pose_row
-from slrig.calibration.solving.problem import flat_geometry
+from slrig.calibration.solving.problem import DeviceNoise, deviations_of, flat_geometry, noise_of, with_design_effect
 from slrig.model import FloatArray
 from tests.unit.calibration.solving.test_projection import row_of
 from tests.unit.calibration.synthetic import Recipe, board_poses, made

@@ -9,7 +9,6 @@ from slrig.calibration.solution import CELLS, DeviceResiduals
 from slrig.calibration.solving.covariance import allowing_for
 from slrig.calibration.solving.held_out import LADDER, chosen_terms, climbed, folds_of
 from slrig.calibration.solving.problem import Problem, fitted
-from slrig.calibration.solving.solve import SolveOptions
 from tests.unit.calibration.solving.test_adjustment import true_geometry
 from tests.unit.calibration.synthetic import Recipe
 
@@ -24,19 +23,19 @@ def chosen(recipe: Recipe) -> tuple[str, ...]:
     problem, _ = problem_of(recipe)
     geometry, _ = true_geometry(recipe)
     fit = fitted(problem, geometry, {"left": LADDER[2]})
-    return chosen_terms(problem, fit, margin=SolveOptions().margin, folds=5)["left"]
+    return chosen_terms(problem, fit)["left"]
 
 
 def test_each_pose_is_held_out_once() -> None:
     problem, _ = problem_of(Recipe(poses=13, projector=False, side=4))
-    folds = folds_of(problem, 5)
+    folds = folds_of(problem)
     assert len(folds) == 5
     np.testing.assert_array_equal(np.sum(folds, axis=0), 1)
 
 
 def test_three_poses_are_too_few_to_hold_any_out() -> None:
     recipe = Recipe(poses=3, projector=False, side=4)
-    assert folds_of(problem_of(recipe)[0], 5) == []
+    assert folds_of(problem_of(recipe)[0]) == []
     assert chosen(recipe) == ("k1",)
 
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.calibration.solving.adjustment import corner_terms, match_terms
-from slrig.calibration.solving.linear import solved
+from slrig.calibration.solving.adjustment import corner_terms, match_terms, solved
 from slrig.calibration.solving.measurements import Measurements, groups, measured, spread
 from slrig.calibration.solving.parameters import Geometry, device_row, difference, pose_row, to_pinhole
 from slrig.calibration.solving.problem import flat_geometry

@@ -11,7 +11,7 @@ import pytest
 
 from slrig.calibration.board import BoardShape
 from slrig.calibration.solution import CELLS, PROJECTOR, Solution
-from slrig.calibration.solving.solve import SolveOptions, solve
+from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray
 from tests.unit.calibration.solving.against_truth import in_deviations
@@ -191,7 +191,7 @@ def test_a_bowed_board_is_found_and_does_no_harm(bow_mm: float) -> None:
     height: FloatArray = shaped.board_shape_mm[:, 2]
     assert np.ptp(height) == pytest.approx(shaped.bow.height_mm, rel=0.2)
     assert max(np.abs(list(in_deviations(shaped, truth).values()))) < 4
-    flat = solve(observations, options=SolveOptions(board_shape=BoardShape.FLAT))
+    flat = solve(observations, board_shape=BoardShape.FLAT)
     assert flat.board_shape_mm is None
     assert flat.bow is None
     assert flat.residuals["left"].rms_px > shaped.residuals["left"].rms_px
