@@ -12,8 +12,16 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from slrig.accept.plan import AcceptancePlan, Artefact, Quantity, Step
-from slrig.calibration.artefacts import FittedPlane, FittedSphere, dispersion_mm, fitted_plane, fitted_sphere
-from slrig.calibration.segmentation import ball_points, plane_points, seen_well
+from slrig.calibration.artefacts import (
+    FittedPlane,
+    FittedSphere,
+    ball_points,
+    dispersion_mm,
+    fitted_plane,
+    fitted_sphere,
+    plane_points,
+    seen_well,
+)
 from slrig.errors import NothingToReconstructError
 from slrig.model import Calibration, FloatArray, IntArray, Mesh
 

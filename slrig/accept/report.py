@@ -17,8 +17,7 @@ from slrig.accept.scene import turn_deg
 from slrig.accept.store import HTML, JSON, kept_points, points_file
 from slrig.accept.verdicts import FORMULA, AcceptanceResult
 from slrig.bundle.storage import write_file
-from slrig.calibration.artefacts import REJECTED_SHARE
-from slrig.calibration.segmentation import STEEPEST_DEG
+from slrig.calibration.artefacts import REJECTED_SHARE, STEEPEST_DEG
 from slrig.model import FloatArray, Pinhole, Pixels
 from slrig.reports.drawing import WIDTH, drawing, legend, path, polygon, ramp, shape
 from slrig.reports.page import filled, jpeg_uri

@@ -1,7 +1,8 @@
-"""Spheres and planes fitted to scans of artefacts, and the decision, after VDI/VDE 2634 part 2 and ISO 10360-13.
+"""Which points of a scan lie on an artefact, the sphere or plane fitted to them, and the decision.
 
-No conformity is claimed. A sphere or plane is fitted by least squares of the distances to it; at most three points in a
-thousand, those that lie furthest off, are left out, and how many is said.
+After VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed. A sphere or plane is fitted by least squares of
+the distances to it; at most three points in a thousand, those that lie furthest off, are left out, and how many is
+said.
 """
 
 from __future__ import annotations
@@ -18,8 +19,18 @@ from slrig.model import FloatArray
 REJECTED_SHARE = 0.003
 """At most this share of the points is left out (VDI/VDE 2634-2)."""
 
+STEEPEST_DEG = 60.0
+"""Points that a device sees more obliquely than this do not count."""
+
 FEWEST_POINTS = 100
 _DISPERSED = 0.95
+_MOST_VOTES = 20_000
+_VOTE_REACH = 0.08  # of the radius: how far the centres that single normals point at may lie from one another
+_SHELL = 0.05  # of the radius, at first
+_DEVIATIONS = 8.0
+_ROUNDS = 4
+_TRIALS = 200
+_TILT_COSINE = np.cos(np.deg2rad(15.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,3 +144,119 @@ def _require_enough(points_mm: FloatArray, what: str) -> None:
             "of camera and projector, and matt"
         )
         raise NothingToReconstructError(message)
+
+
+def ball_points(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, count: int) -> list[NDArray[np.intp]]:
+    """Indices of the points on each of `count` balls of one diameter, the ball with most points first.
+
+    points_mm, normals : (n, 3) float64, the normals outwards. Each normal points back to its ball's centre, one radius
+    below the surface: where most of them meet is a centre.
+
+    Raises
+    ------
+    NothingToReconstructError
+        There are fewer balls of that size.
+    """
+    radius_mm = diameter_mm / 2
+    left = np.ones(len(points_mm), dtype=bool)
+    found: list[NDArray[np.intp]] = []
+    for number in range(count):
+        inside = _ball(points_mm, normals, radius_mm, left)
+        if inside is None:
+            message = (
+                f"expected {count} ball{'s' if count > 1 else ''} of {diameter_mm:g} mm, found {number}; bring the "
+                "artefact wholly into view, matt, and name its certified diameter"
+            )
+            raise NothingToReconstructError(message)
+        found.append(inside)
+        left[inside] = False
+    return sorted(found, key=len, reverse=True)
+
+
+def plane_points(points_mm: FloatArray, normals: FloatArray) -> NDArray[np.intp]:
+    """Indices of the points on the plane that most points lie on; points_mm, normals : (n, 3) float64.
+
+    Raises
+    ------
+    NothingToReconstructError
+        No plane holds enough of them.
+    """
+    rng = np.random.default_rng(0)
+    step = max(len(points_mm) // _MOST_VOTES, 1)
+    sparse, facing = points_mm[::step], normals[::step]
+    extent_mm = float(np.linalg.norm(np.ptp(points_mm, axis=0))) if len(points_mm) else 0.0
+    most, best = 0, (np.zeros(3), np.zeros(3))
+    for seed in rng.integers(0, max(len(sparse), 1), _TRIALS if len(sparse) else 0):
+        off = np.abs((sparse - sparse[seed]) @ facing[seed])
+        votes = int(((off < 0.004 * extent_mm) & (facing @ facing[seed] > _TILT_COSINE)).sum())
+        if votes > most:
+            most, best = votes, (sparse[seed], facing[seed])
+    reach_mm = 0.01 * extent_mm
+    chosen = np.flatnonzero(np.abs((points_mm - best[0]) @ best[1]) < reach_mm)
+    for _ in range(_ROUNDS):
+        if len(chosen) < FEWEST_POINTS:
+            message = (
+                f"expected a plane, found {len(chosen)} points on one; bring it into view, matt, and fill the view"
+            )
+            raise NothingToReconstructError(message)
+        plane = fitted_plane(points_mm[chosen])
+        off = np.abs((points_mm - plane.centre_mm) @ plane.normal)
+        # What stands on the plane is far off; its own noise and form are not.
+        reach_mm = min(reach_mm, _DEVIATIONS * _deviation(off[chosen]))
+        chosen = np.flatnonzero((off < reach_mm) & (np.abs(normals @ plane.normal) > _TILT_COSINE))
+    return chosen
+
+
+def seen_well(points_mm: FloatArray, normals: FloatArray, centres_mm: list[FloatArray]) -> NDArray[np.bool_]:
+    """(n,) bool: points whose normal is less than 60 degrees from the direction to every device.
+
+    centres_mm : the devices' centres of projection in the world, (3,) each.
+    """
+    good = np.ones(len(points_mm), dtype=bool)
+    for centre in centres_mm:
+        towards = centre - points_mm
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        good &= (normals * towards).sum(axis=1) > np.cos(np.deg2rad(STEEPEST_DEG))
+    return good
+
+
+def _ball(
+    points_mm: FloatArray, normals: FloatArray, radius_mm: float, left: NDArray[np.bool_]
+) -> NDArray[np.intp] | None:
+    candidates = np.flatnonzero(left)
+    voters = candidates[:: max(len(candidates) // _MOST_VOTES, 1)]
+    if len(voters) == 0:
+        return None
+    votes = points_mm[voters] - radius_mm * normals[voters]
+    # Late: as in `_sphere`.
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(votes)
+    reach_mm = _VOTE_REACH * radius_mm
+    counts = tree.query_ball_point(votes[::10], reach_mm, return_length=True)
+    centre = votes[::10][int(np.argmax(counts))]
+    for _ in range(_ROUNDS):
+        near = tree.query_ball_point(centre, reach_mm)
+        if not near:
+            return None
+        centre = votes[near].mean(axis=0)
+    nominal_mm, shell_mm = radius_mm, _SHELL * radius_mm
+    inside = candidates
+    for _ in range(_ROUNDS):
+        outwards = points_mm[candidates] - centre
+        distance = np.linalg.norm(outwards, axis=1)
+        along = (outwards * normals[candidates]).sum(axis=1) / np.maximum(distance, 1e-12)
+        inside = candidates[(np.abs(distance - radius_mm) < shell_mm) & (along > _TILT_COSINE)]
+        if len(inside) < FEWEST_POINTS:
+            return None
+        fit = fitted_sphere(points_mm[inside])
+        centre, radius_mm = fit.centre_mm, fit.radius_mm
+        if abs(radius_mm - nominal_mm) > _SHELL * nominal_mm:
+            return None
+        shell_mm = min(shell_mm, max(_DEVIATIONS * _deviation(fit.distances_mm), 1e-6))
+    return np.asarray(inside)
+
+
+def _deviation(distances_mm: FloatArray) -> float:
+    """Standard deviation by the median: what does not belong does not widen it."""
+    return 1.4826 * float(np.median(np.abs(distances_mm - np.median(distances_mm))))

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +46,9 @@ class Moved:
     stated: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class _Projected:
-    """pixel : (n, 2); by_point : (n, 2, 3); by_parameter : (n, 2, 15); inside : (n,) bool, in the image."""
+class _Projected(NamedTuple):
+    """by_point : (n, 2, 3) and by_parameter : (n, 2, 15) float64, of the pixel; inside : (n,) bool, in the image."""
 
-    pixel: FloatArray
     by_point: FloatArray
     by_parameter: FloatArray
     inside: NDArray[np.bool_]
@@ -72,7 +71,9 @@ def moved_points(cameras: Sequence[Pinhole], projector: Pinhole | None, points_m
     coordinate = 0 if axis is Axis.COLUMN else 1
     ray = _unit(points_mm - projector.centre_mm)
     told = np.array(told_depth(axis, cameras, projector))
-    weights = np.stack([np.where(view.inside, _squares(view.by_point, ray), 0.0) for view in views]) * told[:, None]
+    seen_to_move = [(np.einsum("nij,nj->ni", view.by_point, ray) ** 2).sum(axis=1) for view in views]
+    weights = np.stack([np.where(view.inside, m, 0.0) for view, m in zip(views, seen_to_move, strict=True)])
+    weights *= told[:, None]
     total = weights.sum(axis=0)
     weights = weights / np.where(total > 0, total, 1.0)
     by_parameter = np.zeros((len(points_mm), 3, _EACH * (len(cameras) + 1)))
@@ -185,11 +186,7 @@ def _projected(device: Pinhole, points_mm: FloatArray) -> _Projected:
     inside &= (pixel[:, 0] < device.size.width_px - 0.5) & (pixel[:, 1] < device.size.height_px - 0.5)
     # Beyond the radius at which its distortion turns back a lens sees nothing, whatever the polynomial says there.
     inside &= xx * yy - xy * xy > 0
-    return _Projected(pixel, by_device @ device.rotation, by, inside)
-
-
-def _squares(by_point: FloatArray, direction: FloatArray) -> FloatArray:
-    return np.asarray((np.einsum("nij,nj->ni", by_point, direction) ** 2).sum(axis=1))
+    return _Projected(by_device @ device.rotation, by, inside)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

@@ -39,10 +39,7 @@ def artwork(board: Board, *, light_first: bool = False) -> Artwork:
     """Every dark shape of a board: the squares (the one up and left of corner 0 is dark, unless `light_first`), the
     markers, the circles.
 
-    Raises
-    ------
-    CalibrationError
-        OpenCV has no such dictionary, or it has fewer markers than the board needs.
+    Raises CalibrationError where OpenCV has no such dictionary, or it has fewer markers than the board needs.
     """
     no_rectangles, no_circles = np.zeros((0, 2, 2)), np.zeros((0, 3))
     if board.kind is BoardKind.CIRCLES:
@@ -65,10 +62,7 @@ def charuco_board(board: Board, *, light_first: bool = False) -> Any:
     light_first : the layout of OpenCV before 4.6 (`setLegacyPattern`); another one only where the number of rows of
     squares is even.
 
-    Raises
-    ------
-    CalibrationError
-        OpenCV has no such dictionary, or it has fewer markers than the board needs.
+    Raises CalibrationError where OpenCV has no such dictionary, or it has fewer markers than the board needs.
     """
     markers = marker_dictionary(str(board.dictionary))
     needed, held = (board.columns + 1) * (board.rows + 1) // 2, len(markers.bytesList)
@@ -87,10 +81,7 @@ def charuco_board(board: Board, *, light_first: bool = False) -> Any:
 def marker_dictionary(name: str) -> Any:
     """OpenCV's dictionary of markers of this name: `cv2.aruco.Dictionary`.
 
-    Raises
-    ------
-    CalibrationError
-        There is none of this name.
+    Raises CalibrationError where there is none of this name.
     """
     if name not in DICTIONARIES:
         message = f"the board: OpenCV has no dictionary {name!r}; it has {', '.join(DICTIONARIES)}"

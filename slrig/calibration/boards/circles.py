@@ -96,10 +96,7 @@ def circle_blur_px(level: FloatArray, view: BoardView, board: Board) -> FloatArr
 def _grid(lattice: Lattice, board: Board) -> FloatArray | None:
     """(n, 2) float64: the centres in the board's own order; None where the lattice is no such board.
 
-    Raises
-    ------
-    PoseRefusedError
-        It is one whose left and right are changed over.
+    Raises PoseRefusedError where left and right are changed over.
     """
     points_px = _matched(lattice, board, mirrored=False)
     if points_px is None:

@@ -77,10 +77,7 @@ def find_board(image: NDArray[Any], board: Board, /, *, full_scale: float) -> Bo
 def board_region(view: BoardView, board: Board, shape: tuple[int, int], /) -> Mask:
     """(H, W) bool: the pixels of the print, from the outermost squares' outer edges (`Board.print_mm`) inwards.
 
-    Raises
-    ------
-    ValueError
-        The view's corners determine no map: fewer than four, or all on one line.
+    Raises ValueError where the view's corners determine no map: fewer than four, or all on one line.
     """
     return _region(_map(view, board), board, shape)
 

@@ -95,7 +95,7 @@ class Lattice:
         return sides
 
 
-def _around(least: FloatArray, most: FloatArray, x: FloatArray, y: FloatArray) -> list[FloatArray]:
+def _around(least: FloatArray, most: FloatArray, x: NDArray[Any], y: NDArray[Any]) -> list[FloatArray]:
     """Four lines of places (n, 2): at the least and the greatest x, then at the least and the greatest y."""
     ends = np.stack([least, most])
     return [_line(at, y) for at in ends[:, :1]] + [_line(x, at) for at in ends[:, 1:]]
@@ -144,10 +144,7 @@ def turned_half(view: BoardView, board: Board) -> BoardView:
     This turns the board's frame by half about the middle of its corners: what was at (x, y) in it is then at
     (X - x, Y - y), X and Y the greatest coordinates of any corner. Light on the board has no numbers.
 
-    Raises
-    ------
-    ValueError
-        Half a turn of this board can be seen.
+    Raises ValueError where half a turn of this board can be seen.
     """
     if not half_turn_looks_same(board):
         message = f"{board.title} looks different after half a turn: it has one numbering"

@@ -12,6 +12,7 @@ import re
 import textwrap
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,8 +41,7 @@ _STROKE_MM = 0.15
 _BORDER_GREY, _INK_GREY = 0.8, 0.25
 
 
-@dataclass(frozen=True, slots=True)
-class _Text:
+class _Text(NamedTuple):
     """x_mm, y_mm : of the line's start, or its middle; turned : written upwards."""
 
     text: str
@@ -52,8 +52,7 @@ class _Text:
     turned: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class _Line:
+class _Line(NamedTuple):
     x_mm: float
     y_mm: float
     to_x_mm: float
@@ -86,12 +85,13 @@ def board_svg(board: Board, *, page: str = "A4") -> str:
         There is no such page, or the board does not fit on it.
     """
     drawn = _laid_out(board, page)
+    width, height = _number(drawn.width_mm), _number(drawn.height_mm)
     parts = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{_number(drawn.width_mm)}mm" '
-        f'height="{_number(drawn.height_mm)}mm" viewBox="0 0 {_number(drawn.width_mm)} {_number(drawn.height_mm)}">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" '
+        f'viewBox="0 0 {width} {height}">',
         f"<title>{html.escape(drawn.title)}</title>",
-        f'<rect width="{_number(drawn.width_mm)}" height="{_number(drawn.height_mm)}" fill="#fff"/>',
+        f'<rect width="{width}" height="{height}" fill="#fff"/>',
     ]
     for shape in drawn.rectangles_mm:
         path = "".join(
@@ -103,18 +103,17 @@ def board_svg(board: Board, *, page: str = "A4") -> str:
         f'<circle cx="{_number(x)}" cy="{_number(y)}" r="{_number(radius)}" fill="#000"/>'
         for x, y, radius in drawn.circles_mm
     ]
-    parts += [
-        f'<line x1="{_number(line.x_mm)}" y1="{_number(line.y_mm)}" x2="{_number(line.to_x_mm)}" '
-        f'y2="{_number(line.to_y_mm)}" stroke="{_colour(line.grey)}" stroke-width="{_STROKE_MM}"/>'
-        for line in drawn.lines
-    ]
+    for line in drawn.lines:
+        x, y, to_x, to_y = (_number(place) for place in line[:4])
+        stroke = f'stroke="{_colour(line.grey)}" stroke-width="{_STROKE_MM}"'
+        parts.append(f'<line x1="{x}" y1="{y}" x2="{to_x}" y2="{to_y}" {stroke}/>')
     for text in drawn.texts:
+        x, y, size = (_number(place) for place in text[1:4])
         anchor = ' text-anchor="middle"' if text.centred else ""
-        turn = f' transform="rotate(-90 {_number(text.x_mm)} {_number(text.y_mm)})"' if text.turned else ""
+        turn = f' transform="rotate(-90 {x} {y})"' if text.turned else ""
         parts.append(
-            f'<text x="{_number(text.x_mm)}" y="{_number(text.y_mm)}" font-family="Helvetica, Arial, sans-serif" '
-            f'font-size="{_number(text.size_mm)}" fill="{_colour(_INK_GREY)}"{anchor}{turn}>'
-            f"{html.escape(text.text)}</text>"
+            f'<text x="{x}" y="{y}" font-family="Helvetica, Arial, sans-serif" font-size="{size}" '
+            f'fill="{_colour(_INK_GREY)}"{anchor}{turn}>{html.escape(text.text)}</text>'
         )
     return "\n".join([*parts, "</svg>", ""])
 
@@ -122,10 +121,7 @@ def board_svg(board: Board, *, page: str = "A4") -> str:
 def board_pdf(board: Board, *, page: str = "A4") -> bytes:
     """The same page as a PDF document. The same board and page give the same bytes.
 
-    Raises
-    ------
-    CalibrationError
-        As `board_svg`.
+    Raises CalibrationError as `board_svg` does.
     """
     from reportlab.lib.units import mm
     from reportlab.pdfgen.canvas import Canvas
@@ -164,9 +160,8 @@ def board_pdf(board: Board, *, page: str = "A4") -> bytes:
 
 def solve_command(board: Board) -> str:
     """The command that calibrates from poses of this board."""
-    further = ""
-    if board.kind is BoardKind.CHARUCO:
-        further = f" --marker-mm {board.marker_mm:g} --dictionary {board.dictionary}"
+    charuco = board.kind is BoardKind.CHARUCO
+    further = f" --marker-mm {board.marker_mm:g} --dictionary {board.dictionary}" if charuco else ""
     return (
         f"slrig calibrate solve FOLDER --board {board.kind} --corners {board.columns}x{board.rows} "
         f"--square-mm {board.square_mm:g}{further} --output calibration.json"
@@ -187,7 +182,9 @@ def _laid_out(board: Board, page: str) -> _Page:
     shapes = [art.rectangles_mm[art.group == group] + origin for group in range(int(art.group.max(initial=-1)) + 1)]
     circles = art.circles_mm + np.array([*origin, 0.0])
     below_mm = y_mm + high_mm + _QUIET_MM
-    lines = _border(x_mm - _QUIET_MM, y_mm - _QUIET_MM, x_mm + wide_mm + _QUIET_MM, below_mm)
+    (west, north), (east, south) = (x_mm - _QUIET_MM, y_mm - _QUIET_MM), (x_mm + wide_mm + _QUIET_MM, below_mm)
+    border = [(west, north), (east, north), (east, south), (west, south), (west, north)]
+    lines = [_Line(*one, *other, _BORDER_GREY) for one, other in pairwise(border)]
     foot_mm = height_mm - _MARGIN_MM - _LINE_MM * (len(texts) - 0.75)
     written = [_Text(text, _MARGIN_MM, foot_mm + _LINE_MM * index, _FONT_MM) for index, text in enumerate(texts)]
     for upright, start_x, start_y, room_mm in (
@@ -267,28 +264,21 @@ def _sides_mm(page: str) -> tuple[float, float]:
     return float(given[1]), float(given[2])
 
 
-def _border(left: float, top: float, right: float, bottom: float) -> list[_Line]:
-    corners = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
-    return [_Line(*one, *other, _BORDER_GREY) for one, other in pairwise(corners)]
-
-
 def _ruler(x_mm: float, y_mm: float, room_mm: float, *, upright: bool) -> tuple[list[_Line], list[_Text]]:
     """A scale in mm from (x_mm, y_mm): to the right, its ticks downwards, or downwards, its ticks to the left."""
     length = min(_LONGEST_RULER_MM, 10 * math.floor(room_mm / 10)) if room_mm >= 10 else math.floor(room_mm)
     ticks, numbers = [], []
+
+    def place(along: float, away: float) -> tuple[float, float]:
+        return (x_mm - away, y_mm + along) if upright else (x_mm + along, y_mm + away)
+
     for at in range(length + 1):
         tick = 4.0 if at % 10 == 0 else 3.0 if at % 5 == 0 else 2.0
-        if upright:
-            ticks.append(_Line(x_mm, y_mm + at, x_mm - tick, y_mm + at, 0.0))
-        else:
-            ticks.append(_Line(x_mm + at, y_mm, x_mm + at, y_mm + tick, 0.0))
+        ticks.append(_Line(*place(at, 0), *place(at, tick), 0.0))
         if at % 10 == 0:
             told = f"{at} mm" if at == length - length % 10 else str(at)
-            where = (x_mm - 4.7, y_mm + at) if upright else (x_mm + at, y_mm + 6.7)
-            numbers.append(_Text(told, *where, 2.2, centred=True, turned=upright))
-    end = (x_mm, y_mm + length) if upright else (x_mm + length, y_mm)
-    ticks.append(_Line(x_mm, y_mm, *end, 0.0))
-    return ticks, numbers
+            numbers.append(_Text(told, *place(at, 4.7 if upright else 6.7), 2.2, centred=True, turned=upright))
+    return [*ticks, _Line(x_mm, y_mm, *place(length, 0), 0.0)], numbers
 
 
 def _number(value: float) -> str:
@@ -297,4 +287,4 @@ def _number(value: float) -> str:
 
 
 def _colour(grey: float) -> str:
-    return f"#{round(255 * grey):02x}" + f"{round(255 * grey):02x}" * 2
+    return "#" + 3 * f"{round(255 * grey):02x}"

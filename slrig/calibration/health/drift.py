@@ -22,8 +22,9 @@ from enum import StrEnum
 
 import numpy as np
 
-from slrig.calibration.health.equations import EACH, Equations, design, padded
+from slrig.calibration.health.equations import Equations, design, padded
 from slrig.calibration.solution import PARAMETERS, PROJECTOR, device_title, devices_of
+from slrig.calibration.solving.projection import DEVICE
 from slrig.model import Calibration, FloatArray, Pinhole
 
 ALIKE = 9.0
@@ -91,11 +92,13 @@ class Hypothesis:
 def hypotheses(found: Equations, calibration: Calibration, /) -> tuple[Hypothesis, ...]:
     """Every explanation, the most likely first; that nothing changed is among them."""
     devices = devices_of(calibration)
-    tried = [_fitted(found, "", Change.NONE, np.zeros((EACH * len(devices), 0)))]
+    tried = [_fitted(found, "", Change.NONE, np.zeros((DEVICE * len(devices), 0)))]
     for index, (name, device) in enumerate(devices.items()):
         for kind in (Change.TURNED, Change.MOVED, Change.FOCAL, Change.BUMPED):
-            columns = np.zeros((EACH * len(devices), 6 if kind is Change.BUMPED else 1 if kind is Change.FOCAL else 3))
-            columns[EACH * index : EACH * (index + 1)] = _columns(kind, device)
+            columns = np.zeros(
+                (DEVICE * len(devices), 6 if kind is Change.BUMPED else 1 if kind is Change.FOCAL else 3)
+            )
+            columns[DEVICE * index : DEVICE * (index + 1)] = _columns(kind, device)
             tried.append(_fitted(found, name, kind, columns))
     tried.sort(key=lambda each: -each.evidence)
     odds = np.exp((np.array([each.evidence for each in tried]) - tried[0].evidence) / 2)
@@ -118,7 +121,7 @@ def board_growth(found: Equations, calibration: Calibration, /) -> tuple[float, 
     A board that grew looks like a rig that shrank: all devices drew nearer to one another.
     """
     devices = list(devices_of(calibration).values())
-    columns = np.zeros((len(devices), EACH))
+    columns = np.zeros((len(devices), DEVICE))
     for index, device in enumerate(devices):
         columns[index, _SHIFT] = device.rotation @ (device.centre_mm - devices[0].centre_mm)
     columns = columns.reshape(-1, 1) * _MOST_GROWTH
@@ -129,7 +132,7 @@ def board_growth(found: Equations, calibration: Calibration, /) -> tuple[float, 
 
 def _columns(kind: Change, device: Pinhole) -> FloatArray:
     """(15, k): the change of one device per unit of its prior size."""
-    turn, moved, focal = np.zeros((EACH, 3)), np.zeros((EACH, 3)), np.zeros((EACH, 1))
+    turn, moved, focal = np.zeros((DEVICE, 3)), np.zeros((DEVICE, 3)), np.zeros((DEVICE, 1))
     turn[_TURN] = np.eye(3)
     # A turn about the device's own centre turns its translation along.
     turn[_SHIFT] = np.cross(np.eye(3), device.translation_mm).T

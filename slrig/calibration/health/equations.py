@@ -27,8 +27,7 @@ from slrig.calibration.solving.adjustment import corner_terms, match_terms
 from slrig.calibration.solving.measurements import Measurements, groups, measured
 from slrig.calibration.solving.parameters import Geometry, device_row, pose_row, to_board_pose
 from slrig.calibration.solving.problem import flat_geometry
-from slrig.calibration.solving.projection import DEVICE as EACH
-from slrig.calibration.solving.projection import POSE
+from slrig.calibration.solving.projection import DEVICE, POSE
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, IntArray
 
@@ -67,10 +66,7 @@ class Equations:
 def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calibration, /) -> Equations:
     """Set up the equations of one or more poses.
 
-    Raises
-    ------
-    CalibrationError
-        No camera of the calibration sees enough of the board.
+    Raises CalibrationError where no camera of the calibration sees enough of the board.
     """
     names = list(calibration.cameras)
     sizes = {name: camera.size for name, camera in calibration.cameras.items()}
@@ -137,8 +133,8 @@ def _corners(m: Measurements, geometry: Geometry) -> list[_Part]:
         for axis in (0, 1):
             left = -residual[run, axis]
             sigma, kept = _sigma(left, m.corner_sigma[run], surface)
-            by_device = _spread(rows[run, axis, :EACH], camera, len(geometry.devices))
-            by_pose = _spread(rows[run, axis, EACH : EACH + POSE], pose, len(geometry.poses))
+            by_device = _spread(rows[run, axis, :DEVICE], camera, len(geometry.devices))
+            by_pose = _spread(rows[run, axis, DEVICE : DEVICE + POSE], pose, len(geometry.poses))
             parts.append((left[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
     return parts
 
@@ -160,8 +156,10 @@ def _light(m: Measurements, geometry: Geometry) -> list[_Part]:
         surface = _surface(geometry, on_board)
         sigma, kept = _sigma(value, sigma, surface)
         kept = kept & np.isfinite(rows).all(axis=1)
-        by_device = _spread(rows[:, :EACH], camera, devices) + _spread(rows[:, EACH : 2 * EACH], devices - 1, devices)
-        by_pose = _spread(rows[:, 2 * EACH : 2 * EACH + POSE], pose, len(geometry.poses))
+        by_device = _spread(rows[:, :DEVICE], camera, devices) + _spread(
+            rows[:, DEVICE : 2 * DEVICE], devices - 1, devices
+        )
+        by_pose = _spread(rows[:, 2 * DEVICE : 2 * DEVICE + POSE], pose, len(geometry.poses))
         parts.append((value[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
     return parts
 

@@ -81,10 +81,7 @@ def volume_of(solution: Solution, observations: Observations, /) -> tuple[FloatA
     The places lie in the convex hull of the corners, and where the first camera and the projector see them, or without
     a projector two cameras, or the one that there is.
 
-    Raises
-    ------
-    CalibrationError
-        There is no such place, or the corners lie in one plane.
+    Raises CalibrationError where there is no such place, or the corners lie in one plane.
     """
     corners = _board_corners(solution, observations)
     volume_mm = np.stack([corners.min(axis=0), corners.max(axis=0)])

@@ -68,7 +68,10 @@ def plane_map(light: Correspondences) -> FloatArray | None:
     along_column = few.axis == COLUMN
     if min(int(along_column.sum()), int((~along_column).sum())) < _FEWEST_SAMPLES:
         return None
-    in_camera, in_projector = _scaling(few.pixels_px), _scaling_of_axes(few.position_px, along_column)
+    columns, rows = few.position_px[along_column], few.position_px[~along_column]
+    in_camera = _scaling(few.pixels_px.mean(axis=0), float(few.pixels_px.std()))
+    middle = np.array([np.median(columns), np.median(rows)])
+    in_projector = _scaling(middle, max(float(columns.std()), float(rows.std())))
     points = np.column_stack([few.pixels_px, np.ones(len(few.axis))]) @ in_camera.T
     position = few.position_px * np.where(along_column, in_projector[0, 0], in_projector[1, 1])
     position = position + np.where(along_column, in_projector[0, 2], in_projector[1, 2])
@@ -118,14 +121,7 @@ def _corner_sigma(light: Correspondences, corners: int) -> float:
     return max(LEAST_SIGMA_PX, float(np.median(light.sigma_px)) / float(np.sqrt(per_corner)))
 
 
-def _scaling(points_px: FloatArray) -> FloatArray:
-    """A similarity that brings points to the origin at unit spread, which the linear solve needs."""
-    middle, spread = points_px.mean(axis=0), max(float(points_px.std()), 1e-6)
-    return np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])
-
-
-def _scaling_of_axes(position_px: FloatArray, along_column: NDArray[np.bool_]) -> FloatArray:
-    columns, rows = position_px[along_column], position_px[~along_column]
-    spread = max(float(columns.std()), float(rows.std()), 1e-6)
-    middle = np.median(columns), np.median(rows)
+def _scaling(middle: FloatArray, spread: float) -> FloatArray:
+    """A similarity that brings points about a middle to the origin at unit spread, which the linear solve needs."""
+    spread = max(spread, 1e-6)
     return np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1]])

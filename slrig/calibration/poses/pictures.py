@@ -36,14 +36,14 @@ def coverage_picture(
     size: Size,
     *,
     outline_px: FloatArray | None = None,
-    width_px: int = WIDTH_PX,
 ) -> Picture:
     """Return the image's cells, the darker the more poses cover them, and the corners of every pose in its own colour.
 
     points_px : by pose, (n, 2). outline_px : (4, 2), where the board should go next, drawn as a frame; its corner 0 is
     marked.
     """
-    picture, scale = _sheet(size, width_px)
+    across, down = _extent(size, WIDTH_PX)
+    picture, scale = np.full((down, across, 3), _PAPER, dtype=np.uint8), WIDTH_PX / size.width_px
     for row, column, box in _cell_boxes(picture):
         count = int(covered.cells[row, column])
         if count:
@@ -51,9 +51,10 @@ def coverage_picture(
         else:
             colour = _PAPER if covered.reachable[row, column] else _UNREACHABLE
         cv2.rectangle(picture, *box, colour, -1)
-    _grid(picture)
+    for _, _, (start, end) in _cell_boxes(picture):
+        cv2.rectangle(picture, start, (end[0] + 1, end[1] + 1), _LINE, 1)
     for row, column, (corner, _) in _cell_boxes(picture):
-        _text(picture, str(int(covered.cells[row, column])), (corner[0] + 4, corner[1] + 13), 0.4)
+        _text(picture, str(int(covered.cells[row, column])), (corner[0] + 4, corner[1] + 13))
     for index, points in enumerate(points_px):
         colour = _pose_colour(index)
         shown = points[within(points, size)]
@@ -96,12 +97,6 @@ def _extent(size: Size, width_px: int) -> tuple[int, int]:
     return width_px, max(1, round(size.height_px * width_px / size.width_px))
 
 
-def _sheet(size: Size, width_px: int) -> tuple[Picture, float]:
-    """Return an empty sheet of the device's shape, and sheet pixels per pixel of the device."""
-    across, down = _extent(size, width_px)
-    return np.full((down, across, 3), _PAPER, dtype=np.uint8), width_px / size.width_px
-
-
 def _cell_boxes(picture: Picture) -> list[tuple[int, int, tuple[tuple[int, int], tuple[int, int]]]]:
     """Return row, column and two opposite corners, (x, y), of every cell."""
     down = np.linspace(0, picture.shape[0], CELLS + 1).round().astype(int).tolist()
@@ -111,11 +106,6 @@ def _cell_boxes(picture: Picture) -> list[tuple[int, int, tuple[tuple[int, int],
         for row in range(CELLS)
         for column in range(CELLS)
     ]
-
-
-def _grid(picture: Picture) -> None:
-    for _, _, (start, end) in _cell_boxes(picture):
-        cv2.rectangle(picture, start, (end[0] + 1, end[1] + 1), _LINE, 1)
 
 
 def _scaled(points_px: FloatArray, scale: float) -> list[tuple[int, int]]:
@@ -136,8 +126,8 @@ def _pose_colour(index: int) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _text(picture: Picture, words: str, place: tuple[int, int], height: float) -> None:
+def _text(picture: Picture, words: str, place: tuple[int, int]) -> None:
     """Write words, light where the paper under them is dark."""
     under = picture[max(place[1] - 6, 0), min(place[0], picture.shape[1] - 1)]
     colour = _PAPER if int(under.sum()) < _DARK else _INK
-    cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, height, colour, 1, cv2.LINE_AA)
+    cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)

@@ -39,10 +39,7 @@ _MEDIAN = 0.6745
 def refuse_bump(problem: Problem, fit: Fit, free: NDArray[np.bool_], /) -> None:
     """See that no device moved between two poses.
 
-    Raises
-    ------
-    SolveRefusedError
-        One did: it is named, and the pose from which on it stands elsewhere.
+    Raises SolveRefusedError where one did, with its name and the pose from which on it stands elsewhere.
     """
     bump = _bump(problem, fit, free)
     if bump is None:

@@ -40,10 +40,7 @@ def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, 
 
     bend : what is known beforehand of the board's bend; None if it is known to be flat, and the bow is None too.
 
-    Raises
-    ------
-    SolveRefusedError
-        The poses leave a number open, or a focal length all but open.
+    Raises SolveRefusedError where the poses leave a number open, or a focal length all but open.
     """
     narrow, _ = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
     _refuse_open(problem, fit, narrow)

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.observations import BoardView, Observations
@@ -53,10 +52,7 @@ class Start:
 def start_of(observations: Observations, /) -> Start:
     """A start for all cameras and poses.
 
-    Raises
-    ------
-    SolveRefusedError
-        A camera has too few poses, all of them parallel, or shares none with the other cameras.
+    Raises SolveRefusedError where a camera has too few poses, all of them parallel, or shares none with the others.
     """
     names = list(observations.cameras)
     views = [_views(observations, name) for name in names]
@@ -99,7 +95,8 @@ def _lens(board: Board, name: str, size: Size, views: Mapping[int, BoardView], o
     images = [view.points_px for view in views.values()]
     shape = (size.width_px, size.height_px)
     flags = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    found = cv2.calibrateCamera(_single(objects), _single(images), shape, None, None, flags=flags)
+    single = ([each.astype(np.float32) for each in arrays] for arrays in (objects, images))
+    found = cv2.calibrateCamera(*single, shape, None, None, flags=flags)
     matrix, distortion = np.asarray(found[1], dtype=np.float64), np.concatenate([np.ravel(found[2]), np.zeros(5)])[:5]
     _refuse_parallel(name, size, (matrix, distortion), found[3:5], objects, images)
     return matrix, distortion
@@ -199,11 +196,6 @@ def _agreed(ties: list[list[FloatArray]], reach: float) -> tuple[FloatArray, lis
 def _apart(first: FloatArray, second: FloatArray, reach: float) -> float:
     turn = first[:3, :3] - second[:3, :3]
     return float(np.linalg.norm(turn) * reach / np.sqrt(2) + np.linalg.norm(first[:3, 3] - second[:3, 3]))
-
-
-def _single(arrays: list[FloatArray]) -> list[NDArray[np.float32]]:
-    """As OpenCV wants points."""
-    return [each.astype(np.float32) for each in arrays]
 
 
 def _refuse_parallel(

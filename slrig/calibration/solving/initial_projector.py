@@ -27,10 +27,7 @@ def projector_start(devices: FloatArray, poses: FloatArray, matches: Measurement
 
     devices : (c, 21), cameras; poses : (m, 12).
 
-    Raises
-    ------
-    SolveRefusedError
-        There is too little light along one axis, or what it shows is a mirror image.
+    Raises SolveRefusedError where there is too little light along one axis, or what it shows is a mirror image.
     """
     axis = matches.match_where[:, 2]
     counts = [int((axis == one).sum()) for one in (COLUMN, ROW)]

@@ -61,8 +61,8 @@ def measured(
     matches_per_view : at most as many correspondences of each camera, pose and axis are used, spread over its image.
     """
     last = observations.board.corner_count - 1
-    corners: list[tuple[IntArray, FloatArray, FloatArray]] = []
-    matches: list[tuple[IntArray, FloatArray, FloatArray, FloatArray]] = []
+    nothing = np.zeros((0, 3), np.int32), np.zeros((0, 2)), np.zeros(0)
+    corners, matches = [nothing], [(*nothing, np.zeros(0))]
     for number, pose in enumerate(observations.poses):
         for camera, name in enumerate(observations.cameras):
             view = pose.views.get(name)
@@ -74,15 +74,8 @@ def measured(
             seen = pose.correspondences.get(name)
             if seen is not None and len(seen.axis) and observations.projector is not None:
                 matches.append(_match_rows(camera, number, seen, matches_per_view))
-    return Measurements(
-        np.concatenate([np.zeros((0, 3), np.int32), *(part[0] for part in corners)]),
-        np.concatenate([np.zeros((0, 2)), *(part[1] for part in corners)]),
-        np.concatenate([np.zeros(0), *(part[2] for part in corners)]),
-        np.concatenate([np.zeros((0, 3), np.int32), *(part[0] for part in matches)]),
-        np.concatenate([np.zeros((0, 2)), *(part[1] for part in matches)]),
-        np.concatenate([np.zeros(0), *(part[2] for part in matches)]),
-        np.concatenate([np.zeros(0), *(part[3] for part in matches)]),
-    )
+    columns = [*zip(*corners, strict=True), *zip(*matches, strict=True)]
+    return Measurements(*(np.concatenate(column) for column in columns))
 
 
 def _match_rows(

@@ -243,9 +243,8 @@ def _shown(problem: Problem, fit: Fit, axis: int) -> FloatArray:
     m = problem.measurements
     where = m.match_where.copy()
     where[:, 2] = axis
-    return match_terms(fit.geometry, replace(m, match_where=where, match_px=np.zeros_like(m.match_px)), jacobian=False)[
-        0
-    ]
+    from_zero = replace(m, match_where=where, match_px=np.zeros_like(m.match_px))
+    return match_terms(fit.geometry, from_zero, jacobian=False)[0]
 
 
 def _summed(

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.calibration.artefacts import fitted_plane, fitted_sphere
-from slrig.calibration.segmentation import ball_points, plane_points, seen_well
+from slrig.calibration.artefacts import ball_points, fitted_plane, fitted_sphere, plane_points, seen_well
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
 from tests.unit.calibration.test_artefacts import cap
