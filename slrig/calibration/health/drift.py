@@ -95,11 +95,10 @@ def hypotheses(found: Equations, calibration: Calibration, /) -> tuple[Hypothesi
     tried = [_fitted(found, "", Change.NONE, np.zeros((DEVICE * len(devices), 0)))]
     for index, (name, device) in enumerate(devices.items()):
         for kind in (Change.TURNED, Change.MOVED, Change.FOCAL, Change.BUMPED):
-            columns = np.zeros(
-                (DEVICE * len(devices), 6 if kind is Change.BUMPED else 1 if kind is Change.FOCAL else 3)
-            )
-            columns[DEVICE * index : DEVICE * (index + 1)] = _columns(kind, device)
-            tried.append(_fitted(found, name, kind, columns))
+            own = _columns(kind, device)
+            columns = np.zeros((len(devices), *own.shape))
+            columns[index] = own
+            tried.append(_fitted(found, name, kind, columns.reshape(-1, own.shape[1])))
     tried.sort(key=lambda each: -each.evidence)
     odds = np.exp((np.array([each.evidence for each in tried]) - tried[0].evidence) / 2)
     return tuple(replace(each, weight=float(weight)) for each, weight in zip(tried, odds / odds.sum(), strict=True))

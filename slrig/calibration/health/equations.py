@@ -156,9 +156,8 @@ def _light(m: Measurements, geometry: Geometry) -> list[_Part]:
         surface = _surface(geometry, on_board)
         sigma, kept = _sigma(value, sigma, surface)
         kept = kept & np.isfinite(rows).all(axis=1)
-        by_device = _spread(rows[:, :DEVICE], camera, devices) + _spread(
-            rows[:, DEVICE : 2 * DEVICE], devices - 1, devices
-        )
+        by_device = _spread(rows[:, :DEVICE], camera, devices)
+        by_device += _spread(rows[:, DEVICE : 2 * DEVICE], devices - 1, devices)
         by_pose = _spread(rows[:, 2 * DEVICE : 2 * DEVICE + POSE], pose, len(geometry.poses))
         parts.append((value[kept], by_device[kept], by_pose[kept], surface[kept], sigma[kept]))
     return parts

@@ -95,8 +95,8 @@ def _lens(board: Board, name: str, size: Size, views: Mapping[int, BoardView], o
     images = [view.points_px for view in views.values()]
     shape = (size.width_px, size.height_px)
     flags = cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    single = ([each.astype(np.float32) for each in arrays] for arrays in (objects, images))
-    found = cv2.calibrateCamera(*single, shape, None, None, flags=flags)
+    on_board, in_image = ([each.astype(np.float32) for each in arrays] for arrays in (objects, images))
+    found = cv2.calibrateCamera(on_board, in_image, shape, None, None, flags=flags)
     matrix, distortion = np.asarray(found[1], dtype=np.float64), np.concatenate([np.ravel(found[2]), np.zeros(5)])[:5]
     _refuse_parallel(name, size, (matrix, distortion), found[3:5], objects, images)
     return matrix, distortion
