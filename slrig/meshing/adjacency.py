@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -15,34 +15,24 @@ from slrig.model import IntArray
 _CROWDED, _REPEATED = 1, 2  # what is wrong with a face
 
 
-class Incidence(NamedTuple):
-    """The triangles at each vertex: corners[starts[v]:starts[v + 1]] holds 4 * face + corner, rising.
+@kernel
+def in_groups(groups: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """Where the members of each group begin, (count + 1,) int32, and the members in that order, rising, (n,) int32.
 
-    starts : (V + 1,) int32; corners : (3F,) int32.
+    groups : (n,) int32, the group of each, from 0 to count - 1. A counting sort.
     """
-
-    starts: IntArray
-    corners: IntArray
-
-
-def incidence(faces: IntArray, *, vertex_count: int) -> Incidence:
-    """The triangles at each of `vertex_count` vertices, by a counting sort.
-
-    Raises
-    ------
-    ValueError
-        A face names a vertex that is not among them.
-    """
-    starts = np.zeros(vertex_count + 1, dtype=np.int32)
-    corners = np.zeros(faces.size, dtype=np.int32)
-    faces = np.ascontiguousarray(faces)
-    if not _incidence(faces, starts, corners):
-        message = (
-            f"faces name vertices {faces.min()} to {faces.max()}, there are {vertex_count}; "
-            "pass the number of points that the faces index"
-        )
-        raise ValueError(message)
-    return Incidence(starts, corners)
+    starts = np.zeros(count + 2, dtype=np.int32)
+    for group in groups:
+        starts[group + 2] += 1
+    for group in range(count):
+        starts[group + 2] += starts[group + 1]
+    members = np.zeros(len(groups), dtype=np.int32)
+    for member in range(len(groups)):
+        # A group's start stands one place to the right until its members have moved it on to its end.
+        place = groups[member] + 1
+        members[starts[place]] = member
+        starts[place] += 1
+    return starts[:-1], members
 
 
 def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
@@ -58,10 +48,15 @@ def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
         manifold: two faces run along it in the same direction. More than two faces on an edge always do.
     """
     faces = np.ascontiguousarray(faces)
-    around = incidence(faces, vertex_count=vertex_count)
+    if faces.size and (faces.min() < 0 or faces.max() >= vertex_count):
+        message = (
+            f"faces name vertices {faces.min()} to {faces.max()}, there are {vertex_count}; "
+            "pass the number of points that the faces index"
+        )
+        raise ValueError(message)
     across = np.full(faces.shape, -1, dtype=np.int32)
     fault = np.zeros(len(faces), dtype=np.uint8)
-    in_bands(_neighbours, len(faces), faces, around.starts, around.corners, across, fault)
+    in_bands(_neighbours, len(faces), faces, *in_groups(faces.ravel(), vertex_count), across, fault)
     if fault.any():
         face = int(np.flatnonzero(fault)[0])
         named = faces[face].tolist()
@@ -76,29 +71,6 @@ def neighbours(faces: IntArray, *, vertex_count: int) -> IntArray:
 
 
 @kernel(in_every_scan=False)
-def _incidence(faces: Any, starts: Any, corners: Any) -> bool:
-    count = len(starts) - 1
-    for face in range(len(faces)):
-        for corner in range(3):
-            vertex = faces[face, corner]
-            if vertex < 0 or vertex >= count:
-                return False
-            starts[vertex + 1] += 1
-    for vertex in range(count):
-        starts[vertex + 1] += starts[vertex]
-    for face in range(len(faces)):
-        for corner in range(3):
-            vertex = faces[face, corner]
-            corners[starts[vertex]] = 4 * face + corner
-            starts[vertex] += 1
-    # Each start has moved on to the next one's place.
-    for vertex in range(count, 0, -1):
-        starts[vertex] = starts[vertex - 1]
-    starts[0] = 0
-    return True
-
-
-@kernel(in_every_scan=False)
 def _neighbours(first: int, last: int, faces: Any, starts: Any, corners: Any, across: Any, fault: Any) -> None:
     for face in range(first, last):
         for corner in range(3):
@@ -109,7 +81,7 @@ def _neighbours(first: int, last: int, faces: Any, starts: Any, corners: Any, ac
                 fault[face] = _REPEATED
             found, alike = -1, 0
             for at in range(starts[b], starts[b + 1]):
-                other, origin = corners[at] >> 2, corners[at] & 3
+                other, origin = corners[at] // 3, corners[at] % 3
                 if faces[other, origin + 1 if origin < 2 else 0] == a:
                     alike += found >= 0
                     found = other

@@ -29,6 +29,7 @@ from slrig.meshing.boundary_rules import (
     remove,
     side_towards,
 )
+from slrig.meshing.topology import kept_faces
 from slrig.model import FloatArray, IntArray
 
 PSI = math.pi / 2  # the paper's ψ
@@ -125,7 +126,7 @@ def shrunk(
     removed = _shrink(points, faces, across, longest, alive)
     if not removed:
         return Shrunk(faces, across, 0)
-    kept, across = _kept(faces, across, alive)
+    kept, across = kept_faces(faces, across, alive)
     return Shrunk(kept, across, removed)
 
 
@@ -174,7 +175,7 @@ def smoothed(
     removed = len(faces) - int(np.count_nonzero(alive[: len(faces)]))
     if not removed and len(new_faces) == len(faces):
         return Smoothed(faces, across, np.zeros(len(faces), dtype=np.bool_), 0, rounds)
-    kept, across = _kept(new_faces, new_across, alive)
+    kept, across = kept_faces(new_faces, new_across, alive)
     added = np.zeros(len(kept), dtype=np.bool_)
     added[len(faces) - removed :] = True
     return Smoothed(kept, across, added, removed, rounds)
@@ -211,25 +212,6 @@ def _shrink(points: Any, faces: Any, adjacency: Any, longest_mm: Any, alive: Any
                 adjacency[behind, side] = -1
                 stack.append(np.int64(3 * behind + side))
     return removed
-
-
-@kernel
-def _kept(faces: Any, adjacency: Any, alive: Any) -> Any:
-    """The faces that are alive, in their order, and their neighbours in the new numbering."""
-    # Across a boundary lies face -1: the last number is its own.
-    number = np.full(len(faces) + 1, -1, dtype=np.int32)
-    count = 0
-    for face in range(len(faces)):
-        if alive[face]:
-            number[face] = count
-            count += 1
-    kept, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
-    for face in range(len(faces)):
-        if alive[face]:
-            for corner in range(3):
-                kept[number[face], corner] = faces[face, corner]
-                across[number[face], corner] = number[adjacency[face, corner]]
-    return kept, across
 
 
 def _smooth(

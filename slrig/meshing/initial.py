@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
-from slrig.meshing.normals import vertex_normals
 from slrig.meshing.runs import neighbouring_curves, whole_curves
 from slrig.meshing.strips import strip_neighbours, strips, to_drop
-from slrig.meshing.topology import component_sizes
+from slrig.meshing.topology import component_sizes, kept_faces
 from slrig.model import FloatArray, IntArray
 
 _BLOCK = 4096  # faces to a sum; the sums are added up in order, the same for any number of threads
@@ -22,13 +21,12 @@ _SMALLEST_COMPONENT = 100
 
 @dataclass(frozen=True, slots=True)
 class InitialMesh:
-    """faces : (F, 3) int32 into points_mm, the curves' points, counter-clockwise seen from the eye.
+    """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye.
     adjacency : (F, 3) int32, entry k is the face across the edge opposite corner k, -1 at a boundary.
     strip_triangles : Σ(I + J - 2), before dropping; the drops at edges and bridges overlap, dust is what they leave in
     specks of a few triangles.
     """
 
-    points_mm: FloatArray
     faces: IntArray
     adjacency: IntArray
     strip_pairs: int
@@ -37,11 +35,6 @@ class InitialMesh:
     dropped_at_bridges: int
     dropped_as_dust: int
     dropped_triangles: int
-
-    @property
-    def normals(self) -> NDArray[np.float32]:
-        """(n, 3) float32, NaN for points in no triangle; worked out each time it is asked for."""
-        return vertex_normals(self.points_mm, self.faces)
 
 
 def initial_mesh(
@@ -69,26 +62,25 @@ def initial_mesh(
         runs = whole_curves(neighbouring_curves(position_px, offsets, widest_step_px=widest_step_px), offsets)
     everything = strips(points_mm, runs)
     adjacency = strip_neighbours(everything, runs, len(points_mm))
-    drop = to_drop(
+    at_depth_edge, at_bridge = to_drop(
         points_mm, everything, bridge_after, sampling_mm, depth_edge_ratio=depth_edge_ratio, keep_holes=keep_holes
     )
-    connected = ~drop.any
+    connected = ~(at_depth_edge | at_bridge)
     kept = component_sizes(everything, connected) >= _SMALLEST_COMPONENT
     areas_mm2 = np.zeros(-(-len(everything) // _BLOCK))
     in_bands(_facing_areas, len(areas_mm2), np.ascontiguousarray(points_mm), everything, kept, eye_mm, areas_mm2)
-    count = int(np.count_nonzero(kept))
-    faces, across = np.zeros((count, 3), dtype=np.int32), np.zeros((count, 3), dtype=np.int32)
-    _gathered(everything, adjacency, kept, bool(areas_mm2.sum() < 0), faces, across)
+    faces, across = kept_faces(everything, adjacency, kept)
+    if areas_mm2.sum() < 0:
+        faces, across = np.ascontiguousarray(faces[:, ::-1]), np.ascontiguousarray(across[:, ::-1])
     return InitialMesh(
-        points_mm=points_mm,
         faces=faces,
         adjacency=across,
         strip_pairs=len(runs),
         strip_triangles=len(everything),
-        dropped_at_depth_edges=int(np.count_nonzero(drop.depth_edge)),
-        dropped_at_bridges=int(np.count_nonzero(drop.bridge)),
-        dropped_as_dust=int(np.count_nonzero(connected)) - count,
-        dropped_triangles=len(everything) - count,
+        dropped_at_depth_edges=int(np.count_nonzero(at_depth_edge)),
+        dropped_at_bridges=int(np.count_nonzero(at_bridge)),
+        dropped_as_dust=int(np.count_nonzero(connected)) - len(faces),
+        dropped_triangles=len(everything) - len(faces),
     )
 
 
@@ -108,21 +100,3 @@ def _facing_areas(first: int, last: int, points: Any, faces: Any, kept: Any, eye
             towards = x * (eye[0] - points[a, 0]) + y * (eye[1] - points[a, 1]) + z * (eye[2] - points[a, 2])
             total += np.sign(towards) * np.sqrt(x * x + y * y + z * z)
         areas[block] = total
-
-
-@kernel
-def _gathered(faces: Any, across: Any, kept: Any, turn_over: bool, to_faces: Any, to_across: Any) -> None:
-    """Copy the kept faces and who lies across their edges, under new numbers."""
-    # Across a boundary lies face -1: the last number is its own.
-    numbers = np.full(len(faces) + 1, -1, dtype=np.int32)
-    count = 0
-    for face in range(len(faces)):
-        if kept[face]:
-            numbers[face] = count
-            count += 1
-    for face in range(len(faces)):
-        if kept[face]:
-            for corner in range(3):
-                to = 2 - corner if turn_over else corner
-                to_faces[numbers[face], to] = faces[face, corner]
-                to_across[numbers[face], to] = numbers[across[face, corner]]

@@ -64,22 +64,22 @@ class SearchTree:
         Rays start at `origin`, (3,), and run along `directions`, (n, 3); both sides of a triangle count.
         Returns (n,) float64, infinite where a ray meets nothing.
         """
-        return np.asarray(self._walk(origin, directions, first_only=True)[0])
+        return self._ray_hits(origin, directions, first_only=True)[0]
 
     def crossing_counts(self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]]) -> IntArray:
         """How many triangles each ray of `first_hits` crosses, (n,) int32.
 
         A ray along an edge crosses both triangles there.
         """
-        return np.asarray(self._walk(origin, directions, first_only=False)[1])
+        return self._ray_hits(origin, directions, first_only=False)[1]
 
-    def _walk(
+    def _ray_hits(
         self, origin: NDArray[np.floating[Any]], directions: NDArray[np.floating[Any]], *, first_only: bool
     ) -> tuple[FloatArray, IntArray]:
         start = np.ascontiguousarray(origin, dtype=np.float64)
         along = np.ascontiguousarray(directions, dtype=np.float64)
-        reach, crossings = _ray_hits(start, along, self.corners_mm, self.boxes_mm, first_only)
-        return reach, crossings
+        found: tuple[FloatArray, IntArray] = _ray_hits(start, along, self.corners_mm, self.boxes_mm, first_only)
+        return found
 
 
 def _morton_codes(points: FloatArray) -> NDArray[np.uint64]:
@@ -89,20 +89,11 @@ def _morton_codes(points: FloatArray) -> NDArray[np.uint64]:
         return np.zeros(len(points), dtype=np.uint64)
     low = points[finite].min(axis=0)
     extent = max(float((points[finite].max(axis=0) - low).max()), 1e-300)
-    steps = np.where(finite[:, None], (points - low) * ((2**21 - 1) / extent), 0.0)
-    return np.asarray(_interleaved(steps.astype(np.uint64)))
-
-
-@kernel(in_every_scan=False)
-def _interleaved(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    codes = np.zeros(len(steps), dtype=np.uint64)
-    one = np.uint64(1)
-    for i in range(len(steps)):
-        code = np.uint64(0)
-        for bit in range(20, -1, -1):
-            for axis in range(3):
-                code = (code << one) | ((steps[i, axis] >> np.uint64(bit)) & one)
-        codes[i] = code
+    steps = np.where(finite[:, None], (points - low) * ((2**21 - 1) / extent), 0.0).astype(np.uint64)
+    codes = np.zeros(len(points), dtype=np.uint64)
+    for bit in range(21):
+        for axis in range(3):
+            codes |= (steps[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + 2 - axis)
     return codes
 
 

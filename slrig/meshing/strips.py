@@ -7,7 +7,6 @@ away by a second, recorded step: triangles across a depth edge and, on request, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,19 +15,6 @@ from numpy.typing import NDArray
 from slrig.kernels import in_bands, kernel
 from slrig.meshing.flips import prefers_flip
 from slrig.model import FloatArray, IntArray
-
-
-@dataclass(frozen=True, slots=True)
-class DroppedTriangles:
-    """Which triangles go, and why: (F,) bool each; a triangle may have both causes."""
-
-    depth_edge: NDArray[np.bool_]
-    bridge: NDArray[np.bool_]
-
-    @property
-    def any(self) -> NDArray[np.bool_]:
-        """(F,) bool: dropped for either cause."""
-        return self.depth_edge | self.bridge
 
 
 def strips(points_mm: FloatArray, runs: IntArray, /) -> IntArray:
@@ -68,12 +54,11 @@ def to_drop(
     *,
     depth_edge_ratio: float,
     keep_holes: bool,
-) -> DroppedTriangles:
-    """Find the triangles that do not belong to the surface.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The triangles that cross a depth edge, and those that use a bridge: (F,) bool each. A triangle may do both.
 
     sampling_mm : (n,) float64, the distance at which the rig samples a surface that faces it, at each point.
-    A triangle with an edge longer than depth_edge_ratio times that crosses a depth edge. With keep_holes, a triangle
-    that uses the step over a bridge goes too.
+    A triangle with an edge longer than depth_edge_ratio times that crosses a depth edge. Bridges count with keep_holes.
     """
     depth_edge = np.zeros(len(faces), dtype=np.bool_)
     bridge = np.zeros(len(faces), dtype=np.bool_)
@@ -81,7 +66,7 @@ def to_drop(
         _to_drop, len(faces), np.ascontiguousarray(points_mm), np.ascontiguousarray(faces), bridge_after, sampling_mm,
         depth_edge_ratio, keep_holes, depth_edge, bridge,
     )  # fmt: skip
-    return DroppedTriangles(depth_edge=depth_edge, bridge=bridge)
+    return depth_edge, bridge
 
 
 def _firsts(runs: IntArray) -> NDArray[np.int64]:
@@ -148,8 +133,7 @@ def _strip_neighbours(
 @kernel
 def _to_drop(
     first: int, last: int, points: Any, faces: Any, bridge_after: Any, sampling: Any, ratio: float,
-    keep_holes: bool, depth_edge: Any,
-    bridge: Any,
+    keep_holes: bool, depth_edge: Any, bridge: Any,
 ) -> None:  # fmt: skip
     for face in range(first, last):
         longest, allowed, over = 0.0, 0.0, False

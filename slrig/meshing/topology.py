@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.meshing.adjacency import in_groups
 from slrig.model import IntArray
 
 
@@ -38,24 +39,13 @@ class TopologyCounts:
     euler_characteristic: int
 
 
-class CompactIndex(NamedTuple):
-    """How to leave out the vertices that no face uses.
-
-    kept : (K,) int32, old indices of the vertices that stay, rising: `vertices_mm[kept]`.
-    faces : (F, 3) int32, the faces in the new numbering.
-    """
-
-    kept: IntArray
-    faces: IntArray
-
-
 def duplicate_face_count(faces: IntArray) -> int:
     """Number of faces whose three vertices, in any order, an earlier face has already."""
     if not len(faces):
         return 0
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
-    return sum(in_bands(_duplicates, bound, faces, *_faces_by_lowest_vertex(faces, bound)))
+    return sum(in_bands(_duplicates, bound, faces, *in_groups(faces.min(axis=1), bound)))
 
 
 def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
@@ -70,7 +60,9 @@ def component_sizes(faces: IntArray, among: NDArray[np.bool_]) -> IntArray:
     among : (F,) bool. 0 for the others. Faces that share a vertex belong together.
     """
     faces = np.ascontiguousarray(faces)
-    return np.asarray(_component_sizes(faces, among, _joined(faces, among, _vertex_bound(faces))))
+    piece = _joined(faces, among, _vertex_bound(faces))[faces[:, 0]]
+    sizes = np.bincount(piece[among], minlength=_vertex_bound(faces)).astype(np.int32)
+    return np.where(among, sizes[piece], np.int32(0))
 
 
 def topology_counts(faces: IntArray) -> TopologyCounts:
@@ -78,9 +70,12 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
     border = np.zeros(bound, dtype=np.bool_)
-    counted = in_bands(_edge_counts, bound, faces, *_halves_by_lower_vertex(faces, bound), border)
+    half_edges = in_groups(np.minimum(faces, faces[:, [1, 2, 0]]).ravel(), bound)
+    counted = in_bands(_edge_counts, bound, faces, *half_edges, border)
     edges, boundary, nonmanifold, misoriented = (sum(each) for each in zip(*counted, strict=True))
-    vertices, components = _used_and_roots(faces, _joined(faces, np.ones(len(faces), dtype=np.bool_), bound))
+    used = used_vertices(faces, bound)
+    vertices = int(np.count_nonzero(used))
+    roots = _joined(faces, np.ones(len(faces), dtype=np.bool_), bound)
     return TopologyCounts(
         vertices=vertices,
         edges=edges,
@@ -90,44 +85,32 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
         misoriented_edges=misoriented,
         duplicate_faces=duplicate_face_count(faces),
         degenerate_faces=int(degenerate_faces(faces).sum()),
-        components=components,
+        components=int(np.count_nonzero(used & (roots == np.arange(bound)))),
         euler_characteristic=vertices - edges + len(faces),
     )
 
 
-def compact(faces: IntArray, *, vertex_count: int) -> CompactIndex:
-    """How to leave out the vertices that no face uses, keeping the order of the others."""
-    faces = np.ascontiguousarray(faces)
-    renumbered, kept = _renumbered(faces, vertex_count)
-    return CompactIndex(kept, renumbered[faces])
+def used_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
+    """(vertex_count,) bool: the vertices that a face uses."""
+    used = np.zeros(vertex_count, dtype=np.bool_)
+    used[faces] = True
+    return used
+
+
+def kept_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+    """The faces that stay, (F,) bool, in their order, and their neighbours in the new numbering: (K, 3) int32 each."""
+    # Across a boundary lies face -1: the last number is its own.
+    numbers = np.append(np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1)), np.int32(-1))
+    return faces[kept], numbers[adjacency[kept]]
 
 
 def _vertex_bound(faces: IntArray) -> int:
     return int(faces.max()) + 1 if faces.size else 0
 
 
-@kernel
-def _halves_by_lower_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArray, IntArray]:
-    """Where each vertex's half-edges begin; half-edges, 4 * face + first corner, sorted by the lower of their ends."""
-    starts = np.zeros(vertex_bound + 2, dtype=np.int32)
-    for face in range(len(faces)):
-        for corner in range(3):
-            starts[min(faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]) + 2] += 1
-    for vertex in range(vertex_bound):
-        starts[vertex + 2] += starts[vertex + 1]
-    halves = np.zeros(faces.size, dtype=np.int32)
-    for face in range(len(faces)):
-        for corner in range(3):
-            # A vertex's start stands one place to the right until its half-edges have moved it on to its end.
-            place = min(faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]) + 1
-            halves[starts[place]] = 4 * face + corner
-            starts[place] += 1
-    return starts, halves
-
-
 @kernel_part(inline="always")
 def _far_end(faces: IntArray, half: int, vertex: int) -> int:
-    face, corner = half >> 2, half & 3
+    face, corner = half // 3, half % 3
     return int(faces[face, corner] + faces[face, corner + 1 if corner < 2 else 0] - vertex)
 
 
@@ -144,7 +127,7 @@ def _edge_counts(
                 if _far_end(faces, halves[each], vertex) == other:
                     known |= each < at
                     uses += 1
-                    outward += faces[halves[each] >> 2, halves[each] & 3] == vertex
+                    outward += faces[halves[each] // 3, halves[each] % 3] == vertex
             if known:
                 continue
             edges += 1
@@ -154,23 +137,6 @@ def _edge_counts(
             nonmanifold += uses > 2
             misoriented += (outward > 1) + (uses - outward > 1)
     return edges, boundary, nonmanifold, misoriented
-
-
-@kernel
-def _faces_by_lowest_vertex(faces: IntArray, vertex_bound: int) -> tuple[IntArray, IntArray]:
-    """Where the faces of each lowest vertex begin, and the faces in that order."""
-    starts = np.zeros(vertex_bound + 2, dtype=np.int32)
-    for face in range(len(faces)):
-        starts[min(faces[face, 0], faces[face, 1], faces[face, 2]) + 2] += 1
-    for vertex in range(vertex_bound):
-        starts[vertex + 2] += starts[vertex + 1]
-    order = np.zeros(len(faces), dtype=np.int32)
-    for face in range(len(faces)):
-        # A start stands one place to the right until its faces have moved it on to its end.
-        place = min(faces[face, 0], faces[face, 1], faces[face, 2]) + 1
-        order[starts[place]] = face
-        starts[place] += 1
-    return starts, order
 
 
 @kernel
@@ -186,39 +152,6 @@ def _duplicates(first: int, last: int, faces: IntArray, starts: IntArray, order:
                     count += 1
                     break
     return count
-
-
-@kernel
-def _used_and_roots(faces: IntArray, roots: IntArray) -> tuple[int, int]:
-    """Number of vertices that a face uses, and of those among them that stand for their piece."""
-    used = np.zeros(len(roots), dtype=np.bool_)
-    for face in range(len(faces)):
-        for corner in range(3):
-            used[faces[face, corner]] = True
-    vertices, pieces = 0, 0
-    for vertex in range(len(roots)):
-        vertices += used[vertex]
-        pieces += used[vertex] and roots[vertex] == vertex
-    return vertices, pieces
-
-
-@kernel
-def _renumbered(faces: IntArray, vertex_count: int) -> tuple[IntArray, IntArray]:
-    """The new number of each vertex, and the old number of each that stays."""
-    used = np.zeros(vertex_count, dtype=np.bool_)
-    for face in range(len(faces)):
-        for corner in range(3):
-            used[faces[face, corner]] = True
-    renumbered = np.zeros(vertex_count, dtype=np.int32)
-    count = 0
-    for vertex in range(vertex_count):
-        renumbered[vertex] = count
-        count += used[vertex]
-    kept = np.zeros(count, dtype=np.int32)
-    for vertex in range(vertex_count):
-        if used[vertex]:
-            kept[renumbered[vertex]] = vertex
-    return renumbered, kept
 
 
 @kernel_part
@@ -250,16 +183,3 @@ def _joined(faces: IntArray, among: Any, vertex_bound: int) -> IntArray:
     for vertex in range(vertex_bound):
         parents[vertex] = parents[parents[vertex]]
     return parents
-
-
-@kernel
-def _component_sizes(faces: IntArray, among: Any, roots: IntArray) -> IntArray:
-    counts = np.zeros(len(roots), dtype=np.int32)
-    for face in range(len(faces)):
-        if among[face]:
-            counts[roots[faces[face, 0]]] += 1
-    sizes = np.zeros(len(faces), dtype=np.int32)
-    for face in range(len(faces)):
-        if among[face]:
-            sizes[face] = counts[roots[faces[face, 0]]]
-    return sizes

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.kernels import in_bands, kernel
-from slrig.meshing.topology import compact
+from slrig.meshing.topology import used_vertices
 from slrig.model import FloatArray, IntArray, Mesh, Pixels
 
 
@@ -21,7 +18,9 @@ def brightness(
     """
     grey = np.zeros(len(pixels_px), dtype=np.uint8)
     for index, (white, full_scale) in enumerate(zip(whites, full_scales, strict=True)):
-        in_bands(_brightness, len(grey), pixels_px, camera, index, white, 255 / full_scale, grey)
+        mine = camera == index
+        columns, rows = np.rint(pixels_px[mine]).astype(np.intp).T
+        grey[mine] = np.clip(np.rint(white[rows, columns] * (255 / full_scale)), 0, 255)
     return grey
 
 
@@ -35,46 +34,19 @@ def compact_mesh(
     position_px: FloatArray,
     /,
 ) -> Mesh:
-    """The mesh of the points that a face uses.
+    """The mesh of the points that a face uses, in their order.
 
     faces : (F, 3) int32 into points_mm (n, 3) float64; normals (n, 3), grey (n,), sigma_mm (n,) of the points.
     offsets : (c + 1,) int32, curve i holds points offsets[i]:offsets[i + 1], all points belong to one;
     position_px : (c,) float64, projector column of each curve.
     """
-    index = compact(faces, vertex_count=len(points_mm))
-    count = len(index.kept)
-    vertices, turned = np.zeros((count, 3), dtype=np.float32), np.zeros((count, 3), dtype=np.float32)
-    shade, sigma = np.zeros(count, dtype=np.uint8), np.zeros(count, dtype=np.float32)
-    stripe = np.zeros(count, dtype=np.int32)
-    in_bands(
-        _gather, len(position_px), index.kept, np.searchsorted(index.kept, offsets),
-        np.floor(position_px).astype(np.int32),
-        points_mm, normals, grey, sigma_mm, vertices, turned, shade, sigma, stripe,
-    )  # fmt: skip
+    used = used_vertices(faces, len(points_mm))
+    numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
     return Mesh(
-        vertices_mm=vertices, faces=index.faces, normals=turned, grey=shade, sigma_mm=sigma, stripe=stripe
-    )  # fmt: skip
-
-
-@kernel
-def _brightness(
-    first: int, last: int, pixels: Any, camera: Any, index: int, white: Any, factor: float, grey: Any
-) -> None:
-    for point in range(first, last):
-        if camera[point] == index:
-            column, row = int(np.rint(pixels[point, 0])), int(np.rint(pixels[point, 1]))
-            grey[point] = int(min(max(np.rint(white[row, column] * factor), 0.0), 255.0))
-
-
-@kernel
-def _gather(
-    first: int, last: int, kept: Any, firsts: Any, columns: Any, points: Any, normals: Any, grey: Any, sigma: Any,
-    to_points: Any, to_normals: Any, to_grey: Any, to_sigma: Any, to_stripe: Any,
-) -> None:  # fmt: skip
-    for curve in range(first, last):
-        for to in range(firsts[curve], firsts[curve + 1]):
-            point = kept[to]
-            for axis in range(3):
-                to_points[to, axis] = points[point, axis]
-                to_normals[to, axis] = normals[point, axis]
-            to_grey[to], to_sigma[to], to_stripe[to] = grey[point], sigma[point], columns[curve]
+        vertices_mm=points_mm[used].astype(np.float32),
+        faces=numbers[faces],
+        normals=normals[used],
+        grey=grey[used],
+        sigma_mm=sigma_mm[used].astype(np.float32),
+        stripe=np.repeat(np.floor(position_px).astype(np.int32), np.diff(offsets))[used],
+    )

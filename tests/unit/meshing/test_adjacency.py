@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slrig.meshing.adjacency import incidence, neighbours
+from slrig.meshing.adjacency import in_groups, neighbours
 from slrig.model import IntArray
 
 
@@ -80,11 +80,11 @@ def test_what_is_no_wound_manifold_is_refused(faces: IntArray, said: str) -> Non
         neighbours(faces, vertex_count=5)
 
 
-def test_incidence_lists_corners_by_vertex() -> None:
+def test_groups_list_corners_by_vertex() -> None:
     faces = patch(6, 7, 3)
-    starts, corners = incidence(faces, vertex_count=50)
+    starts, corners = in_groups(faces.ravel(), 50)
     for vertex in range(50):
-        wanted = [4 * i + k for i, face in enumerate(faces.tolist()) for k in range(3) if face[k] == vertex]
+        wanted = [3 * i + k for i, face in enumerate(faces.tolist()) for k in range(3) if face[k] == vertex]
         assert corners[starts[vertex] : starts[vertex + 1]].tolist() == wanted
     assert starts[-1] == len(corners) == faces.size
 

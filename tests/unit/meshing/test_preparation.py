@@ -12,8 +12,8 @@ import pytest
 from slrig.kernels import _entries
 from slrig.meshing import preparation
 
-_LATER = {"slrig.meshing.rasteriser", "slrig.meshing.vertices"}
-"""Of pictures and of the arrays that are written."""
+_LATER = "slrig.meshing.rasteriser"
+"""Of pictures."""
 _SIGNATURES = """
 from {module} import {name}
 from tests.unit.meshing.test_preparation import compiled
@@ -27,7 +27,7 @@ def compiled() -> set[str]:
     return {
         f"{each.py_func.__module__}.{each.py_func.__qualname__}{types}"
         for each, _ in _entries
-        if each.py_func.__module__.startswith("slrig.meshing.") and each.py_func.__module__ not in _LATER
+        if each.py_func.__module__.startswith("slrig.meshing.") and each.py_func.__module__ != _LATER
         for types in each.signatures
     }
 
@@ -43,8 +43,16 @@ def test_it_compiles_what_a_scan_needs() -> None:
     beside = _compiled_by("slrig.meshing.preparation", "mesh_sample")
     needed = _compiled_by("slrig.scan.reconstruct", "warm_kernels", "lambda _: None")
     assert len(beside) > 20
-    # Vertices are numbered anew only for what is written.
-    assert {each for each in needed - beside if "._renumbered(" not in each} == set()
+    assert needed - beside == set()
+
+
+@pytest.mark.slow
+def test_it_ends_in_peace_while_its_input_is_open() -> None:
+    command = [sys.executable, "-m", preparation.__name__]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:  # noqa: S603 - our own
+        assert process.wait(300) == 0
+        assert process.stderr is not None
+        assert process.stderr.read() == b""
 
 
 @pytest.mark.slow

@@ -155,11 +155,11 @@ def dropped(
 ) -> tuple[list[bool], list[bool], list[bool]]:  # fmt: skip
     none = np.zeros(len(points), dtype=np.bool_)
     spacing = np.ones(len(points)) if sampling is None else sampling
-    drop = to_drop(
+    depth_edge, bridge = to_drop(
         points, faces, none if bridge_after is None else bridge_after, spacing,
         depth_edge_ratio=ratio, keep_holes=keep_holes,
     )  # fmt: skip
-    return drop.depth_edge.tolist(), drop.bridge.tolist(), drop.any.tolist()
+    return depth_edge.tolist(), bridge.tolist(), (depth_edge | bridge).tolist()
 
 
 TRIANGLES = np.array([[0, 1, 2], [0, 3, 4]], dtype=np.int32)

@@ -8,13 +8,15 @@ import numba
 import numpy as np
 import pytest
 
+from slrig.meshing.adjacency import neighbours
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.topology import (
-    compact,
     component_sizes,
     degenerate_faces,
     duplicate_face_count,
+    kept_faces,
     topology_counts,
+    used_vertices,
 )
 from slrig.model import FloatArray, IntArray
 from tests.unit.meshing.plain import boundary_edges
@@ -129,19 +131,17 @@ def test_sizes_of_components_agree_with_flooding() -> None:
     assert component_sizes(faces[:0], among[:0]).shape == (0,)
 
 
-def test_compact_agrees_with_plain_numpy() -> None:
-    faces = np.random.default_rng(8).integers(0, 500, (100, 3)).astype(np.int32)
-    found = compact(faces, vertex_count=600)
-    kept, renumbered = np.unique(faces, return_inverse=True)
-    assert found.kept.tolist() == kept.tolist()
-    assert found.faces.tolist() == renumbered.reshape(-1, 3).tolist()
+def test_kept_faces_keep_their_neighbours() -> None:
+    faces = grid(6, 9)
+    kept = np.asarray(np.random.default_rng(8).random(len(faces)) < 0.6)
+    rest, across = kept_faces(faces, neighbours(faces, vertex_count=54), kept)
+    np.testing.assert_array_equal(rest, faces[kept])
+    np.testing.assert_array_equal(across, neighbours(rest, vertex_count=54))
+    assert rest.dtype == across.dtype == np.int32
 
 
-def test_compact_drops_what_no_face_uses_and_keeps_order() -> None:
-    kept = compact(faces_of((7, 2, 4), (4, 2, 9)), vertex_count=11)
-    assert kept.kept.tolist() == [2, 4, 7, 9]
-    assert kept.faces.tolist() == [[2, 0, 1], [1, 0, 3]]
-    assert kept.faces.dtype == np.int32
+def test_used_vertices_are_those_of_faces() -> None:
+    assert np.flatnonzero(used_vertices(faces_of((7, 2, 4), (4, 2, 9)), 11)).tolist() == [2, 4, 7, 9]
 
 
 def test_no_face_is_no_fault() -> None:
@@ -149,7 +149,7 @@ def test_no_face_is_no_fault() -> None:
     counts = topology_counts(none)
     assert counts.vertices == counts.edges == counts.components == counts.euler_characteristic == 0
     assert boundary_edges(none).shape == (0, 2)
-    assert compact(none, vertex_count=4).kept.shape == (0,)
+    assert not used_vertices(none, 4).any()
     assert np.isnan(vertex_normals(np.zeros((4, 3)), none)).all()
 
 
