@@ -309,9 +309,7 @@ def _with_fewer_bits(
     bits[~lost] = 0
     cells = len(tables.cell_position)
     fewer = decode(frames, noise, tables.index_of_word, cells, limits.decoding, unresolved=bits)
-    code = CodeMap(*(np.where(lost, one, other) for one, other in (
-        (fewer.lowest, code.lowest), (fewer.highest, code.highest), (fewer.refusal, code.refusal),
-    )))  # fmt: skip
+    code = CodeMap(*(np.where(lost, one, other) for one, other in zip(fewer, code, strict=True)))
     return replace(coded, code=fewer, unresolved=bits), code
 
 
@@ -319,9 +317,7 @@ def _outside(points: LinePoints, lost: NDArray[np.bool_]) -> LinePoints:
     """The points of one frame where lines are not lost."""
     columns, rows = np.rint(points.points_px).astype(np.intp).T
     kept = ~lost[rows, columns]
-    return LinePoints(
-        points.points_px[kept], points.normals[kept], points.strength[kept], points.strong[kept], points.sigma_px[kept]
-    )
+    return LinePoints(*(each[kept] for each in points))
 
 
 def _normalised_line(coded: _Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -9,7 +9,7 @@ anywhere else the interval is wide and the pixel is refused.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +44,7 @@ class DecodingLimits:
     widest_interval: int = 3
 
 
-@dataclass(frozen=True, slots=True)
-class CodeMap:
+class CodeMap(NamedTuple):
     """For each camera pixel the interval of code cells that it may show, both ends included.
 
     lowest, highest : (H, W) int32, -1 where refused; refusal : (H, W) uint8, `Refusal`.

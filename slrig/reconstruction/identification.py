@@ -7,7 +7,7 @@ column in the frame that the point was found in. A chain is cut where the column
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -58,21 +58,14 @@ def identify(
     count = len(stripes.points_px)
     shown, cause = np.full(count, np.nan), np.zeros(count, dtype=np.uint8)
     in_bands(
-        _position_kernel, len(stripes), stripes.offsets, stripes.frame, stripes.points_px, code.lowest, code.highest,
-        position_of, near_shadow, near_step, shown, cause,
+        _position_kernel, len(stripes), stripes.offsets, stripes.frame, stripes.points_px, code, position_of,
+        near_shadow, near_step, shown, cause,
     )  # fmt: skip
     order, offsets, chains, position = _identify_kernel(
         stripes.offsets, stripes.points_px, shown, cause, shortest_points, refusal
     )
-    points, normals, sigma_px = gathered(order, stripes.points_px, stripes.normals, stripes.sigma_px)
-    cut = Stripes(
-        offsets=offsets,
-        frame=stripes.frame[chains],
-        points_px=points,
-        normals=normals,
-        sigma_px=sigma_px,
-    )
-    return CodedStripes(cut, position), refusal
+    cut = gathered(order, stripes.points_px, stripes.normals, stripes.sigma_px)
+    return CodedStripes(Stripes(offsets, stripes.frame[chains], *cut), position), refusal
 
 
 def with_refused_points(
@@ -95,28 +88,28 @@ def with_refused_points(
     for index, points in enumerate(found):
         cause = np.zeros(len(points.points_px), dtype=np.uint8)
         in_bands(
-            _cause_kernel, len(cause), points.points_px, position_of[index], code.lowest, code.highest,
-            frames.lines, clipped_at, position,
+            _cause_kernel, len(cause), points.points_px, position_of[index], code, frames.lines, clipped_at, position,
             near_shadow, near_step, cause,
         )  # fmt: skip
         # One after another: the last of the points that share a pixel stands.
         refused = np.flatnonzero(cause)
         columns, rows = np.rint(points.points_px[refused]).astype(np.int32).T
         refusal[rows, columns] = cause[refused]
-    return replace(code, refusal=refusal)
+    return code._replace(refusal=refusal)
 
 
 @kernel
 def _cause_kernel(
-    first: int, last: int, points: Any, position_of: Any, lowest: Any, highest: Any, lines: Any, clipped_at: float,
+    first: int, last: int, points: Any, position_of: Any, code: Any, lines: Any, clipped_at: float,
     position: Any, near_shadow: Any, near_step: Any, cause: Any,
 ) -> None:  # fmt: skip
     """Fill in why each point of a frame is refused, 0 where it is not."""
     for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
-        if lowest[y, x] < 0:
+        if code.lowest[y, x] < 0:
             continue
-        cause[i] = _cause(position_of[lowest[y, x]], position_of[highest[y, x]], near_shadow[y, x], near_step[y, x])
+        low, high = position_of[code.lowest[y, x]], position_of[code.highest[y, x]]
+        cause[i] = _cause(low, high, near_shadow[y, x], near_step[y, x])
         if not cause[i] and np.isnan(position[y, x]):
             for k in range(len(lines)):
                 if lines[k, y, x] >= clipped_at:
@@ -139,17 +132,16 @@ def _cause(low: float, high: float, near_shadow: bool, near_step: bool) -> int:
 
 @kernel
 def _position_kernel(
-    first: int, last: int, offsets: Any, frame: Any, points: Any, lowest: Any, highest: Any, position_of: Any,
+    first: int, last: int, offsets: Any, frame: Any, points: Any, code: Any, position_of: Any,
     near_shadow: Any, near_step: Any, position: Any, cause: Any,
 ) -> None:  # fmt: skip
     """Fill in the position that each point shows, NaN where it is refused, and the cause of that."""
     for s in range(first, last):
         for i in range(offsets[s], offsets[s + 1]):
             x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
-            if lowest[y, x] < 0:
+            if code.lowest[y, x] < 0:
                 continue
-            low = position_of[frame[s], lowest[y, x]]
-            high = position_of[frame[s], highest[y, x]]
+            low, high = position_of[frame[s], code.lowest[y, x]], position_of[frame[s], code.highest[y, x]]
             cause[i] = _cause(low, high, near_shadow[y, x], near_step[y, x])
             if not cause[i]:
                 position[i] = low

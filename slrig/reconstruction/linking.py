@@ -7,8 +7,7 @@ so on until one curve is left. Joins are remembered as bridges.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,7 @@ from slrig.reconstruction.stripes import gathered
 _END_POINTS = 10  # the paper's r, for which it gives no number
 
 
-@dataclass(frozen=True, slots=True)
-class StripeEnsemble:
+class StripeEnsemble(NamedTuple):
     """One ordered curve per code, by rising position. Curve i holds the points offsets[i]:offsets[i + 1].
 
     offsets : (c + 1,) int32; position_px : (c,) float64; points_px, normals : (n, 2) float64; sigma_px : (n,) float64;

@@ -7,8 +7,7 @@ Only the first harmonic of the light is used: neither the stripe's shape nor the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,8 +21,7 @@ from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.surface_fit import stencils
 
 
-@dataclass(frozen=True, slots=True)
-class PositionMap:
+class PositionMap(NamedTuple):
     """The projector position of one axis at every pixel.
 
     position : (H, W) float32, px, NaN where refused; sigma : (H, W) float32, its standard deviation from noise, px,
@@ -54,7 +52,7 @@ def position_map(
     # An interval of more than half a period may hold the phase twice, and does not tell which.
     widest_px = 0.5 * patterns[0].period_px if phase else np.inf
     middle = np.full(code.lowest.shape, np.nan, dtype=np.float32)
-    in_bands(_middle_kernel, len(middle), code.lowest, code.highest, code.refusal, cell_position, widest_px, middle)
+    in_bands(_middle_kernel, len(middle), code, cell_position, widest_px, middle)
     if not phase:
         return PositionMap(middle, np.full_like(middle, np.nan))
     period = patterns[0].period_px
@@ -77,14 +75,12 @@ def _phases(lines: NDArray[np.float32], *given: Any) -> tuple[NDArray[np.float32
 
 
 @kernel
-def _middle_kernel(
-    first: int, last: int, lowest: Any, highest: Any, refusal: Any, cell_position: Any, widest: float, out: Any
-) -> None:
+def _middle_kernel(first: int, last: int, code: Any, cell_position: Any, widest: float, out: Any) -> None:
     """Fill in the middle of each pixel's code interval, px, where it is neither refused nor too wide."""
     for y in range(first, last):
-        for x in range(lowest.shape[1]):
-            if refusal[y, x] == 0:
-                low, high = cell_position[lowest[y, x]], cell_position[highest[y, x]]
+        for x in range(out.shape[1]):
+            if code.refusal[y, x] == 0:
+                low, high = cell_position[code.lowest[y, x]], cell_position[code.highest[y, x]]
                 if high - low <= widest:
                     out[y, x] = 0.5 * (low + high)
 
@@ -137,8 +133,13 @@ def _add_variance(line: Any, cosine: float, sine: float, read: float, slope: flo
         cc[x] += (read + slope * max(line[x], 0.0)) * (cosine * cosine)
 
 
-FittedPoints = tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]
-"""What `fit_kernel` fills in: points (n, 2), normals (n, 2) along the gradient, sigma_px (n,), found (n,) bool."""
+class FittedPoints(NamedTuple):
+    """What `fit_kernel` fills in: points (n, 2), normals (n, 2) along the gradient, sigma_px (n,), found (n,) bool."""
+
+    points: FloatArray
+    normals: FloatArray
+    sigma_px: FloatArray
+    found: NDArray[np.bool_]
 
 
 def windows(seen: PositionMap, usable: NDArray[np.bool_]) -> tuple[Any, ...]:
@@ -150,4 +151,4 @@ def windows(seen: PositionMap, usable: NDArray[np.bool_]) -> tuple[Any, ...]:
 
 def no_points(count: int) -> FittedPoints:
     """Room for what `fit_kernel` fills in."""
-    return np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), np.zeros(count, dtype=np.bool_)
+    return FittedPoints(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), np.zeros(count, dtype=np.bool_))

@@ -40,8 +40,7 @@ def _crossings(
     position_of: FloatArray,
     started: IntArray,
     landed: NDArray[np.uint8],
-    moved: FloatArray,
-    normals: FloatArray,
+    fitted: FittedPoints,
     targets: FloatArray,
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Where lines cross pixels, less those crossings from which a fit would surely land at a pixel that has its point.
@@ -58,9 +57,7 @@ def _crossings(
     # All shifts are shown: line n of them all, counted across the projector, is at first + n and in frame n mod frames.
     frame = int(np.flatnonzero(np.isfinite(position_of).any(axis=1))[0])
     first = float(shown[0]) - frame
-    given = (
-        seen.position, usable, code.lowest, code.highest, by_cell, first, started, landed, moved, normals, targets,
-    )  # fmt: skip
+    given = seen.position, usable, code, by_cell, first, started, landed, fitted, targets
     counts = np.zeros((rows, frames), dtype=np.int64)
     crossed = np.zeros(usable.shape, dtype=np.bool_)
     nowhere = np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0)
@@ -74,14 +71,15 @@ def _crossings(
 
 @kernel
 def _crossing_kernel(
-    begin: int, end: int, position: Any, usable: Any, lowest: Any, highest: Any, by_cell: Any, first: float,
-    started: Any, landed: Any, moved: Any, normals: Any, begun_targets: Any,
+    begin: int, end: int, position: Any, usable: Any, code: Any, by_cell: Any, first: float,
+    started: Any, landed: Any, fitted: Any, begun_targets: Any,
     crossed: Any, place: Any, fill: bool, frame: Any, starts: Any, targets: Any,
 ) -> None:  # fmt: skip
     """Count the crossings of each row and frame in `place`, and note the pixels in `crossed`; or put them where `place`
     says that they begin.
     """
     rows, columns = position.shape
+    moved, normals = fitted.points, fitted.normals
     frames = by_cell.shape[1]
     for y in range(max(begin, 1), min(end, rows - 1)):
         for x in range(1, columns - 1):
@@ -94,7 +92,7 @@ def _crossing_kernel(
             if not squared > LEAST_GRADIENT * LEAST_GRADIENT:
                 continue
             reach = _CROSSING_PX * (abs(gx) + abs(gy)) + 1e-6
-            low_cell, high_cell = lowest[y, x], highest[y, x]
+            low_cell, high_cell = code.lowest[y, x], code.highest[y, x]
             nearest = int(np.ceil(here - reach - first))
             for line in range(nearest, int(np.floor(here + reach - first)) + 1):
                 k = line % frames
@@ -169,24 +167,21 @@ def refined(
     given = windows(seen, usable)
     clear = cv2.erode(usable.view(np.uint8), np.ones((7, 7), dtype=np.uint8), borderValue=0)
     old = no_points(count)
-    moved, normals, _, good = old
     targets, away = np.zeros(count), np.zeros(count)
     started, landed = _nothing_taken(len(found), usable.shape)
     for index, (points, part) in enumerate(zip(found, parts, strict=True)):
         starts = np.ascontiguousarray(points.points_px)
-        in_bands(_target_kernel, len(starts), starts, code.lowest, code.highest, position_of[index], targets[part])
-        fitted = tuple(each[part] for each in old)
-        in_bands(fit_kernel, len(starts), *given, starts, targets[part], *fitted, rows_at_least=POINTS)
+        in_bands(_target_kernel, len(starts), starts, code, position_of[index], targets[part])
+        fitted = FittedPoints(*(each[part] for each in old))
+        in_bands(fit_kernel, len(starts), *given, starts, targets[part], fitted, rows_at_least=POINTS)
         own = np.ascontiguousarray(points.sigma_px)
-        in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, *fitted, away[part])
-        _taken_kernel(starts, moved[part], good[part], part.start, index % _LINES_KEPT, started, landed[index])
-    disagreement = np.array([_sure_median(_drawn(away[p], good[p])) for p in parts])
-    frame, missed_starts, missed_targets = _crossings(
-        seen, usable, code, position_of, started, landed, moved, normals, targets
-    )
+        in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away[part])
+        _taken_kernel(starts, fitted.points, fitted.found, part.start, index % _LINES_KEPT, started, landed[index])
+    disagreement = np.array([_sure_median(_drawn(away[p], old.found[p])) for p in parts])
+    frame, *crossings = _crossings(seen, usable, code, position_of, started, landed, old, targets)
     missed = no_points(len(frame))
-    in_bands(fit_kernel, len(frame), *given, missed_starts, missed_targets, *missed, rows_at_least=POINTS)
-    in_bands(_new_kernel, len(frame), frame, coarsest_px, landed, missed[0], missed[2], missed[3])
+    in_bands(fit_kernel, len(frame), *given, *crossings, missed, rows_at_least=POINTS)
+    in_bands(_new_kernel, len(frame), frame, coarsest_px, landed, missed)
     new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
     new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
     pairs = zip(found, parts, new_parts, strict=True)
@@ -195,7 +190,7 @@ def refined(
 
 def _joined(points: LinePoints, old: FittedPoints, part: slice, missed: FittedPoints, more: slice) -> LinePoints:
     """The good points of one frame: those that the filter found, and those that it missed."""
-    kept, added = old[3][part], missed[3][more]
+    kept, added = old.found[part], missed.found[more]
     first, count = int(np.count_nonzero(kept)), int(np.count_nonzero(added))
     out = np.zeros((first + count, 2)), np.zeros((first + count, 2)), np.zeros(first + count)
     strength, strong = np.zeros(first + count), np.zeros(first + count, dtype=np.bool_)
@@ -229,17 +224,7 @@ def _sure_median(away: FloatArray) -> float:
 
 @kernel
 def _settle_kernel(
-    first: int,
-    last: int,
-    starts: Any,
-    own_sigma: Any,
-    clear: Any,
-    coarsest: float,
-    moved: Any,
-    normals: Any,
-    sigma: Any,
-    good: Any,
-    away: Any,
+    first: int, last: int, starts: Any, own_sigma: Any, clear: Any, coarsest: float, fitted: Any, away: Any
 ) -> None:
     """Give each point what its own frame knows of it, and put how far the other frames moved it into `away`.
 
@@ -247,6 +232,7 @@ def _settle_kernel(
     own frame may know better: its part in the mean is its share of the inverse variance. A filter is trusted clear of
     borders only, and where both agree.
     """
+    moved, normals, sigma, good = fitted
     for i in range(first, last):
         good[i] = good[i] and sigma[i] < coarsest
         x, y = starts[i, 0], starts[i, 1]
@@ -263,16 +249,14 @@ def _settle_kernel(
 
 
 @kernel
-def _target_kernel(
-    first: int, last: int, points: Any, lowest: Any, highest: Any, position_of: Any, targets: Any
-) -> None:
+def _target_kernel(first: int, last: int, points: Any, code: Any, position_of: Any, targets: Any) -> None:
     """The position of the line that each point lies on, NaN where its pixel may mean two. position_of : (cells,)."""
     for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         targets[i] = np.nan
-        if lowest[y, x] >= 0:
-            low = position_of[lowest[y, x]]
-            if low == position_of[highest[y, x]]:
+        if code.lowest[y, x] >= 0:
+            low = position_of[code.lowest[y, x]]
+            if low == position_of[code.highest[y, x]]:
                 targets[i] = low
 
 
@@ -291,10 +275,9 @@ def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, slot: int, sta
 
 
 @kernel
-def _new_kernel(
-    first: int, last: int, frame: Any, coarsest: float, landed: Any, points: Any, sigma: Any, good: Any
-) -> None:
+def _new_kernel(first: int, last: int, frame: Any, coarsest: float, landed: Any, fitted: Any) -> None:
     """Leave good only points that are fine enough and land where their line has none."""
+    points, _, sigma, good = fitted
     for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         good[i] = good[i] and sigma[i] < coarsest and not landed[frame[i], y, x]

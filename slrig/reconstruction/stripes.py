@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -57,8 +58,7 @@ class Stripes:
         return len(self.offsets) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class LinePoints:
+class LinePoints(NamedTuple):
     """Sub-pixel points of one line or bit frame, not yet linked.
 
     points_px, normals, sigma_px : as in `Stripes`; strength : (n,) float64, the filter's response;
@@ -78,15 +78,8 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
     shape : (rows, columns) of the image.
     """
     borders = np.cumsum([0, *(len(each.points_px) for each in frames)], dtype=np.int64)
-    points, normals = (
-        np.concatenate([np.zeros((0, 2)), *values])
-        for values in ([each.points_px for each in frames], [each.normals for each in frames])
-    )
-    strength, sigma_px = (
-        np.concatenate([np.zeros(0), *values])
-        for values in ([each.strength for each in frames], [each.sigma_px for each in frames])
-    )
-    strong = np.concatenate([np.zeros(0, dtype=bool), *(each.strong for each in frames)])
+    none = LinePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.bool_), np.zeros(0))
+    points, normals, strength, strong, sigma_px = map(np.concatenate, zip(none, *frames, strict=True))
     order, offsets, frame = chain_frames(points, normals, strength, strong, borders, shape)
     return Stripes(offsets, frame, *gathered(order, points, normals, sigma_px))
 
@@ -174,7 +167,7 @@ def measured_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], li
     For a Gaussian bar smoothed to scale S the response is -r/S² at the centre, so S² = -r/r_nn.
     """
     probe = 1.2
-    found = _points(image, noise, lit, StripeLimits(weak_sigma=12.0), probe, RIDGE)
+    found = line_points(RIDGE, image, noise, lit, StripeLimits(weak_sigma=12.0), sigma_px=probe)
     strength = found.strength
     if len(strength) < 50:
         return probe
@@ -186,63 +179,44 @@ def measured_sigma_px(image: NDArray[np.float32], noise: NDArray[np.float32], li
     return float(np.sqrt(max(squared, 0.25)))
 
 
-def stripe_points(
-    image: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    lit: NDArray[np.bool_],
-    limits: StripeLimits,
-    /,
-    *,
-    sigma_px: float,
-) -> LinePoints:
-    """Centres of the bright stripes of a normalised line frame.
-
-    image, noise : (H, W) float32; lit : (H, W) bool, pixels that can hold a point; sigma_px : scale of the Gaussian.
-    """
-    return _points(image, noise, lit, limits, sigma_px, RIDGE)
-
-
-def edge_points(
-    image: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    lit: NDArray[np.bool_],
-    limits: StripeLimits,
-    /,
-    *,
-    sigma_px: float,
-) -> LinePoints:
-    """Zero crossings of a bit minus its inverse; arguments as for `stripe_points`."""
-    return _points(image, noise, lit, limits, sigma_px, EDGE)
-
-
-def _response_noise_factor(sigma_px: float, kind: int) -> float:
-    """Standard deviation of the response to noise alone, over that of the noise."""
-    # ∫ g_xx² = 3/(16 π σ⁶) for the ridge response, ∫ g_x² = 1/(8 π σ⁴) for the gradient.
-    if kind == RIDGE:
-        return float(np.sqrt(3 / (16 * np.pi)) / sigma_px**3)
-    return float(np.sqrt(1 / (8 * np.pi)) / sigma_px**2)
-
-
-def _points(
-    image: NDArray[np.float32],
-    noise: NDArray[np.float32],
-    lit: NDArray[np.bool_],
-    limits: StripeLimits,
-    sigma_px: float,
+def line_points(
     kind: int,
+    image: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    lit: NDArray[np.bool_],
+    limits: StripeLimits,
+    /,
+    *,
+    sigma_px: float,
 ) -> LinePoints:
-    factor = _response_noise_factor(sigma_px, kind)
-    weakest = np.float32(limits.weak_sigma * factor)
+    """Points of one frame, and how sure they are.
+
+    kind : `RIDGE` or `EDGE`; image, noise : (H, W) float32; lit : (H, W) bool, pixels that can hold a point;
+    sigma_px : scale of the Gaussian.
+    """
+    # Standard deviation of the response to noise alone, over that of the noise: ∫ g_xx² = 3/(16 π σ⁶) for the ridge
+    # response, ∫ g_x² = 1/(8 π σ⁴) for the gradient. Of the numerator of the last step: ∫ g_x², and ∫ g² = 1/(4 π σ²).
+    gradient_noise = np.sqrt(1 / (8 * np.pi)) / sigma_px**2
+    if kind == RIDGE:
+        response_noise, gain = np.sqrt(3 / (16 * np.pi)) / sigma_px**3, gradient_noise
+    else:
+        response_noise, gain = gradient_noise, np.sqrt(1 / (4 * np.pi)) / sigma_px
+    weakest = np.float32(limits.weak_sigma * response_noise)
     offset, strength = taylor_step(image, noise, lit, weakest, *kernels(sigma_px), kind)
     rows, columns, height = _responses_kernel(strength)
     if len(height):
         counts = height > limits.weak_fraction * np.percentile(height, 90)
         rows, columns = rows[counts], columns[counts]
     x, y, normals, response, kept = newton_step(image, offset, columns, rows, sigma_px, kind)
-    # Noise of the numerator of the last step over its slope: ∫ g_x² for the ridge, ∫ g² = 1/(4 π σ²) for the edge.
-    gain = np.sqrt(1 / (8 * np.pi)) / sigma_px**2 if kind == RIDGE else np.sqrt(1 / (4 * np.pi)) / sigma_px
-    strongest = np.float32(limits.strong_sigma * factor)
+    strongest = np.float32(limits.strong_sigma * response_noise)
     return LinePoints(*_kept_kernel(kept, x, y, normals, response, noise, rows, columns, gain, strongest))
+
+
+stripe_points = partial(line_points, RIDGE)
+"""Centres of the bright stripes of a normalised line frame."""
+
+edge_points = partial(line_points, EDGE)
+"""Zero crossings of a bit minus its inverse."""
 
 
 @kernel

@@ -52,17 +52,18 @@ def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
 @kernel
 def fit_kernel(
     first: int, last: int, position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
-    whole_freedom: float, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
+    whole_freedom: float, starts: Any, targets: Any, fitted: Any,
 ) -> None:  # fmt: skip
-    """Fill in points, normals, deviation and found, zeros so far: where a local surface has the wanted positions.
+    """Fill in `phase.FittedPoints`, zeros so far: where a local surface has the wanted positions.
 
     A quadratic surface is fitted to the 5 x 5 pixels round the start with Gaussian weights, a plane where pixels are
     missing; pixels that others in between separate from the start are left out. From the start the point moves along
-    the gradient by Newton's method. deviation : along the normal, from noise or from the scatter of the pixels about
+    the gradient by Newton's method. Its deviation along the normal is that of noise or of the pixels' scatter about
     the surface, whichever is larger. usable : (H, W) bool, pixels whose light is of one surface.
     whole : (H, W) uint8, pixels whose 5 x 5 neighbours are all usable; stencils, basis, plane, whole_freedom : as
     `stencils` returns them. Sums over pixels are of differences from the middle one, small enough for single precision.
     """
+    points, normals, deviation, found = fitted
     rows, columns = position.shape
     flat_position, flat_sigma = position.reshape(-1), sigma.reshape(-1)
     # A small image of pixels, for one point whose neighbours are not all usable.

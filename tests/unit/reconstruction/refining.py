@@ -17,8 +17,8 @@ def line_crossings(
     seen: PositionMap, usable: NDArray[np.bool_], code: CodeMap, position_of: FloatArray, /
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Where lines cross pixels, by the position map alone: frame (n,) int32, starts_px (n, 2) and targets_px (n,)."""
-    begun = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
-    return _crossings(seen, usable, code, position_of, *_nothing_taken(len(position_of), usable.shape), *begun)
+    begun = _nothing_taken(len(position_of), usable.shape)
+    return _crossings(seen, usable, code, position_of, *begun, no_points(0), np.zeros(0))
 
 
 def fitted_points(
@@ -27,5 +27,5 @@ def fitted_points(
     """Points of the image at which a local surface of the position map has the wanted positions."""
     fitted = no_points(len(starts_px))
     starts, targets = np.ascontiguousarray(starts_px), np.asarray(targets_px, dtype=np.float64)
-    in_bands(fit_kernel, len(starts), *windows(seen, usable), starts, targets, *fitted, rows_at_least=POINTS)
+    in_bands(fit_kernel, len(starts), *windows(seen, usable), starts, targets, fitted, rows_at_least=POINTS)
     return fitted

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -26,7 +24,7 @@ def epipolar_directions(other: Pinhole, points_mm: FloatArray) -> FloatArray:
 
 
 def stripes(points_mm: FloatArray, normals: FloatArray) -> StripeEnsemble:
-    return replace(ensemble_of([opencv_pixels(CAMERA, points_mm)], [1.0]), normals=normals)
+    return ensemble_of([opencv_pixels(CAMERA, points_mm)], [1.0])._replace(normals=normals)
 
 
 @pytest.mark.parametrize("other", [OTHER_CAMERA, ABOVE], ids=["beside", "above"])

@@ -42,7 +42,7 @@ def seen(
     ensemble = ensemble_of(pixels, columns, sigma_px=sigma_px, breaks=dict.fromkeys(range(len(columns)), cuts))
     noise = np.random.default_rng(seed).normal(0, noise_px, len(ensemble.points_px)) if noise_px else 0.0
     moved = ensemble.points_px + np.multiply.outer(noise, [1.0, 0.0]) if noise_px else ensemble.points_px
-    return camera_projector(replace(ensemble, points_px=moved), camera, PROJECTOR, Axis.COLUMN)[0]
+    return camera_projector(ensemble._replace(points_px=moved), camera, PROJECTOR, Axis.COLUMN)[0]
 
 
 def both(first: SheetCurves, second: SheetCurves) -> MergedCurves:

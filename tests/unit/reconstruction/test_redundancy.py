@@ -65,7 +65,7 @@ def seen(
         pixels.append(curve + rng.normal(0, 1, len(curve))[:, None] * noise_px * normals[-1])
     cuts = tuple(int(cut) for cut in np.flatnonzero(np.diff(rows) > GAP_PX))
     ensemble = ensemble_of(pixels, COLUMNS, sigma_px=noise_px or 0.01, breaks=dict.fromkeys(range(len(COLUMNS)), cuts))
-    ensemble = replace(ensemble, normals=np.concatenate(normals))
+    ensemble = ensemble._replace(normals=np.concatenate(normals))
     return camera_projector(ensemble, believed or camera, PROJECTOR, Axis.COLUMN)[0]
 
 

@@ -41,7 +41,7 @@ def seen(
     tangent = np.concatenate(ahead) - np.concatenate(pixels)
     tangent /= np.linalg.norm(tangent, axis=1)[:, None]
     ensemble = ensemble_of(pixels, columns, sigma_px=0.02, breaks=breaks)
-    return replace(ensemble, normals=np.stack([tangent[:, 1], -tangent[:, 0]], axis=1))
+    return ensemble._replace(normals=np.stack([tangent[:, 1], -tangent[:, 0]], axis=1))
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_stripes_of_rows_run_by_the_columns_of_the_first_camera() -> None:
     for camera, order in ((CAMERA, columns[::-1]), (above, columns)):
         found = [lit_by_row(camera, row, order) for row in rows]
         ensemble = ensemble_of([pixels for pixels, _ in found], rows, sigma_px=0.02)
-        ensembles.append(replace(ensemble, normals=np.concatenate([normals for _, normals in found])))
+        ensembles.append(ensemble._replace(normals=np.concatenate([normals for _, normals in found])))
     mine, theirs = ensembles
     curves = camera_camera(mine, theirs, CAMERA, above)
     assert len(curves.points_mm) >= len(rows) * (len(columns) - 2)
@@ -133,8 +133,8 @@ def test_the_deviation_adds_the_errors_of_both_cameras(other: Pinhole) -> None:
     assert len(curves.points_mm) == len(first.points_px)
 
     def moved(mine: float, theirs: float) -> FloatArray:
-        a = replace(first, points_px=first.points_px + mine * first.normals)
-        b = replace(second, points_px=second.points_px + theirs * second.normals)
+        a = first._replace(points_px=first.points_px + mine * first.normals)
+        b = second._replace(points_px=second.points_px + theirs * second.normals)
         return camera_camera(a, b, CAMERA, other).points_mm
 
     own = (moved(0.02, 0.0) - moved(-0.02, 0.0)) / 2

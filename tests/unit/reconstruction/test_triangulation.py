@@ -95,7 +95,7 @@ def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
     moved = []
     for sign in (1, -1):
         aside = ensemble.points_px + sign * ensemble.sigma_px[:, None] * ensemble.normals
-        moved.append(camera_projector(replace(ensemble, points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN)[0].points_mm)
+        moved.append(camera_projector(ensemble._replace(points_px=aside), CAMERA, PROJECTOR, Axis.COLUMN)[0].points_mm)
     np.testing.assert_allclose(curves.deviation_mm, (moved[0] - moved[1]) / 2, rtol=1e-3, atol=1e-7)
     # Depth resolution of the rig: Z²/(f b) per pixel.
     assert 0.5 < np.linalg.norm(curves.deviation_mm, axis=1).mean() / (0.03 * 520**2 / (1400 * 150)) < 2.0
@@ -106,7 +106,7 @@ def test_the_scatter_of_points_is_what_the_deviation_says() -> None:
     clean = on_ball([150.0], rows)
     rng = np.random.default_rng(3)
     noisy = clean.points_px + rng.normal(0, 0.02, len(rows))[:, None] * clean.normals
-    ensemble = replace(clean, points_px=noisy, sigma_px=np.full(len(rows), 0.02))
+    ensemble = clean._replace(points_px=noisy, sigma_px=np.full(len(rows), 0.02))
     curves, _ = camera_projector(ensemble, CAMERA, PROJECTOR, Axis.COLUMN)
     truth = camera_projector(clean, CAMERA, PROJECTOR, Axis.COLUMN)[0].points_mm
     shift = np.linalg.norm(curves.points_mm - truth, axis=1)

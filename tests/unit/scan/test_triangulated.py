@@ -41,7 +41,7 @@ def curves_in(camera: Pinhole, rows: FloatArray, projector: Pinhole = PROJECTOR)
     tangents = np.concatenate(ahead) - np.concatenate(pixels)
     tangents /= np.linalg.norm(tangents, axis=1)[:, None]
     normals = np.stack([tangents[:, 1], -tangents[:, 0]], axis=1)
-    return replace(ensemble_of(pixels, COLUMNS), normals=normals)
+    return ensemble_of(pixels, COLUMNS)._replace(normals=normals)
 
 
 def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> CameraResult:
