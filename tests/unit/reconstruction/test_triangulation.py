@@ -86,8 +86,7 @@ def test_the_deviation_is_how_far_the_point_moves_with_its_stripe() -> None:
     ensemble = on_ball([120.0, 170.0], rows)
     rng = np.random.default_rng(2)
     angle = rng.uniform(-0.5, 0.5, len(ensemble.points_px))
-    ensemble = replace(
-        ensemble,
+    ensemble = ensemble._replace(
         normals=np.stack([np.cos(angle), np.sin(angle)], axis=1),
         sigma_px=rng.uniform(0.01, 0.05, len(ensemble.points_px)),
     )
