@@ -309,7 +309,11 @@ def _with_fewer_bits(
     bits[~lost] = 0
     cells = len(tables.cell_position)
     fewer = decode(frames, noise, tables.index_of_word, cells, limits.decoding, unresolved=bits)
-    code = CodeMap(*(np.where(lost, one, other) for one, other in zip(fewer, code, strict=True)))
+    code = CodeMap(
+        np.where(lost, fewer.lowest, code.lowest),
+        np.where(lost, fewer.highest, code.highest),
+        np.where(lost, fewer.refusal, code.refusal),
+    )
     return replace(coded, code=fewer, unresolved=bits), code
 
 

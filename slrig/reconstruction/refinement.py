@@ -172,7 +172,7 @@ def refined(
     for index, (points, part) in enumerate(zip(found, parts, strict=True)):
         starts = np.ascontiguousarray(points.points_px)
         in_bands(_target_kernel, len(starts), starts, code, position_of[index], targets[part])
-        fitted = FittedPoints(*(each[part] for each in old))
+        fitted = FittedPoints(old.points[part], old.normals[part], old.sigma_px[part], old.found[part])
         in_bands(fit_kernel, len(starts), *given, starts, targets[part], fitted, rows_at_least=POINTS)
         own = np.ascontiguousarray(points.sigma_px)
         in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away[part])
