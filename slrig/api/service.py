@@ -143,7 +143,7 @@ def assembled_service(
     )
     limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
     scan_retention = ScanRetention(store, folder, limits, runner.delete)
-    runner.after_scan = scan_retention.look
+    runner.after_each(scan_retention.look)
     tasks = Tasks(runner, calibrations, verifications, acceptance, tidy=retention)
     # The folder's lock keeps every other process out.
     scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)

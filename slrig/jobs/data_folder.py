@@ -122,6 +122,10 @@ class DataFolder:
         """Where the files of a running scan are made."""
         return self.incoming / str(scan_id)
 
+    def hidden(self, scan_id: UUID) -> str:
+        """What is left out of words that outlast the staging folder: where that lies."""
+        return f"{self.staging(scan_id)}/"
+
     def stage(self, scan_id: UUID) -> Path:
         """Make the staging folder of a scan, empty."""
         folder = self.staging(scan_id)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from uuid import UUID
 
 import structlog
 
-from slrig.errors import StorageError
-from slrig.failure import JobFailure
+from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
+from slrig.failure import UNEXPECTED, JobFailure, failure_of
 from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
 
@@ -29,6 +29,25 @@ class Ending:
     state: JobState
     fault: JobFailure | None
     summary: Mapping[str, Any] | None = None
+
+
+def ending_by(error: Exception, job_id: UUID, *, hidden: str) -> Ending:
+    """How a job ends by an error, which the log is told unless somebody wanted it.
+
+    hidden : left out of its message. The staging folder is gone when that is read.
+    """
+    fault = failure_of(error)
+    fault = replace(fault, message=fault.message.replace(hidden, ""))
+    state = JobState.FAILED
+    if isinstance(error, ScanCancelledError):
+        state = JobState.CANCELLED
+    elif isinstance(error, ScanInterruptedError):
+        state = JobState.INTERRUPTED
+    elif fault.code == UNEXPECTED:
+        _log.error("a job failed", job=str(job_id), exc_info=error)
+    else:
+        _log.warning("a job failed", job=str(job_id), code=fault.code, cause=fault.message)
+    return Ending(job_id, state, fault)
 
 
 class Endings:

@@ -25,20 +25,22 @@ class ProgressRecorder:
     """
 
     def __init__(
-        self, store: JobStore, job_id: UUID, *, hidden: str, now_s: Callable[[], float] = time.monotonic
+        self,
+        store: JobStore,
+        job_id: UUID,
+        *,
+        hidden: str,
+        span: tuple[float, float] = (0.0, 1.0),
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`hidden` is left out of what is recorded."""
+        """`hidden` is left out of what is recorded; the fractions told are of `span`, a part of the whole job."""
         self._now_s = now_s
         self._told_s = -math.inf
         self._hidden = hidden
         self._store = store
         self._job_id = job_id
-        self._start, self._end = 0.0, 1.0
+        self._start, self._end = span
         self._told = JobProgress("", -1.0, "")
-
-    def span(self, start: float, end: float) -> None:
-        """Map the fractions that follow into start..end of the whole job."""
-        self._start, self._end = start, end
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
         """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""

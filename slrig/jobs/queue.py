@@ -1,7 +1,4 @@
-"""The queue of jobs on a rig: one at a time on one owner thread, a few that wait, pictures in between.
-
-What is done with the rig is not its business: a scan (`slrig.scan.job`), or what a `slrig.jobs.job.RigWork` carries.
-"""
+"""The queue of jobs on a rig: one at a time on one owner thread, a few that wait, pictures in between."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TypeVar
 from uuid import UUID
 
 import structlog
@@ -31,9 +27,6 @@ from slrig.rig.session import RigSession, driver_errors
 from slrig.rig.watchdog import Call, Watchdog
 
 _log = structlog.get_logger(__name__)
-
-
-_Job = TypeVar("_Job", bound=Job)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +69,7 @@ class JobQueue:
         if call is not None:
             raise DeviceError(call.hangs())
 
-    def submit(self, make: Callable[[], _Job], *, wait: bool) -> _Job:
+    def submit(self, make: Callable[[], Job], *, wait: bool) -> None:
         """Put the job that `make` returns in line; `wait` lets it stand behind others.
 
         Raises
@@ -101,7 +94,6 @@ class JobQueue:
             self._waiting.append(job)
             self._changed.notify_all()
         self._previews.interrupt()
-        return job
 
     def take_up(self, jobs: Sequence[Job]) -> None:
         """Put jobs of an earlier run in line, however many; before `start`."""
@@ -114,7 +106,7 @@ class JobQueue:
             if queued is not None:
                 self._waiting.remove(queued)
                 message = f"{_begun(queued.holder.words)} was cancelled while it waited for the rig."
-                queued.cut_off(ScanCancelledError(message))
+                queued.conclude(ScanCancelledError(message))
             elif self._active is not None and self._active.id == job_id:
                 self._active.stop.set()
                 return True
@@ -173,7 +165,7 @@ class JobQueue:
             if self._active is not None:
                 self._active.stop.set()
             for job in cut_off:
-                job.cut_off(interruption())
+                job.conclude(interruption())
             self._changed.notify_all()
         self._watchdog.stop()
         self._previews.fail(interruption())
@@ -203,7 +195,7 @@ class JobQueue:
         with self._changed:
             active = self._active
             if active is not None:
-                active.cut_off(error)
+                active.conclude(error)
         if active is not None:
             active.settle()
 
@@ -240,17 +232,22 @@ class JobQueue:
             self._changed.notify_all()
 
     def _run(self, job: Job) -> None:
+        # What is no Exception, and ends the thread, is no success either.
+        error: Exception | None = RuntimeError("the thread that owns the rig was ended")
         try:
             try:
-                job.run(self.rig)
+                job.work(self.rig, job)
+                error = None
+            except Exception as raised:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
+                error = interruption() if self._ending else raised
             finally:
                 self.rig.darken()
-            job.clear_up()
+            job.clear_up(error)
         finally:
             # The rig is free before anyone can read that the work is over: a client may start its next one at once.
             with self._changed:
                 self._active = None
-                job.conclude()
+                job.conclude(error)
             job.settle()
         if not self._ending:
             self._log_unopened(self.rig.recover())

@@ -11,10 +11,10 @@ from uuid import UUID
 import structlog
 
 from slrig.devices import Rig
-from slrig.errors import ScanCancelledError, ScanInterruptedError, SlrigError, StorageError
-from slrig.failure import JobFailure, failure_of, interruption
+from slrig.errors import ScanInterruptedError, SlrigError, StorageError
+from slrig.failure import JobFailure, interruption
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.endings import Ending, Endings
+from slrig.jobs.endings import Ending, Endings, ending_by
 from slrig.jobs.job import Holder
 from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobRecord, JobState
@@ -142,7 +142,7 @@ class RigJobs:
         self._endings.close()
 
     def _recorder(self, job_id: UUID) -> ProgressRecorder:
-        return ProgressRecorder(self.jobs, job_id, hidden=f"{self._folder.staging(job_id)}/")
+        return ProgressRecorder(self.jobs, job_id, hidden=self._folder.hidden(job_id))
 
     def _capture(self, job_id: UUID, parts: Parts, rig: Rig, cancelled: Cancelled) -> None:
         self.jobs.advance(job_id, JobState.CAPTURING)
@@ -177,17 +177,7 @@ class RigJobs:
         self._end(job_id, parts, error)
 
     def _end(self, job_id: UUID, parts: Parts, error: Exception) -> None:
-        state, fault = JobState.FAILED, failure_of(error)
-        if isinstance(error, ScanCancelledError):
-            state = JobState.CANCELLED
-        elif isinstance(error, ScanInterruptedError):
-            state = JobState.INTERRUPTED
-        elif isinstance(error, SlrigError):
-            _log.warning("a job failed", job=str(job_id), code=fault.code, cause=fault.message)
-        else:
-            _log.error("a job failed", job=str(job_id), exc_info=error)
-        fault = JobFailure(fault.code, fault.message.replace(f"{self._folder.staging(job_id)}/", ""))
-        self._settle(Ending(job_id, state, fault), parts)
+        self._settle(ending_by(error, job_id, hidden=self._folder.hidden(job_id)), parts)
 
     def _settle(self, ending: Ending, parts: Parts) -> None:
         self._folder.discard(ending.id)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,13 +11,13 @@ import structlog
 
 from slrig.bundle.health import write_health
 from slrig.devices import Rig
-from slrig.errors import ScanCancelledError, ScanInterruptedError, SlrigError, StorageError
-from slrig.failure import UNEXPECTED, JobFailure, disk_errors, failure_of, interruption
+from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
+from slrig.failure import disk_errors
 from slrig.jobs.channel import Task
 from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
-from slrig.jobs.endings import Ending, Endings
+from slrig.jobs.endings import Ending, Endings, ending_by
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
-from slrig.jobs.job import Holder
+from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore
@@ -67,12 +66,12 @@ class WatchesHealth(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ScanTools:
     """What every scan is made with.
 
-    spare_bytes : left free on the disk. ending : tells that the service ends. health : who knows whether the
-    calibration still holds, if anybody does. after : called when a scan is over.
+    spare_bytes : left free on the disk. health : who knows whether the calibration still holds, if anybody does.
+    after : called, on the rig's thread, when a scan is over.
     """
 
     store: JobStore
@@ -81,160 +80,137 @@ class ScanTools:
     capture: CaptureBundle
     endings: Endings
     spare_bytes: int
-    ending: Callable[[], bool]
-    health: Callable[[], WatchesHealth | None] = lambda: None
+    health: WatchesHealth | None = None
     after: Callable[[], None] = lambda: None
 
 
-class ScanJob:
-    """One scan that waits or is under way. Implements `slrig.jobs.job.Job`."""
+def scan_job(record: JobRecord, tools: ScanTools) -> Job:
+    """The work with the rig that a scan on record asks for."""
+    scan = _Scan(record, tools)
+    holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
+    return Job(record.id, holder, record.created_at, scan.run, scan.ended, scan.clear_up, scan.concluded)
+
+
+class _Scan:
+    """One scan that waits or is under way."""
 
     def __init__(self, record: JobRecord, tools: ScanTools) -> None:
         self._record = record
-        self.id = record.id
-        self.holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
-        self.since = record.created_at
-        self.stop = threading.Event()
+        self._id = record.id
         self._plan = plan_from_json(record.plan)
         self._tools = tools
-        self._begun = False
-        self._captured = False
-        self._ending: Ending | None = Ending(record.id, JobState.FAILED, failure_of(RuntimeError()))
+        self._job: Job | None = None
+        self._captured = self._worked = False
+        self._summary: Mapping[str, Any] | None = None
 
-    def run(self, held: RigSession) -> None:
-        """See `Job`."""
-        self._begun = True
+    def run(self, held: RigSession, job: Job) -> None:
+        """See `Job.work`."""
+        self._job = job
         self._tools.endings.settle()
-        self._ending = self._ended(held)
+        if self._record.state is JobState.COMPUTING:
+            # The service was killed in the middle of it: all that is needed lies there.
+            self._reconstruct(job, self._tools.folder.clear_results(self._id), None)
+        else:
+            self._reconstruct(job, *self._capture(held, job))
 
-    def clear_up(self) -> None:
-        """See `Job`."""
-        if self._ending is not None and self._ending.state is not JobState.SUCCEEDED:
-            self._keep_evidence(self._ending.state)
+    def clear_up(self, error: Exception | None) -> None:
+        """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
+        self._worked = True
+        folder = self._tools.folder
+        if error is not None and not self._goes_on(error):
+            try:
+                if not isinstance(error, ScanCancelledError) and (folder.staging(self._id) / "bundle").is_dir():
+                    folder.keep_bundle(self._id)
+            except Exception:  # noqa: BLE001 - see below
+                # The scan's own fault is the one to tell; without its bundle it is told all the same.
+                _log.exception("the bundle of a failed scan could not be kept", scan=str(self._id))
+            folder.discard(self._id)
         self._tools.worker.start()
 
-    def conclude(self) -> None:
+    def concluded(self, error: Exception | None) -> None:
         """See `Job`."""
-        if self._ending is not None:
-            self._tools.endings.add(self._ending)
+        if error is None:
+            self._tools.endings.add(Ending(self._id, JobState.SUCCEEDED, None, self._summary))
+        elif self._goes_on(error):
+            _log.info("a scan is left to the next start of the service", scan=str(self._id))
+        else:
+            ending = ending_by(error, self._id, hidden=self._tools.folder.hidden(self._id))
+            if (
+                ending.state is JobState.FAILED
+                and not self._worked
+                and self._job is not None
+                and self._job.stop.is_set()
+            ):
+                # It was to end, and its driver hangs.
+                ending = replace(ending, state=JobState.CANCELLED)
+            self._tools.endings.add(ending)
 
-    def cut_off(self, error: SlrigError) -> None:
-        """See `Job`."""
-        state = JobState.FAILED
-        if isinstance(error, ScanInterruptedError) and self._goes_on:
-            return
-        if isinstance(error, ScanInterruptedError):
-            state = JobState.INTERRUPTED
-        elif isinstance(error, ScanCancelledError) or self.stop.is_set():
-            state = JobState.CANCELLED
-        self._tools.endings.add(Ending(self.id, state, failure_of(error)))
-
-    def settle(self) -> None:
+    def ended(self, _error: Exception | None) -> None:
         """See `Job`."""
         self._tools.endings.settle()
         self._tools.after()
 
-    @property
-    def _goes_on(self) -> bool:
+    def _goes_on(self, error: Exception) -> bool:
         """Whether the next start of the service takes the scan up, as `slrig.scan.sweep` does."""
-        return not self._begun or self._captured
+        return isinstance(error, ScanInterruptedError) and (self._job is None or self._captured)
 
-    def _ended(self, held: RigSession) -> Ending | None:
-        """How it ended; None where the service ends first and the next one goes on with it."""
-        log = _log.bind(scan=str(self.id))
-        state, summary, fault = JobState.FAILED, None, None
-        try:
-            summary = self._walk(held)
-            state = JobState.SUCCEEDED
-        except Exception as error:
-            fault = self._told(error)
-            if self._tools.ending() and self._captured:
-                log.info("a scan is left to the next start of the service")
-                return None
-            if self._tools.ending():
-                state, fault = JobState.INTERRUPTED, failure_of(interruption())
-            elif isinstance(error, ScanCancelledError):
-                state = JobState.CANCELLED
-            elif fault.code == UNEXPECTED:
-                log.exception("scan failed", code=fault.code)
-            else:
-                log.warning("scan failed", code=fault.code, cause=fault.message)
-        return Ending(self.id, state, fault, summary)
-
-    def _told(self, error: Exception) -> JobFailure:
-        # The staging folder is gone when the message is read: what it names is then the scan's own bundle.
-        fault = failure_of(error)
-        return JobFailure(fault.code, fault.message.replace(f"{self._tools.folder.staging(self.id)}/", ""))
-
-    def _walk(self, held: RigSession) -> Mapping[str, Any]:
+    def _capture(self, held: RigSession, job: Job) -> tuple[Path, FrameFeed]:
+        """Record a bundle; return the staging folder that holds it, and what has sent its frames to the worker."""
         tools = self._tools
-        progress = ProgressRecorder(tools.store, self.id, hidden=f"{tools.folder.staging(self.id)}/")
-        if self._record.state is JobState.COMPUTING:
-            # The service was killed in the middle of it: all that is needed lies there.
-            return self._reconstructed(tools.folder.clear_results(self.id), progress, None)
-        self.since = tools.store.advance(self.id, JobState.CAPTURING)
+        job.since = tools.store.advance(self._id, JobState.CAPTURING)
         rig = held.open()
         held.refuse_misfit()
         if held.facts is not None:
             frame_bytes = check_plan(self._plan, held.facts, rig.calibration)
             tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
-        staged = tools.folder.stage(self.id)
+        staged = tools.folder.stage(self._id)
         bundle = staged / "bundle"
-        progress.span(0.0, CAPTURE_SHARE)
         feed = tools.worker.feed()
+        progress = self._progress(0.0, CAPTURE_SHARE)
         try:
             with driver_errors(held.name):
-                tools.capture(rig, self._plan, bundle, progress=progress, cancelled=self.stop.is_set, frames=feed)
+                tools.capture(rig, self._plan, bundle, progress=progress, cancelled=job.stop.is_set, frames=feed)
         except Exception as error:
             feed.abandon()
             held.doubt(error)
             raise
         held.darken()
-        health = tools.health()
         with disk_errors(staged):
-            if health is not None and (stamp := health.stamp()) is not None:
+            if tools.health is not None and (stamp := tools.health.stamp()) is not None:
                 write_health(bundle, stamp)
             sync_tree(bundle)
-        if self.stop.is_set():
+        if job.stop.is_set():
             feed.abandon()
             message = "The scan was cancelled."
             raise ScanCancelledError(message)
-        return self._reconstructed(staged, progress, feed)
+        return staged, feed
 
-    def _reconstructed(self, staged: Path, progress: ProgressRecorder, feed: FrameFeed | None) -> Mapping[str, Any]:
-        """Make the mesh of the bundle in staging, put the scan in its place, and return the summary of its report."""
+    def _reconstruct(self, job: Job, staged: Path, feed: FrameFeed | None) -> None:
+        """Make the mesh of the bundle in staging, and put the scan in its place."""
         tools, bundle = self._tools, staged / "bundle"
-        self._captured = self._reconstructing()
-        progress.span(CAPTURE_SHARE, 1.0)
+        try:
+            tools.store.advance(self._id, JobState.COMPUTING)
+            self._captured = True
+        except StorageError as error:
+            _log.warning("that a scan is reconstructed could not be recorded", scan=str(self._id), cause=str(error))
         call = reconstruction(tools.worker.module, bundle, staged / "result", self._plan.reconstruction)
-        report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=self.stop.is_set, feed=feed)
+        progress = self._progress(CAPTURE_SHARE, 1.0)
+        report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=job.stop.is_set, feed=feed)
         _require_promised(staged / "result")
         record = self._record
-        write_record(staged, KeptRecord(self.id, record.rig, record.label, self._plan, record.created_at, self.since))
-        tools.folder.commit(self.id)
-        if (health := tools.health()) is not None:
-            _noted(health, report)
-        return report_summary(report)
+        write_record(staged, KeptRecord(self._id, record.rig, record.label, self._plan, record.created_at, job.since))
+        tools.folder.commit(self._id)
+        if tools.health is not None:
+            try:
+                tools.health.note(report)
+            except Exception:  # noqa: BLE001 - the scan stands, whatever becomes of that
+                _log.exception("what a scan says of its calibration could not be noted")
+        self._summary = report_summary(report)
 
-    def _reconstructing(self) -> bool:
-        """Record that the bundle is whole, and return whether that is on record; the scan goes on without."""
-        try:
-            self._tools.store.advance(self.id, JobState.COMPUTING)
-        except StorageError as error:
-            _log.warning("that a scan is reconstructed could not be recorded", scan=str(self.id), cause=str(error))
-            return False
-        return True
-
-    def _keep_evidence(self, state: JobState) -> None:
-        """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
-        folder = self._tools.folder
-        try:
-            if state is not JobState.CANCELLED and (folder.staging(self.id) / "bundle").is_dir():
-                folder.keep_bundle(self.id)
-        except Exception:  # noqa: BLE001 - see below
-            # The scan's own fault is the one to tell; without its bundle it is told all the same.
-            _log.exception("the bundle of a failed scan could not be kept", scan=str(self.id))
-        folder.discard(self.id)
+    def _progress(self, start: float, end: float) -> ProgressRecorder:
+        return ProgressRecorder(
+            self._tools.store, self._id, hidden=self._tools.folder.hidden(self._id), span=(start, end)
+        )
 
 
 def reconstruction(pipeline: str, bundle: Path, output: Path, plan: ReconstructionPlan) -> Task:
@@ -256,11 +232,3 @@ def _require_promised(result: Path) -> None:
             f"The reconstruction ended, and {' and '.join(missing)} is not on the disk. Check the disk; scan again."
         )
         raise StorageError(message)
-
-
-def _noted(health: WatchesHealth, report: Mapping[str, Any]) -> None:
-    """Tell what a scan says of its calibration. The scan stands, whatever becomes of that."""
-    try:
-        health.note(report)
-    except Exception:  # noqa: BLE001 - see above
-        _log.exception("what a scan says of its calibration could not be noted")

@@ -13,18 +13,18 @@ import structlog
 
 from slrig.devices import Rig
 from slrig.errors import InvalidInputError, ScanInterruptedError, ScanStateError
-from slrig.failure import failure_of
+from slrig.failure import UNEXPECTED, failure_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.endings import Endings
-from slrig.jobs.job import Holder, RigWork
+from slrig.jobs.job import Holder, Job
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import RigQueue
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.preview import Light, Watch
-from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
-from slrig.scan.job import CaptureBundle, ScanJob, ScanTools, WatchesHealth
+from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_errors
+from slrig.scan.job import CaptureBundle, ScanTools, WatchesHealth, scan_job
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
 from slrig.scan.records import plan_json
@@ -86,25 +86,11 @@ class Runner:
         self._store = store
         self._folder = folder
         self._worker = worker
-        self._spare_bytes = spare_bytes
         self._closing = threading.Lock()
         self._closed = False
         self._queue = JobQueue(rig, queue_length=queue_length, give_up=give_up)
         self._endings = Endings(store)
-        self._health: WatchesHealth | None = None
-        self.after_scan: Callable[[], None] = lambda: None
-        """Called, on the rig's thread, after each scan."""
-        self._tools = ScanTools(
-            store,
-            folder,
-            worker,
-            capture,
-            self._endings,
-            spare_bytes,
-            ending=lambda: self._queue.ending,
-            health=lambda: self._health,
-            after=lambda: self.after_scan(),
-        )
+        self._tools = ScanTools(store, folder, worker, capture, self._endings, spare_bytes)
 
     def start(self) -> None:
         """Start the owner thread, which opens the rig, and the worker, which loads its kernels."""
@@ -113,7 +99,7 @@ class Runner:
 
     def take_up(self, scans: Iterable[UUID]) -> None:
         """Put scans in line that a kill of the service left unfinished, see `slrig.scan.sweep`; before `start`."""
-        self._queue.take_up([ScanJob(self._store.get(scan), self._tools) for scan in scans])
+        self._queue.take_up([scan_job(self._store.get(scan), self._tools) for scan in scans])
 
     def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
         """Record a scan and have it done; `wait` lets it queue behind others.
@@ -139,13 +125,13 @@ class Runner:
         frame_bytes = 0 if rig.facts is None else check_plan(plan, rig.facts, rig.calibration)
         rig.refuse_misfit()
         # Frames once as captured, and as much again for meshes and the zipped bundle of a careful client.
-        self._folder.require_space(2 * frame_bytes + self._spare_bytes)
+        self._folder.require_space(2 * frame_bytes + self._tools.spare_bytes)
         record: JobRecord | None = None
 
-        def make() -> ScanJob:
+        def make() -> Job:
             nonlocal record
             record = self._store.create(plan_json(plan), rig=rig.name, label=label, key=key)
-            return ScanJob(record, self._tools)
+            return scan_job(record, self._tools)
 
         self._queue.submit(make, wait=wait)
         if record is None:
@@ -162,9 +148,11 @@ class Runner:
         ended: Callable[[Exception | None], None],
         begun: Callable[[], object] = lambda: None,
     ) -> None:
-        """Have `work` done with the rig, in line with the scans. See `RigWork`.
+        """Have `work` done with the rig, in line with the scans.
 
-        `begun` is called once a place in the line is certain, before the work can begin.
+        work : called on the owner thread with the open rig and `cancelled`; it raises ScanCancelledError when that
+        turned true. ended : called once, when the rig is free again, with what was raised, None where nothing was.
+        begun : called once a place in the line is certain, before the work can begin.
 
         Raises
         ------
@@ -173,9 +161,22 @@ class Runner:
         """
         self._queue.refuse_while_stuck()
 
-        def make() -> RigWork:
+        def with_rig(held: RigSession, job: Job) -> None:
+            job.since = utc_now()
+            try:
+                rig = held.open()
+                with driver_errors(held.name):
+                    work(rig, job.stop.is_set)
+            except Exception as error:
+                if not self._queue.ending:
+                    held.doubt(error)
+                    if failure_of(error).code == UNEXPECTED:
+                        _log.exception("work with the rig failed", work=holder.words)
+                raise
+
+        def make() -> Job:
             begun()
-            return RigWork(work_id, holder, utc_now(), work, ended, lambda: self._queue.ending)
+            return Job(work_id, holder, utc_now(), with_rig, ended)
 
         self._queue.submit(make, wait=wait)
 
@@ -185,7 +186,11 @@ class Runner:
 
     def watch_health(self, health: WatchesHealth) -> None:
         """Have scans that begin from now on carry the health of their calibration, and tell what they find of it."""
-        self._health = health
+        self._tools.health = health
+
+    def after_each(self, told: Callable[[], None]) -> None:
+        """Have `told` called, on the rig's thread, after each scan."""
+        self._tools.after = told
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:
         """Have what is begun from now on use a calibration; None has it use the rig's own.
