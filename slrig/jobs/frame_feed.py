@@ -27,24 +27,10 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Frames of this outline will come."""
+    """Frames of this outline will come, and then what they have proven."""
 
     outline: CaptureHeader
     calibration: Calibration
-
-
-@dataclass(frozen=True, slots=True)
-class Take:
-    """One frame."""
-
-    shot: Shot
-
-
-@dataclass(frozen=True, slots=True)
-class End:
-    """That was the last frame; `evidence` is what the frames have proven."""
-
-    evidence: EvidenceSummary
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +63,7 @@ class FrameFeed:
     def __init__(self, send: Callable[[object], bool], *, most_bytes: int = MOST_WAITING_BYTES) -> None:
         self._send = send
         self._most_bytes = most_bytes
-        self._waiting: queue.Queue[Begin | Take | End | Abandon] = queue.Queue()
+        self._waiting: queue.Queue[Begin | Shot | EvidenceSummary | Abandon] = queue.Queue()
         self._taken: set[tuple[int, str, float | None]] = set()
         self._given_up = threading.Event()
         self._ended = threading.Event()
@@ -107,11 +93,11 @@ class FrameFeed:
             _log.info("the reconstruction falls behind the capture; it will read the bundle")
             self.abandon()
         else:
-            self._waiting.put(Take(shot))
+            self._waiting.put(shot)
 
     def end(self, evidence: EvidenceSummary) -> None:
         """Queue the end."""
-        self._waiting.put(End(evidence))
+        self._waiting.put(evidence)
 
     def abandon(self) -> None:
         """Send no more, and have what was sent forgotten. After the end has been sent this does nothing."""
@@ -139,7 +125,7 @@ class FrameFeed:
             if not self._send(message):
                 self._given_up.set()
                 return
-            if isinstance(message, End):
+            if isinstance(message, EvidenceSummary):
                 self._ended.set()
                 return
 
@@ -157,10 +143,10 @@ class FedFrames:
             match message:
                 case Begin(outline, calibration):
                     self._live = self._begin(outline, calibration)
-                case Take(shot) if self._live is not None:
-                    self._live.take(shot)
-                case End(evidence) if self._live is not None:
-                    self._live.end(evidence)
+                case Shot() if self._live is not None:
+                    self._live.take(message)
+                case EvidenceSummary() if self._live is not None:
+                    self._live.end(message)
                 case Abandon():
                     self.forget()
         except Exception as error:  # noqa: BLE001 - a head start that fails is no failure of the scan

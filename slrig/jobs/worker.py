@@ -25,19 +25,8 @@ import structlog
 
 from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.failure import errors_by_code, interruption
-from slrig.jobs.channel import (
-    Failed,
-    Fed,
-    Preparing,
-    Ready,
-    Run,
-    Task,
-    Unloadable,
-    received,
-    sent,
-)
 from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.worker_process import serve
+from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, Run, Task, Unloadable, received, sent, serve
 from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Told
 
 SILENCE_TOLD_S = 5.0

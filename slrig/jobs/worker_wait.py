@@ -13,8 +13,8 @@ from multiprocessing.process import BaseProcess
 import structlog
 
 from slrig.errors import ScanCancelledError, WorkerLostError
-from slrig.jobs.channel import Done, Failed, Preparing, Progressed, Task, Unloadable, received, sent
 from slrig.jobs.frame_feed import FrameFeed
+from slrig.jobs.worker_process import Done, Failed, Preparing, Progressed, Task, Unloadable, received, sent
 
 CANCEL_LIMIT_S = 10.0
 """A job that has not stopped this long after it was asked to is stopped by ending its process."""

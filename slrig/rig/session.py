@@ -14,7 +14,6 @@ from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
 from slrig.failure import UNEXPECTED, JobFailure, failure_of
 from slrig.model import Calibration, Size
-from slrig.rig.positioner import GuardedPositioner
 from slrig.rig.watchdog import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
 
 _LAST_RESORT_S = 1.0
@@ -95,7 +94,7 @@ class RigSession:
                 if rig is not None:
                     self._close(rig)
                 raise
-            self._rig, self._bare = _guarded(rig, self.calls), rig
+            self._rig, self._bare = guarded(rig, self.calls), rig
             self.calls.failure = None
             self.fault = None
         active = self.active
@@ -212,8 +211,3 @@ def _facts(rig: Rig) -> RigFacts:
     cameras = {name: camera.info for name, camera in rig.cameras.items()}
     positions = () if rig.positioner is None else tuple(rig.positioner.poses)
     return RigFacts(cameras, rig.projector.info, rig.calibration, positions)
-
-
-def _guarded(rig: Rig, calls: Calls) -> Rig:
-    positioner = None if rig.positioner is None else GuardedPositioner(rig.positioner, calls)
-    return replace(guarded(rig, calls), positioner=positioner)

@@ -11,18 +11,20 @@ import errno
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import structlog
 
 from slrig.devices import (
+    USUAL,
     AppliedSettings,
     Camera,
     CameraInfo,
     CameraSettings,
+    Positioner,
     Projector,
     ProjectorInfo,
     Rig,
@@ -47,6 +49,9 @@ OPEN = "open"
 OPEN_LIMIT_S = 60.0
 """How long opening a rig may take without telling of progress: network cameras are looked for, some projectors boot."""
 
+MOVE_LIMIT_S = 120.0
+"""How long a move of the board may take: a stage crosses its whole travel, a robot goes round an obstacle."""
+
 LOOK_S = 0.5
 """How often the watchdog looks."""
 
@@ -55,6 +60,7 @@ _GONE = {errno.ENODEV, errno.ENXIO, errno.ESHUTDOWN}
 _log = structlog.get_logger(__name__)
 
 _Value = TypeVar("_Value")
+_Device = TypeVar("_Device", bound=Camera | Projector)
 
 
 @dataclass(slots=True)
@@ -203,82 +209,98 @@ class Watchdog:
 
 
 def guarded(rig: Rig, calls: Calls) -> Rig:
-    """The same rig, all calls of its devices by way of `calls`."""
-    cameras: dict[str, Camera] = {name: _GuardedCamera(camera, name, calls) for name, camera in rig.cameras.items()}
-    return replace(rig, cameras=cameras, projector=_GuardedProjector(rig.projector, calls))
+    """The same rig, all calls of its devices and of what moves the board by way of `calls`."""
+    return replace(
+        rig,
+        cameras={name: _GuardedCamera(camera, f"camera '{name}'", calls) for name, camera in rig.cameras.items()},
+        projector=_GuardedProjector(rig.projector, f"projector '{rig.projector.info.name}'", calls),
+        positioner=None if rig.positioner is None else GuardedPositioner(rig.positioner, calls),
+    )
 
 
-class _GuardedCamera:
-    """Implements `slrig.devices.Camera` by another one."""
+class _Guarded(Generic[_Device]):
+    """A device whose calls go by way of `calls`. name : what errors call it."""
 
-    def __init__(self, camera: Camera, name: str, calls: Calls) -> None:
-        self._camera = camera
-        self._device = f"camera '{name}'"
+    def __init__(self, device: _Device, name: str, calls: Calls) -> None:
+        self._device = device
+        self._name = name
         self._calls = calls
+
+    def close(self) -> None:
+        self._made("close", self._device.close)
+
+    def _made(self, step: str, function: Callable[[], _Value], *, limit_s: float | None = None) -> _Value:
+        limits = self._device.info.limits
+        limit_s = limits.call_s if limit_s is None else limit_s
+        return self._calls.make(self._name, step, limit_s, function, computed=limits.computed)
+
+
+class _GuardedCamera(_Guarded[Camera]):
+    """Implements `slrig.devices.Camera` by another one."""
 
     @property
     def info(self) -> CameraInfo:
-        return self._camera.info
+        return self._device.info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        return self._made("configure", lambda: self._camera.configure(settings))
+        return self._made("configure", lambda: self._device.configure(settings))
 
     def arm(self, count: int, trigger: Trigger) -> None:
-        self._made("arm", lambda: self._camera.arm(count, trigger))
+        self._made("arm", lambda: self._device.arm(count, trigger))
 
     def trigger(self) -> None:
-        self._made("trigger", self._camera.trigger)
+        self._made("trigger", self._device.trigger)
 
     def read(self, after_ns: int, timeout_s: float) -> Frame:
-        limits = self._camera.info.limits
-        limit_s = 2 * timeout_s + limits.read_slack_s
-        read = partial(self._camera.read, after_ns, timeout_s)
-        return self._calls.make(self._device, "read", limit_s, read, computed=limits.computed)
+        limit_s = 2 * timeout_s + self._device.info.limits.read_slack_s
+        return self._made("read", lambda: self._device.read(after_ns, timeout_s), limit_s=limit_s)
 
     def disarm(self) -> None:
-        self._made("disarm", self._camera.disarm)
-
-    def close(self) -> None:
-        self._made("close", self._camera.close)
-
-    def _made(self, step: str, function: Callable[[], _Value]) -> _Value:
-        limits = self._camera.info.limits
-        return self._calls.make(self._device, step, limits.call_s, function, computed=limits.computed)
+        self._made("disarm", self._device.disarm)
 
 
-class _GuardedProjector:
+class _GuardedProjector(_Guarded[Projector]):
     """Implements `slrig.devices.Projector` by another one."""
-
-    def __init__(self, projector: Projector, calls: Calls) -> None:
-        self._projector = projector
-        self._calls = calls
 
     @property
     def info(self) -> ProjectorInfo:
-        return self._projector.info
+        return self._device.info
 
     def load(self, sequence: PatternSequence) -> None:
-        self._made("load", lambda: self._projector.load(sequence))
+        self._made("load", lambda: self._device.load(sequence))
 
     def show(self, index: int) -> Shown:
-        return self._made("show", lambda: self._projector.show(index))
+        return self._made("show", lambda: self._device.show(index))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        self._made("play", lambda: self._projector.play(exposure_s, period_s))
+        self._made("play", lambda: self._device.play(exposure_s, period_s))
 
     def stop(self) -> None:
-        self._made("stop", self._projector.stop)
+        self._made("stop", self._device.stop)
 
     def blank(self) -> None:
-        self._made("blank", self._projector.blank)
+        self._made("blank", self._device.blank)
+
+
+class GuardedPositioner:
+    """Implements `slrig.devices.Positioner` by another one, all calls by way of `calls`."""
+
+    def __init__(self, positioner: Positioner, calls: Calls) -> None:
+        self._positioner = positioner
+        self._made = partial(calls.make, "the positioner")
+
+    @property
+    def poses(self) -> Sequence[str]:
+        """See `Positioner`."""
+        return self._positioner.poses
+
+    def move(self, index: int) -> None:
+        """See `Positioner`."""
+        self._made("move", MOVE_LIMIT_S, lambda: self._positioner.move(index))
 
     def close(self) -> None:
-        self._made("close", self._projector.close)
-
-    def _made(self, step: str, function: Callable[[], _Value]) -> _Value:
-        info = self._projector.info
-        device = f"projector '{info.name}'"
-        return self._calls.make(device, step, info.limits.call_s, function, computed=info.limits.computed)
+        """See `Positioner`."""
+        self._made("close", USUAL.call_s, self._positioner.close)
 
 
 def _of_the_system(error: OSError, call: Call) -> DeviceError:

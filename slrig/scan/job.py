@@ -13,7 +13,6 @@ from slrig.bundle.health import write_health
 from slrig.devices import Rig
 from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.channel import Task
 from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
 from slrig.jobs.endings import Ending, Endings, ending_by
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
@@ -22,6 +21,7 @@ from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
+from slrig.jobs.worker_process import Task
 from slrig.rig.session import RigSession, driver_errors
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.plan_check import check_plan

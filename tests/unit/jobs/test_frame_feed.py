@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs import worker_wait
-from slrig.jobs.frame_feed import Abandon, Begin, End, FrameFeed, Take
+from slrig.jobs.frame_feed import Abandon, Begin, FrameFeed
 from slrig.jobs.records import JobState
 from slrig.jobs.worker import Worker
 from slrig.model import Shot
@@ -66,12 +67,12 @@ def test_frames_are_sent_in_order() -> None:
     fed(feed, *SHOTS)
     assert feed.settled(WAIT_S)
     assert feed.whole
-    assert far.kinds() == [Begin, Take, Take, End]
-    assert far.messages[1:3] == [Take(SHOTS[0]), Take(SHOTS[1])]
+    assert far.kinds() == [Begin, Shot, Shot, EvidenceSummary]
+    assert far.messages[1:3] == list(SHOTS)
     # After the end there is nothing left to be abandoned.
     feed.abandon()
     assert feed.whole
-    assert far.kinds()[-1] is End
+    assert far.kinds()[-1] is EvidenceSummary
 
 
 def test_capture_is_not_held_up_by_a_reconstruction_that_falls_behind() -> None:

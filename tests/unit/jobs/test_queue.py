@@ -23,9 +23,8 @@ from slrig.errors import (
 )
 from slrig.jobs.job import Holder
 from slrig.jobs.records import JobState
-from slrig.rig.positioner import MOVE_LIMIT_S, GuardedPositioner
 from slrig.rig.session import ActiveCalibration
-from slrig.rig.watchdog import Calls
+from slrig.rig.watchdog import MOVE_LIMIT_S, Calls, GuardedPositioner
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench
 from tests.unit.scan.fakes import WAIT_S

@@ -25,9 +25,8 @@ from slrig.errors import (
 from slrig.failure import failure_of, interruption
 from slrig.jobs import worker as worker_module
 from slrig.jobs import worker_wait
-from slrig.jobs.channel import Done, Failed, Progressed, Task
 from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
-from slrig.jobs.worker_process import serve
+from slrig.jobs.worker_process import Done, Failed, Progressed, Task, serve
 from slrig.jobs.worker_wait import JobWait
 from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
