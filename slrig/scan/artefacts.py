@@ -1,7 +1,7 @@
-"""The files of a scan: mesh and points in the formats that other programs read, and the report.
+"""The files of a scan: mesh and points in the formats that other programs read, the report, and the folder of them.
 
-Everything is encoded in memory first and written through `write_file`, which leaves a whole file or none.
-The same values give the same bytes: no file holds a time stamp, a path or a random name.
+Everything is encoded in memory first and written through `write_file`, which leaves a whole file or none. The folder
+appears whole or not at all. The same values give the same bytes: no file holds a time stamp, a path or a random name.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -18,12 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.storage import refusals_of, write_file
+from slrig.bundle.storage import refusals_of, staging_name, sync_folder, write_file
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
 
 MESH = "mesh.ply"
+REPORT = "report.json"
+REPORT_FORMAT = "slrig-report"
 ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {"mesh.stl": encode_mesh_stl, "mesh.obj": encode_mesh_obj}
 """Files that are large, and made only when somebody wants them."""
 
@@ -225,3 +229,60 @@ def _plain(value: object, where: str) -> object:
         return value.as_posix()
     message = f"{where}: JSON has no form for a {type(value).__name__}; give a number, text, list or mapping"
     raise TypeError(message)
+
+
+@contextmanager
+def staged_folder(output: Path) -> Iterator[Path]:
+    """Yield a folder to write into; on success it becomes `output` by one rename, on error it is removed.
+
+    Raises
+    ------
+    InvalidInputError
+        `output` is a file, or a folder that holds something else than results of an earlier run.
+    StorageError
+        The disk refused.
+    """
+    output = output.absolute()
+    _require_replaceable(output)
+    staging = staging_name(output)
+    with refusals_of(output):
+        staging.mkdir(parents=True)
+    try:
+        yield staging
+        with refusals_of(output):
+            sync_folder(staging)
+            _put_in_place(staging, output)
+            sync_folder(output.parent)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+
+def _put_in_place(staging: Path, output: Path) -> None:
+    if not output.exists():
+        staging.rename(output)
+        return
+    old = staging_name(output)
+    output.rename(old)
+    try:
+        staging.rename(output)
+    except OSError:
+        old.rename(output)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _require_replaceable(output: Path) -> None:
+    if not output.exists():
+        return
+    if output.is_dir() and (not any(output.iterdir()) or _is_report(output / REPORT)):
+        return
+    what = "a folder with other files in it" if output.is_dir() else "a file"
+    message = f"{output}: results go into a folder of their own, and this is {what}; name a new folder"
+    raise InvalidInputError(message)
+
+
+def _is_report(path: Path) -> bool:
+    try:
+        return bool(json.loads(path.read_bytes()).get("format") == REPORT_FORMAT)
+    except (OSError, ValueError, AttributeError):
+        return False

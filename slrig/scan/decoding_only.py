@@ -26,9 +26,8 @@ from slrig.reconstruction.fusion import fused_frames
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import position_map
 from slrig.reconstruction.resolution import unresolved_bits
-from slrig.scan.artefacts import write_report
+from slrig.scan.artefacts import REPORT, REPORT_FORMAT, staged_folder, write_report
 from slrig.scan.pictures import rejection_picture, write_png
-from slrig.scan.staging import REPORT, REPORT_FORMAT, staged_folder
 
 _FEW, _MANY = 0.05, 0.25
 

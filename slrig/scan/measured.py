@@ -26,9 +26,8 @@ from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.report import capture_notes, capture_report
-from slrig.scan.resolved import unresolved_notes
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
-from slrig.scan.triangulated import Triangulated, triangulated
+from slrig.scan.triangulated import Triangulated, triangulated, unresolved_notes
 
 _STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
 

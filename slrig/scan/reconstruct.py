@@ -26,8 +26,7 @@ from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, 
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
-from slrig.scan.artefacts import encode_points_ply, write_mesh, write_report
-from slrig.scan.calibration_report import calibration_report
+from slrig.scan.artefacts import REPORT, encode_points_ply, staged_folder, write_mesh, write_report
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.offered import rejected_picture
@@ -36,15 +35,14 @@ from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
+    calibration_report,
     camera_report,
     mesh_report,
     redundancy_report,
     with_seconds,
 )
-from slrig.scan.resolved import steps
-from slrig.scan.staging import REPORT, staged_folder
 from slrig.scan.stream import CameraResult, LiveScan
-from slrig.scan.triangulated import Triangulated, widest_gap_px
+from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
 
 
 @dataclass(frozen=True, slots=True)

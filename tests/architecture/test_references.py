@@ -99,7 +99,7 @@ def test_dotted_names_in_docstrings_are_names_of_something() -> None:
 def test_a_name_that_is_not_there_would_be_found() -> None:
     assert _exists(["slrig", "model", "Pinhole"])
     assert _exists(["slrig", "model", "rig", "Pinhole", "centre_mm"])
-    assert _exists(["slrig", "scan", "job", "ScanJob", "run"])
+    assert _exists(["slrig", "jobs", "job", "Job", "conclude"])
     assert not _exists(["slrig", "scan", "work", "Tasks"])
     assert not _exists(["slrig", "model", "rig", "Pinhole", "center_mm"])
     assert not _exists(["slrig", "no_room"])

@@ -20,9 +20,9 @@ from slrig.errors import BundleError
 from slrig.model import Calibration, Solved
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.artefacts import write_converted
-from slrig.scan.calibration_report import calibration_report
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.report import calibration_report
 
 RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
 BOX = np.array([[-40.0, -40, -40], [40, 40, 40]])

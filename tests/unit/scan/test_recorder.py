@@ -12,7 +12,7 @@ from slrig.bundle import BundleWriter, read_bundle
 from slrig.bundle.refused import Refused
 from slrig.errors import BundleError, StorageError
 from slrig.model import Black, CameraFormat, Shot, Size, White
-from slrig.scan.recording import Recorder
+from slrig.scan.acquisition import Recorder
 from tests.unit.scan.fakes import WAIT_S
 
 FORMATS = {"cam0": CameraFormat(Size(64, 48), 8)}
