@@ -10,8 +10,7 @@ from pydantic import BaseModel, Field
 
 from slrig.api.schemas import filled
 from slrig.bundle.faults import Strict
-from slrig.schedule.cron import Cron
-from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Order, Run, RunState, Schedule, TaskKind
 
 UPCOMING = 5
 """How many of the next due times are shown."""

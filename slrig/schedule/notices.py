@@ -38,14 +38,7 @@ class Notices:
     url : where to POST to; None sends nothing.
     """
 
-    def __init__(
-        self,
-        url: str | None,
-        *,
-        rig: str,
-        clock: Clock = utc_now,
-        most: int = MOST_WAITING,
-    ) -> None:
+    def __init__(self, url: str | None, *, rig: str, clock: Clock = utc_now, most: int = MOST_WAITING) -> None:
         self._url = url
         # The rest of the address often holds a secret.
         self._host = None if url is None else urlsplit(url).hostname

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from datetime import datetime, timedelta
-from typing import Any, Protocol
+from typing import Any
 
 import structlog
 
@@ -25,32 +26,21 @@ LOOK_S = 10.0
 """The clock is looked at this often at the least, so that one that is set anew is noticed."""
 
 _LEAST_WAIT_S = 0.05
+"""Between two looks, so that a run that cannot be started yet does not keep a core busy."""
 
 _log = structlog.get_logger(__name__)
 
 
-class Work(Protocol):
-    """Does what a schedule asks for, on a thread of the scheduler's."""
+Work = Callable[[Schedule, Run, Callable[[], bool]], Mapping[str, Any]]
+"""Does what a schedule asks for, on a thread of the scheduler's, until the call that it is given says that it is
+cancelled. Returns what there is to tell.
 
-    def __call__(self, schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
-        """Do it, and return what there is to tell.
+Raises RigBusyError where somebody holds the rig, before anything was done; SlrigError where it could not be done: what
+may pass, see `passes`, has the run try again within its grace.
+"""
 
-        Raises
-        ------
-        RigBusyError
-            Somebody holds the rig: before anything was done.
-        SlrigError
-            It could not be done. What may pass, see `passes`, has the run try again within its grace.
-        """
-        ...
-
-
-class Notice(Protocol):
-    """Told of every run that came to an end, or never began."""
-
-    def __call__(self, schedule: Schedule, run: Run, /) -> None:
-        """Take note. Must not raise."""
-        ...
+Notice = Callable[[Schedule, Run], None]
+"""Told of every run that came to an end, or never began. Must not raise."""
 
 
 def passes(error: SlrigError) -> bool:
@@ -116,24 +106,20 @@ class Scheduler:
 
     def tick(self) -> datetime:
         """Look at the clock once. Returns when to look again."""
-        now = self._clock()
+        now, store = self._clock(), self._store
         if self._idle.is_set():
-            self._tell(self._store.interrupt_own(now))
-        self._store.beat(now)
-        self._tell(self._store.interrupt_dead(now))
-        self._tell(run for run in self._store.reckon(now) if run.state.final)
-        self._tell(self._store.expire(now))
-        for run in self._store.startable(now):
+            self._tell(store.interrupt_own(now))
+        store.beat(now)
+        self._tell(store.interrupt_dead(now))
+        self._tell(run for run in store.reckon(now) if run.state.final)
+        self._tell(store.expire(now))
+        for run in store.startable(now):
             if self._stop.is_set() or not self._idle.is_set():
                 break
-            if self._store.start(run, now):
+            if store.start(run, now):
                 self._begin(run)
-        return self._next_look(now)
-
-    def _next_look(self, now: datetime) -> datetime:
         look = now + timedelta(seconds=LOOK_S)
-        following = self._store.next_moment()
-        return look if following is None else min(following, look)
+        return min(store.next_moment() or look, look)
 
     def _begin(self, run: Run) -> None:
         schedule = self._store.get(run.schedule)
@@ -154,7 +140,7 @@ class Scheduler:
     def _end(self, schedule: Schedule, run: Run) -> None:
         state, reason, result = RunState.FAILED, None, None
         try:
-            result = self._work(schedule, run, cancelled=self._stop.is_set)
+            result = self._work(schedule, run, self._stop.is_set)
             state = RunState.SUCCEEDED
             reason = f"at try {run.attempts + 1}" if run.attempts else run.reason
         except SlrigError as error:
@@ -171,14 +157,9 @@ class Scheduler:
         if self._stop.is_set() and state is not RunState.SUCCEEDED:
             state, reason = RunState.INTERRUPTED, "the service ended in the middle of it"
         self._store.finish(run, state, self._clock(), reason=reason, result=result)
-        self._tell(each for each in self._runs(schedule) if each.number == run.number)
-
-    def _runs(self, schedule: Schedule) -> Iterable[Run]:
-        """The newest runs of a schedule; none if it was removed meanwhile."""
-        try:
-            return self._store.runs(schedule.id)
-        except ScheduleNotFoundError:
-            return ()
+        # It may have been removed meanwhile.
+        with suppress(ScheduleNotFoundError):
+            self._tell(each for each in self._store.runs(schedule.id) if each.number == run.number)
 
     def _tell(self, runs: Iterable[Run]) -> None:
         for run in runs:

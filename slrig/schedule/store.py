@@ -7,19 +7,20 @@ process died stops saying so, and is recorded as interrupted.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime, timedelta
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timedelta
 from typing import Any
 from uuid import UUID, uuid4
 
-from sqlalchemy import func, select
+from pydantic import TypeAdapter
+from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from slrig.errors import ScheduleNotFoundError
 from slrig.jobs.database import Database
+from slrig.jobs.records import stamp
 from slrig.jobs.tables import RunRow, ScheduleRow
-from slrig.schedule.cron import Cron
-from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.recurrence import DueRun, reckon
 
 LIFE_S = 60.0
@@ -27,9 +28,14 @@ LIFE_S = 60.0
 
 _KEPT_RUNS = 5000
 
+_AS_ORDERED = ("task", "options", "label", "grace_s", "retry_s", "catch_up", "enabled")
+"""The columns that are as an order's attributes of the same name."""
+
+_run_adapter = TypeAdapter(Run)
+
 
 class ScheduleStore:
-    """Schedules and runs. Safe to call from any thread and from several processes. `now` is a moment with a zone."""
+    """Schedules and runs. Safe to call from any thread and from several processes. `now` is in UTC."""
 
     def __init__(self, database: Database) -> None:
         self.database = database
@@ -39,17 +45,11 @@ class ScheduleStore:
         """Put a new schedule on record. It is due from now on."""
         row = ScheduleRow(
             id=str(uuid4()),
-            label=order.label,
             cron=order.cron.text,
             time_zone=order.cron.time_zone,
-            task=order.task,
-            options=dict(order.options),
-            grace_s=order.grace_s,
-            retry_s=order.retry_s,
-            catch_up=order.catch_up,
-            enabled=order.enabled,
-            created_at=_stamp(now),
-            next_due=_stamp(order.cron.after(now)),
+            **{name: getattr(order, name) for name in _AS_ORDERED},
+            created_at=stamp(now),
+            next_due=stamp(order.cron.after(now)),
         )
         with self.database.changing() as session:
             session.add(row)
@@ -69,10 +69,7 @@ class ScheduleStore:
     def enable(self, schedule_id: UUID, *, enabled: bool) -> Schedule:
         """Pause a schedule, or let it go on. What was due during the pause is then reckoned as after any other.
 
-        Raises
-        ------
-        ScheduleNotFoundError
-            There is no such schedule.
+        Raises ScheduleNotFoundError.
         """
         with self.database.changing() as session:
             row = _found(session, schedule_id)
@@ -109,13 +106,13 @@ class ScheduleStore:
         with self.database.changing() as session:
             for row in session.scalars(select(ScheduleRow).where(ScheduleRow.enabled)):
                 order = _order(row)
-                found = reckon(order, _moment(row.next_due), now)
+                found = reckon(order, datetime.fromisoformat(row.next_due), now)
                 for due in found.runs:
                     made += self._recorded(session, row, due, now)
                 following = found.next_due
                 while self._row(session, row.id, following) is not None:
                     following = order.cron.after(following)
-                row.next_due = _stamp(following)
+                row.next_due = stamp(following)
                 if made:
                     _prune(session, row.id)
             session.flush()
@@ -125,7 +122,7 @@ class ScheduleStore:
         """The runs that wait for the rig and may try it now, the one due first first."""
         query = (
             select(RunRow)
-            .where(RunRow.state == RunState.WAITING, RunRow.next_attempt <= _stamp(now))
+            .where(RunRow.state == RunState.WAITING, RunRow.next_attempt <= stamp(now))
             .order_by(RunRow.due, RunRow.number)
         )
         with self.database.reading() as session:
@@ -136,8 +133,8 @@ class ScheduleStore:
         due = select(func.min(ScheduleRow.next_due)).where(ScheduleRow.enabled)
         attempt = select(func.min(RunRow.next_attempt)).where(RunRow.state == RunState.WAITING)
         with self.database.reading() as session:
-            found = [stamp for query in (due, attempt) if (stamp := session.scalar(query)) is not None]
-            return _moment(min(found)) if found else None
+            found = [first for query in (due, attempt) if (first := session.scalar(query)) is not None]
+            return datetime.fromisoformat(min(found)) if found else None
 
     def start(self, run: Run, now: datetime) -> bool:
         """Take a waiting run; False if somebody else has it, or another run is under way."""
@@ -147,7 +144,7 @@ class ScheduleStore:
             if row is None or row.state != RunState.WAITING or under_way is not None:
                 return False
             row.state, row.owner, row.attempts = RunState.RUNNING, self._owner, row.attempts + 1
-            row.started_at, row.alive_until = _stamp(now), _stamp(now + timedelta(seconds=LIFE_S))
+            row.started_at, row.alive_until = stamp(now), stamp(now + timedelta(seconds=LIFE_S))
             return True
 
     def postpone(self, run: Run, reason: str, next_attempt: datetime) -> None:
@@ -155,7 +152,7 @@ class ScheduleStore:
         with self.database.changing() as session:
             row = session.get(RunRow, run.number)
             if row is not None and not RunState(row.state).final:
-                row.state, row.reason, row.next_attempt = RunState.WAITING, reason, _stamp(next_attempt)
+                row.state, row.reason, row.next_attempt = RunState.WAITING, reason, stamp(next_attempt)
                 row.owner = row.alive_until = row.started_at = None
 
     def finish(
@@ -166,7 +163,6 @@ class ScheduleStore:
             row = session.get(RunRow, run.number)
             if row is not None and not RunState(row.state).final:
                 _close(row, state, now, reason)
-                row.reason = reason
                 row.result = None if result is None else dict(result)
 
     def beat(self, now: datetime) -> None:
@@ -174,7 +170,7 @@ class ScheduleStore:
         with self.database.changing() as session:
             query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
             for row in session.scalars(query):
-                row.alive_until = _stamp(now + timedelta(seconds=LIFE_S))
+                row.alive_until = stamp(now + timedelta(seconds=LIFE_S))
 
     def interrupt_dead(self, now: datetime, *, alone: bool = False) -> Sequence[Run]:
         """Record runs whose process died as interrupted: those that did not say for long that they are alive.
@@ -185,34 +181,35 @@ class ScheduleStore:
         if not alone:
             # The second test is for a clock that was set back: nobody says that far ahead that he is alive.
             query = query.where(
-                (RunRow.alive_until < _stamp(now)) | (RunRow.alive_until > _stamp(now + timedelta(seconds=2 * LIFE_S)))
+                (RunRow.alive_until < stamp(now)) | (RunRow.alive_until > stamp(now + timedelta(seconds=2 * LIFE_S)))
             )
-        with self.database.changing() as session:
-            dead = list(session.scalars(query))
-            for row in dead:
-                _close(row, RunState.INTERRUPTED, now, "the service ended in the middle of it")
-            return [_run(row) for row in dead]
+        return self._closed(query, RunState.INTERRUPTED, now, lambda _: "the service ended in the middle of it")
 
     def interrupt_own(self, now: datetime) -> Sequence[Run]:
         """Record the runs that this process began as interrupted. Only while it has none under way: what it still has
         on record as running ended while the disk refused to take that down.
         """
         query = select(RunRow).where(RunRow.state == RunState.RUNNING, RunRow.owner == self._owner)
-        with self.database.changing() as session:
-            ended = list(session.scalars(query))
-            for row in ended:
-                _close(row, RunState.INTERRUPTED, now, "it ended, and how could not be put on record")
-            return [_run(row) for row in ended]
+        return self._closed(query, RunState.INTERRUPTED, now, lambda _: "it ended, and how could not be put on record")
 
     def expire(self, now: datetime) -> Sequence[Run]:
         """Record runs that waited for the whole of their grace as skipped, each with what it waited for."""
-        query = select(RunRow).where(RunRow.state == RunState.WAITING, RunRow.deadline < _stamp(now))
+        query = select(RunRow).where(RunRow.state == RunState.WAITING, RunRow.deadline < stamp(now))
+
+        def reason(row: RunRow) -> str:
+            waited = f"for the whole of its grace: {row.reason}" if row.attempts else "before it could be started"
+            return f"its time passed {waited}"
+
+        return self._closed(query, RunState.SKIPPED, now, reason)
+
+    def _closed(
+        self, query: Select[tuple[RunRow]], state: RunState, now: datetime, reason: Callable[[RunRow], str]
+    ) -> Sequence[Run]:
         with self.database.changing() as session:
-            late = list(session.scalars(query))
-            for row in late:
-                waited = f"for the whole of its grace: {row.reason}" if row.attempts else "before it could be started"
-                _close(row, RunState.SKIPPED, now, f"its time passed {waited}")
-            return [_run(row) for row in late]
+            rows = list(session.scalars(query))
+            for row in rows:
+                _close(row, state, now, reason(row))
+            return [_run(row) for row in rows]
 
     def _recorded(self, session: Session, schedule: ScheduleRow, due: DueRun, now: datetime) -> list[RunRow]:
         if self._row(session, schedule.id, due.due) is not None:
@@ -223,21 +220,21 @@ class ScheduleStore:
                 _close(older, RunState.COALESCED, now, f"overtaken by the next due time; it had waited: {older.reason}")
         row = RunRow(
             schedule_id=schedule.id,
-            due=_stamp(due.due),
+            due=stamp(due.due),
             state=due.state,
             reason=due.reason,
             count=due.count,
             attempts=0,
-            deadline=_stamp(due.deadline),
-            next_attempt=_stamp(now) if due.state is RunState.WAITING else None,
-            finished_at=_stamp(now) if due.state.final else None,
+            deadline=stamp(due.deadline),
+            next_attempt=stamp(now) if due.state is RunState.WAITING else None,
+            finished_at=stamp(now) if due.state.final else None,
         )
         session.add(row)
         session.flush()
         return [row]
 
     def _row(self, session: Session, schedule_id: str, due: datetime) -> RunRow | None:
-        return session.scalar(select(RunRow).where(RunRow.schedule_id == schedule_id, RunRow.due == _stamp(due)))
+        return session.scalar(select(RunRow).where(RunRow.schedule_id == schedule_id, RunRow.due == stamp(due)))
 
 
 def _found(session: Session, schedule_id: UUID) -> ScheduleRow:
@@ -257,48 +254,20 @@ def _prune(session: Session, schedule_id: str) -> None:
 
 
 def _close(row: RunRow, state: RunState, now: datetime, reason: str | None) -> None:
-    row.state, row.finished_at, row.next_attempt, row.alive_until = state, _stamp(now), None, None
-    row.reason = reason if reason is not None else row.reason
+    row.state, row.reason, row.finished_at = state, reason, stamp(now)
+    row.next_attempt = row.alive_until = None
 
 
 def _order(row: ScheduleRow) -> Order:
-    return Order(
-        Cron(row.cron, row.time_zone),
-        TaskKind(row.task),
-        row.options,
-        row.label,
-        row.grace_s,
-        row.retry_s,
-        row.catch_up,
-        row.enabled,
-    )
+    given = {name: getattr(row, name) for name in _AS_ORDERED}
+    return Order(Cron(row.cron, row.time_zone), **{**given, "task": TaskKind(row.task)})
 
 
 def _schedule(row: ScheduleRow) -> Schedule:
-    return Schedule(UUID(row.id), _order(row), _moment(row.created_at), _moment(row.next_due))
+    created_at, next_due = map(datetime.fromisoformat, (row.created_at, row.next_due))
+    return Schedule(UUID(row.id), _order(row), created_at, next_due)
 
 
 def _run(row: RunRow) -> Run:
-    return Run(
-        number=row.number,
-        schedule=UUID(row.schedule_id),
-        due=_moment(row.due),
-        state=RunState(row.state),
-        reason=row.reason,
-        count=row.count,
-        attempts=row.attempts,
-        deadline=_moment(row.deadline),
-        next_attempt=None if row.next_attempt is None else _moment(row.next_attempt),
-        started_at=None if row.started_at is None else _moment(row.started_at),
-        finished_at=None if row.finished_at is None else _moment(row.finished_at),
-        result=row.result,
-    )
-
-
-def _stamp(moment: datetime) -> str:
-    # One zone and one length: the texts sort as the moments do.
-    return moment.astimezone(UTC).isoformat(timespec="milliseconds")
-
-
-def _moment(stamp: str) -> datetime:
-    return datetime.fromisoformat(stamp)
+    found = {column.name: getattr(row, column.name) for column in RunRow.__table__.columns}
+    return _run_adapter.validate_python({**found, "schedule": row.schedule_id})

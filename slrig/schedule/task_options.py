@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 from pydantic import Field, ValidationError
 
-from slrig.accept.asking import AcceptanceRequest
 from slrig.bundle.faults import Strict, explain, keys_of
 from slrig.calibration.board import Board, BoardKind
-from slrig.errors import CalibrationError, ScheduleError
+from slrig.errors import ScheduleError
+from slrig.rig.session import RigFacts
 
 ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
 Position = Annotated[int, Field(ge=0, le=10_000)]
@@ -50,7 +50,7 @@ class CalibrationOptions(Strict):
     activate: bool = False
 
 
-Options = TypeVar("Options", VerificationOptions, CalibrationOptions, AcceptanceRequest)
+Options = TypeVar("Options", bound=Strict)
 
 
 def checked(model: type[Options], given: Mapping[str, Any], *, task: str) -> Options:
@@ -61,18 +61,38 @@ def checked(model: type[Options], given: Mapping[str, Any], *, task: str) -> Opt
     ScheduleError
         One is unknown or wrong: all faults in one message, and the options that there are.
     """
-    there_are = f"options of {task} are: {', '.join(model.model_fields)}"
     try:
-        options = model.model_validate(dict(given))
+        return model.model_validate(dict(given))
     except ValidationError as error:
         faults = "; ".join(line.strip() for line in explain(error, dict(given), keys_of(model)).splitlines())
-        message = f"options: {faults}. The {there_are}"
+        message = f"options: {faults}. The options of {task} are: {', '.join(model.model_fields)}"
         raise ScheduleError(message) from error
-    board = getattr(options, "board", None)
-    if isinstance(board, BoardOptions):
-        try:
-            board.board()
-        except CalibrationError as error:
-            message = f"options: {error}"
-            raise ScheduleError(message) from error
-    return options
+
+
+def require_positions(facts: RigFacts | None, asked: Sequence[int | str]) -> None:
+    """Refuse work that needs a positioner where the rig has none, or not those positions.
+
+    facts None : the rig is not open, and nobody knows; a run is refused then. asked : by number from 0 or by name.
+
+    Raises
+    ------
+    ScheduleError
+        No run could be done with this rig.
+    """
+    if facts is None:
+        return
+    names = facts.positions
+    if not names:
+        message = (
+            "this rig has no positioner, and nobody is there to move anything when a schedule is due: schedule a "
+            "verification of a board that stays in view, and calibrate or test by hand (slrig calibrate run, slrig "
+            "accept)"
+        )
+        raise ScheduleError(message)
+    missing = [each for each in asked if each not in names and each not in range(len(names))]
+    if missing:
+        message = (
+            f"options: this rig's positioner has no {', '.join(map(repr, missing))}; it has 0 to {len(names) - 1}: "
+            f"{', '.join(names)}"
+        )
+        raise ScheduleError(message)

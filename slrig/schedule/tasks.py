@@ -8,26 +8,28 @@ from typing import Any, Protocol
 from uuid import UUID, uuid4
 
 from slrig.accept.desk import AcceptanceDesk
+from slrig.bundle.faults import Strict
 from slrig.calibrate.calibrating import Calibrations
-from slrig.errors import ScanStateError
+from slrig.errors import CalibrationError, ScanStateError, ScheduleError
 from slrig.jobs.job import Holder
 from slrig.scan.runner import RigAccess
-from slrig.schedule.acceptance_task import AcceptanceTask
-from slrig.schedule.calibration_task import CalibrationTask
-from slrig.schedule.polling import until
 from slrig.schedule.records import Order, Run, Schedule, TaskKind
-from slrig.schedule.verification_task import VerificationTask
+from slrig.schedule.rig_tasks import AcceptanceTask, CalibrationTask, VerificationTask, until
+from slrig.schedule.task_options import checked
 from slrig.verify.job import VerificationDesk
 
 
 class Task(Protocol):
-    """One kind of work."""
+    """One kind of work. options : what may be said of it; both methods are given one of these."""
 
-    def check(self, options: Mapping[str, Any], /) -> None:
-        """Raise ScheduleError for options that no run could be done with, as far as is known now."""
+    @property
+    def options(self) -> type[Strict]: ...  # noqa: D102 - see above
+
+    def check(self, asked: Any, /) -> None:
+        """Raise ScheduleError or CalibrationError for options that no run could be done with, as far as is known."""
         ...
 
-    def do(self, holder: Holder, options: Mapping[str, Any], /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def do(self, holder: Holder, asked: Any, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """Do it, the rig held by `holder`, and return what there is to tell, as JSON values.
 
         Raises
@@ -66,11 +68,17 @@ class Tasks:
 
     def check(self, order: Order) -> None:
         """Raise ScheduleError, with every fault, for options that no run could be done with."""
-        self._of[order.task].check(order.options)
+        task = self._of[order.task]
+        try:
+            task.check(checked(task.options, order.options, task=order.task))
+        except CalibrationError as error:
+            message = f"options: {error}"
+            raise ScheduleError(message) from error
 
-    def __call__(self, schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def __call__(self, schedule: Schedule, run: Run, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
         """See `slrig.schedule.scheduler.Work`."""
-        holder, stop = holder_of(schedule, run), threading.Event()
+        order, stop = schedule.order, threading.Event()
+        task, holder = self._of[order.task], holder_of(schedule, run)
 
         def ends() -> bool:
             return cancelled() or stop.is_set()
@@ -79,7 +87,7 @@ class Tasks:
             self._stops[schedule.id] = stop
         try:
             self._open_rig(holder, ends)
-            return self._of[schedule.order.task].do(holder, schedule.order.options, cancelled=ends)
+            return task.do(holder, checked(task.options, order.options, task=order.task), cancelled=ends)
         finally:
             with self._lock:
                 self._stops.pop(schedule.id, None)
@@ -111,8 +119,7 @@ def holder_of(schedule: Schedule, run: Run) -> Holder:
     """Who holds the rig for a run.
 
     >>> from datetime import UTC, datetime
-    >>> from slrig.schedule.cron import Cron
-    >>> from slrig.schedule.records import RunState
+    >>> from slrig.schedule.records import Cron, RunState
     >>> due = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
     >>> order = Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION)
     >>> schedule = Schedule(UUID(int=7), order, due, due)

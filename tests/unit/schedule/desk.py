@@ -9,8 +9,7 @@ from typing import Any
 
 from slrig.errors import RigBusyError
 from slrig.jobs.database import Database
-from slrig.schedule.cron import Cron
-from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 
@@ -38,7 +37,7 @@ class Desk:
             notice=lambda _, run: self.told.append((run.due, run.state)),
         )
 
-    def _work(self, schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def _work(self, schedule: Schedule, run: Run, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
         assert not cancelled()
         if self.busy is not None:
             raise RigBusyError(self.busy, holder=self.busy, since=START.isoformat())

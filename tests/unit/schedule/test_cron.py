@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from slrig.errors import ScheduleError
-from slrig.schedule.cron import Cron
+from slrig.schedule.records import Cron
 
 BERLIN = "Europe/Berlin"
 

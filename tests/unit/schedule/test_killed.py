@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from slrig.jobs.database import Database
-from slrig.schedule.cron import Cron
-from slrig.schedule.records import Order, RunState, TaskKind
+from slrig.schedule.records import Cron, Order, RunState, TaskKind
 from slrig.schedule.store import ScheduleStore
 from tests.unit.schedule import victim
 

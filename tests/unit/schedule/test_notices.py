@@ -18,9 +18,8 @@ import structlog
 from slrig.config import ServiceSettings, read_settings
 from slrig.errors import ConfigError
 from slrig.jobs.database import Database
-from slrig.schedule.cron import Cron
 from slrig.schedule.notices import TOLD, NoticedHealth, Notices
-from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from tests.unit.scan.fakes import WAIT_S
 from tests.unit.verify.health_bench import a_verification, hours
 

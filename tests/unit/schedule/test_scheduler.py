@@ -18,8 +18,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     WorkerLostError,
 )
-from slrig.schedule.cron import Cron
-from slrig.schedule.records import Order, RunState, TaskKind
+from slrig.schedule.records import Cron, Order, RunState, TaskKind
 from tests.unit.schedule.desk import START, Desk
 
 NewDesk = Callable[..., Desk]

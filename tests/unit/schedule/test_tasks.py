@@ -27,20 +27,17 @@ from slrig.errors import (
     ScheduleError,
     SlrigError,
     SolveRefusedError,
-    UnsupportedByDeviceError,
 )
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.job import Holder
 from slrig.jobs.records import JobKind, JobState
 from slrig.jobs.store import JobStore
-from slrig.schedule.acceptance_task import AcceptanceTask
-from slrig.schedule.cron import Cron
-from slrig.schedule.polling import error_of
-from slrig.schedule.records import Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
+from slrig.schedule.rig_tasks import error_of
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
-from slrig.schedule.tasks import Tasks, holder_of
+from slrig.schedule.tasks import Tasks
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
 from slrig.verify.verification import VerificationTools
@@ -82,7 +79,7 @@ class TaskBench(CalibrationBench):
 
     def do(self, task: TaskKind, *, cancelled: Callable[[], bool] = lambda: False, **options: Any) -> Mapping[str, Any]:
         """One run."""
-        return self.tasks(*scheduled(task, options), cancelled=cancelled)
+        return self.tasks(*scheduled(task, options), cancelled)
 
     def use_a_calibration(self) -> None:
         """Have scans use a calibration whose board is known."""
@@ -239,7 +236,7 @@ def test_device_that_fails_ends_the_run(bench: TaskBench) -> None:
 def test_rig_without_a_positioner_is_told_in_words(tmp_path: Path) -> None:
     bench = TaskBench(tmp_path, positioner=False)
     bench.runner.start()
-    with pytest.raises(UnsupportedByDeviceError, match="no positioner, and nobody is there to move the board"):
+    with pytest.raises(ScheduleError, match="no positioner, and nobody is there to move anything"):
         bench.do(TaskKind.CALIBRATION, board=BOARD)
     assert bench.calibrations.latest() == []
     bench.close()
@@ -366,14 +363,14 @@ def test_acceptance_is_measured_by_script_and_tells_its_decision(
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
     tasks = Tasks(cast("Any", queue), cast("Any", None), cast("Any", None), desk)
-    told = tasks(schedule, run, cancelled=lambda: False)
+    told = tasks(schedule, run, lambda: False)
     assert queue.holders == [HOLDER.format("acceptance")]
     assert told["decision"] == "passes"
     assert told["quantities"]["PF"]["position"].startswith("sphere-")
     assert desk.file(UUID(told["acceptance"]), "report.html").is_file()
     queue.busy = True
     with pytest.raises(RigBusyError):
-        AcceptanceTask(cast("Any", queue), desk).do(holder_of(schedule, run), {}, cancelled=lambda: False)
+        tasks(schedule, run, lambda: False)
 
 
 def test_fault_of_a_busy_rig_is_not_told_as_one() -> None:

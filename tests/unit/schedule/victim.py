@@ -33,7 +33,7 @@ def keep(folder: Path, seed: int, ready: Connection) -> None:
     chance = random.Random(seed)
     diary = os.open(folder / "diary", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 
-    def work(_schedule: Schedule, run: Run, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+    def work(_schedule: Schedule, run: Run, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:
         assert not cancelled()
         if chance.random() < 0.2:
             busy = "held by a scan"

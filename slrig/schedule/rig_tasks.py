@@ -1,0 +1,248 @@
+"""The kinds of work that a schedule does with the rig: a verification, a calibration, an acceptance test."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+from uuid import UUID
+
+from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.desk import AcceptanceDesk
+from slrig.accept.records import AcceptanceState
+from slrig.accept.verdicts import verdicts
+from slrig.calibrate.calibrating import Calibrations
+from slrig.calibrate.pose_shooting import PoseRequest
+from slrig.calibrate.records import SessionState
+from slrig.calibration.board import Board
+from slrig.calibration.judging.verdict import Grade
+from slrig.errors import (
+    CalibrationError,
+    CalibrationNotFoundError,
+    CalibrationStateError,
+    DeviceError,
+    LibraryMissingError,
+    RigBusyError,
+    ScanCancelledError,
+    SlrigError,
+    WorkerLostError,
+)
+from slrig.failure import JobFailure, errors_by_code, failure_of
+from slrig.jobs.job import Holder
+from slrig.jobs.records import JobState
+from slrig.scan.runner import RigAccess
+from slrig.schedule.task_options import CalibrationOptions, VerificationOptions, require_positions
+from slrig.verify.job import VerificationDesk
+
+LOOK_S = 0.1
+"""How often work that somebody else does is looked at."""
+
+_TOLD = ("state", "reasons", "remedy", "expected_mm", "drift_mm", "scale_percent", "scale_mm")
+
+
+def until(
+    reached: Callable[[], bool], cancelled: Callable[[], bool], *, cancel: Callable[[], object] = lambda: None
+) -> None:
+    """Return once `reached()`; have the work ended by `cancel` when `cancelled()` turns true before.
+
+    Raises
+    ------
+    ScanCancelledError
+        `cancelled()` became true.
+    """
+    while not reached():
+        if cancelled():
+            cancel()
+            message = "the run was cancelled"
+            raise ScanCancelledError(message)
+        time.sleep(LOOK_S)
+
+
+def error_of(fault: JobFailure) -> SlrigError:
+    """The error that a recorded fault stands for.
+
+    >>> error_of(JobFailure("pose-refused", "no camera sees the board"))
+    PoseRefusedError('no camera sees the board')
+    """
+    kind = errors_by_code().get(fault.code, SlrigError)
+    # These two take more than a message.
+    return DeviceError(fault.message) if kind in {RigBusyError, LibraryMissingError} else kind(fault.message)
+
+
+class VerificationTask:
+    """The board shot where it is, or where the positioner takes it, and judged."""
+
+    options = VerificationOptions
+
+    def __init__(self, queue: RigAccess, calibrations: Calibrations, desk: VerificationDesk) -> None:
+        self._queue = queue
+        self._calibrations = calibrations
+        self._desk = desk
+
+    def check(self, asked: VerificationOptions, /) -> None:
+        """See `Task`. A calibration may be made before the first run; a board to look at is named now or never."""
+        self._board(asked)
+        if asked.position is not None:
+            require_positions(self._queue.status().facts, [asked.position])
+
+    def do(self, holder: Holder, asked: VerificationOptions, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """See `Task`. A rig that is found stale is a verification that succeeded."""
+        board, jobs = self._board(asked), self._desk.jobs
+        job = self._desk.shoot(board, position=asked.position, exposure_s=asked.exposure_s, holder=holder).id
+        until(lambda: jobs.get(job).state.final, cancelled, cancel=lambda: self._desk.cancel(job))
+        over = jobs.get(job)
+        if over.fault is not None:
+            raise error_of(over.fault)
+        found = over.summary or {}
+        return {"verification": found["id"], **{name: found.get(name) for name in _TOLD}}
+
+    def _board(self, asked: VerificationOptions) -> Board:
+        """The board that is asked for, or that of the calibration in use."""
+        if asked.board is not None:
+            return asked.board.board()
+        active = self._calibrations.active
+        board = None if active is None else self._calibrations.register.get(active).board
+        if board is None:
+            used = "no calibration that was made here is in use" if active is None else "the one in use was imported"
+            message = (
+                f"which board is in view is not known: {used}. Give the schedule the option "
+                '"board", as {"kind": "charuco", "corners": [11, 8], "square_mm": 12}, or activate a calibration that '
+                "was made here"
+            )
+            raise CalibrationError(message)
+        return board
+
+
+class CalibrationTask:
+    """Every pose of the positioner shot, the solve, and, if asked for, its use. Scans may come between two poses; a
+    pose waits in line behind them.
+
+    tidy : called after each, however it ended, so that they do not pile up.
+    """
+
+    options = CalibrationOptions
+
+    def __init__(self, queue: RigAccess, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+        self._queue = queue
+        self._calibrations = calibrations
+        self._tidy = tidy
+
+    def check(self, asked: CalibrationOptions, /) -> None:
+        """See `Task`."""
+        asked.board.board()
+        require_positions(self._queue.status().facts, asked.positions)
+
+    def do(self, holder: Holder, asked: CalibrationOptions, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """See `Task`. Poses that are refused are left out; one that fails ends the run."""
+        facts = self._queue.status().facts
+        require_positions(facts, asked.positions)
+        first, *others = asked.positions or range(0 if facts is None else len(facts.positions))
+        session = self._calibrations.open(asked.board.board(), label=holder.words).id
+        try:
+            try:
+                # The first may not wait: a busy rig is told before anything was done.
+                self._shoot(session, holder, PoseRequest(first, asked.exposure_s), wait=False)
+            except BaseException:
+                self._calibrations.delete(session)
+                raise
+            for position in others:
+                # Until the last pose was shot: it may still be read while the next one is.
+                self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING}, cancelled)
+                self._shoot(session, holder, PoseRequest(position, asked.exposure_s), wait=True)
+            self._await_poses(session, {JobState.QUEUED, JobState.CAPTURING, JobState.COMPUTING}, cancelled)
+            return self._solved(session, asked, cancelled)
+        except (DeviceError, WorkerLostError):
+            # It is tried again from the first pose on. A pose that is being read yet leaves it to `tidy`.
+            with suppress(CalibrationStateError, CalibrationNotFoundError):
+                self._calibrations.delete(session)
+            raise
+        finally:
+            self._tidy()
+
+    def _shoot(self, session: UUID, holder: Holder, request: PoseRequest, *, wait: bool) -> None:
+        self._calibrations.poses.shoot(session, request, wait=wait, holder=holder)
+
+    def _await_poses(self, session: UUID, pending: set[JobState], cancelled: Callable[[], bool]) -> None:
+        register, poses = self._calibrations.register, self._calibrations.poses
+
+        def cancel() -> None:
+            for pose in register.get(session).poses:
+                poses.cancel(session, pose.number)
+
+        until(lambda: not any(pose.state in pending for pose in register.get(session).poses), cancelled, cancel=cancel)
+        for pose in register.get(session).poses:
+            if pose.fault is not None and not pose.refused:
+                raise error_of(pose.fault)
+
+    def _solved(self, session: UUID, asked: CalibrationOptions, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        register = self._calibrations.register
+        self._calibrations.solves.solve(session)
+        until(lambda: register.get(session).state is not SessionState.SOLVING, cancelled)
+        record = register.get(session)
+        if record.fault is not None:
+            raise error_of(record.fault)
+        result = record.result or {}
+        verdict = result.get("verdict") or {}
+        # Nobody looks at the report before scans use it.
+        activated = asked.activate and verdict.get("grade") != Grade.DO_NOT_USE
+        if activated:
+            self._calibrations.activate(session)
+        return {
+            "calibration": str(session),
+            "poses": len(record.poses),
+            "accepted": len(record.accepted),
+            "refused": {
+                pose.position_name or pose.name: pose.fault.message
+                for pose in record.poses
+                if pose.refused and pose.fault is not None
+            },
+            "verdict": verdict.get("summary"),
+            "expected_error_mm": (result.get("expected") or {}).get("point_mm"),
+            "activated": activated,
+        }
+
+
+class AcceptanceTask:
+    """Every prescribed position measured by the rig's positioner, and the decision. The rig is held for the whole."""
+
+    options = AcceptanceRequest
+
+    def __init__(self, queue: RigAccess, desk: AcceptanceDesk) -> None:
+        self._queue = queue
+        self._desk = desk
+
+    def check(self, _asked: AcceptanceRequest, /) -> None:
+        """See `Task`."""
+        require_positions(self._queue.status().facts, ())
+
+    def do(self, holder: Holder, asked: AcceptanceRequest, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
+        """See `Task`. A rig that fails the test is a run that succeeded."""
+        desk = self._desk
+        test = desk.open(asked.plan).id
+        try:
+            desk.measure(test, wait=False, scripted=True, holder=holder)
+        except BaseException:
+            desk.cancel(test)
+            raise
+        until(
+            lambda: desk.get(test).state is not AcceptanceState.MEASURING, cancelled, cancel=lambda: desk.cancel(test)
+        )
+        record = desk.get(test)
+        if record.decision is None:
+            desk.cancel(test)
+            raise error_of(record.fault or failure_of(RuntimeError("the test ended without a result")))
+        return {
+            "acceptance": str(test),
+            "decision": str(record.decision),
+            "quantities": {
+                str(each.quantity): {
+                    "error_mm": each.error_mm,
+                    "limit_mm": each.limit_mm,
+                    "uncertainty_mm": each.uncertainty_mm,
+                    "position": each.step,
+                    "decision": str(each.decision),
+                }
+                for each in verdicts(record.readings, record.plan)
+            },
+        }
