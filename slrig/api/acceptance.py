@@ -20,7 +20,6 @@ from slrig.api.schemas import AnyFault, filled
 from slrig.api.service import Serving
 from slrig.bundle.faults import Strict
 from slrig.calibration.artefacts import Decision
-from slrig.jobs.records import JobRecord
 
 router = APIRouter(prefix="/acceptance", tags=["acceptance"])
 
@@ -83,7 +82,7 @@ class AcceptanceBody(AcceptanceSummary):
     error: AnyFault = Field(description="why the last position was not measured; it may be measured again")
 
 
-@router.post("", status_code=201, responses=problems(409, 422, 503, 507))
+@router.post("", status_code=201, responses=problems(409, 503, 507))
 def open_acceptance(
     service: Serving,
     response: Response,
@@ -105,19 +104,19 @@ def open_acceptance(
     return _body(opened)
 
 
-@router.get("", responses=problems(422))
+@router.get("")
 def list_acceptance(service: Serving, limit: Annotated[int, Query(ge=1, le=200)] = 50) -> AcceptanceList:
     """List acceptance tests, newest first."""
     return AcceptanceList(tests=[_summary(each) for each in service.acceptance.latest()[:limit]])
 
 
-@router.get("/{test_id}", responses=problems(404, 422))
+@router.get("/{test_id}")
 def look_at_acceptance(service: Serving, test_id: UUID) -> AcceptanceBody:
     """Return a test: what to do next, what was measured, and what was decided."""
     return _body(service.acceptance.get(test_id))
 
 
-@router.post("/{test_id}/position", status_code=202, responses=problems(404, 409, 422, 429, 502, 503, 507))
+@router.post("/{test_id}/position", status_code=202, responses=problems(409, 429, 502, 503, 507))
 def measure_position(
     service: Serving,
     test_id: UUID,
@@ -127,32 +126,32 @@ def measure_position(
     """Measure the next position, with its repeats; by script, all that are left. The answer comes at once."""
     desk, wait = service.acceptance, request.if_busy == "queue"
 
-    def start(key: str | None) -> JobRecord:
-        return desk.measure(test_id, wait=wait, scripted=request.scripted, key=key)
+    def start(key: str | None) -> UUID:
+        return desk.measure(test_id, wait=wait, scripted=request.scripted, key=key).id
 
     started_once(service.keys, desk.jobs, idempotency_key, request, start, parent=test_id)
     return _body(desk.get(test_id))
 
 
-@router.post("/{test_id}/cancel", status_code=202, responses=problems(404, 422, 507))
+@router.post("/{test_id}/cancel", status_code=202, responses=problems(507))
 def cancel_acceptance(service: Serving, test_id: UUID) -> AcceptanceBody:
     """End a test early. May be repeated."""
     return _body(service.acceptance.cancel(test_id))
 
 
-@router.delete("/{test_id}", status_code=204, responses=problems(404, 409, 422, 507))
+@router.delete("/{test_id}", status_code=204, responses=problems(409, 507))
 def delete_acceptance(service: Serving, test_id: UUID) -> None:
     """Delete a test with all its files. One that is being measured is refused."""
     service.acceptance.delete(test_id)
 
 
-@router.get("/{test_id}/report.html", responses=problems(404, 409, 422))
+@router.get("/{test_id}/report.html", responses=problems(409))
 def acceptance_page(service: Serving, test_id: UUID) -> FileResponse:
     """Return the report for people."""
     return FileResponse(service.acceptance.file(test_id, HTML), media_type="text/html; charset=utf-8")
 
 
-@router.get("/{test_id}/report.json", responses=problems(404, 409, 422))
+@router.get("/{test_id}/report.json", responses=problems(409))
 def acceptance_report(service: Serving, test_id: UUID) -> FileResponse:
     """Return the report for machines."""
     return FileResponse(service.acceptance.file(test_id, JSON), media_type="application/json")

@@ -10,27 +10,13 @@ from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from slrig.api import (
-    acceptance,
-    artefacts,
-    calibration,
-    calibration_files,
-    events,
-    health,
-    metrics,
-    preview,
-    rig,
-    scans,
-    schedules,
-    system,
-)
-from slrig.api.body_limits import BodyLimits
+from slrig.api import acceptance, artefacts, calibration, events, health, rig, scans, schedules, system
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
+from slrig.api.events import OpenStreams
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
-from slrig.api.security import LOCAL_NAMES, KeyCheck
+from slrig.api.security import LOCAL_NAMES, BodyLimits, KeyCheck
 from slrig.api.service import Service
-from slrig.api.streams import OpenStreams
 
 _TITLE = "slrig"
 _SUMMARY = "Structured-light scans over HTTP: from POST /scan to a triangle mesh in millimetres"
@@ -48,9 +34,7 @@ def bare_app() -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         lifespan=_life,
     )
-    scanning = (scans, events, artefacts, rig, preview)
-    calibrating = (calibration, calibration_files, health)
-    for part in (*scanning, *calibrating, acceptance, schedules, metrics, system):
+    for part in (scans, events, artefacts, rig, calibration, health, acceptance, schedules, system):
         app.include_router(part.router)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Header, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, StreamingResponse
 
-from slrig.api.openapi import problems
+from slrig.api.openapi import file_of
 from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
@@ -99,12 +99,11 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
 
 
 def _answers(media_type: str) -> dict[int | str, dict[str, Any]]:
-    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    whole = file_of(media_type, 409, 416)
     return {
-        200: {"description": "the file", "content": content},
-        206: {"description": "the range that was asked for", "content": content},
+        **whole,
+        206: {**whole[200], "description": "the range that was asked for"},
         304: {"description": "the file is the one whose ETag was sent"},
-        **problems(404, 409, 416, 422),
     }
 
 

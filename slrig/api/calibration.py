@@ -1,4 +1,4 @@
-"""/calibration: open a session, shoot its poses, solve it, have scans use it; list, import, compare, delete."""
+"""/calibration: open a session, shoot its poses, solve it, have scans use it; list, import, compare, delete; files."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Body, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
@@ -21,23 +22,23 @@ from slrig.api.calibration_schemas import (
     PoseRequestBody,
     ScriptRequest,
     SolveRequest,
-    board_of,
     calibration_body,
     calibration_summary,
-    comparison_body,
     pose_body,
 )
 from slrig.api.idempotency import IdempotencyKey, started_once
-from slrig.api.openapi import problems
-from slrig.api.schemas import pattern_plan
+from slrig.api.openapi import file_of, problems
+from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
+from slrig.bundle.description import CAMERA_NAME
 from slrig.calibrate.calibrating import EXPORTS
+from slrig.calibrate.pose_answering import picture_name
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT
 from slrig.calibration.board import USUAL_BOARD
-from slrig.jobs.records import JobRecord
+from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
 
 IMPORT_PATH = "/calibration/import"
 MOST_IMPORT_BYTES = MOST_CALIBRATION_BYTES
@@ -54,22 +55,20 @@ _ENDINGS = {
 
 router = APIRouter(prefix="/calibration", tags=["calibration"])
 
-PoseNumber = int
 Label = Annotated[str | None, Query(min_length=1, max_length=200, description="free text, to find it again")]
 
 
-def answered(service: Service, record: SessionRecord) -> CalibrationBody:
-    """A calibration as an answer."""
+def _answered(service: Service, record: SessionRecord) -> CalibrationBody:
     calibrations = service.calibrations
     return calibration_body(
         record,
         active=calibrations.active,
-        files=ready_files(service, record),
+        files=_ready_files(service, record),
         last_event=calibrations.register.jobs.last_event_of(record.id),
     )
 
 
-def ready_files(service: Service, record: SessionRecord) -> dict[str, str]:
+def _ready_files(service: Service, record: SessionRecord) -> dict[str, str]:
     """Name to URL path of each file of a calibration that can be fetched now."""
     if not record.solve:
         return {}
@@ -78,7 +77,7 @@ def ready_files(service: Service, record: SessionRecord) -> dict[str, str]:
     return {name: f"/calibration/{record.id}/{name}" for name in names}
 
 
-@router.post("", status_code=201, responses=problems(422, 507))
+@router.post("", status_code=201, responses=problems(507))
 def open_calibration(
     service: Serving,
     response: Response,
@@ -89,19 +88,19 @@ def open_calibration(
     if request.patterns.rows is None:
         patterns = replace(patterns, rows=True)
     patterns = replace(patterns, codes=request.projector)
-    board = USUAL_BOARD if request.board is None else board_of(request.board)
+    board = USUAL_BOARD if request.board is None else request.board.board()
     record = service.calibrations.open(board, label=request.label, patterns=patterns)
     response.headers["Location"] = f"/calibration/{record.id}"
-    return answered(service, record)
+    return _answered(service, record)
 
 
-@router.get("", responses=problems(422))
+@router.get("")
 def list_calibrations(service: Serving, limit: Annotated[int, Query(ge=1, le=200)] = 50) -> CalibrationList:
     """List calibrations from new to old, and say which one scans use."""
     active = service.calibrations.active
     shown = service.calibrations.latest()[:limit]
     return CalibrationList(
-        calibrations=[calibration_summary(each, active=active, files=ready_files(service, each)) for each in shown],
+        calibrations=[calibration_summary(each, active=active, files=_ready_files(service, each)) for each in shown],
         active=active,
     )
 
@@ -109,7 +108,7 @@ def list_calibrations(service: Serving, limit: Annotated[int, Query(ge=1, le=200
 @router.post(
     "/import",
     status_code=201,
-    responses=problems(415, 422, 507),
+    responses=problems(415, 507),
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -135,22 +134,22 @@ async def import_calibration(
     text = await request.body()
     record = await run_in_threadpool(service.calibrations.submit, text, ending, label=label)
     response.headers["Location"] = f"/calibration/{record.id}"
-    return await run_in_threadpool(answered, service, record)
+    return await run_in_threadpool(_answered, service, record)
 
 
-@router.get("/compare", responses=problems(404, 409, 422))
+@router.get("/compare", responses=problems(404, 409))
 def compare_calibrations(service: Serving, first: UUID, second: UUID) -> ComparisonBody:
     """Compare two calibrations of one rig: each device's differences in their σ, and by how much points move."""
-    return comparison_body(first, second, service.calibrations.compare(first, second))
+    return filled(ComparisonBody, service.calibrations.compare(first, second), first=first, second=second)
 
 
-@router.get("/{calibration_id}", responses=problems(404, 422))
+@router.get("/{calibration_id}")
 def look_at_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
     """Return a calibration: its poses with their answers, what is covered, what to move next, and what came of it."""
-    return answered(service, service.calibrations.register.get(calibration_id))
+    return _answered(service, service.calibrations.register.get(calibration_id))
 
 
-@router.post("/{calibration_id}/pose", status_code=202, responses=problems(404, 409, 422, 429, 502, 503, 507))
+@router.post("/{calibration_id}/pose", status_code=202, responses=problems(409, 429, 502, 503, 507))
 def shoot_pose(
     service: Serving,
     response: Response,
@@ -160,14 +159,14 @@ def shoot_pose(
 ) -> PoseBody:
     """Shoot a pose of the board. The answer comes at once; look at the pose for what was found."""
     asked, wait = PoseRequest(request.position, request.exposure_s), request.if_busy == "queue"
-    poses = service.calibrations.poses
-    return _accepted(
-        service, response, calibration_id, idempotency_key, request,
-        lambda key: poses.shoot(calibration_id, asked, wait=wait, key=key),
-    )  # fmt: skip
+
+    def shoot(key: str | None) -> PoseRecord:
+        return service.calibrations.poses.shoot(calibration_id, asked, wait=wait, key=key)
+
+    return _accepted(service, response, calibration_id, idempotency_key, request, shoot)
 
 
-@router.post("/{calibration_id}/script", status_code=202, responses=problems(404, 409, 422, 429, 502, 503, 507))
+@router.post("/{calibration_id}/script", status_code=202, responses=problems(409, 429, 502, 503, 507))
 def shoot_script(
     service: Serving,
     response: Response,
@@ -179,11 +178,11 @@ def shoot_script(
     between two of them. To stop, cancel the pose that is under way.
     """
     asked, wait = PoseRequest(None, request.exposure_s), request.if_busy == "queue"
-    poses = service.calibrations.poses
-    return _accepted(
-        service, response, calibration_id, idempotency_key, request,
-        lambda key: poses.script(calibration_id, request.positions, asked, wait=wait, key=key),
-    )  # fmt: skip
+
+    def shoot(key: str | None) -> PoseRecord:
+        return service.calibrations.poses.script(calibration_id, request.positions, asked, wait=wait, key=key)
+
+    return _accepted(service, response, calibration_id, idempotency_key, request, shoot)
 
 
 def _accepted(
@@ -197,59 +196,122 @@ def _accepted(
     """The pose as it was when it was made, so that a repeated request gets the same answer."""
     register = service.calibrations.register
     cameras = register.get(calibration_id).cameras
-
-    def start(key: str | None) -> JobRecord:
-        return register.jobs.get(shoot(key).id)
-
-    job = started_once(service.keys, register.jobs, key, request, start, parent=calibration_id)
+    job = started_once(service.keys, register.jobs, key, request, lambda key: shoot(key).id, parent=calibration_id)
     body = pose_body(calibration_id, pose_of(job), cameras)
     response.headers["Location"] = body.links.self
     return body
 
 
-@router.get("/{calibration_id}/pose/{number}", responses=problems(404, 422))
-def look_at_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> PoseBody:
+@router.get("/{calibration_id}/pose/{number}")
+def look_at_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBody:
     """Return a pose: its state, and what was found, or why it was refused and what to do."""
     register = service.calibrations.register
     pose = register.pose(calibration_id, number)
     return pose_body(calibration_id, pose, register.get(calibration_id).cameras)
 
 
-@router.post("/{calibration_id}/pose/{number}/cancel", status_code=202, responses=problems(404, 422))
-def cancel_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> PoseBody:
+@router.post("/{calibration_id}/pose/{number}/cancel", status_code=202)
+def cancel_pose(service: Serving, calibration_id: UUID, number: int) -> PoseBody:
     """Ask a pose to end early, and with it the script that it is part of. May be repeated."""
     pose = service.calibrations.poses.cancel(calibration_id, number)
     return pose_body(calibration_id, pose, service.calibrations.register.get(calibration_id).cameras)
 
 
-@router.delete("/{calibration_id}/pose/{number}", status_code=204, responses=problems(404, 409, 422, 507))
-def drop_pose(service: Serving, calibration_id: UUID, number: PoseNumber) -> None:
+@router.delete("/{calibration_id}/pose/{number}", status_code=204, responses=problems(409, 507))
+def drop_pose(service: Serving, calibration_id: UUID, number: int) -> None:
     """Drop a pose with its frames. The next solve does without it."""
     service.calibrations.poses.drop(calibration_id, number)
 
 
-@router.post("/{calibration_id}/solve", status_code=202, responses=problems(404, 409, 422, 507))
+@router.post("/{calibration_id}/solve", status_code=202, responses=problems(409, 507))
 def solve_calibration(
     service: Serving, calibration_id: UUID, request: Annotated[SolveRequest, Body(default_factory=SolveRequest)]
 ) -> CalibrationBody:
     """Solve the calibration from its accepted poses. The answer comes at once; `progress` tells how far it is."""
     solves = service.calibrations.solves
-    return answered(service, solves.solve(calibration_id, board_shape=request.board_shape))
+    return _answered(service, solves.solve(calibration_id, board_shape=request.board_shape))
 
 
-@router.post("/{calibration_id}/activate", responses=problems(404, 409, 422, 507))
+@router.post("/{calibration_id}/activate", responses=problems(409, 507))
 def activate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
     """Have the scans that follow use this calibration in place of the rig's own, after a restart too."""
-    return answered(service, service.calibrations.activate(calibration_id))
+    return _answered(service, service.calibrations.activate(calibration_id))
 
 
-@router.post("/{calibration_id}/deactivate", responses=problems(404, 409, 422, 507))
+@router.post("/{calibration_id}/deactivate", responses=problems(409, 507))
 def deactivate_calibration(service: Serving, calibration_id: UUID) -> CalibrationBody:
     """Have the scans that follow use the rig's own calibration again."""
-    return answered(service, service.calibrations.deactivate(calibration_id))
+    return _answered(service, service.calibrations.deactivate(calibration_id))
 
 
-@router.delete("/{calibration_id}", status_code=204, responses=problems(404, 409, 422, 507))
+@router.delete("/{calibration_id}", status_code=204, responses=problems(409, 507))
 def delete_calibration(service: Serving, calibration_id: UUID) -> None:
     """Delete a calibration with all its poses. The one in use is refused."""
     service.calibrations.delete(calibration_id)
+
+
+def _serve(name: str, media_type: str) -> Callable[..., Response]:
+    def fetch(service: Serving, calibration_id: UUID) -> Response:
+        content = service.calibrations.exported(calibration_id, name)
+        # Another solve of the same session gives another file.
+        headers = {"Content-Disposition": f'inline; filename="{name}"', "Cache-Control": "no-store"}
+        return Response(content, media_type=media_type, headers=headers)
+
+    fetch.__doc__ = f"Return what the last solve gave, as {name}."
+    return fetch
+
+
+for _name, _media_type in zip(EXPORTS, ("application/json", "application/yaml", "application/xml"), strict=True):
+    router.add_api_route(
+        f"/{{calibration_id}}/{_name}",
+        _serve(_name, _media_type),
+        response_class=Response,
+        responses=file_of(_media_type, 409, 507),
+        operation_id=f"fetch_{_name.replace('.', '_')}",
+        summary=f"Fetch {_name}",
+    )
+
+
+@router.get(f"/{{calibration_id}}/{REPORT}", response_class=Response, responses=file_of("text/html", 409))
+def fetch_calibration_report(service: Serving, calibration_id: UUID) -> Response:
+    """Return the report of the last solve: one page that holds everything that it shows and runs no script."""
+    path = service.calibrations.file(calibration_id, REPORT)
+    # It asks nobody for anything, and nothing in it may.
+    policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+    headers = {"Cache-Control": "no-store", "Content-Security-Policy": policy}
+    return FileResponse(path, media_type="text/html", headers=headers)
+
+
+@router.get("/{calibration_id}/pose/{number}/picture.png", response_class=Response, responses=file_of("image/png", 409))
+def fetch_pose_picture(
+    service: Serving,
+    calibration_id: UUID,
+    number: int,
+    camera: Annotated[str | None, Query(pattern=CAMERA_NAME, description="Default: the first one")] = None,
+) -> Response:
+    """Return what a camera saw of a pose: its white frame, with the corners that were found. Refused poses have it."""
+    calibrations = service.calibrations
+    pose = calibrations.register.pose(calibration_id, number)
+    cameras = calibrations.register.get(calibration_id).cameras
+    chosen = next(iter(cameras), "") if camera is None else camera
+    path = calibrations.store.pose(calibration_id, number) / picture_name(chosen)
+    if cameras and chosen not in cameras:
+        message = f"Calibration {calibration_id} has no camera '{chosen}'; it has {', '.join(cameras)}."
+        raise CameraNotFoundError(message)
+    if not path.is_file():
+        message = f"{pose.name} of calibration {calibration_id} is {pose.state} and has no picture."
+        raise ArtefactNotReadyError(message)
+    return FileResponse(path, media_type="image/png", headers={"Cache-Control": "private, no-cache"})
+
+
+@router.get("/{calibration_id}/coverage.png", response_class=Response, responses=file_of("image/png", 409))
+def fetch_coverage_picture(
+    service: Serving,
+    calibration_id: UUID,
+    device: Annotated[
+        str | None, Query(pattern=CAMERA_NAME, description="a camera, or projector. Default: the first camera")
+    ] = None,
+) -> Response:
+    """Return a picture of what a device has seen of the board so far, and of where the board should go next."""
+    content = service.calibrations.coverage_picture(calibration_id, device)
+    return Response(content, media_type="image/png", headers={"Cache-Control": "no-store"})

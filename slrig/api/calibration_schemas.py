@@ -12,10 +12,10 @@ from pydantic import BaseModel, BeforeValidator, Field
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
 from slrig.bundle.faults import Strict
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, plain
-from slrig.calibration.board import USUAL_BOARD, Board, BoardKind, BoardShape
-from slrig.calibration.judging.comparison import Comparison
+from slrig.calibration.board import USUAL_BOARD, BoardKind, BoardShape
 from slrig.jobs.records import JobState
 from slrig.scan.plan import PatternPlan
+from slrig.schedule.task_options import BoardOptions
 
 Millimetres = Annotated[float, Field(gt=0, le=1000)]
 CornerCount = Annotated[int, Field(ge=3, le=60)]
@@ -24,10 +24,9 @@ Known = Annotated[float | None, BeforeValidator(plain)]
 IfBusy = Literal["reject", "queue"]
 
 
-class BoardRequest(Strict):
+class BoardRequest(BoardOptions):
     """The board that is printed: see `slrig calibrate board`."""
 
-    kind: Annotated[BoardKind, Field(strict=False)]
     corners: Annotated[
         list[CornerCount],
         Field(min_length=2, max_length=2, description="inner corners (circles), columns then rows"),
@@ -220,12 +219,6 @@ class ComparisonBody(BaseModel):
     words: list[str]
 
 
-def board_of(request: BoardRequest) -> Board:
-    """The board that a request means. Raises CalibrationError."""
-    columns, rows = request.corners
-    return Board(request.kind, columns, rows, request.square_mm, request.marker_mm, request.dictionary)
-
-
 def pose_body(session_id: UUID, pose: PoseRecord, cameras: Mapping[str, object]) -> PoseBody:
     """A pose as an answer; `cameras` are those of the session."""
     here = f"/calibration/{session_id}/pose/{pose.number}"
@@ -255,11 +248,6 @@ def calibration_body(
         error=record.fault,
         last_event=last_event,
     )
-
-
-def comparison_body(first: UUID, second: UUID, found: Comparison) -> ComparisonBody:
-    """A comparison as an answer."""
-    return filled(ComparisonBody, found, first=first, second=second)
 
 
 def _summary(record: SessionRecord, active: UUID | None, files: Mapping[str, str]) -> dict[str, Any]:

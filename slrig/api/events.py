@@ -1,28 +1,33 @@
-"""What happens to jobs and to calibrations, as event streams."""
+"""What happens to jobs and to calibrations, as server-sent events that can be resumed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.exceptions import HTTPException
 
 from slrig.api.openapi import problems
 from slrig.api.problems import fault_problem
 from slrig.api.service import Serving
-from slrig.api.streams import Followed, LastEventId, event_stream, stream_answers
 from slrig.calibrate.records import SessionState
 from slrig.calibrate.register import CalibrationRegister
+from slrig.config import ServiceSettings
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobEvent, JobState
 from slrig.jobs.store import JobStore
 
-router = APIRouter()
+_LAST_WORD_S = 2.0
+"""How much longer than the work that it follows an event stream may live when the service ends."""
 
 _SOLVES = {
     JobState.QUEUED: SessionState.OPEN,
@@ -33,12 +38,63 @@ _SOLVES = {
 }
 """What a calibration is while its newest solve is in a state."""
 
-_JOB = stream_answers(
+LastEventId = Annotated[
+    int, Header(ge=0, le=2**53, description="number of the last event that was seen; those after it follow")
+]
+
+router = APIRouter()
+
+
+class OpenStreams:
+    """How many event streams are open. Lives on the event loop's thread."""
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._count = 0
+
+    def require_room(self) -> None:
+        """Raise HTTPException 429 when as many streams are open as may."""
+        if self._count >= self._limit:
+            detail = (
+                f"{self._count} event streams are open, as many as may. Close one, or ask for GET /scan/ID instead."
+            )
+            raise HTTPException(429, detail, headers={"Retry-After": "5"})
+
+    def __enter__(self) -> None:
+        self._count += 1
+
+    def __exit__(self, *_: object) -> None:
+        self._count -= 1
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What is followed.
+
+    look : the events after one, and whether no more will come, for now or because it was deleted; asked on another
+    thread. watch : has a call made, from any thread, after each new event; returns the call that ends that. last :
+    number of the newest event.
+    """
+
+    look: Callable[[int], tuple[Sequence[JobEvent], bool]]
+    watch: Callable[[Callable[[], None]], Callable[[], None]]
+    last: Callable[[], int]
+
+
+def _answers(events: str, nothing: str) -> dict[int | str, dict[str, Any]]:
+    return {
+        200: {"description": events, "content": {"text/event-stream": {"schema": {"type": "string"}}}},
+        204: {"description": nothing},
+        **problems(429),
+    }
+
+
+_JOB = _answers(
     "`progress` events with stage, fraction and detail; `state` events with the new state. The stream ends after the "
     "event of a final state.",
     "nothing has happened since the event that was named, and nothing more will",
 )
-_CALIBRATION = stream_answers(
+_CALIBRATION = _answers(
     "`pose` events with the number and the new state of a pose; `progress` events with stage, fraction and detail, and "
     "the number of the pose; `state` events when a solve begins (`solving`) and ends (`solved`, `failed`). The stream "
     "ends when nothing is under way any more. Event numbers rise, with gaps.",
@@ -46,20 +102,13 @@ _CALIBRATION = stream_answers(
 )
 
 
-@router.get(
-    "/scan/{scan_id}/events", tags=["scan"], response_class=Response, responses={**_JOB, **problems(404, 422, 429)}
-)
+@router.get("/scan/{scan_id}/events", tags=["scan"], response_class=Response, responses=_JOB)
 async def follow_scan(request: Request, service: Serving, scan_id: UUID, last_event_id: LastEventId = 0) -> Response:
     """Follow a scan until it is over. Events that happened before come first."""
     return await _follow_job(request, service, service.store, scan_id, last_event_id)
 
 
-@router.get(
-    "/rig/verification/{verification_id}/events",
-    tags=["health"],
-    response_class=Response,
-    responses={**_JOB, **problems(404, 422, 429)},
-)
+@router.get("/rig/verification/{verification_id}/events", tags=["health"], response_class=Response, responses=_JOB)
 async def follow_verification(
     request: Request, service: Serving, verification_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
@@ -68,10 +117,7 @@ async def follow_verification(
 
 
 @router.get(
-    "/calibration/{calibration_id}/events",
-    tags=["calibration"],
-    response_class=Response,
-    responses={**_CALIBRATION, **problems(404, 422, 429)},
+    "/calibration/{calibration_id}/events", tags=["calibration"], response_class=Response, responses=_CALIBRATION
 )
 async def follow_calibration(
     request: Request, service: Serving, calibration_id: UUID, last_event_id: LastEventId = 0
@@ -83,9 +129,34 @@ async def follow_calibration(
         partial(_look_at_calibration, register, calibration_id),
         partial(register.jobs.watch, calibration_id),
         partial(register.jobs.last_event_of, calibration_id),
-        _data,
     )
-    return await event_stream(request, service.settings, followed, last_event_id)
+    return await _stream(request, service.settings, followed, last_event_id)
+
+
+async def _follow_job(request: Request, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
+    # One that is on no record is refused here; one that is deleted later only ends its stream.
+    await run_in_threadpool(jobs.get, job_id)
+    return await _stream(request, service.settings, followed_job(jobs, job_id), after)
+
+
+def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
+    """A job as it is followed until its state is final; it may be deleted meanwhile."""
+
+    def look(after: int) -> tuple[Sequence[JobEvent], bool]:
+        try:
+            # In this order: what ends between the two looks has its last event among those found.
+            ended = jobs.get(job_id).state.final
+            return jobs.events(job_id, after=after), ended
+        except JobNotFoundError:
+            return (), True
+
+    def last() -> int:
+        try:
+            return jobs.last_event(job_id)
+        except JobNotFoundError:
+            return 0
+
+    return Followed(look, partial(jobs.watch, job_id), last)
 
 
 def _look_at_calibration(
@@ -112,38 +183,50 @@ def _of_calibration(event: JobEvent, pose: int | None) -> JobEvent:
     return replace(event, data={**event.data, "state": _SOLVES[event.data["state"]]})
 
 
-async def _follow_job(request: Request, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
-    # One that is on no record is refused here; one that is deleted later only ends its stream.
-    await run_in_threadpool(jobs.get, job_id)
-    return await event_stream(request, service.settings, followed_job(jobs, job_id), after)
-
-
-def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
-    """A job as it is followed until its state is final; it may be deleted meanwhile."""
-    return Followed(
-        partial(_look, jobs, job_id), partial(jobs.watch, job_id), partial(_last_event, jobs, job_id), _data
+async def _stream(request: Request, settings: ServiceSettings, followed: Followed, after: int) -> Response:
+    """The events after one, and those that follow until no more will come. Raises HTTPException 429."""
+    streams: OpenStreams = request.app.state.streams
+    events, over = await run_in_threadpool(followed.look, after)
+    if over and not events:
+        # An EventSource that reconnects after the last event is told by 204 to stop trying.
+        return Response(status_code=204)
+    streams.require_room()
+    return EventSourceResponse(
+        told(followed, after, streams),
+        ping=settings.keepalive_s,
+        sep="\n",
+        # At the end of the service all work ends, and its stream by that; without this the stream would end first.
+        shutdown_grace_period=settings.shutdown_s + _LAST_WORD_S,
     )
 
 
-def _last_event(jobs: JobStore, job_id: UUID) -> int:
-    try:
-        return jobs.last_event(job_id)
-    except JobNotFoundError:
-        return 0
+async def told(followed: Followed, after: int, streams: OpenStreams) -> AsyncIterator[ServerSentEvent]:
+    """Each event after one, as it comes, until no more will."""
+    loop = asyncio.get_running_loop()
+    news = asyncio.Event()
 
+    def wake() -> None:
+        loop.call_soon_threadsafe(news.set)
 
-def _look(jobs: JobStore, job_id: UUID, after: int) -> tuple[Sequence[JobEvent], bool]:
-    try:
-        # In this order: what ends between the two looks has its last event among those found.
-        ended = jobs.get(job_id).state.final
-        return jobs.events(job_id, after=after), ended
-    except JobNotFoundError:
-        return (), True
+    unwatch = followed.watch(wake)
+    with streams:
+        try:
+            # A client that names an event that has not come yet would never be told that it has.
+            after = min(after, await run_in_threadpool(followed.last))
+            over = False
+            while not over:
+                news.clear()
+                events, over = await run_in_threadpool(followed.look, after)
+                for event in events:
+                    after = event.number
+                    yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(after), sep="\n")
+                if not over:
+                    await news.wait()
+        finally:
+            unwatch()
 
 
 def _data(event: JobEvent) -> dict[str, Any]:
-    data = dict(event.data)
-    fault = data.get("error")
-    if fault is not None:
-        data["error"] = fault_problem(JobFailure(fault["code"], fault["message"]))
-    return data
+    """What is sent of an event: a fault as the problem that it is."""
+    fault = event.data.get("error")
+    return dict(event.data) if fault is None else {**event.data, "error": fault_problem(JobFailure(**fault))}

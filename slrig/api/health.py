@@ -9,7 +9,7 @@ from uuid import UUID
 from fastapi import APIRouter, Body, Query, Response
 from pydantic import BaseModel, Field
 
-from slrig.api.calibration_schemas import BoardRequest, IfBusy, board_of
+from slrig.api.calibration_schemas import BoardRequest, IfBusy
 from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
@@ -20,7 +20,6 @@ from slrig.calibration.health.verdict import HealthState
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.verify.plot import health_svg
-from slrig.verify.store import VerificationRecord
 
 router = APIRouter(prefix="/rig", tags=["health"])
 
@@ -124,12 +123,12 @@ def look_at_health(service: Serving) -> HealthBody:
         calibration=None if calibration is None else calibration.solve_id,
         calibration_age_s=age_s,
         refuses_scans_when_stale=service.refuse_when_stale,
-        latest=None if latest is None else _figures(latest),
+        latest=None if latest is None else VerificationFigures.model_validate(latest.document()),
         links={"history": "/rig/health/history", "plot": "/rig/health.svg", "verify": "/rig/verification"},
     )
 
 
-@router.get("/health/history", responses=problems(422))
+@router.get("/health/history")
 def list_health(
     service: Serving,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
@@ -140,13 +139,13 @@ def list_health(
         message = f"since: expected a time with its offset from UTC, as 2026-11-20T06:00:00Z, found {since.isoformat()}"
         raise CalibrationError(message)
     found = service.verifications.store.history(limit=limit, since=since)
-    return HealthPage(verifications=[_figures(record) for record in found])
+    return HealthPage(verifications=[VerificationFigures.model_validate(record.document()) for record in found])
 
 
 @router.get(
     "/health.svg",
     response_class=Response,
-    responses={200: {"content": {"image/svg+xml": {}}, "description": "the plot"}, **problems(422)},
+    responses={200: {"content": {"image/svg+xml": {}}, "description": "the plot"}},
 )
 def plot_health(service: Serving, limit: Annotated[int, Query(ge=1, le=2000)] = 500) -> Response:
     """Draw the newest verifications over time."""
@@ -154,7 +153,7 @@ def plot_health(service: Serving, limit: Annotated[int, Query(ge=1, le=2000)] = 
     return Response(health_svg(records[::-1]), media_type="image/svg+xml")
 
 
-@router.post("/verification", status_code=202, responses=problems(409, 422, 429, 502, 503, 507))
+@router.post("/verification", status_code=202, responses=problems(409, 429, 502, 503, 507))
 def verify_rig(
     service: Serving,
     response: Response,
@@ -162,26 +161,24 @@ def verify_rig(
     idempotency_key: IdempotencyKey = None,
 ) -> VerificationBody:
     """Shoot the board and judge the calibration in use by it. The answer comes at once; look again later."""
-    board = _board_in_use(service) if request.board is None else board_of(request.board)
+    board = _board_in_use(service) if request.board is None else request.board.board()
+    desk, wait = service.verifications, request.if_busy == "queue"
 
-    def start(key: str | None) -> JobRecord:
-        return service.verifications.shoot(
-            board, position=request.position, exposure_s=request.exposure_s, wait=request.if_busy == "queue", key=key
-        )
+    def start(key: str | None) -> UUID:
+        return desk.shoot(board, position=request.position, exposure_s=request.exposure_s, wait=wait, key=key).id
 
-    job = started_once(service.keys, service.verifications.jobs, idempotency_key, request, start)
-    body = _body(job)
+    body = _body(started_once(service.keys, desk.jobs, idempotency_key, request, start))
     response.headers["Location"] = body.links["self"]
     return body
 
 
-@router.get("/verification/{verification_id}", responses=problems(404, 422))
+@router.get("/verification/{verification_id}")
 def look_at_verification(service: Serving, verification_id: UUID) -> VerificationBody:
     """Return a verification: its state, and what was found, or why nothing was."""
     return _body(service.verifications.jobs.get(verification_id))
 
 
-@router.post("/verification/{verification_id}/cancel", status_code=202, responses=problems(404, 422))
+@router.post("/verification/{verification_id}/cancel", status_code=202)
 def cancel_verification(service: Serving, verification_id: UUID) -> VerificationBody:
     """Ask a verification to end early. May be repeated."""
     return _body(service.verifications.cancel(verification_id))
@@ -200,12 +197,7 @@ def _board_in_use(service: Service) -> Board:
     return board
 
 
-def _figures(record: VerificationRecord) -> VerificationFigures:
-    return VerificationFigures.model_validate(record.document())
-
-
 def _body(job: JobRecord) -> VerificationBody:
     here = f"/rig/verification/{job.id}"
-    found = None if job.summary is None else VerificationFigures.model_validate(job.summary)
     links = {"self": here, "events": f"{here}/events", "cancel": f"{here}/cancel", "health": "/rig/health"}
-    return filled(VerificationBody, job, found=found, error=job.fault, links=links)
+    return filled(VerificationBody, job, found=job.summary, error=job.fault, links=links)

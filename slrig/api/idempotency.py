@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
@@ -10,7 +11,6 @@ from uuid import UUID
 from fastapi import Header
 from pydantic import BaseModel
 
-from slrig.api.schemas import fingerprint
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobProgress, JobRecord, JobState
 from slrig.jobs.store import JobStore
@@ -26,29 +26,6 @@ IdempotencyKey = Annotated[
 ]
 
 
-def started_once(
-    keys: RequestKeys,
-    store: JobStore,
-    key: str | None,
-    request: BaseModel,
-    start: Callable[[str | None], JobRecord],
-    *,
-    parent: UUID | None = None,
-) -> JobRecord:
-    """The job that a request makes, or made before with this key, as it was when it was made.
-
-    start : makes it, and ties it to the key that it is given; what it raises leaves the key free. parent : to which the
-    job belongs.
-
-    Raises
-    ------
-    IdempotencyError
-        The key was sent with another request, or its first request is still being answered.
-    """
-    made = once(keys, key, request, lambda key: start(key).id, parent=parent)
-    return _at_first(store.get(made))
-
-
 def once(
     keys: RequestKeys,
     key: str | None,
@@ -57,7 +34,16 @@ def once(
     *,
     parent: UUID | None = None,
 ) -> UUID:
-    """The id of what a request makes, or made before with this key. See `started_once`."""
+    """The id of what a request makes, or made before with this key.
+
+    start : makes it, and ties it to the key that it is given; what it raises leaves the key free. parent : to which it
+    belongs.
+
+    Raises
+    ------
+    IdempotencyError
+        The key was sent with another request, or its first request is still being answered.
+    """
     if key is None:
         return start(None)
     mine = own_key(key, request, parent)
@@ -71,14 +57,18 @@ def once(
         keys.release(mine)
 
 
-def own_key(key: str, request: BaseModel, parent: UUID | None = None) -> str:
-    """A key as it is on record: that of one kind of request, below one parent."""
-    return " ".join([type(request).__name__, *([] if parent is None else [str(parent)]), key])
-
-
-def _at_first(record: JobRecord) -> JobRecord:
+def started_once(
+    keys: RequestKeys,
+    store: JobStore,
+    key: str | None,
+    request: BaseModel,
+    start: Callable[[str | None], UUID],
+    *,
+    parent: UUID | None = None,
+) -> JobRecord:
+    """The job that a request makes, or made before with this key, as it was when it was made. See `once`."""
     return replace(
-        record,
+        store.get(once(keys, key, request, start, parent=parent)),
         state=JobState.QUEUED,
         started_at=None,
         finished_at=None,
@@ -86,3 +76,13 @@ def _at_first(record: JobRecord) -> JobRecord:
         fault=None,
         summary=None,
     )
+
+
+def own_key(key: str, request: BaseModel, parent: UUID | None = None) -> str:
+    """A key as it is on record: that of one kind of request, below one parent."""
+    return " ".join([type(request).__name__, *([] if parent is None else [str(parent)]), key])
+
+
+def fingerprint(request: BaseModel) -> str:
+    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
+    return hashlib.sha256(request.model_dump_json().encode()).hexdigest()

@@ -16,8 +16,16 @@ _EVERYWHERE = (400, 401, 413, 500)
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """The `responses` of a route that may answer with problems of these statuses."""
+    """The `responses` of a route that may answer with problems of these statuses. `describe` adds those of every route
+    of its kind: 404 where the path names something, 422 where a request may say something.
+    """
     return {status: {"description": HTTPStatus(status).phrase, "content": _PROBLEM} for status in statuses}
+
+
+def file_of(media_type: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route that answers with a file, or with problems of these statuses."""
+    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    return {200: {"description": "the file", "content": content}, **problems(*statuses)}
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
@@ -37,8 +45,8 @@ def describe(app: FastAPI) -> dict[str, Any]:
         "header": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
     }
     document["security"] = [{"bearer": []}, {"header": []}]
-    for path in document["paths"].values():
-        for operation in path.values():
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
             answers = operation["responses"]
             for status, found in list(answers.items()):
                 if "HTTPValidationError" in json.dumps(found):
@@ -46,6 +54,8 @@ def describe(app: FastAPI) -> dict[str, Any]:
             needed = [status for status in _EVERYWHERE if status != 401 or operation.get("security") != []]
             if "parameters" in operation or "requestBody" in operation:
                 needed.append(422)
+            if "{" in path:
+                needed.append(404)
             for status in needed:
                 answers.setdefault(str(status), problems(status)[status])
             operation["responses"] = dict(sorted(answers.items()))

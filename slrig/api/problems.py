@@ -7,66 +7,36 @@ from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig import errors
 from slrig.errors import RigBusyError, SlrigError
 from slrig.failure import UNEXPECTED, JobFailure, errors_by_code
 
 MEDIA_TYPE = "application/problem+json"
 
-STATUS: Mapping[type[SlrigError], int] = {
-    errors.SlrigError: 500,
-    errors.InvalidInputError: 422,
-    errors.ConfigError: 422,
-    errors.BundleError: 422,
-    errors.CalibrationError: 422,
-    errors.PatternError: 422,
-    errors.ScheduleError: 422,
-    errors.ScheduleNotFoundError: 404,
-    errors.ScanEvidenceError: 502,
-    errors.NothingToReconstructError: 422,
-    errors.DeviceError: 502,
-    errors.DeviceGoneError: 503,
-    errors.DeviceBusyError: 503,
-    errors.DeviceStateError: 500,
-    errors.UnsupportedByDeviceError: 422,
-    errors.WrongSystemError: 422,
-    errors.FrameTimeoutError: 504,
-    errors.DriverNotFoundError: 503,
-    errors.DriverBrokenError: 503,
-    errors.LibraryMissingError: 503,
-    errors.RigBusyError: 409,
-    errors.QueueFullError: 429,
-    errors.ScanCancelledError: 409,
-    errors.CameraNotFoundError: 404,
-    errors.PoseRefusedError: 422,
-    errors.SolveRefusedError: 422,
-    errors.CalibrationNotFoundError: 404,
-    errors.CalibrationStateError: 409,
-    errors.JobNotFoundError: 404,
-    errors.ArtefactNotReadyError: 409,
-    errors.ScanStateError: 409,
-    errors.IdempotencyError: 422,
-    errors.StorageError: 507,
-    errors.ServiceError: 502,
-    errors.WorkerLostError: 500,
-    errors.OutOfMemoryError: 500,
-    errors.ScanInterruptedError: 503,
-    errors.KeyInFlightError: 409,
+_CODES = {
+    404: "schedule-not-found camera-not-found calibration-not-found job-not-found",
+    409: "rig-busy scan-cancelled calibration-state artefact-not-ready scan-state key-in-flight",
+    422: "invalid-input config bundle calibration pattern schedule nothing-to-reconstruct "
+    "unsupported-by-device wrong-system pose-refused solve-refused idempotency",
+    429: "queue-full",
+    500: "slrig device-state worker-lost out-of-memory",
+    502: "scan-evidence device service",
+    503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted",
+    504: "frame-timeout",
+    507: "storage",
 }
-"""Which status stands for which error. A test holds it against the whole error tree."""
 
-RETRY_AFTER_S: Mapping[type[SlrigError], int] = {
-    errors.RigBusyError: 5,
-    errors.QueueFullError: 30,
-    errors.KeyInFlightError: 1,
-}
+STATUS = {code: status for status, codes in _CODES.items() for code in codes.split()}
+"""Which status stands for which error, by its code. A test holds it against the whole error tree."""
+
+RETRY_AFTER_S = {"rig-busy": 5, "queue-full": 30, "key-in-flight": 1}
 
 _NAMES = {413: "content-too-large", 416: "range-not-satisfiable", 422: "invalid-request"}
 # Python's own names for these differ from version to version.
@@ -120,18 +90,12 @@ def problem(status: int, code: str, detail: str, **members: Any) -> dict[str, An
 
 def fault_problem(fault: JobFailure) -> dict[str, Any]:
     """The problem that stands for a scan's recorded fault."""
-    known = errors_by_code().get(fault.code)
-    return problem(500 if known is None else STATUS[known], fault.code, fault.message)
+    return problem(STATUS.get(fault.code, 500), fault.code, fault.message)
 
 
 def answer(document: Mapping[str, Any], *, headers: Mapping[str, str] | None = None) -> JSONResponse:
     """A problem as a response."""
-    return JSONResponse(
-        document,
-        status_code=document["status"],
-        media_type=MEDIA_TYPE,
-        headers=None if headers is None else {**headers},
-    )
+    return JSONResponse(document, document["status"], headers, MEDIA_TYPE)
 
 
 def explanations() -> dict[str, str]:
@@ -159,8 +123,8 @@ async def _slrig_error(_request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, SlrigError):
         raise error
     held = {"holder": error.holder, "since": error.since} if isinstance(error, RigBusyError) else {}
-    document = problem(STATUS[errors_by_code()[error.code]], error.code, str(error), **held)
-    wait_s = RETRY_AFTER_S.get(type(error))
+    document = problem(STATUS[error.code], error.code, str(error), **held)
+    wait_s = RETRY_AFTER_S.get(error.code)
     return answer(document, headers=None if wait_s is None else {"Retry-After": str(wait_s)})
 
 
@@ -196,29 +160,28 @@ def field_faults(found: Sequence[Any], *, is_json: bool = True) -> list[dict[str
 
     `is_json` says whether the request called its body JSON.
     """
-    faults_found = []
-    for entry in found:
-        if entry["type"] == "json_invalid":
-            message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
-            faults_found.append({"field": "body", "message": message})
-            continue
-        if entry["loc"] == ("body",) and not is_json:
-            message = "expected a JSON object; send it with Content-Type: application/json"
-            faults_found.append({"field": "body", "message": message})
-            continue
-        place = [printable(str(part)) for part in entry["loc"] if part != "body"]
-        sent = entry.get("input")
-        message = printable(_MESSAGES.get(entry["type"], entry["msg"]))
-        fault: dict[str, Any] = {"field": ".".join(place) or "body", "message": message}
-        if isinstance(sent, str) and len(sent) <= 80:
-            fault["found"] = printable(sent)
-        elif isinstance(sent, float) and not abs(sent) <= 1e300:
-            # NaN and infinities, which Python's JSON reader lets through, are no JSON on the way out.
-            fault["found"] = str(sent)
-        elif isinstance(sent, (bool, int, float)):
-            fault["found"] = sent
-        faults_found.append(fault)
-    return faults_found
+    return [_field_fault(entry, is_json=is_json) for entry in found]
+
+
+def _field_fault(entry: Any, *, is_json: bool) -> dict[str, Any]:
+    if entry["type"] == "json_invalid":
+        message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
+        return {"field": "body", "message": message}
+    if entry["loc"] == ("body",) and not is_json:
+        message = "expected a JSON object; send it with Content-Type: application/json"
+        return {"field": "body", "message": message}
+    place = [printable(str(part)) for part in entry["loc"] if part != "body"]
+    sent = entry.get("input")
+    message = printable(_MESSAGES.get(entry["type"], entry["msg"]))
+    fault: dict[str, Any] = {"field": ".".join(place) or "body", "message": message}
+    if isinstance(sent, str) and len(sent) <= 80:
+        fault["found"] = printable(sent)
+    elif isinstance(sent, float) and not abs(sent) <= 1e300:
+        # NaN and infinities, which Python's JSON reader lets through, are no JSON on the way out.
+        fault["found"] = str(sent)
+    elif isinstance(sent, (bool, int, float)):
+        fault["found"] = sent
+    return fault
 
 
 def printable(text: str) -> str:
@@ -249,39 +212,29 @@ class PlainErrorsToProblems:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        refused: int | None = None
-        headers: list[tuple[bytes, bytes]] = []
+        refused: Message | None = None
         body = bytearray()
 
         async def rewrite(message: Message) -> None:
             nonlocal refused
-            if message["type"] == "http.response.start":
-                kept = {name.lower(): value for name, value in message.get("headers", ())}
-                if message["status"] >= 400 and not kept.get(b"content-type", b"").startswith(MEDIA_TYPE.encode()):
-                    refused = message["status"]
-                    dropped = {b"content-type", b"content-length"}
-                    headers.extend((name, value) for name, value in kept.items() if name not in dropped)
-                    return
-            elif refused is not None and message["type"] == "http.response.body":
+            if message["type"] == "http.response.start" and message["status"] >= 400:
+                kind = Headers(raw=message.get("headers", [])).get("content-type", "")
+                refused = None if kind.startswith(MEDIA_TYPE) else message
+            if refused is None:
+                await send(message)
+            elif message["type"] == "http.response.body":
                 body.extend(message.get("body", b""))
                 if not message.get("more_body", False):
-                    await self._send_problem(send, HTTPStatus(refused), headers, bytes(body))
-                return
-            await send(message)
+                    await _as_problem(refused, body)(scope, receive, send)
 
         await self._app(scope, receive, rewrite)
 
-    async def _send_problem(
-        self, send: Send, status: HTTPStatus, headers: list[tuple[bytes, bytes]], body: bytes
-    ) -> None:
-        text = body.decode("utf-8", "replace")
-        detail = _PLAIN_DETAILS.get(text, text or status.description or status.phrase)
-        content = json.dumps(_http_problem(status, detail)).encode()
-        length = (b"content-length", str(len(content)).encode())
-        start = {
-            "type": "http.response.start",
-            "status": status.value,
-            "headers": [*headers, (b"content-type", MEDIA_TYPE.encode()), length],
-        }
-        await send(start)
-        await send({"type": "http.response.body", "body": content})
+
+def _as_problem(refused: Message, body: bytes) -> Response:
+    """A plain refusal, its first message and its text, as a problem with the headers that it had."""
+    status = HTTPStatus(refused["status"])
+    text = body.decode("utf-8", "replace")
+    detail = _PLAIN_DETAILS.get(text, text or status.description or status.phrase)
+    dropped = {"content-type", "content-length"}
+    headers = {name: value for name, value in Headers(raw=refused.get("headers", [])).items() if name not in dropped}
+    return Response(json.dumps(_http_problem(status, detail)), status, headers, MEDIA_TYPE)

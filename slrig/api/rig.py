@@ -1,21 +1,46 @@
-"""/rig and /device: the rig as it is held, and what else is installed and plugged in."""
+"""/rig, /device and /preview: the rig as it is held, what else is plugged in, and what a camera sees meanwhile."""
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from datetime import datetime
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter
+import cv2
+import numpy as np
+from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from numpy.typing import NDArray
+from starlette.responses import StreamingResponse
 
+from slrig.api.events import OpenStreams
+from slrig.api.openapi import problems
 from slrig.api.schemas import CalibrationInUse, CameraBody, DeviceList, ProjectorBody, RigBody, filled
 from slrig.api.service import Serving
 from slrig.devices import CameraInfo
 from slrig.discovery import found_devices, installed_drivers
+from slrig.errors import SlrigError
 from slrig.jobs.records import utc_now
-from slrig.model import Size
+from slrig.rig.preview import Light, Watch
 from slrig.scan.runner import RunnerStatus
 
+_BOUNDARY = "picture"
+_WIDEST_PX = 1280
+_QUALITY = 80
+_LOOK_S = 0.5
+"""How long one look for a picture holds a thread; then the client is asked whether it is still there."""
+
 router = APIRouter(tags=["rig"])
+
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": f"JPEG pictures, each a part of a multipart body (boundary `{_BOUNDARY}`), 8 bits of grey, at "
+        f"most {_WIDEST_PX} px wide and 15 a second. While a scan holds the rig no pictures come; afterwards they go "
+        "on. The stream ends when the camera fails.",
+        "content": {f"multipart/x-mixed-replace; boundary={_BOUNDARY}": {"schema": {"type": "string"}}},
+    }
+}
 
 
 @router.get("/rig")
@@ -33,9 +58,7 @@ def look_at_rig(service: Serving) -> RigBody:
         calibration=_in_use(status),
         positions=[] if facts is None else facts.positions,
         cameras=[] if facts is None else [_camera(name, camera) for name, camera in facts.cameras.items()],
-        projector=None
-        if facts is None
-        else filled(ProjectorBody, facts.projector, size_px=_extent(facts.projector.size)),
+        projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
     )
 
@@ -66,12 +89,56 @@ def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
 
 
 def _camera(name: str, camera: CameraInfo) -> CameraBody:
-    form = camera.format
-    triggers = sorted(camera.triggers)
-    return filled(
-        CameraBody, camera, name=name, size_px=_extent(form.size), bit_depth=form.bit_depth, triggers=triggers
+    form, triggers = camera.format, sorted(camera.triggers)
+    return filled(CameraBody, camera, name=name, size_px=form.size, bit_depth=form.bit_depth, triggers=triggers)
+
+
+@router.get("/preview/{camera}", response_class=Response, responses={**_STREAM, **problems(409, 429, 502, 503)})
+async def look_through_camera(
+    request: Request,
+    service: Serving,
+    camera: Annotated[str, Path(max_length=64, description="name of a camera of the rig")],
+    light: Annotated[Light, Query(description="what the projector does meanwhile: dark, or all white")] = Light.OFF,
+) -> Response:
+    """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
+    streams: OpenStreams = request.app.state.streams
+    streams.require_room()
+    watch = await run_in_threadpool(service.runner.watch, camera, light)
+    return StreamingResponse(
+        _parts(watch, streams),
+        media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}",
+        headers={"Cache-Control": "no-store"},
     )
 
 
-def _extent(size: Size) -> tuple[int, int]:
-    return (size.width_px, size.height_px)
+async def _parts(watch: Watch, streams: OpenStreams) -> AsyncIterator[bytes]:
+    number = 0
+    with streams, watch:
+        while True:
+            try:
+                picture = await run_in_threadpool(watch.picture, number, _LOOK_S)
+            except SlrigError:
+                # The answer has begun: all that is left is to end it. `/rig` tells why.
+                return
+            if picture is None:
+                # An empty line between parts: whoever has gone is noticed by it.
+                yield b"\r\n"
+                continue
+            number = picture.number
+            jpeg = await run_in_threadpool(encoded, picture.image)
+            head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+            yield head.encode() + jpeg + b"\r\n"
+
+
+def encoded(image: NDArray[np.uint8]) -> bytes:
+    """A JPEG of an image (H, W) uint8, at most `_WIDEST_PX` wide."""
+    height, width = image.shape
+    if width > _WIDEST_PX:
+        image = np.asarray(
+            cv2.resize(image, (_WIDEST_PX, max(round(height * _WIDEST_PX / width), 1)), interpolation=cv2.INTER_AREA)
+        )
+    made, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not made:
+        message = f"a picture of {width} x {height} could not be encoded as JPEG"
+        raise ValueError(message)
+    return jpeg.tobytes()

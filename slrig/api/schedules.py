@@ -2,100 +2,198 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-from typing import Annotated
+from datetime import datetime
+from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Body, Query, Response
+from fastapi import APIRouter, Body, Response
+from pydantic import BaseModel, Field
 
 from slrig.api.openapi import problems
-from slrig.api.schedule_schemas import (
-    RunPage,
-    ScheduleBody,
-    ScheduleList,
-    ScheduleRequest,
-    run_body,
-    schedule_body,
-)
-from slrig.api.service import Serving
-
-USUAL_PAGE = 50
+from slrig.api.schemas import filled
+from slrig.api.service import Cursor, PageLength, Serving, paged
+from slrig.bundle.faults import Strict
+from slrig.jobs.records import utc_now
+from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Order, RunState, Schedule, TaskKind
 
 router = APIRouter(prefix="/schedule", tags=["schedule"])
 
+_UPCOMING = 5
+"""How many of the next due times are shown."""
 
-@router.post("", status_code=201, responses=problems(422, 507))
+
+class ScheduleRequest(Strict):
+    """A schedule: when, what, and how late it may be."""
+
+    cron: Annotated[str, Field(min_length=9, max_length=200)] = Field(
+        description="minute, hour, day of month, month, day of week, as Debian's cron reads them: "
+        "'30 6 * * mon-fri' is 06:30 on working days"
+    )
+    time_zone: Annotated[str, Field(min_length=1, max_length=64)] = Field(
+        default="UTC", description="whose clocks: a name of the IANA database, such as Europe/Berlin"
+    )
+    task: Annotated[TaskKind, Field(strict=False)] = Field(
+        description="verification: does the calibration still hold; calibration: every pose of a positioner, then a "
+        "solve; acceptance: the prescribed artefacts"
+    )
+    options: dict[str, Any] = Field(default_factory=dict, description="of the task, as its own request has them")
+    label: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    grace_s: Annotated[float, Field(ge=0, le=MOST_GRACE_S)] = Field(
+        default=3600.0, description="how long after its time a run may still start, a busy rig included"
+    )
+    retry_s: Annotated[float, Field(ge=LEAST_RETRY_S, le=MOST_GRACE_S)] = Field(
+        default=60.0, description="how often a run that found the rig busy, or a device that failed, tries again"
+    )
+    catch_up: bool = Field(
+        default=True,
+        description="after a pause longer than the grace, make up for the newest of the runs that were missed, once",
+    )
+    enabled: bool = True
+
+    def order(self) -> Order:
+        """What is asked for. Raises ScheduleError."""
+        asked = {name: value for name, value in self if name not in {"cron", "time_zone"}}
+        return Order(Cron(self.cron, self.time_zone), **asked)
+
+
+class ScheduleLinks(BaseModel):
+    """Where to go from here."""
+
+    self: str
+    runs: str
+    pause: str
+    resume: str
+
+
+class ScheduleBody(BaseModel):
+    """A schedule on record."""
+
+    id: UUID
+    cron: str
+    time_zone: str
+    task: TaskKind
+    options: dict[str, Any]
+    label: str | None
+    grace_s: float
+    retry_s: float
+    catch_up: bool
+    enabled: bool
+    created_at: datetime
+    upcoming: list[datetime] = Field(
+        description="the next five due times, as clocks in its time zone show them; those of a paused schedule once "
+        "it is resumed"
+    )
+    links: ScheduleLinks
+
+
+class ScheduleList(BaseModel):
+    """Every schedule, oldest first."""
+
+    schedules: list[ScheduleBody]
+
+
+class RunBody(BaseModel):
+    """One due time, and what became of it."""
+
+    number: int
+    due: datetime = Field(description="as clocks in the schedule's time zone show it")
+    state: RunState
+    reason: str | None = Field(description="in words, where it did not simply succeed")
+    count: int = Field(description="how many due times this row stands for")
+    attempts: int
+    next_attempt: datetime | None
+    started_at: datetime | None
+    finished_at: datetime | None
+    result: dict[str, Any] | None
+
+
+class RunPage(BaseModel):
+    """Runs from new to old. `next` asks for the page after this one, null on the last."""
+
+    runs: list[RunBody]
+    next: str | None
+
+
+def _body(schedule: Schedule) -> ScheduleBody:
+    order, here = schedule.order, f"/schedule/{schedule.id}"
+    return filled(
+        ScheduleBody,
+        order,
+        id=schedule.id,
+        cron=order.cron.text,
+        time_zone=order.cron.time_zone,
+        created_at=schedule.created_at,
+        upcoming=[order.cron.local(due) for due in order.cron.upcoming(utc_now(), _UPCOMING)],
+        links=ScheduleLinks(self=here, runs=f"{here}/runs", pause=f"{here}/pause", resume=f"{here}/resume"),
+    )
+
+
+@router.post("", status_code=201, responses=problems(507))
 def add_schedule(service: Serving, response: Response, request: Annotated[ScheduleRequest, Body()]) -> ScheduleBody:
     """Put a schedule on record. The answer shows when it is due next. One that could only fail is refused."""
-    now = _now()
     order = request.order()
     service.tasks.check(order)
-    schedule = service.schedules.create(order, now)
+    schedule = service.schedules.create(order, utc_now())
     service.scheduler.wake()
     response.headers["Location"] = f"/schedule/{schedule.id}"
-    return schedule_body(schedule, now)
+    return _body(schedule)
 
 
 @router.get("")
 def list_schedules(service: Serving) -> ScheduleList:
     """List schedules, oldest first."""
-    now = _now()
-    return ScheduleList(schedules=[schedule_body(each, now) for each in service.schedules.all()])
+    return ScheduleList(schedules=[_body(each) for each in service.schedules.all()])
 
 
-@router.get("/{schedule_id}", responses=problems(404, 422))
+@router.get("/{schedule_id}")
 def look_at_schedule(service: Serving, schedule_id: UUID) -> ScheduleBody:
     """Return a schedule."""
-    return schedule_body(service.schedules.get(schedule_id), _now())
+    return _body(service.schedules.get(schedule_id))
 
 
-@router.get("/{schedule_id}/runs", responses=problems(404, 422))
+@router.get("/{schedule_id}/runs")
 def list_runs(
     service: Serving,
     response: Response,
     schedule_id: UUID,
-    cursor: Annotated[int | None, Query(ge=1, le=2**53, description="`next` of the page before")] = None,
-    limit: Annotated[int, Query(ge=1, le=200)] = USUAL_PAGE,
+    cursor: Cursor = None,
+    limit: PageLength = 50,
 ) -> RunPage:
     """List what became of a schedule's due times, from new to old."""
-    limit = min(limit, service.settings.page_limit)
-    schedule = service.schedules.get(schedule_id)
-    found = service.schedules.runs(schedule_id, before=cursor, limit=limit + 1)
-    shown = found[:limit]
-    following = None
-    if len(found) > limit:
-        following = f"/schedule/{schedule_id}/runs?cursor={shown[-1].number}&limit={limit}"
-        response.headers["Link"] = f'<{following}>; rel="next"'
-    return RunPage(runs=[run_body(run, schedule.order.cron) for run in shown], next=following)
+    schedules, cron = service.schedules, service.schedules.get(schedule_id).order.cron
+    shown, following = paged(
+        lambda most: schedules.runs(schedule_id, before=cursor, limit=most),
+        limit,
+        f"/schedule/{schedule_id}/runs",
+        service,
+        response,
+    )
+    return RunPage(runs=[filled(RunBody, run, due=cron.local(run.due)) for run in shown], next=following)
 
 
-@router.post("/{schedule_id}/pause", responses=problems(404, 422))
+@router.post("/{schedule_id}/pause")
 def pause_schedule(service: Serving, schedule_id: UUID) -> ScheduleBody:
     """Let nothing become due until it is resumed. A run under way goes on. May be repeated."""
-    return schedule_body(service.schedules.enable(schedule_id, enabled=False), _now())
+    return _body(service.schedules.enable(schedule_id, enabled=False))
 
 
-@router.post("/{schedule_id}/resume", responses=problems(404, 422))
+@router.post("/{schedule_id}/resume")
 def resume_schedule(service: Serving, schedule_id: UUID) -> ScheduleBody:
     """Go on after a pause; `catch_up` says whether what was missed is made up for, once. May be repeated."""
     schedule = service.schedules.enable(schedule_id, enabled=True)
     service.scheduler.wake()
-    return schedule_body(schedule, _now())
+    return _body(schedule)
 
 
-@router.post("/{schedule_id}/cancel", status_code=202, responses=problems(404, 409, 422))
+@router.post("/{schedule_id}/cancel", status_code=202, responses=problems(409))
 def cancel_run(service: Serving, schedule_id: UUID) -> ScheduleBody:
     """Ask the run that is under way to end early; the schedule stays as it is. May be repeated while it is."""
     schedule = service.schedules.get(schedule_id)
     service.tasks.cancel(schedule)
-    return schedule_body(schedule, _now())
+    return _body(schedule)
 
 
-@router.delete("/{schedule_id}", status_code=204, responses=problems(404, 422))
+@router.delete("/{schedule_id}", status_code=204)
 def remove_schedule(service: Serving, schedule_id: UUID) -> None:
     """Forget a schedule and its runs."""
     service.schedules.remove(schedule_id)
-
-
-def _now() -> datetime:
-    return datetime.now(UTC)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import datetime
@@ -16,7 +15,7 @@ from slrig.bundle.faults import Strict
 from slrig.config import BracketSeconds, ScanDefaults
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
-from slrig.model import Axis, FlipRule
+from slrig.model import Axis, FlipRule, Size
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
 MOST_EXPOSURE_S = 60.0
@@ -108,11 +107,6 @@ def filled(body: type[Body], source: object, /, **others: Any) -> Body:
     """An answer with the attributes of `source` by their names, at every depth, save what `others` says."""
     own = {name: getattr(source, name) for name in body.model_fields if name not in others}
     return body.model_validate({**own, **others}, from_attributes=True)
-
-
-def fingerprint(request: BaseModel) -> str:
-    """What tells two requests with one idempotency key apart: equal for equal requests, however they were written."""
-    return hashlib.sha256(request.model_dump_json().encode()).hexdigest()
 
 
 def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
@@ -215,13 +209,19 @@ def scan_body(record: JobRecord, files: Mapping[str, str]) -> ScanBody:
     return filled(ScanBody, record, error=record.fault, links=links)
 
 
+Extent = Annotated[
+    tuple[int, int], BeforeValidator(lambda size: (size.width_px, size.height_px) if isinstance(size, Size) else size)
+]
+"""A `Size`, shown as width and height."""
+
+
 class CameraBody(BaseModel):
     """A camera of the rig, as it declares itself."""
 
     name: str
     model: str
     serial: str
-    size_px: tuple[int, int]
+    size_px: Extent
     bit_depth: int
     triggers: list[str]
     exposure_range_s: tuple[float, float]
@@ -234,7 +234,7 @@ class ProjectorBody(BaseModel):
     name: str
     model: str
     serial: str
-    size_px: tuple[int, int]
+    size_px: Extent
     plays: bool
     latency_s: float
 

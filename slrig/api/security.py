@@ -1,13 +1,15 @@
-"""Who may talk to the service: whoever has the key, by a name that the service knows itself by."""
+"""Who may talk to the service, by which name, and how much at once: whoever has the key."""
 
 from __future__ import annotations
 
 import hashlib
 import hmac
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 
 from starlette.datastructures import Headers
+from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from slrig import KEY_VARIABLE
@@ -95,3 +97,16 @@ def _sent_key(headers: Headers) -> str | None:
     if scheme.lower() == "bearer" and token.strip():
         return token.strip()
     return headers.get("x-api-key")
+
+
+class BodyLimits:
+    """Middleware: how long a body may be. `most_bytes` holds for every path but those of `longer`."""
+
+    def __init__(self, app: ASGIApp, *, most_bytes: int, longer: Mapping[str, int]) -> None:
+        self._usual = RequestBodyLimitMiddleware(app, max_body_size=most_bytes)
+        self._longer = {path: RequestBodyLimitMiddleware(app, max_body_size=most) for path, most in longer.items()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        limited = self._longer.get(scope["path"], self._usual) if scope["type"] == "http" else self._usual
+        await limited(scope, receive, send)

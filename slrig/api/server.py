@@ -19,7 +19,7 @@ from slrig import KEY_VARIABLE
 from slrig.api.app import create_app
 from slrig.api.logs import set_up_logs
 from slrig.api.security import claim_key
-from slrig.api.service import Service, assembled_service
+from slrig.api.service import Service
 from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
@@ -86,7 +86,7 @@ def open_service(
     )
     try:
         runner.take_up(swept.resumed)
-        return assembled_service(
+        return Service(
             settings,
             rig.scan,
             folder,
@@ -242,6 +242,3 @@ def _listener(settings: ServiceSettings) -> socket.socket:
         raise ServiceError(message) from error
     listener.set_inheritable(False)
     return listener
-
-
-__all__ = ["ADDRESS_FILE", "open_service", "serve"]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, TypeVar
 
-from fastapi import Depends, Request
+from fastapi import Depends, Query, Request, Response
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.calibrate.calibrating import Calibrations
@@ -16,12 +16,13 @@ from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.keys import RequestKeys
-from slrig.jobs.records import JobKind
+from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
 from slrig.schedule.notices import NoticedHealth, Notices
+from slrig.schedule.records import Run
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
@@ -32,29 +33,80 @@ _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
 
 
-@dataclass(frozen=True, slots=True)
 class Service:
     """One service: its settings, its data, the one that scans, those that calibrate, verify and test, and the schedule.
 
+    Until `start` nothing works but what sends notices. worker : the runner's, which computes for all of them.
     refuse_when_stale : whether the rig file has scans refused then.
+
+    Raises
+    ------
+    StorageError
+        The disk refused. What was given is still the caller's to close.
     """
 
-    settings: ServiceSettings
-    scan_defaults: ScanDefaults
-    folder: DataFolder
-    store: JobStore
-    keys: RequestKeys
-    runner: Runner
-    calibrations: Calibrations
-    verifications: VerificationDesk
-    acceptance: AcceptanceDesk
-    schedules: ScheduleStore
-    tasks: Tasks
-    scheduler: Scheduler
-    notices: Notices
-    retention: Retention
-    scan_retention: ScanRetention
-    refuse_when_stale: bool = False
+    def __init__(
+        self,
+        settings: ServiceSettings,
+        scan_defaults: ScanDefaults,
+        folder: DataFolder,
+        store: JobStore,
+        runner: Runner,
+        worker: Worker,
+        *,
+        rig_name: str,
+        calibration_tools: CalibrationTools | None = None,
+        refuse_when_stale: bool = False,
+    ) -> None:
+        self.settings = settings
+        self.scan_defaults = scan_defaults
+        self.folder = folder
+        self.store = store
+        self.runner = runner
+        self.refuse_when_stale = refuse_when_stale
+        database, spare_bytes = store.database, settings.min_free_bytes
+        self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
+        self.keys.release_all()
+        self.calibrations = Calibrations(
+            folder,
+            runner,
+            JobStore(database, JobKind.POSE, JobKind.SOLVE),
+            rig_name=rig_name,
+            tools=calibration_tools or usual_calibration_tools(worker),
+            spare_bytes=spare_bytes,
+        )
+        self.notices = Notices(settings.webhook_url, rig=rig_name)
+        self.verifications = VerificationDesk(
+            folder,
+            runner,
+            NoticedHealth(database, self.notices),
+            JobStore(database, JobKind.VERIFICATION),
+            tools=verification_tools(worker),
+            spare_bytes=spare_bytes,
+        )
+        runner.watch_health(self.verifications)
+        self.acceptance = AcceptanceDesk(
+            folder,
+            runner,
+            JobStore(database, JobKind.POSITION),
+            evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
+            report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
+        )
+        for desk in (self.verifications, self.calibrations, self.acceptance):
+            desk.take_up()
+        self.retention = Retention(
+            self.calibrations,
+            folder,
+            keep=settings.keep_calibrations,
+            named=lambda: {test.calibration for test in self.acceptance.latest()},
+        )
+        limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
+        self.scan_retention = ScanRetention(store, folder, limits, runner.delete)
+        runner.after_each(self.scan_retention.look)
+        self.schedules = ScheduleStore(database)
+        self.tasks = Tasks(runner, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
+        # The folder's lock keeps every other process out.
+        self.scheduler = Scheduler(self.schedules, self.tasks, alone=True, notice=self.notices.run)
 
     def start(self) -> None:
         """Open the rig, look at the clock, and remove what is old."""
@@ -82,97 +134,30 @@ class Service:
         self.folder.release()
 
 
-def assembled_service(
-    settings: ServiceSettings,
-    scan_defaults: ScanDefaults,
-    folder: DataFolder,
-    store: JobStore,
-    runner: Runner,
-    worker: Worker,
-    *,
-    rig_name: str,
-    calibration_tools: CalibrationTools | None = None,
-    refuse_when_stale: bool = False,
-) -> Service:
-    """A service of what scans, and of the rest made to go with it. Nothing is started but what sends notices.
-
-    worker : the runner's, which computes for all of them.
-
-    Raises
-    ------
-    StorageError
-        The disk refused. What was given is still the caller's to close.
-    """
-    spare_bytes = settings.min_free_bytes
-    keys = RequestKeys(store.database, life_s=settings.idempotency_keep_s)
-    keys.release_all()
-    calibrations = Calibrations(
-        folder,
-        runner,
-        JobStore(store.database, JobKind.POSE, JobKind.SOLVE),
-        rig_name=rig_name,
-        tools=calibration_tools or usual_calibration_tools(worker),
-        spare_bytes=spare_bytes,
-    )
-    schedules = ScheduleStore(store.database)
-    notices = Notices(settings.webhook_url, rig=rig_name)
-    health = NoticedHealth(store.database, notices)
-    verifications = VerificationDesk(
-        folder,
-        runner,
-        health,
-        JobStore(store.database, JobKind.VERIFICATION),
-        tools=verification_tools(worker),
-        spare_bytes=spare_bytes,
-    )
-    runner.watch_health(verifications)
-    acceptance = AcceptanceDesk(
-        folder,
-        runner,
-        JobStore(store.database, JobKind.POSITION),
-        evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
-        report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
-    )
-    for desk in (verifications, calibrations, acceptance):
-        desk.take_up()
-    retention = Retention(
-        calibrations,
-        folder,
-        keep=settings.keep_calibrations,
-        named=lambda: {test.calibration for test in acceptance.latest()},
-    )
-    limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
-    scan_retention = ScanRetention(store, folder, limits, runner.delete)
-    runner.after_each(scan_retention.look)
-    tasks = Tasks(runner, calibrations, verifications, acceptance, tidy=retention)
-    # The folder's lock keeps every other process out.
-    scheduler = Scheduler(schedules, tasks, alone=True, notice=notices.run)
-    return Service(
-        settings=settings,
-        scan_defaults=scan_defaults,
-        folder=folder,
-        store=store,
-        keys=keys,
-        runner=runner,
-        calibrations=calibrations,
-        verifications=verifications,
-        acceptance=acceptance,
-        schedules=schedules,
-        tasks=tasks,
-        scheduler=scheduler,
-        notices=notices,
-        retention=retention,
-        scan_retention=scan_retention,
-        refuse_when_stale=refuse_when_stale,
-    )
-
-
 def _of_request(request: Request) -> Service:
-    service = request.app.state.service
-    if not isinstance(service, Service):
-        raise TypeError(type(service))
+    service: Service = request.app.state.service
     return service
 
 
 Serving = Annotated[Service, Depends(_of_request)]
 """A handler's parameter: the service that it serves."""
+
+Cursor = Annotated[int | None, Query(ge=1, le=2**53, description="`next` of the page before")]
+PageLength = Annotated[int, Query(ge=1, le=200)]
+Shown = TypeVar("Shown", JobRecord, Run)
+
+
+def paged(
+    found: Callable[[int], Sequence[Shown]], limit: int, path: str, service: Service, response: Response
+) -> tuple[Sequence[Shown], str | None]:
+    """The records of a page, and the path of the page after it, which the header `Link` names, too.
+
+    found : gives so many records, from new to old. limit : the most that is asked for; the settings may allow less.
+    """
+    limit = min(limit, service.settings.page_limit)
+    records = found(limit + 1)
+    if len(records) <= limit:
+        return records, None
+    following = f"{path}?cursor={records[limit - 1].number}&limit={limit}"
+    response.headers["Link"] = f'<{following}>; rel="next"'
+    return records[:limit], following

@@ -12,7 +12,7 @@ from fastapi.testclient import TestClient
 
 from slrig.api.app import create_app
 from slrig.api.security import digest
-from slrig.api.service import assembled_service
+from slrig.api.service import Service
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
@@ -41,7 +41,7 @@ class ServedBench(TameBench):
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
         self.tame = TameCalibrating(self)
-        self.service = assembled_service(
+        self.service = Service(
             chosen,
             defaults,
             folder,

@@ -10,9 +10,8 @@ from uuid import UUID
 import pytest
 from sse_starlette import ServerSentEvent
 
-from slrig.api.events import followed_job
-from slrig.api.streams import OpenStreams
-from slrig.api.streams import told as stream_of
+from slrig.api.events import OpenStreams, followed_job
+from slrig.api.events import told as stream_of
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobRecord, JobState
 from slrig.jobs.store import JobStore

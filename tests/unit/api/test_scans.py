@@ -12,8 +12,8 @@ import pytest
 import trimesh
 from fastapi.testclient import TestClient
 
-from slrig.api.idempotency import own_key
-from slrig.api.schemas import ScanRequest, fingerprint
+from slrig.api.idempotency import fingerprint, own_key
+from slrig.api.schemas import ScanRequest
 from slrig.jobs.worker import Worker
 from tests.unit.api.conftest import ServedBench, ended
 
