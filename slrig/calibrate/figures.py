@@ -55,21 +55,11 @@ class DeviceFigures:
     residuals: DeviceResiduals
 
     @property
-    def title(self) -> str:
-        """The device as a heading has it."""
-        return device_title(self.name)
-
-    @property
     def solved(self) -> Mapping[str, Figure]:
         """Its `values`, and where it is unless that was held."""
         placed = any(axis.sigma > 0 for axis in self.centre_mm)
         place = dict(zip(("x_mm", "y_mm", "z_mm"), self.centre_mm, strict=True))
         return {**self.values, **place} if placed else self.values
-
-    @property
-    def is_projector(self) -> bool:
-        """Whether it is the projector."""
-        return self.name == PROJECTOR
 
     @property
     def held_out_ratio(self) -> float:
@@ -124,24 +114,21 @@ def device_figures(result: CalibrationResult) -> tuple[DeviceFigures, ...]:
             for each, number, sigma in zip(_INNER, numbers, sigmas, strict=False)
             if each not in LENS_TERMS or each in terms
         }
-        found.append(
-            DeviceFigures(
-                name, device.size, terms, values, _centre(device, covariance), result.solution.residuals[name]
-            )
-        )
+        x, y, z = (
+            _propagated([device], covariance, lambda one, axis=axis: float(one[0][1][axis])) for axis in range(3)
+        )  # type: ignore[misc]
+        found.append(DeviceFigures(name, device.size, terms, values, (x, y, z), result.solution.residuals[name]))
     return tuple(found)
 
 
 def baselines(result: CalibrationResult) -> tuple[Baseline, ...]:
     """Every pair of devices, in the order of the devices."""
     middle = result.expected.volume_mm.mean(axis=0)
-    covariance = result.solution.covariance
-    placed = list(_placed(result.calibration))
     found = []
-    for (first, one, own), (second, other, its) in combinations(placed, 2):
+    for (first, one, own), (second, other, its) in combinations(_placed(result.calibration), 2):
         rows = np.r_[own, its]
-        shared = covariance[np.ix_(rows, rows)]
-        length = _propagated((one, other), shared, lambda pair: float(np.linalg.norm(_apart(pair))))
+        shared = result.solution.covariance[np.ix_(rows, rows)]
+        length = _propagated((one, other), shared, lambda pair: float(np.linalg.norm(pair[1][1] - pair[0][1])))
         angle = _propagated((one, other), shared, lambda pair: _angle_deg(pair, middle))
         found.append(Baseline(first, second, length, angle))
     return tuple(found)
@@ -151,33 +138,22 @@ def pose_figures(result: CalibrationResult, board: Board, names: Sequence[str]) 
     """Every pose of `names`, in their order, and then those that the result knows beside them."""
     solution = result.solution
     known = [*solution.poses, *solution.outliers]
-    ordered = [name for name in names if name in known]
-    ordered += [name for name in known if name not in ordered]
     first = next(iter(result.calibration.cameras.values()))
     middle_mm = board.points_mm.mean(axis=0)
     found = []
-    for name in ordered:
+    for name in dict.fromkeys([*(name for name in names if name in known), *known]):
         rms = {
             device: residuals.pose_rms_px[name]
             for device, residuals in solution.residuals.items()
             if name in residuals.pose_rms_px
         }
         tilt = distance = math.nan
-        pose = solution.poses.get(name)
-        if pose is not None:
-            seen = BoardPose(
-                first.rotation @ pose.rotation, first.rotation @ pose.translation_mm + first.translation_mm
-            )
-            board_pose = attitude(seen, middle_mm)
-            tilt, distance = board_pose.steep_deg, board_pose.distance_mm
+        if (pose := solution.poses.get(name)) is not None:
+            turned, moved_mm = first.rotation @ pose.rotation, first.rotation @ pose.translation_mm
+            seen = attitude(BoardPose(turned, moved_mm + first.translation_mm), middle_mm)
+            tilt, distance = seen.steep_deg, seen.distance_mm
         found.append(PoseFigures(name, rms, tilt, distance, solution.outliers.get(name, "")))
     return tuple(found)
-
-
-def volume_diagonal_mm(result: CalibrationResult) -> float:
-    """The diagonal of the working volume, mm."""
-    least, most = result.expected.volume_mm
-    return float(np.linalg.norm(most - least))
 
 
 def named_devices(calibration: Calibration) -> Mapping[str, Pinhole]:
@@ -191,14 +167,6 @@ def _placed(calibration: Calibration) -> list[tuple[str, Pinhole, slice]]:
     rows = len(PARAMETERS)
     named = named_devices(calibration).items()
     return [(name, device, slice(rows * at, rows * (at + 1))) for at, (name, device) in enumerate(named)]
-
-
-def _centre(device: Pinhole, covariance: FloatArray) -> tuple[Figure, Figure, Figure]:
-    x, y, z = (
-        _propagated((device,), covariance, lambda one, axis=axis: float(one[0][1][axis]))  # type: ignore[misc]
-        for axis in range(3)
-    )
-    return (x, y, z)
 
 
 Posed = tuple[FloatArray, FloatArray]
@@ -226,10 +194,6 @@ def _propagated(
 def _moved(device: Pinhole, change: FloatArray) -> Posed:
     rotation = Rotation.from_rotvec(change[_TURN]).as_matrix() @ device.rotation
     return rotation, -rotation.T @ (device.translation_mm + change[_SHIFT])
-
-
-def _apart(pair: Sequence[Posed]) -> FloatArray:
-    return pair[1][1] - pair[0][1]
 
 
 def _angle_deg(pair: Sequence[Posed], middle_mm: FloatArray) -> float:

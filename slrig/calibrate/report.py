@@ -8,30 +8,15 @@ from functools import partial
 import numpy as np
 from markupsafe import Markup
 
-from slrig.calibrate.charts import (
-    coverage_map,
-    error_range_mm,
-    error_slices,
-    longest_arrow_px,
-    residual_map,
-    rig_view,
-)
-from slrig.calibrate.figures import (
-    DeviceFigures,
-    PoseFigures,
-    baselines,
-    device_figures,
-    device_title,
-    named_devices,
-    pose_figures,
-    volume_diagonal_mm,
-)
+from slrig.calibrate import charts
+from slrig.calibrate.figures import PoseFigures, baselines, device_figures, device_title, named_devices, pose_figures
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibrate.words import PARAMETERS, rounded
+from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
 from slrig.calibration.judging.verdict import board_words
 from slrig.calibration.poses.light_view import lit_board
 from slrig.calibration.poses.pictures import pose_picture
+from slrig.calibration.solution import PROJECTOR
 from slrig.model import Pixels
 from slrig.reports.drawing import legend
 from slrig.reports.page import filled, jpeg_uri
@@ -62,11 +47,11 @@ def report_html(
     remarks : by pose, what could be better about it. refused : by pose, why it could not be read at all.
     machine : where it was solved, in words.
     """
-    expected, board_pose = result.expected, list(result.solution.poses.values())
+    expected = result.expected
     devices = device_figures(result)
     shown = pose_figures(result, board, [pose.observation.name for pose in poses])
-    least_mm, most_mm = error_range_mm(expected)
-
+    least_mm, most_mm = charts.error_range_mm(expected)
+    sides_mm = expected.volume_mm[1] - expected.volume_mm[0]
     return filled(
         "calibration.html",
         result=result,
@@ -85,18 +70,17 @@ def report_html(
         pairs=baselines(result),
         least_mm=least_mm,
         most_mm=most_mm,
-        sides_mm=tuple(expected.volume_mm[1] - expected.volume_mm[0]),
-        diagonal_mm=volume_diagonal_mm(result),
-        slices=error_slices(expected),
+        sides_mm=tuple(sides_mm),
+        diagonal_mm=float(np.linalg.norm(sides_mm)),
         pictures=list(_pictures(shown, poses, pictures or {}, board)),
-        parameters=PARAMETERS,
         board_words=board_words,
         coverage=partial(_coverage, result, poses, board),
+        charts=charts,
         device_title=device_title,
         legend=legend,
-        longest_arrow_px=longest_arrow_px,
-        residual_map=residual_map,
-        rig_view=partial(rig_view, result.calibration, board_pose, board, expected.volume_mm),
+        rig_view=partial(
+            charts.rig_view, result.calibration, list(result.solution.poses.values()), board, expected.volume_mm
+        ),
         rounded=rounded,
     )
 
@@ -116,14 +100,13 @@ def _pictures(
             yield jpeg_uri(drawn[..., ::-1], _QUALITY), words
 
 
-def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board, figures: DeviceFigures) -> Markup:
-    board_pose, left_out = result.solution.poses, result.solution.outliers
-    used = [pose.observation for pose in poses if pose.observation.name not in left_out]
-    if figures.is_projector:
-        parts = [lit_board(pose, figures.size).positions_px for pose in used]
+def _coverage(result: CalibrationResult, poses: Sequence[ReadPose], board: Board, name: str) -> Markup:
+    device = named_devices(result.calibration)[name]
+    used = [pose.observation for pose in poses if pose.observation.name not in result.solution.outliers]
+    if name == PROJECTOR:
+        parts = [lit_board(pose, device.size).positions_px for pose in used]
     else:
-        parts = [pose.views[figures.name].points_px for pose in used if figures.name in pose.views]
+        parts = [pose.views[name].points_px for pose in used if name in pose.views]
     points = np.concatenate([np.zeros((0, 2)), *parts])
     chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), _MOST_DOTS)).astype(int))
-    device = named_devices(result.calibration)[figures.name]
-    return coverage_map(device, board, list(board_pose.values()), points[chosen], name=figures.name)
+    return charts.coverage_map(device, board, list(result.solution.poses.values()), points[chosen], name=name)
