@@ -33,10 +33,9 @@ from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
 from slrig.bundle.description import CAMERA_NAME
 from slrig.calibrate.calibrating import EXPORTS
-from slrig.calibrate.pose_answering import picture_name
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, pose_of
-from slrig.calibrate.store import REPORT
+from slrig.calibrate.store import REPORT, picture_name
 from slrig.calibration.board import USUAL_BOARD
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
 

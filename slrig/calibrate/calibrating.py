@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 from uuid import UUID, uuid4
 
 import structlog
@@ -13,39 +11,35 @@ import structlog
 from slrig.bundle.calibration_file import write_calibration
 from slrig.bundle.opencv_calibration import write_opencv_calibration
 from slrig.bundle.storage import write_durably
-from slrig.calibrate.pose_answering import PoseAnswers, setting_of
-from slrig.calibrate.pose_shooting import PoseDesk
+from slrig.calibrate.pose_shooting import PoseDesk, outcome_of
 from slrig.calibrate.records import USUAL_PATTERNS, SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solves import SolveDesk
-from slrig.calibrate.store import CALIBRATION, ActivePointer, CalibrationStore
-from slrig.calibrate.sweep import sweep_calibrations
-from slrig.calibrate.tools import CalibrationTools, sizes_of
+from slrig.calibrate.store import CALIBRATION, READING, ActivePointer, CalibrationStore
+from slrig.calibrate.tools import CalibrationTools, setting_of
 from slrig.calibration.board import Board
 from slrig.calibration.judging.comparison import Comparison
-from slrig.errors import ArtefactNotReadyError, CalibrationError, CalibrationStateError, CameraNotFoundError
-from slrig.failure import disk_errors
+from slrig.errors import (
+    ArtefactNotReadyError,
+    CalibrationError,
+    CalibrationStateError,
+    CameraNotFoundError,
+    StorageError,
+)
+from slrig.failure import disk_errors, failure_of
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.records import Clock, utc_now
+from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import RigJobs
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 from slrig.scan.plan import PatternPlan
-from slrig.scan.runner import RigAccess
+from slrig.scan.runner import Runner
 
 EXPORTS = ("calibration.json", "calibration.yml", "calibration.xml")
 """The forms in which a calibration can be had, and taken in."""
 
 _log = structlog.get_logger(__name__)
-
-
-class CalibratedRig(RigAccess, Protocol):
-    """`slrig.scan.runner.Runner`: does work with the rig, and takes a calibration for what is begun from now on."""
-
-    def use_calibration(self, active: ActiveCalibration | None) -> None:
-        """Scan with it; None scans with the rig's own. Raises CalibrationError if it is for other devices."""
-        ...
 
 
 class Calibrations:
@@ -62,43 +56,91 @@ class Calibrations:
     def __init__(
         self,
         folder: DataFolder,
-        rig: CalibratedRig,
+        runner: Runner,
         jobs: JobStore,
         *,
         rig_name: str,
         tools: CalibrationTools,
-        clock: Clock = utc_now,
         spare_bytes: int = 0,
     ) -> None:
         self.store = CalibrationStore(folder)
         self.register = CalibrationRegister(self.store, jobs)
-        self._work = RigJobs(jobs, rig, folder)
-        self._rig = rig
+        self._work = RigJobs(jobs, runner, folder)
+        self._runner = runner
         self._rig_name = rig_name
-        self._clock = clock
         self._tools = tools
-        self.answers = PoseAnswers(self.register, self._tools)
-        self.poses = PoseDesk(
-            self.register, folder, rig, self._work, self._tools, self.answers, clock=clock, spare_bytes=spare_bytes
-        )
-        self.solves = SolveDesk(self.register, self._work, self._tools, self.answers, clock=clock, earlier=self._in_use)
-        found = self.store.active_calibration()
-        if found is not None:
-            pointer, calibration = found
-            rig.use_calibration(ActiveCalibration(str(pointer.id), calibration))
+        self.poses = PoseDesk(self.register, folder, runner, self._work, tools, spare_bytes)
+        self.solves = SolveDesk(self.register, self._work, tools)
+        runner.use_calibration(self.store.active_calibration())
 
     def take_up(self) -> None:
-        """Go on with what the last run of the service left: see `sweep_calibrations`."""
-        sweep_calibrations(self.register, self.poses, self.solves)
+        """Settle what the last run of the service left open, or have it go on. Before the rig is used.
+
+        - A pose that waited is shot; one whose frames are there is read; one that has its answer gets it; one that had
+          the rig, and a solve, was interrupted. See `PoseDesk.take_up`, `SolveDesk.take_up`.
+        - A pose that was accepted and has no files is recorded as failed.
+        - A pose in its place without a record, as beside a database that was lost, is on record again, as it says
+          itself.
+        - Jobs of a calibration that is gone are forgotten.
+        """
+        records = self.register.all()
+        by_session = self.register.jobs.of()
+        for session_id in by_session.keys() - {record.id for record in records}:
+            self.register.jobs.delete_of(session_id)
+        for record in records:
+            jobs = by_session.get(record.id, [])
+            for job in jobs:
+                if job.kind is JobKind.POSE:
+                    self._settle_pose(record.id, job)
+                elif not job.state.final:
+                    self.solves.take_up(record.id, job)
+            known = {job.plan["number"] for job in jobs if job.kind is JobKind.POSE}
+            for number in self.store.pose_numbers(record.id):
+                if number not in known:
+                    self._restore_pose(record, number)
+
+    def _settle_pose(self, session_id: UUID, job: JobRecord) -> None:
+        number = job.plan["number"]
+        place, answer = self.store.pose(session_id, number), self.store.answer(session_id, number)
+        if job.state.final:
+            if job.state is JobState.SUCCEEDED and not (place / READING).is_file():
+                message = f"The files of pose {number} are gone from {place}. Shoot it again."
+                self.register.jobs.lose_files(job.id, failure_of(StorageError(message)))
+        elif answer is None:
+            self.poses.take_up(session_id, job)
+        else:
+            outcome = outcome_of(answer)
+            state = JobState.SUCCEEDED if outcome.fault is None else JobState.FAILED
+            self.register.jobs.finish(job.id, state, fault=outcome.fault, summary=outcome.summary)
+
+    def _restore_pose(self, record: SessionRecord, number: int) -> None:
+        """Put a pose on record again, or remove what is none."""
+        answer = self.store.answer(record.id, number)
+        if answer is None:
+            self.store.discard_pose(record.id, number)
+            return
+        outcome = outcome_of(answer)
+        self.register.jobs.restore(
+            uuid4(),
+            answer["pose"],
+            outcome.summary or {},
+            rig=record.rig,
+            label=None,
+            created_at=record.created_at,
+            started_at=record.created_at,
+            fault=outcome.fault,
+            parent=record.id,
+        )
+        _log.warning("left by the last run", calibration=str(record.id), pose=number, found="recovered")
 
     def open(self, board: Board, *, label: str | None = None, patterns: PatternPlan = USUAL_PATTERNS) -> SessionRecord:
         """Open a session for a board. Touches no device. Raises StorageError."""
         with self.register.lock:
             record = SessionRecord(
-                self.register.next_number(), uuid4(), self._clock(), self._rig_name, label, board, patterns
+                self.register.next_number(), uuid4(), utc_now(), self._rig_name, label, board, patterns
             )
             self.register.add(record)
-        self.answers.warm()
+        self.poses.warm()
         return record
 
     def submit(self, text: bytes, ending: str, *, label: str | None = None) -> SessionRecord:
@@ -124,27 +166,24 @@ class Calibrations:
                 raise CalibrationError(message) from error
             source.unlink()
             write_calibration(staged / CALIBRATION, calibration)
-            projector = None if calibration.projector is None else calibration.projector.size
             with self.register.lock:
                 record = SessionRecord(
                     self.register.next_number(),
                     session_id,
-                    self._clock(),
+                    utc_now(),
                     self._rig_name,
                     label,
                     cameras={name: device.size for name, device in calibration.cameras.items()},
-                    projector=projector,
-                    state=SessionState.SOLVED,
-                    solve=1,
+                    projector=None if calibration.projector is None else calibration.projector.size,
                 )
-                self.register.add(replace(record, state=SessionState.OPEN, solve=0))
+                self.register.add(record)
                 try:
                     self.store.commit_solve(session_id, 1, staged)
-                    self.register.change(session_id, lambda _: record)
+                    self.register.change(session_id, state=SessionState.SOLVED, solve=1)
                 except BaseException:
                     self.register.remove(session_id)
                     raise
-                return record
+                return self.register.get(session_id)
         finally:
             self.store.discard(staged)
 
@@ -162,13 +201,11 @@ class Calibrations:
         """
         with self.register.lock:
             record = self.register.get(session_id)
-            calibration = self._calibration(record)
-            self._rig.use_calibration(ActiveCalibration(str(session_id), calibration))
+            self._runner.use_calibration(ActiveCalibration(str(session_id), self.calibration(session_id)))
             try:
                 self.store.activate(ActivePointer(session_id, record.solve))
             except BaseException:
-                found = self.store.active_calibration()
-                self._rig.use_calibration(None if found is None else ActiveCalibration(str(found[0].id), found[1]))
+                self._runner.use_calibration(self.store.active_calibration())
                 raise
         _log.info("calibration activated", calibration=str(session_id), solve=record.solve)
         return record
@@ -181,7 +218,7 @@ class Calibrations:
                 message = f"Calibration {session_id} is not in use."
                 raise CalibrationStateError(message)
             self.store.activate(None)
-            self._rig.use_calibration(None)
+            self._runner.use_calibration(None)
         return record
 
     @property
@@ -216,7 +253,14 @@ class Calibrations:
 
     def calibration(self, session_id: UUID) -> Calibration:
         """Return what the last solve gave. Raises CalibrationNotFoundError, CalibrationStateError, CalibrationError."""
-        return self._calibration(self.register.get(session_id))
+        record = self.register.get(session_id)
+        if not record.solve:
+            message = (
+                f"Calibration {record.id} is {record.state} and was not solved yet. Solve it first "
+                f"(POST /calibration/{record.id}/solve)."
+            )
+            raise CalibrationStateError(message)
+        return self.store.calibration(record.id, record.solve)
 
     def file(self, session_id: UUID, name: str) -> Path:
         """Return where a file of the last solve lies. Raises CalibrationNotFoundError, ArtefactNotReadyError."""
@@ -255,12 +299,12 @@ class Calibrations:
             message = f"Calibration {session_id} has no pose yet, and nothing is covered."
             raise ArtefactNotReadyError(message)
         setting = setting_of(record)
-        names = list(sizes_of(setting))
+        names = list(setting.sizes)
         chosen = names[0] if device is None else device
         if chosen not in names:
             message = f"Calibration {session_id} has no device '{chosen}'; it has {', '.join(names)}."
             raise CameraNotFoundError(message)
-        return self._tools.coverage_picture(setting, chosen, self.answers.readings(record), record.next_move or {})
+        return self._tools.coverage_picture(setting, chosen, self.store.readings(record), record.next_move or {})
 
     def compare(self, first: UUID, second: UUID) -> Comparison:
         """Return what the second says otherwise than the first. Raises as `calibration` does."""
@@ -273,16 +317,3 @@ class Calibrations:
     def close(self) -> None:
         """Put on record what the disk refused before. Idempotent; after the rig's runner has been closed."""
         self._work.close()
-
-    def _calibration(self, record: SessionRecord) -> Calibration:
-        if not record.solve:
-            message = (
-                f"Calibration {record.id} is {record.state} and was not solved yet. Solve it first "
-                f"(POST /calibration/{record.id}/solve)."
-            )
-            raise CalibrationStateError(message)
-        return self.store.calibration(record.id, record.solve)
-
-    def _in_use(self) -> Calibration | None:
-        found = self.store.active_calibration()
-        return None if found is None else found[1]

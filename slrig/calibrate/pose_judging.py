@@ -13,7 +13,7 @@ from slrig.calibrate.pose_pictures import white_frame
 from slrig.calibrate.records import SessionRecord, plain
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibrate.tools import Judgement, Setting, Standing, sizes_of
+from slrig.calibrate.tools import Judgement, Setting, Standing
 from slrig.calibration.judging.verdict import board_words
 from slrig.calibration.poses.checks import judge_pose
 from slrig.calibration.poses.coverage import Coverage, coverage
@@ -38,14 +38,14 @@ _ANSWER = (
 def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
     """Return what to tell of a pose, the accepted ones before it at hand."""
     observations = [each.observation for each in earlier]
-    found = judge_pose(pose.observation, pose.figures, observations, setting.board, sizes_of(setting))
+    found = judge_pose(pose.observation, pose.figures, observations, setting.board, setting.sizes)
     answer = {name: plain(getattr(found, name)) for name in _ANSWER}
     return Judgement(found.refusals, answer, Standing(_coverage(found.coverage), _advice(found.advice)))
 
 
 def standing(poses: Sequence[ReadPose], setting: Setting) -> Standing:
     """Return what the accepted poses cover, and what to move next."""
-    observations, sizes = [each.observation for each in poses], sizes_of(setting)
+    observations, sizes = [each.observation for each in poses], setting.sizes
     guess = rig_guess(observations, setting.board, sizes)
     covered = coverage(observations, setting.board, sizes, guess=guess)
     advice = next_move(observations, setting.board, sizes, guess=guess, covered=covered)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from slrig.bundle.description import read_description
 from slrig.bundle.images import read_pages
 from slrig.calibrate.solving import ReadPose
-from slrig.calibrate.tools import Setting, sizes_of
+from slrig.calibrate.tools import Setting
 from slrig.calibration.board import Board
 from slrig.calibration.observations import PoseObservation
 from slrig.calibration.poses.coverage import coverage
@@ -51,7 +51,7 @@ def coverage_png(setting: Setting, device: str, poses: Sequence[ReadPose], next_
 
     next_move : as a session keeps it (`slrig.calibrate.pose_judging`).
     """
-    sizes = sizes_of(setting)
+    sizes = setting.sizes
     observations = [each.observation for each in poses]
     covered = coverage(observations, setting.board, sizes)
     outline = None

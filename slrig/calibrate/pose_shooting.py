@@ -1,19 +1,27 @@
-"""Poses of a session, shot: in line with the scans, one by one or as a script of the positioner's."""
+"""Poses of a session, shot in line with the scans, one by one or as a script of the positioner's, then read and judged.
+
+A pose is a job; its summary is what the pose's folder says of it, the figures or the cause.
+"""
 
 from __future__ import annotations
 
+import json
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.calibrate.pose_answering import PoseAnswers, board_of, opened
+from slrig.bundle.storage import write_durably
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, pose_of
 from slrig.calibrate.register import CalibrationRegister
-from slrig.calibrate.store import BUNDLE
-from slrig.calibrate.tools import CalibrationTools
+from slrig.calibrate.solving import ReadPose
+from slrig.calibrate.store import ANSWER, BUNDLE, READING, picture_name, reading_bytes
+from slrig.calibrate.tools import CalibrationTools, Judgement, Standing, setting_of
 from slrig.devices import Rig
 from slrig.errors import (
     CalibrationError,
@@ -22,12 +30,12 @@ from slrig.errors import (
     SlrigError,
     UnsupportedByDeviceError,
 )
-from slrig.failure import JobFailure
+from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
 from slrig.jobs.progress import ProgressRecorder
-from slrig.jobs.records import Clock, JobKind, JobRecord, JobState
-from slrig.jobs.rig_jobs import Cancelled, Parts, RigJobs
+from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
+from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
 from slrig.model import Size
 from slrig.rig.session import RigFacts
 from slrig.scan.plan import ScanPlan
@@ -47,33 +55,26 @@ class PoseRequest:
     exposure_s: float | None = None
 
 
+@dataclass(slots=True)
 class PoseDesk:
-    """Shoots, cancels and drops poses. Any thread may call.
+    """Shoots, reads, cancels and drops poses. Any thread may call."""
 
-    A job's summary is what the pose's folder says of it: see `slrig.calibrate.pose_answering`.
-    """
+    register: CalibrationRegister
+    folder: DataFolder
+    queue: RigAccess
+    work: RigJobs
+    tools: CalibrationTools
+    spare_bytes: int
 
-    def __init__(
-        self,
-        register: CalibrationRegister,
-        folder: DataFolder,
-        queue: RigAccess,
-        work: RigJobs,
-        tools: CalibrationTools,
-        answers: PoseAnswers,
-        *,
-        clock: Clock,
-        spare_bytes: int,
-    ) -> None:
-        self._register = register
-        self._store = register.store
-        self._folder = folder
-        self._queue = queue
-        self._work = work
-        self._tools = tools
-        self._clock = clock
-        self._spare_bytes = spare_bytes
-        self._answers = answers
+    def warm(self) -> None:
+        """Load, on a thread of its own, what reading a pose needs."""
+        threading.Thread(target=self._warm, name="slrig-warm", daemon=True).start()
+
+    def _warm(self) -> None:
+        try:
+            self.tools.warm()
+        except Exception:  # noqa: BLE001 - the first pose will tell
+            _log.exception("what reads poses cannot be loaded")
 
     def shoot(
         self,
@@ -101,43 +102,40 @@ class PoseDesk:
         RigBusyError, QueueFullError, DeviceError
             As a scan.
         """
-        with self._register.lock:
-            record = self._register.get(session_id)
-            _refuse_closed(record)
-            status = self._queue.status()
+        with self.register.lock:
+            record = self.register.get(session_id)
+            setting_of(record)
+            if record.state is SessionState.SOLVING:
+                message = f"Calibration {record.id} is being solved. Shoot the next pose when that is over."
+                raise CalibrationStateError(message)
+            status = self.queue.status()
             place, name = _position(request.position, status.facts)
             scan = _scan(record, request.exposure_s)
             if status.facts is not None:
-                require_same_rig(record, status.facts)
-                self._folder.require_space(2 * check_plan(scan, status.facts) + self._spare_bytes)
+                _require_same_rig(record, status.facts)
+                self.folder.require_space(2 * check_plan(scan, status.facts) + self.spare_bytes)
             number = record.latest_pose + 1
             job_id = uuid4()
-            pose = PoseRecord(number, job_id, JobState.QUEUED, self._clock(), place, name, request.exposure_s)
+            pose = PoseRecord(number, job_id, JobState.QUEUED, utc_now(), place, name, request.exposure_s)
 
             def begun() -> None:
-                self._register.change(session_id, lambda found: replace(found, latest_pose=number))
-                self._register.jobs.create(
-                    pose.plan,
-                    rig=status.rig,
-                    label=None,
-                    key=key,
-                    job_id=job_id,
-                    kind=JobKind.POSE,
-                    parent=session_id,
+                self.register.change(session_id, latest_pose=number)
+                self.register.jobs.create(
+                    pose.plan, rig=status.rig, label=None, key=key, job_id=job_id, kind=JobKind.POSE, parent=session_id
                 )
 
-            parts = self._parts(session_id, job_id, pose, scan)
-            self._work.submit(job_id, parts, holder=holder or _holder(session_id, number), wait=wait, record=begun)
-            return self._register.pose(session_id, number)
+            parts = self._parts(session_id, pose, scan)
+            self.work.submit(job_id, parts, holder=holder or _holder(session_id, number), wait=wait, record=begun)
+            return self.register.pose(session_id, number)
 
     def take_up(self, session_id: UUID, job: JobRecord) -> None:
         """Go on with a pose of an earlier run of the service: one that waited is shot, one that was read is read once
         more, one that had the rig was interrupted.
         """
         pose = pose_of(job)
-        parts = self._parts(session_id, job.id, pose, _scan(self._register.get(session_id), pose.exposure_s))
-        whole = (self._folder.staging(job.id) / BUNDLE).is_dir()
-        self._work.take_up(job, parts, holder=_holder(session_id, pose.number), resumes=whole)
+        parts = self._parts(session_id, pose, _scan(self.register.get(session_id), pose.exposure_s))
+        whole = (self.folder.staging(job.id) / BUNDLE).is_dir()
+        self.work.take_up(job, parts, holder=_holder(session_id, pose.number), resumes=whole)
 
     def script(
         self,
@@ -153,42 +151,42 @@ class PoseDesk:
         Other work may come between two of them. A pose that fails or is cancelled ends the script; one that is refused
         does not. Raises as `shoot` does.
         """
-        with self._register.lock:
-            facts = self._queue.status().facts
+        with self.register.lock:
+            facts = self.queue.status().facts
             asked = positions or range(len(facts.positions) if facts is not None else 0)
             indices = [place for place, _ in (_position(each, facts) for each in asked) if place is not None]
             if not indices:
                 _position(0, facts)
             first = self.shoot(session_id, replace(request, position=indices[0]), wait=wait, key=key)
-            self._set_script(session_id, tuple(indices[1:]))
+            self._set_script(session_id, *indices[1:])
             return first
 
     def cancel(self, session_id: UUID, number: int) -> PoseRecord:
         """Ask a pose to end early, and the script that it belongs to. Returns at once; a pose that is over stays so."""
-        pose = self._register.pose(session_id, number)
+        pose = self.register.pose(session_id, number)
         if not pose.state.final:
-            self._set_script(session_id, ())
-            self._work.cancel(pose.id)
-        return self._register.pose(session_id, number)
+            self._set_script(session_id)
+            self.work.cancel(pose.id)
+        return self.register.pose(session_id, number)
 
     def drop(self, session_id: UUID, number: int) -> None:
         """Forget a pose and remove its files. Raises CalibrationStateError while it is under way."""
-        with self._register.lock:
-            pose = self._register.pose(session_id, number)
-            record = self._register.get(session_id)
-            if not pose.state.final or record.state is SessionState.SOLVING:
-                what = f"{pose.name} is {pose.state}" if not pose.state.final else "the calibration is being solved"
-                message = f"{what[:1].upper()}{what[1:]}. Wait until that is over, then drop the pose."
+        with self.register.lock:
+            pose = self.register.pose(session_id, number)
+            solving = self.register.get(session_id).state is SessionState.SOLVING
+            if not pose.state.final or solving:
+                what = "The calibration is being solved" if pose.state.final else f"Pose {number} is {pose.state}"
+                message = f"{what}. Wait until that is over, then drop the pose."
                 raise CalibrationStateError(message)
             if pose.accepted:
-                self._register.change(session_id, opened)
-            self._store.discard_pose(session_id, number)
-            self._register.jobs.delete(pose.id)
-        self._answers.survey(session_id)
+                self.register.change(session_id, state=SessionState.OPEN)
+            self.register.store.discard_pose(session_id, number)
+            self.register.jobs.delete(pose.id)
+        self._survey(session_id)
 
-    def _parts(self, session_id: UUID, job_id: UUID, pose: PoseRecord, scan: ScanPlan) -> Parts:
+    def _parts(self, session_id: UUID, pose: PoseRecord, scan: ScanPlan) -> Parts:
         """The two parts of a pose."""
-        staged = self._folder.staging(job_id)
+        staged = self.folder.staging(pose.id)
         last_frame_s = time.monotonic()
 
         def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
@@ -200,49 +198,101 @@ class PoseDesk:
                 rig.positioner.move(pose.position)
             # Neither an earlier calibration nor what a rendered rig knows of its scene is any business of this one's.
             bare = replace(rig, calibration=None, head=None)
-            self._tools.capture(bare, scan, staged / BUNDLE, progress=progress, cancelled=cancelled)
+            self.tools.capture(bare, scan, staged / BUNDLE, progress=progress, cancelled=cancelled)
             last_frame_s = time.monotonic()
 
         def ended(state: JobState, fault: JobFailure | None) -> None:
             """Remove a pose that came to nothing, and end the script with it."""
             if state is not JobState.SUCCEEDED and (fault is None or fault.code != PoseRefusedError.code):
-                self._set_script(session_id, ())
-                self._store.discard_pose(session_id, pose.number)
+                self._set_script(session_id)
+                self.register.store.discard_pose(session_id, pose.number)
 
         return Parts(
             capture=capture,
             captured=lambda: self._go_on(session_id, pose.exposure_s),
-            compute=lambda _: self._answers.read(session_id, pose, staged, last_frame_s),
+            compute=lambda _: self._read(session_id, pose, staged, last_frame_s),
             ended=ended,
         )
 
     def _meet(self, session_id: UUID, rig: Rig) -> None:
         """Take the rig's devices down with the first pose, and hold the others against them."""
         facts = RigFacts({name: camera.info for name, camera in rig.cameras.items()}, rig.projector.info, None)
-        record = self._register.get(session_id)
-        require_same_rig(record, facts)
+        record = self.register.get(session_id)
+        _require_same_rig(record, facts)
         if not record.cameras:
-            projector = _projector(record, facts)
-            self._register.change(session_id, lambda found: replace(found, cameras=facts.sizes, projector=projector))
+            self.register.change(session_id, cameras=facts.sizes, projector=_projector(record, facts))
 
-    def _set_script(self, session_id: UUID, left: tuple[int, ...]) -> None:
-        self._register.change(session_id, lambda found: replace(found, script=left), must_last=False)
+    def _read(self, session_id: UUID, pose: PoseRecord, staged: Path, since_s: float) -> Outcome:
+        """Read a pose whose frames lie in `staged`, put it in its place, and return what was found.
+
+        since_s : when the last frame came, on the monotonic clock.
+        """
+        record = self.register.get(session_id)
+        setting = setting_of(record)
+        reading: ReadPose | None = None
+        try:
+            reading = self.tools.read(staged / BUNDLE, setting.board, pose.name)
+            judged = self.tools.judge(reading, self.register.store.readings(record), setting)
+        except PoseRefusedError as error:
+            # The number is told beside it; and the person shot it just now.
+            judged = Judgement((str(error).removeprefix(f"pose '{pose.name}': "),), {}, None)
+        document = {"pose": pose.plan, "refused": list(judged.refusals), "answer": judged.answer}
+        with disk_errors(staged):
+            write_durably(staged / ANSWER, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+            for camera in setting.cameras:
+                picture = self.tools.picture(staged / BUNDLE, camera, reading, setting.board)
+                write_durably(staged / picture_name(camera), picture)
+            if reading is not None and not judged.refusals:
+                write_durably(staged / READING, reading_bytes(reading))
+        self.register.store.commit_pose(session_id, pose.number, staged)
+        # An accepted pose opens a solved session again; the earlier result stays.
+        state = {} if judged.refusals else {"state": SessionState.OPEN}
+        self.register.change(session_id, must_last=False, **_noted(judged.standing), **state)
+        seconds = round(time.monotonic() - since_s, 3)
+        refused = bool(judged.refusals)
+        _log.info("pose read", calibration=str(session_id), pose=pose.number, refused=refused, seconds=seconds)
+        return outcome_of(document, seconds=seconds)
+
+    def _survey(self, session_id: UUID) -> None:
+        """Bring coverage and advice up to date; they are a help, and nothing fails for want of them."""
+        try:
+            record = self.register.get(session_id)
+            if record.board is not None and record.cameras:
+                standing = self.tools.survey(self.register.store.readings(record), setting_of(record))
+                self.register.change(session_id, must_last=False, **_noted(standing))
+        except Exception:  # noqa: BLE001 - see above
+            _log.exception("coverage could not be told", calibration=str(session_id))
+
+    def _set_script(self, session_id: UUID, *left: int) -> None:
+        self.register.change(session_id, must_last=False, script=left)
 
     def _go_on(self, session_id: UUID, exposure_s: float | None) -> None:
         """Have the next pose of a script shot, exposed like the one before."""
-        with self._register.lock:
-            script = self._register.get(session_id).script
+        with self.register.lock:
+            script = self.register.get(session_id).script
             if not script:
                 return
-            self._set_script(session_id, script[1:])
+            self._set_script(session_id, *script[1:])
             try:
                 self.shoot(session_id, PoseRequest(script[0], exposure_s), wait=True)
             except SlrigError as error:
                 _log.warning("the script of poses ends", calibration=str(session_id), cause=str(error))
-                self._set_script(session_id, ())
+                self._set_script(session_id)
 
 
-def require_same_rig(record: SessionRecord, facts: RigFacts) -> None:
+def outcome_of(answer: Mapping[str, Any], *, seconds: float | None = None) -> Outcome:
+    """What the job of a pose came to, by what the pose's folder says."""
+    refusals = answer["refused"]
+    fault = JobFailure(PoseRefusedError.code, " ".join(refusals)) if refusals else None
+    return Outcome({"answer": answer["answer"], "seconds": seconds}, fault)
+
+
+def _noted(standing: Standing | None) -> Mapping[str, Any]:
+    """The fields of a session that say where it stands."""
+    return {} if standing is None else {"coverage": standing.coverage, "next_move": standing.next_move}
+
+
+def _require_same_rig(record: SessionRecord, facts: RigFacts) -> None:
     """Raise CalibrationError unless the rig's devices are those of the session's poses."""
     projector = _projector(record, facts)
     if not record.cameras or (dict(record.cameras) == dict(facts.sizes) and record.projector == projector):
@@ -262,13 +312,6 @@ def _projector(record: SessionRecord, facts: RigFacts) -> Size | None:
 def _devices(cameras: Mapping[str, Size], projector: Size | None) -> str:
     had = ", ".join(f"{name} {size}" for name, size in cameras.items())
     return had if projector is None else f"{had} and a projector of {projector}"
-
-
-def _refuse_closed(record: SessionRecord) -> None:
-    board_of(record)
-    if record.state is SessionState.SOLVING:
-        message = f"Calibration {record.id} is being solved. Shoot the next pose when that is over."
-        raise CalibrationStateError(message)
 
 
 def _scan(record: SessionRecord, exposure_s: float | None) -> ScanPlan:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -11,8 +9,8 @@ from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
-import numpy as np
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_jsonable_python
 
 from slrig.calibration.board import Board
 from slrig.errors import InvalidInputError, PoseRefusedError, StorageError
@@ -140,27 +138,23 @@ def with_jobs(session: SessionRecord, jobs: Sequence[JobRecord]) -> SessionRecor
     poses = tuple(sorted((pose_of(job) for job in jobs if job.kind is JobKind.POSE), key=lambda pose: pose.number))
     solves = [job for job in jobs if job.kind is JobKind.SOLVE]
     running = [job for job in jobs if not job.state.final]
-    state = session.state
-    if any(job.kind is JobKind.SOLVE for job in running):
-        state = SessionState.SOLVING
-    told = [job.progress for job in running if job.state is not JobState.QUEUED]
+    state = SessionState.SOLVING if any(not job.state.final for job in solves) else session.state
     fault = solves[-1].fault if solves and state is SessionState.FAILED else None
-    progress = told[0] if told else None
+    progress = next((job.progress for job in running if job.state is not JobState.QUEUED), None)
     return replace(session, state=state, poses=poses, progress=progress, fault=fault, under_way=bool(running))
 
 
-_OF_JOBS = {"poses", "progress", "fault", "under_way"}
 _session_adapter = TypeAdapter(SessionRecord)
 
 
-def session_json(session: SessionRecord) -> dict[str, Any]:
-    """A session as JSON values, without what its jobs say."""
-    document: dict[str, Any] = _session_adapter.dump_python(session, mode="json", exclude=_OF_JOBS)
-    return document
+def session_json(session: SessionRecord) -> bytes:
+    """A session as JSON text, without what its jobs say."""
+    of_jobs = {"poses", "progress", "fault", "under_way"}
+    return _session_adapter.dump_json(session, indent=1, exclude=of_jobs) + b"\n"
 
 
 def session_from_json(text: bytes, source: str) -> SessionRecord:
-    """The inverse of `session_json`, from text. Raises StorageError when it is not that."""
+    """The inverse of `session_json`. Raises StorageError when it is not that."""
     try:
         return _session_adapter.validate_json(text)
     except (ValidationError, InvalidInputError) as error:
@@ -171,19 +165,8 @@ def session_from_json(text: bytes, source: str) -> SessionRecord:
 def plain(value: Any) -> Any:
     """A value of dataclasses, arrays, tuples and mappings as JSON values; what JSON has no number for is null.
 
+    >>> import numpy as np
     >>> plain({"a": np.array([1.5, np.nan]), "b": (Size(2, 3),)})
     {'a': [1.5, None], 'b': [{'width_px': 2, 'height_px': 3}]}
     """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {each.name: plain(getattr(value, each.name)) for each in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(name): plain(each) for name, each in value.items()}
-    if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (bool, int, float)):
-        return value
-    return str(value)
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())

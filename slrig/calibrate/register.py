@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 from uuid import UUID
 
 import structlog
 
 from slrig.calibrate.records import PoseRecord, SessionRecord, with_jobs
-from slrig.calibrate.store import CalibrationStore, not_found
+from slrig.calibrate.store import CalibrationStore
 from slrig.errors import CalibrationNotFoundError, StorageError
 from slrig.jobs.store import JobStore
 
@@ -39,20 +41,16 @@ class CalibrationRegister:
     def get(self, session_id: UUID) -> SessionRecord:
         """Return a calibration. Raises CalibrationNotFoundError."""
         with self.lock:
-            session = self._sessions.get(session_id)
-            if session is None:
-                raise not_found(session_id)
-            return with_jobs(session, self.jobs.of(session_id).get(session_id, ()))
+            return with_jobs(self._session(session_id), self.jobs.of(session_id).get(session_id, ()))
 
     def pose(self, session_id: UUID, number: int) -> PoseRecord:
         """Return a pose. Raises CalibrationNotFoundError."""
-        record = self.get(session_id)
-        for pose in record.poses:
-            if pose.number == number:
-                return pose
-        numbers = ", ".join(str(pose.number) for pose in record.poses) or "none"
-        message = f"Calibration {session_id} has no pose {number}; its poses: {numbers}."
-        raise CalibrationNotFoundError(message)
+        poses = {pose.number: pose for pose in self.get(session_id).poses}
+        if number not in poses:
+            numbers = ", ".join(str(each) for each in poses) or "none"
+            message = f"Calibration {session_id} has no pose {number}; its poses: {numbers}."
+            raise CalibrationNotFoundError(message)
+        return poses[number]
 
     def next_number(self) -> int:
         """Return the number of the next calibration."""
@@ -72,10 +70,8 @@ class CalibrationRegister:
             del self._sessions[session_id]
         self.jobs.delete_of(session_id)
 
-    def change(
-        self, session_id: UUID, change: Callable[[SessionRecord], SessionRecord], *, must_last: bool = True
-    ) -> None:
-        """Replace a session, first on disk. `change` sees, and gives, it without what its jobs say.
+    def change(self, session_id: UUID, *, must_last: bool = True, **fields: Any) -> None:
+        """Replace fields of a session, first on disk.
 
         Where `must_last` is False, a disk that refuses leaves the change in memory alone, to be saved with the next:
         the way something ended is not lost because the disk is full.
@@ -88,10 +84,8 @@ class CalibrationRegister:
             The disk refused; nothing has changed.
         """
         with self.lock:
-            before = self._sessions.get(session_id)
-            if before is None:
-                raise not_found(session_id)
-            after = change(before)
+            before = self._session(session_id)
+            after = replace(before, **fields)
             if after == before:
                 return
             try:
@@ -104,3 +98,9 @@ class CalibrationRegister:
                     calibration=str(session_id), cause=str(error),
                 )  # fmt: skip
             self._sessions[session_id] = after
+
+    def _session(self, session_id: UUID) -> SessionRecord:
+        if session_id not in self._sessions:
+            message = f"No calibration {session_id} is on record here. GET /calibration lists those that are."
+            raise CalibrationNotFoundError(message)
+        return self._sessions[session_id]

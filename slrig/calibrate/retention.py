@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
@@ -23,37 +24,30 @@ from slrig.jobs.data_folder import DataFolder
 _log = structlog.get_logger(__name__)
 
 
+@dataclass(frozen=True, slots=True)
 class Retention:
     """Keeps the newest calibrations of a data folder, and those that are needed. Any thread may call.
 
     keep : so many are kept whatever they are. named : further names of calibrations that are needed.
     """
 
-    def __init__(
-        self,
-        calibrations: Calibrations,
-        folder: DataFolder,
-        *,
-        keep: int,
-        named: Callable[[], set[str]] = set,
-    ) -> None:
-        self._calibrations = calibrations
-        self._folder = folder
-        self._keep = keep
-        self._named = named
+    calibrations: Calibrations
+    folder: DataFolder
+    keep: int
+    named: Callable[[], set[str]] = set
 
     def __call__(self) -> tuple[UUID, ...]:
         """Remove what is neither new nor needed, say so in the log, and return which."""
-        old = [record for record in self._calibrations.latest()[self._keep :] if not record.under_way]
+        old = [record for record in self.calibrations.latest()[self.keep :] if not record.under_way]
         if not old:
             return ()
-        needed = named_by_scans(self._folder.scans) | {_session_of(name) for name in self._named()}
+        needed = named_by_scans(self.folder.scans) | {_session_of(name) for name in self.named()}
         removed = []
         for record in reversed(old):
             if self._names(record) & needed:
                 continue
             try:
-                self._calibrations.delete(record.id)
+                self.calibrations.delete(record.id)
             except (CalibrationNotFoundError, CalibrationStateError):
                 # Gone, in use, or taken up again meanwhile.
                 continue
@@ -67,7 +61,7 @@ class Retention:
                 label=record.label,
                 opened=record.created_at.isoformat(timespec="seconds"),
                 poses=len(record.poses),
-                kept=self._keep,
+                kept=self.keep,
             )
         return tuple(removed)
 
@@ -76,7 +70,7 @@ class Retention:
         names = {str(record.id)}
         for number in range(1, record.solve + 1):
             with suppress(CalibrationError):
-                names.add(_session_of(self._calibrations.store.calibration(record.id, number).solve_id))
+                names.add(_session_of(self.calibrations.store.calibration(record.id, number).solve_id))
         return names
 
 

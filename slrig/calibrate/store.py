@@ -10,22 +10,29 @@ What is being made lies in DATA/.incoming, and is renamed into place once.
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import uuid
+import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+import numpy as np
+
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.storage import sync_folder, write_durably, write_file
 from slrig.calibrate.records import SessionRecord, session_from_json, session_json
-from slrig.errors import CalibrationError, CalibrationNotFoundError, StorageError
+from slrig.calibrate.solving import ReadPose
+from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
+from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder, sync_tree
 from slrig.model import Calibration
+from slrig.rig.session import ActiveCalibration
 
 SESSION = "session.json"
 CALIBRATION = "calibration.json"
@@ -37,6 +44,11 @@ BUNDLE = "bundle"
 _ACTIVE_FORMAT = "slrig-active-calibration"
 
 
+def picture_name(camera: str) -> str:
+    """The file of a pose's picture in one camera."""
+    return f"picture-{camera}.png"
+
+
 @dataclass(frozen=True, slots=True)
 class ActivePointer:
     """Which solve of which calibration is in use."""
@@ -46,7 +58,10 @@ class ActivePointer:
 
 
 class CalibrationStore:
-    """Reads and writes calibrations below a data folder. One process uses it; callers hold their own lock."""
+    """Reads and writes calibrations below a data folder. One process uses it; callers hold their own lock.
+
+    Whatever writes raises StorageError when the disk refuses.
+    """
 
     def __init__(self, folder: DataFolder) -> None:
         self._folder = folder
@@ -72,32 +87,32 @@ class CalibrationStore:
             try:
                 with disk_errors(place):
                     text = (place / SESSION).read_bytes()
-                session = session_from_json(text, str(place / SESSION))
+                found.append(session_from_json(text, str(place / SESSION)))
             except (StorageError, FileNotFoundError):
                 self._folder.orphans.mkdir(exist_ok=True)
                 place.rename(self._folder.orphans / place.name)
-                continue
-            found.append(session)
         return sorted(found, key=lambda session: session.number)
 
     def create(self, session: SessionRecord) -> None:
-        """Make the folder of a new calibration. Raises StorageError."""
+        """Make the folder of a new calibration."""
         staged = self._folder.incoming / f"calibration-{session.id}"
         with disk_errors(staged):
             try:
                 for name in ("poses", "solves"):
                     (staged / name).mkdir(parents=True)
-                write_durably(staged / SESSION, _text(session))
-                sync_tree(staged)
-                staged.rename(self.folder(session.id))
-            except OSError:
-                shutil.rmtree(staged, ignore_errors=True)
+                write_durably(staged / SESSION, session_json(session))
+                self._commit(staged, self.folder(session.id))
+            except (OSError, StorageError):
+                self.discard(staged)
                 raise
-            sync_folder(self._folder.calibrations)
 
     def save(self, session: SessionRecord) -> None:
-        """Put a session on record in place of what it was. Raises StorageError."""
-        write_file(self.folder(session.id) / SESSION, _text(session))
+        """Put a session on record in place of what it was."""
+        write_file(self.folder(session.id) / SESSION, session_json(session))
+
+    def delete(self, session_id: UUID) -> None:
+        """Remove a calibration with all its files: by one rename out of place first."""
+        self._remove(self.folder(session_id))
 
     def commit_pose(self, session_id: UUID, number: int, staged: Path) -> None:
         """Move a pose into place, whole and durable."""
@@ -120,6 +135,10 @@ class CalibrationStore:
         except (OSError, ValueError):
             return None
 
+    def readings(self, record: SessionRecord) -> list[ReadPose]:
+        """What was read of a session's accepted poses, so that the frames need not be. Raises StorageError."""
+        return [_read_reading(self.pose(record.id, pose.number) / READING) for pose in record.accepted]
+
     def stage_solve(self, session_id: UUID) -> Path:
         """Make a folder for the results of a solve."""
         staged = self._folder.incoming / f"solve-{session_id}-{uuid.uuid4().hex[:12]}"
@@ -138,22 +157,12 @@ class CalibrationStore:
         """Remove what was staged. Idempotent."""
         shutil.rmtree(staged, ignore_errors=True)
 
-    def delete(self, session_id: UUID) -> None:
-        """Remove a calibration with all its files: by one rename out of place first."""
-        self._remove(self.folder(session_id))
-
     def calibration(self, session_id: UUID, solve: int) -> Calibration:
         """Return what a solve gave. Raises CalibrationError."""
         return read_calibration(self.solve(session_id, solve) / CALIBRATION)
 
     def active(self) -> ActivePointer | None:
-        """Return which calibration is in use; None where none was activated.
-
-        Raises
-        ------
-        StorageError
-            The pointer cannot be read.
-        """
+        """Return which calibration is in use; None where none is. Raises StorageError if that cannot be read."""
         path = self._pointer
         try:
             with disk_errors(path):
@@ -171,7 +180,7 @@ class CalibrationStore:
             raise StorageError(message) from error
 
     def activate(self, pointer: ActivePointer | None) -> None:
-        """Put on record which calibration is in use. Raises StorageError."""
+        """Put on record which calibration is in use."""
         if pointer is None:
             with disk_errors(self._pointer):
                 self._pointer.unlink(missing_ok=True)
@@ -180,13 +189,13 @@ class CalibrationStore:
         document = {"format": _ACTIVE_FORMAT, "version": 1, "id": str(pointer.id), "solve": pointer.solve}
         write_file(self._pointer, (json.dumps(document) + "\n").encode())
 
-    def active_calibration(self) -> tuple[ActivePointer, Calibration] | None:
+    def active_calibration(self) -> ActiveCalibration | None:
         """Return what is in use, read. Raises StorageError with what to do where that is gone."""
         pointer = self.active()
         if pointer is None:
             return None
         try:
-            return pointer, self.calibration(pointer.id, pointer.solve)
+            return ActiveCalibration(str(pointer.id), self.calibration(pointer.id, pointer.solve))
         except CalibrationError as error:
             message = (
                 f"The active calibration {pointer.id} cannot be read ({error}). Remove {self._pointer} to scan with "
@@ -210,14 +219,39 @@ class CalibrationStore:
         gone = self._folder.incoming / f"gone-{uuid.uuid4().hex}"
         with disk_errors(place):
             place.rename(gone)
-        shutil.rmtree(gone, ignore_errors=True)
+        self.discard(gone)
 
 
-def not_found(session_id: UUID) -> CalibrationNotFoundError:
-    """The error for an id that is on record nowhere."""
-    message = f"No calibration {session_id} is on record here. GET /calibration lists those that are."
-    return CalibrationNotFoundError(message)
+_READ_PARTS: dict[str, type[Any]] = {"view": BoardView, "light": Correspondences, "figures": ViewFigures}
 
 
-def _text(session: SessionRecord) -> bytes:
-    return (json.dumps(session_json(session), indent=1, allow_nan=False) + "\n").encode()
+def reading_bytes(pose: ReadPose) -> bytes:
+    """What was read of a pose as the bytes of an .npz file: one array per field of each part of each camera."""
+    parts = zip(_READ_PARTS, (pose.observation.views, pose.observation.correspondences, pose.figures), strict=True)
+    arrays = {
+        f"{part}/{camera}/{field}": np.asarray(value)
+        for part, cameras in parts
+        for camera, found in cameras.items()
+        for field, value in asdict(found).items()
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, name=np.array(pose.observation.name), **arrays)  # type: ignore[arg-type] # none is allow_pickle
+    return buffer.getvalue()
+
+
+def _read_reading(path: Path) -> ReadPose:
+    fields: dict[str, dict[str, dict[str, Any]]] = {part: {} for part in _READ_PARTS}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        name = str(arrays.pop("name"))
+        for key, array in arrays.items():
+            part, camera, field = key.split("/")
+            fields[part].setdefault(camera, {})[field] = array if array.ndim else array.item()
+        views, light, figures = (
+            {camera: kind(**values) for camera, values in fields[part].items()} for part, kind in _READ_PARTS.items()
+        )
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        message = f"{path} cannot be read ({error}). Drop that pose (DELETE …/pose/N) and shoot it again."
+        raise StorageError(message) from error
+    return ReadPose(PoseObservation(name, views, light), figures)

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from slrig.calibrate.records import SessionRecord, plain
+from slrig.calibrate.records import SessionRecord
 from slrig.calibrate.solving import CalibrationResult, ReadPose
-from slrig.calibration.board import Board, BoardShape
+from slrig.calibration.board import Board
 from slrig.calibration.judging.comparison import Comparison
 from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
+from slrig.errors import CalibrationStateError
 from slrig.jobs.worker import Worker
 from slrig.model import Calibration, Size
 from slrig.scan.acquisition import capture_bundle
@@ -25,14 +26,24 @@ from slrig.scan.plan import Progress, ScanPlan
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What stands before the rig, and what the rig is: the board, and the extents of the devices.
-
-    projector is None where only the cameras are calibrated.
-    """
+    """The board before the rig, and the extents of the devices; projector is None where only cameras are calibrated."""
 
     board: Board
     cameras: Mapping[str, Size]
     projector: Size | None
+
+    @property
+    def sizes(self) -> Mapping[str, Size]:
+        """The extents of the devices, the projector among them where there is one."""
+        return self.cameras if self.projector is None else {**self.cameras, PROJECTOR: self.projector}
+
+
+def setting_of(record: SessionRecord) -> Setting:
+    """The setting of a session. Raises CalibrationStateError for an imported calibration, which has no board."""
+    if record.board is None:
+        message = f"Calibration {record.id} was imported and has no board. Open a new one to shoot poses."
+        raise CalibrationStateError(message)
+    return Setting(record.board, record.cameras, record.projector)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,41 +75,6 @@ class CapturePose(Protocol):
         ...
 
 
-class SolvePoses(Protocol):
-    """`slrig.calibrate.solving.solve_poses`."""
-
-    def __call__(
-        self,
-        board: Board,
-        cameras: Mapping[str, Size],
-        projector: Size | None,
-        poses: Sequence[ReadPose],
-        /,
-        *,
-        progress: Progress,
-        earlier: Calibration | None = None,
-        board_shape: BoardShape = BoardShape.AUTO,
-    ) -> CalibrationResult:
-        """Return the calibration. Raises SolveRefusedError."""
-        ...
-
-
-class WriteReport(Protocol):
-    """Writes the report of a solve as a page of its own."""
-
-    def __call__(
-        self,
-        path: Path,
-        result: CalibrationResult,
-        poses: Sequence[ReadPose],
-        record: SessionRecord,
-        bundles: Mapping[str, Path],
-        /,
-    ) -> None:
-        """Write it. bundles : of the accepted poses, by name."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class CalibrationTools:
     """Each part of the work. The signatures are those of the functions that `calibration_tools` names.
@@ -112,17 +88,12 @@ class CalibrationTools:
     survey: Callable[[Sequence[ReadPose], Setting], Standing]
     picture: Callable[[Path, str, ReadPose | None, Board], bytes]
     coverage_picture: Callable[[Setting, str, Sequence[ReadPose], Mapping[str, Any]], bytes]
-    solve: SolvePoses
-    report: WriteReport
+    solve: Callable[..., CalibrationResult]
+    report: Callable[[Path, CalibrationResult, Sequence[ReadPose], SessionRecord, Mapping[str, Path]], None]
     compare: Callable[[Calibration, Calibration], Comparison]
     parse: Callable[[Path], Calibration]
-    summary: Callable[[CalibrationResult], Mapping[str, Any]] = plain
+    summary: Callable[[CalibrationResult], Mapping[str, Any]]
     warm: Callable[[], None] = lambda: None
-
-
-def sizes_of(setting: Setting) -> Mapping[str, Size]:
-    """The extents of the devices, the projector among them where there is one."""
-    return setting.cameras if setting.projector is None else {**setting.cameras, PROJECTOR: setting.projector}
 
 
 def calibration_tools(worker: Worker) -> CalibrationTools:

@@ -441,7 +441,7 @@ def test_restart_keeps_the_active_one_and_marks_what_was_cut_off(bench: Calibrat
     assert fault is not None
     assert (fault.code, "Start it again" in fault.message) == ("scan-interrupted", True)
     assert [each.id for each in again.latest()] == [session_id, active]
-    assert [each.observation.name for each in again.answers.readings(record)] == ["pose 1"]
+    assert [each.observation.name for each in again.store.readings(record)] == ["pose 1"]
 
 
 def test_end_of_the_service_cuts_off_what_is_under_way(bench: CalibrationBench) -> None:

@@ -206,7 +206,7 @@ def test_calibration_takes_every_pose_solves_and_is_used_only_if_asked(bench: Ta
 
 def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = {"verdict": {"grade": "do_not_use", "summary": "do not use: 9 px", "reasons": []}}
-    monkeypatch.setattr(bench.calibrations.solves, "_tools", replace(bench.tame.tools(), summary=lambda _: bad))
+    monkeypatch.setattr(bench.calibrations.solves, "tools", replace(bench.tame.tools(), summary=lambda _: bad))
     told = bench.do(TaskKind.CALIBRATION, board=BOARD, activate=True)
     assert (told["activated"], told["verdict"]) == (False, "do not use: 9 px")
     assert bench.calibrations.active is None
