@@ -15,6 +15,7 @@ from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Pixels, 
 from slrig.reconstruction.frames import exposure_count
 
 Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 Window = tuple[slice, slice]
 """A cut of an image: its rows and its columns."""
 
@@ -33,25 +34,30 @@ class PoseFrames:
     """
 
     white: Image
-    clipped: NDArray[np.bool_]
+    clipped: Mask
     black: Image | None
     views: tuple[Image, ...]
 
 
-def device_sizes(capture: Capture) -> dict[str, Size]:
-    """The sizes of the devices that a capture is of: cameras by name, and PROJECTOR where it played codes.
-
-    `slrig.calibration.poses.checks.check_same_devices` compares those of two poses.
-    """
-    cameras = {name: form.size for name, form in capture.cameras.items()}
-    return _with_projector(cameras, capture.projector, capture.patterns)
-
-
 def bundle_device_sizes(folder: Path) -> dict[str, Size]:
-    """The same of a bundle, from its description alone. Raises BundleError."""
+    """The sizes of the devices that a bundle is of: cameras by name, and PROJECTOR where it played codes.
+
+    From its description alone. `slrig.calibration.poses.checks.check_same_devices` compares those of two poses.
+    Raises BundleError.
+    """
     description = read_description(folder)
     cameras = {name: form.size for name, form in description.camera_formats().items()}
-    return _with_projector(cameras, description.projector_size(), description.pattern_list())
+    coded = any(isinstance(pattern, Gray | LineShift) for pattern in description.pattern_list())
+    return {**cameras, PROJECTOR: description.projector_size()} if coded else cameras
+
+
+def window_about(region: Mask, margin_px: int) -> Window:
+    """The box about what is True in an image, and a margin round it."""
+    spans = []
+    for axis, length in enumerate(region.shape):
+        (places,) = np.nonzero(region.any(axis=1 - axis))
+        spans.append(slice(max(int(places[0]) - margin_px, 0), min(int(places[-1]) + 1 + margin_px, length)))
+    return spans[0], spans[1]
 
 
 def coded_axes(capture: Capture, camera: str, name: str) -> tuple[Axis, ...]:
@@ -138,8 +144,3 @@ def _views(patterns: tuple[Pattern, ...], shots: list[Shot], black: Image | None
 
 def _mean(images: list[Pixels]) -> Image:
     return np.asarray(np.mean(images, axis=0, dtype=np.float32), dtype=np.float32)
-
-
-def _with_projector(cameras: dict[str, Size], projector: Size, patterns: tuple[Pattern, ...]) -> dict[str, Size]:
-    coded = any(isinstance(pattern, Gray | LineShift) for pattern in patterns)
-    return {**cameras, PROJECTOR: projector} if coded else cameras

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from slrig.calibrate.pose_frames import Image, Window
+from slrig.calibrate.pose_frames import Image, Mask, window_about
 from slrig.calibration.board import Board
 from slrig.calibration.boards.detection import find_board, placed_again
 from slrig.calibration.observations import BoardView
@@ -24,6 +24,7 @@ from slrig.errors import PoseRefusedError
 from slrig.model import FloatArray
 
 _LEAST_WINDOW, _MOST_WINDOW = 7, 31
+"""Sides of the surroundings of a corner that are followed, px: 0.8 of the way to its neighbour, within these."""
 _LEVELS = 2
 _CLEAR_PX = 1.0
 _ALIKE = 0.9
@@ -37,9 +38,7 @@ _CHANGED, _CHANGED_SHARE = 0.1, 0.002
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-3)
 
 
-def moved_px(
-    views: Sequence[Image], view: BoardView, board: Board, region: NDArray[np.bool_], full_scale: float, /
-) -> float:
+def moved_px(views: Sequence[Image], view: BoardView, board: Board, region: Mask, full_scale: float, /) -> float:
     """The rms distance, px, of the corners from where the first frame shows them, less what noise makes of those that
     stand still; NaN with one frame only.
 
@@ -53,7 +52,7 @@ def moved_px(
     """
     if len(views) < 2:
         return float("nan")
-    window = _window(region)
+    window = window_about(region, _MOST_WINDOW)
     start = view.points_px - np.array([window[1].start, window[0].start])
     board_there = region[window]
     first = _grey(views[0][window], full_scale)
@@ -73,19 +72,18 @@ def _as_a_whole(views: Sequence[Image], view: BoardView, board: Board, full_scal
     """By how much all corners together moved from the first frame to one in the middle, and to the last, px; those of
     which too few corners can be placed are left out.
     """
-    later = {len(views) // 2, len(views) - 1} - {0}
-    before, *after = (placed_again(views[at], view, board, full_scale=full_scale) for at in (0, *sorted(later)))
-    told = (_moved_together(before, each) for each in after)
-    return [moved for moved in told if not np.isnan(moved)]
+    chosen = sorted({0, len(views) // 2, len(views) - 1})
+    before, *after = (placed_again(views[at], view, board, full_scale=full_scale) for at in chosen)
+    return [moved for each in after if (moved := _moved_together(before, each)) is not None]
 
 
-def _moved_together(before: BoardView, after: BoardView) -> float:
-    """The rms of the affine displacement between two views, px, by as much as it exceeds chance, else 0; NaN if
+def _moved_together(before: BoardView, after: BoardView) -> float | None:
+    """The rms of the affine displacement between two views, px, by as much as it exceeds chance, else 0; None if
     they have too few corners in common.
     """
     _, mine, its = np.intersect1d(before.corner, after.corner, return_indices=True)
     if len(mine) < _LEAST_COMMON:
-        return float("nan")
+        return None
     variance = before.sigma_px[mine] ** 2 + after.sigma_px[its] ** 2
     off, place = after.points_px[its] - before.points_px[mine], before.points_px[mine]
     terms = np.column_stack([np.ones(len(place)), place - place.mean(axis=0)])
@@ -114,8 +112,8 @@ def _apart(first: Image, image: Image, board: Board, full_scale: float) -> float
 
 def _flow(first: NDArray[np.uint8], image: NDArray[np.uint8], start: FloatArray) -> FloatArray:
     """(n, 2) float64: by how much the surroundings of each corner moved; far off where they were lost."""
-    apart = float(np.median(_nearest(start))) if len(start) > 1 else _MOST_WINDOW
-    side = int(np.clip(0.8 * apart, _LEAST_WINDOW, _MOST_WINDOW)) | 1
+    to_neighbour_px = float(np.median(cKDTree(start).query(start, k=[2])[0]))
+    side = int(np.clip(0.8 * to_neighbour_px, _LEAST_WINDOW, _MOST_WINDOW)) | 1
     given = start.astype(np.float32).reshape(-1, 1, 2)
     followed, status, _ = cv2.calcOpticalFlowPyrLK(
         first, image, given, given.copy(), winSize=(side, side), maxLevel=_LEVELS, criteria=_CRITERIA,
@@ -126,26 +124,11 @@ def _flow(first: NDArray[np.uint8], image: NDArray[np.uint8], start: FloatArray)
     return np.asarray(moved)
 
 
-def _nearest(points_px: FloatArray) -> FloatArray:
-    """(n,) float64: the distance of each point from its nearest neighbour."""
-    distances, _ = cKDTree(points_px).query(points_px, k=[2])
-    return np.asarray(distances, dtype=np.float64).ravel()
-
-
-def _correlation(first: NDArray[np.uint8], image: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
+def _correlation(first: NDArray[np.uint8], image: NDArray[np.uint8], where: Mask) -> float:
     """How alike two pictures of the board are, 1 for the same but for brightness and contrast."""
     a, b = first[where].astype(np.float64), image[where].astype(np.float64)
     spread = float(a.std() * b.std())
     return float(np.mean((a - a.mean()) * (b - b.mean())) / spread) if spread > 0 else 0.0
-
-
-def _window(region: NDArray[np.bool_]) -> Window:
-    """The box about the board, with room for the surroundings of its outer corners."""
-    spans = []
-    for axis in (0, 1):
-        (places,) = np.nonzero(region.any(axis=1 - axis))
-        spans.append(slice(max(int(places[0]) - _MOST_WINDOW, 0), int(places[-1]) + 1 + _MOST_WINDOW))
-    return spans[0], spans[1]
 
 
 def _grey(image: Image, full_scale: float) -> NDArray[np.uint8]:

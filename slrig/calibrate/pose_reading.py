@@ -4,6 +4,7 @@ and figures that tell how well each camera saw it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle import read_capture
-from slrig.calibrate.pose_frames import PoseFrames, coded_axes, cut_capture, pose_frames
+from slrig.calibrate.pose_frames import PoseFrames, coded_axes, cut_capture, pose_frames, window_about
 from slrig.calibrate.pose_movement import differ, moved_px
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.board import Board
@@ -30,8 +31,6 @@ from slrig.reconstruction.camera import CodeTables
 from slrig.reconstruction.correspondence import CorrespondenceLimits, ProjectorPositions, projector_positions
 from slrig.reconstruction.frames import AxisFrames, axis_frames
 from slrig.reconstruction.phase import has_phase
-
-Mask = NDArray[np.bool_]
 
 MOST_LIGHT = 30_000
 """Correspondences kept of one camera and axis. A pixel is drawn the more likely, the more it tells (1/σ²). Of pixels
@@ -126,8 +125,7 @@ class _Seen:
         """The light on the board along each axis, in the whole camera's pixels; lit and decoded are of the board's."""
         if not axes or not self.region.any():
             return ()
-        rows, columns = (_extent(np.asarray(self.region.any(axis=1 - axis))) for axis in (0, 1))
-        window = (rows, columns)
+        window = window_about(self.region, _ROUND_PX)
         cut = cut_capture(capture, self._camera, window)
         region = self.region[window]
         from_border = self._used_blur_px * 2 + _FROM_BORDER_PX
@@ -144,7 +142,10 @@ class _Seen:
                 frames, code_tables(frames, capture.projector), asked, CorrespondenceLimits(),
                 camera_blur_px=self._used_blur_px,
             )  # fmt: skip
-            found.append(_placed(seen, region, offset=(columns.start, rows.start)))
+            offset = np.array([window[1].start, window[0].start], dtype=np.float64)
+            found.append(
+                replace(seen, pixels_px=seen.pixels_px + offset, lit=seen.lit & region, decoded=seen.decoded & region)
+            )
         return tuple(found)
 
     def figures(self, light: tuple[ProjectorPositions, ...]) -> ViewFigures:
@@ -214,14 +215,6 @@ def _joined(found: tuple[ProjectorPositions, ...]) -> Correspondences:
     return Correspondences(pixels, axes, position, sigma)
 
 
-def _placed(seen: ProjectorPositions, region: Mask, *, offset: tuple[int, int]) -> ProjectorPositions:
-    """Positions of a window of the image in the whole image's pixels."""
-    return ProjectorPositions(
-        seen.axis, seen.pixels_px + np.array(offset, dtype=np.float64), seen.position_px, seen.sigma_px,
-        seen.lit & region, seen.decoded & region, seen.by_phase,
-    )  # fmt: skip
-
-
 def _decoded(light: tuple[ProjectorPositions, ...]) -> float:
     """Share of the lit pixels that are decoded along all axes."""
     if not light:
@@ -229,12 +222,6 @@ def _decoded(light: tuple[ProjectorPositions, ...]) -> float:
     lit = np.logical_and.reduce([each.lit for each in light])
     decoded = np.logical_and.reduce([each.decoded for each in light])
     return float(decoded.sum() / lit.sum()) if lit.any() else 0.0
-
-
-def _extent(occupied: Mask) -> slice:
-    """The stretch of a line of pixels that is occupied, and a little round it."""
-    (places,) = np.nonzero(occupied)
-    return slice(max(int(places[0]) - _ROUND_PX, 0), min(int(places[-1]) + 1 + _ROUND_PX, len(occupied)))
 
 
 def _median(values: NDArray[np.float32]) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import write_bundle
-from slrig.calibrate.pose_frames import bundle_device_sizes, device_sizes
+from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibrate.pose_movement import moved_px
 from slrig.calibrate.pose_reading import read_captured, read_pose
 from slrig.calibrate.solving import ReadPose
@@ -109,10 +109,10 @@ def test_a_bundle_reads_as_its_frames_do(pose: Capture, read: ReadPose, tmp_path
         again.observation.correspondences["left"].position_px, read.observation.correspondences["left"].position_px
     )
     assert again.figures == read.figures
-    assert bundle_device_sizes(tmp_path / "one") == device_sizes(pose)
+    assert bundle_device_sizes(tmp_path / "one") == {"left": pose.cameras["left"].size, PROJECTOR: pose.projector}
 
 
-def test_white_alone_gives_corners_and_no_light(pose: Capture) -> None:
+def test_white_alone_gives_corners_and_no_light(pose: Capture, tmp_path: Path) -> None:
     alone = without(pose, Black, Gray, LineShift)
     found = read_captured(alone, BOARD, "cameras")
     assert len(found.observation.views["left"].corner) == BOARD.corner_count
@@ -122,7 +122,8 @@ def test_white_alone_gives_corners_and_no_light(pose: Capture) -> None:
     assert 0.6 < figures.contrast < 0.9
     assert figures.moved_px < 0.05
     white_only = replace(alone, patterns=(White(),), shots=tuple(replace(each, pattern=0) for each in alone.shots[:1]))
-    assert PROJECTOR not in device_sizes(white_only)
+    write_bundle(tmp_path / "white", white_only)
+    assert PROJECTOR not in bundle_device_sizes(tmp_path / "white")
     assert np.isnan(read_captured(white_only, BOARD, "one frame").figures["left"].moved_px)
 
 
@@ -251,11 +252,15 @@ def test_a_board_without_the_projectors_light_is_refused_by_cause(pose: Capture)
         read_captured(still, BOARD, "unlit")
 
 
-def test_a_capture_from_another_rig_is_told_apart(pose: Capture) -> None:
-    first = device_sizes(pose)
-    assert set(first) == {"left", PROJECTOR}
-    check_same_devices("pose 1", device_sizes(pose), first)
+def test_a_capture_from_another_rig_is_told_apart(pose: Capture, tmp_path: Path) -> None:
     smaller = shot(Standing(scale=0.25), line_shift=False)
-    for other in (smaller, replace(pose, projector=Size(640, 480))):
+    sizes = []
+    for name, each in enumerate((pose, pose, smaller, replace(pose, projector=Size(640, 480)))):
+        write_bundle(tmp_path / str(name), each)
+        sizes.append(bundle_device_sizes(tmp_path / str(name)))
+    first, again, *others = sizes
+    assert set(first) == {"left", PROJECTOR}
+    check_same_devices("pose 1", again, first)
+    for other in others:
         with pytest.raises(CalibrationError, match="another rig"):
-            check_same_devices("pose 2", device_sizes(other), first)
+            check_same_devices("pose 2", other, first)
