@@ -17,10 +17,13 @@ from slrig.model import Calibration, FloatArray, Pinhole, Size
 from slrig.reports.drawing import WIDTH, drawing, ink_on, path, polygon, ramp_colour, shape
 
 _ARROW_SHARE = 0.42
+"""The longest arrow, of a cell's shorter side: it stays within the cell, whose middle it has."""
 _POINTS_ALONG = 8
+"""Points to a side of the board, so that the lens bends its outline smoothly."""
 _MARGIN = 34.0
 _END_SHARE = 0.12
 _NUMBER_PX = 20.0
+"""A cell narrower than this, in units of the drawing, has no room for a number."""
 _SAME_MM = 1e-2
 _LABEL_WIDE, _LABEL_HIGH = 56.0, 32.0
 _X, _Y, _Z = 0, 1, 2
@@ -68,9 +71,8 @@ def coverage_map(
     """
     height = _height(device.size)
     scale = WIDTH / device.size.width_px
-    outline_mm = _outline_mm(board, along=_POINTS_ALONG)
-    outlines = [_projected(device, outline_mm @ pose.rotation.T + pose.translation_mm) for pose in poses]
-    boards = [polygon((outline + 0.5) * scale, "board") for outline in outlines]
+    outlines_mm = [_outline_mm(board, pose, along=_POINTS_ALONG) for pose in poses]
+    boards = [polygon((_projected(device, outline_mm) + 0.5) * scale, "board") for outline_mm in outlines_mm]
     dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in (points_px + 0.5) * scale)
     steps = range(1, CELLS)
     grid = "".join(f"M{WIDTH * at / CELLS:.1f} 0v{height:.1f}M0 {height * at / CELLS:.1f}h{WIDTH:.1f}" for at in steps)
@@ -141,8 +143,8 @@ def rig_view(
     axes = [_Z, _Y if aside else _X]
     named = named_devices(calibration)
     cones = [_cone(device, float(volume_mm[1, _Z]), aside=aside)[:, axes] for device in named.values()]
-    boards = [(_outline_mm(board) @ pose.rotation.T + pose.translation_mm)[:, axes] for pose in poses]
-    corners = np.array([[volume_mm[a, axes[0]], volume_mm[b, axes[1]]] for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    boards = [_outline_mm(board, pose)[:, axes] for pose in poses]
+    corners = _rectangle(*volume_mm[:, axes])
     extent = np.concatenate([corners, *boards, *cones])
     low, high = extent.min(axis=0), extent.max(axis=0)
     scale = (WIDTH - 2 * _MARGIN) / max(high[0] - low[0], 1e-9)
@@ -152,10 +154,13 @@ def rig_view(
         return np.asarray((points - low) * scale + _MARGIN)
 
     parts = [
-        polygon(placed(cone), "cone light" if name == PROJECTOR else "cone")
-        for name, cone in zip(named, cones, strict=True)
+        *(
+            polygon(placed(cone), "cone light" if name == PROJECTOR else "cone")
+            for name, cone in zip(named, cones, strict=True)
+        ),
+        polygon(placed(corners), "volume"),
+        *(polygon(placed(outline), "board") for outline in boards),
     ]
-    parts += [polygon(placed(corners), "volume"), *(polygon(placed(outline), "board") for outline in boards)]
     spots = [placed(device.centre_mm[axes]) for device in named.values()]
     for name, (x, y), shift in zip(named, spots, _label_shifts(spots), strict=True):
         kind = "projector" if name == PROJECTOR else "camera"
@@ -173,37 +178,38 @@ def rig_view(
 
 def _label_shifts(spots: Sequence[FloatArray]) -> list[float]:
     """For each spot how far below it its label stands: below, unless another device is close by there; then above."""
-    shifts = []
-    for at, spot in enumerate(spots):
-        below = (
-            (spot[1], at) < (other[1], number)
-            and abs(other[0] - spot[0]) < _LABEL_WIDE
-            and other[1] - spot[1] < _LABEL_HIGH
-            for number, other in enumerate(spots)
-        )
-        shifts.append(-9.0 if any(below) else 17.0)
-    return shifts
+
+    def beneath(at: int, other: int) -> bool:
+        across, down = spots[other] - spots[at]
+        return (down, other) > (0, at) and down < _LABEL_HIGH and abs(across) < _LABEL_WIDE
+
+    every = range(len(spots))
+    return [-9.0 if any(beneath(at, other) for other in every) else 17.0 for at in every]
 
 
 def _cone(device: Pinhole, far_mm: float, *, aside: bool) -> FloatArray:
     """(3, 3): the centre, and where the two edges of the image meet z = `far_mm` in the world, mm."""
     width, height = device.size.width_px - 1, device.size.height_px - 1
-    middle = ((width / 2, 0), (width / 2, height)) if aside else ((0, height / 2), (width, height / 2))
-    ends = []
-    for column, row in middle:
+    edges = ((width / 2, 0), (width / 2, height)) if aside else ((0, height / 2), (width, height / 2))
+    ends = [device.centre_mm]
+    for column, row in edges:
         ray = device.rotation.T @ np.linalg.solve(device.matrix, np.array([column, row, 1.0]))
         reach = (far_mm - device.centre_mm[_Z]) / ray[_Z] if abs(ray[_Z]) > 1e-9 else far_mm
         ends.append(device.centre_mm + ray * reach)
-    return np.stack([device.centre_mm, *ends])
+    return np.stack(ends)
 
 
-def _outline_mm(board: Board, *, along: int = 1) -> FloatArray:
-    """(4 along, 3) float64: the edge of what is printed, in the board's frame, `along` points to a side."""
-    (left, top), (right, bottom) = board.print_mm
-    corners = np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]], dtype=np.float64)
-    following = np.roll(corners, -1, axis=0)
+def _outline_mm(board: Board, pose: BoardPose, *, along: int = 1) -> FloatArray:
+    """(4 along, 3) float64: the edge of what is printed, in the world, `along` points to a side."""
+    corners = np.pad(_rectangle(*board.print_mm), ((0, 0), (0, 1)))
     steps = np.arange(along)[:, None, None] / along
-    return np.asarray((corners + steps * (following - corners)).swapaxes(0, 1).reshape(-1, 3))
+    outline_mm = (corners + steps * (np.roll(corners, -1, axis=0) - corners)).swapaxes(0, 1).reshape(-1, 3)
+    return np.asarray(outline_mm @ pose.rotation.T + pose.translation_mm)
+
+
+def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
+    """(4, 2): its corners in their order around it."""
+    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
 def _projected(device: Pinhole, points_mm: FloatArray) -> FloatArray:

@@ -91,15 +91,6 @@ class PoseFigures:
     left_out: str
 
 
-def device_title(name: str) -> str:
-    """A device as a heading has it.
-
-    >>> device_title("left"), device_title("projector")
-    ("Camera 'left'", 'Projector')
-    """
-    return "Projector" if name == PROJECTOR else f"Camera '{name}'"
-
-
 def device_figures(result: CalibrationResult) -> tuple[DeviceFigures, ...]:
     """Every device, cameras in order, then the projector."""
     found = []

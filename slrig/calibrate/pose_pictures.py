@@ -51,14 +51,13 @@ def coverage_png(setting: Setting, device: str, poses: Sequence[ReadPose], next_
 
     next_move : as a session keeps it (`slrig.calibrate.pose_judging`).
     """
-    sizes = setting.sizes
+    size = setting.sizes[device]
     observations = [each.observation for each in poses]
-    covered = coverage(observations, setting.board, sizes)
-    outline = None
-    if next_move.get("camera") == device and next_move.get("outline_px"):
-        outline = np.asarray(next_move["outline_px"], dtype=np.float64)
-    points = [_points_px(each, device, sizes[device]) for each in observations]
-    return _png(coverage_picture(covered.devices[device], points, sizes[device], outline_px=outline))
+    covered = coverage(observations, setting.board, setting.sizes)
+    outline = next_move.get("outline_px") if next_move.get("camera") == device else None
+    outline_px = np.asarray(outline, dtype=np.float64) if outline else None
+    points = [_points_px(each, device, size) for each in observations]
+    return _png(coverage_picture(covered.devices[device], points, size, outline_px=outline_px))
 
 
 def _points_px(pose: PoseObservation, device: str, size: Size) -> FloatArray:

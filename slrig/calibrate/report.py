@@ -9,11 +9,12 @@ import numpy as np
 from markupsafe import Markup
 
 from slrig.calibrate import charts
-from slrig.calibrate.figures import PoseFigures, baselines, device_figures, device_title, named_devices, pose_figures
+from slrig.calibrate.figures import PoseFigures, baselines, device_figures, named_devices, pose_figures
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
 from slrig.calibration.judging.verdict import board_words
+from slrig.calibration.poses.coverage import device_title
 from slrig.calibration.poses.light_view import lit_board
 from slrig.calibration.poses.pictures import pose_picture
 from slrig.calibration.solution import PROJECTOR
@@ -95,7 +96,7 @@ def _pictures(
     views = {pose.observation.name: pose.observation.views for pose in poses}
     for pose in shown:
         for camera, picture in pictures.get(pose.name, {}).items():
-            words = f"{pose.name}, {device_title(camera).lower()}" + (" — left out" if pose.left_out else "")
+            words = f"{pose.name}, {device_title(camera)}" + (" — left out" if pose.left_out else "")
             drawn = pose_picture(picture, views.get(pose.name, {}).get(camera), board, width_px=_PICTURE_PX)
             yield jpeg_uri(drawn[..., ::-1], _QUALITY), words
 

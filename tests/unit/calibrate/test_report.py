@@ -159,6 +159,18 @@ def test_whatever_a_person_or_a_device_named_is_text() -> None:
     assert Page(found).words.count(label) > 5
 
 
+def test_a_devices_name_keeps_its_capitals() -> None:
+    whole, solution = result(), result().solution
+    cameras = dict.fromkeys(("Nikon D5", "Canon"), whole.calibration.cameras["left"])
+    pinholes = replace(whole.calibration, cameras=cameras, projector=None)
+    residuals = dict.fromkeys(cameras, solution.residuals["left"])
+    named = replace(whole, solution=replace(solution, residuals=residuals), calibration=pinholes)
+    white = {POSES[0]: {"Canon": np.full((1024, 1280), 90, dtype=np.uint8)}}
+    words = Page(report_html(named, [], white, board=BOARD, title="two cameras")).words
+    assert "Camera 'Nikon D5' and camera 'Canon':" in "".join(words)
+    assert f"{POSES[0]}, camera 'Canon'" in words
+
+
 def test_verdict_comes_first_and_in_words() -> None:
     verdict = result().verdict
     assert page().figures["grade"] == verdict.grade.words.capitalize()
