@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -13,16 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slrig.accept.plan import (
-    USUAL_REPEATS,
-    AcceptancePlan,
-    Artefacts,
-    Certified,
-    Limits,
-    Step,
-    exact_artefacts,
-    usual_limits,
-)
+from slrig.accept.plan import AcceptancePlan, Artefacts, Certified, Limits, Step, exact_artefacts, usual_limits
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.report import document
 from slrig.accept.running import Place, required_calibration, run_acceptance
@@ -31,7 +22,8 @@ from slrig.accept.store import HTML, JSON
 from slrig.accept.verdicts import AcceptanceResult
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.calibration.artefacts import Decision
-from slrig.cli.display import progress_shown
+from slrig.cli.acceptance_command import Asked
+from slrig.cli.display import answered, progress_shown
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
@@ -40,73 +32,49 @@ from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm.
+def plan_for(asked: Asked, rig: Rig) -> AcceptancePlan:
+    """The test of an open rig. Raises CalibrationError, InvalidInputError."""
+    calibration = required_calibration(rig)
+    rendered = rig.truth() is not None
+    volume = rig_volume_mm(calibration) if asked.volume_mm is None else np.array(asked.volume_mm).reshape(2, 3)
+    usual_mm = usual_limits(volume, rendered=rendered).spacing_mm
+    return acceptance_plan(
+        calibration,
+        volume,
+        _artefacts(asked, exact_artefacts(volume) if rendered else None),
+        rendered=rendered,
+        limits=Limits(
+            usual_mm if asked.spacing_limit_mm is None else asked.spacing_limit_mm,
+            asked.form_limit_mm,
+            asked.size_limit_mm,
+            asked.flatness_limit_mm,
+        ),
+        repeats=asked.repeats,
+        exposure_s=asked.exposure_s,
+        notes=asked.notes,
+    )
 
-    sphere_mm, bar_mm : certified value and its expanded uncertainty. volume_mm : six numbers, the least corner first.
-    """
 
-    sphere_mm: tuple[float, float] | None = None
-    bar_mm: tuple[float, float] | None = None
-    plane_mm: tuple[float, float] | None = None
-    ball_mm: float | None = None
-    sphere_form_mm: float | None = None
-    plane_form_mm: float | None = None
-    volume_mm: Sequence[float] | None = None
-    spacing_limit_mm: float | None = None
-    form_limit_mm: float | None = None
-    size_limit_mm: float | None = None
-    flatness_limit_mm: float | None = None
-    repeats: int = USUAL_REPEATS
-    exposure_s: float | None = None
-    certificate: str = ""
-    temperature_c: float | None = None
-    notes: str = ""
-
-    def plan(self, rig: Rig) -> AcceptancePlan:
-        """The test of an open rig. Raises CalibrationError, InvalidInputError."""
-        calibration = required_calibration(rig)
-        rendered = rig.truth() is not None
-        volume = rig_volume_mm(calibration) if self.volume_mm is None else np.array(self.volume_mm).reshape(2, 3)
-        usual = usual_limits(volume, rendered=rendered)
-        limits = Limits(
-            usual.spacing_mm if self.spacing_limit_mm is None else self.spacing_limit_mm,
-            self.form_limit_mm,
-            self.size_limit_mm,
-            self.flatness_limit_mm,
+def _artefacts(asked: Asked, made: Artefacts | None) -> Artefacts:
+    if made is not None and (asked.sphere_mm, asked.bar_mm, asked.plane_mm) == (None, None, None):
+        return replace(made, temperature_c=asked.temperature_c)
+    if asked.sphere_mm is None or asked.bar_mm is None or asked.plane_mm is None:
+        message = (
+            "an acceptance test needs --sphere DIAMETER U, --bar DISTANCE U and --plane LENGTH WIDTH: values and "
+            "expanded uncertainties (k = 2) from the certificates, in mm"
         )
-        return acceptance_plan(
-            calibration,
-            volume,
-            self._artefacts(exact_artefacts(volume) if rendered else None),
-            rendered=rendered,
-            limits=limits,
-            repeats=self.repeats,
-            exposure_s=self.exposure_s,
-            notes=self.notes,
-        )
-
-    def _artefacts(self, made: Artefacts | None) -> Artefacts:
-        if made is not None and (self.sphere_mm, self.bar_mm, self.plane_mm) == (None, None, None):
-            return replace(made, temperature_c=self.temperature_c)
-        if self.sphere_mm is None or self.bar_mm is None or self.plane_mm is None:
-            message = (
-                "an acceptance test needs --sphere DIAMETER U, --bar DISTANCE U and --plane LENGTH WIDTH: values and "
-                "expanded uncertainties (k = 2) from the certificates, in mm"
-            )
-            raise InvalidInputError(message)
-        exact = None if made is None else 0.0
-        return Artefacts(
-            Certified(*self.sphere_mm),
-            Certified(*self.bar_mm),
-            self.plane_mm,
-            self.ball_mm,
-            exact if self.sphere_form_mm is None else self.sphere_form_mm,
-            exact if self.plane_form_mm is None else self.plane_form_mm,
-            self.certificate,
-            self.temperature_c,
-        )
+        raise InvalidInputError(message)
+    exact = None if made is None else 0.0
+    return Artefacts(
+        Certified(*asked.sphere_mm),
+        Certified(*asked.bar_mm),
+        asked.plane_mm,
+        asked.ball_mm,
+        exact if asked.sphere_form_mm is None else asked.sphere_form_mm,
+        exact if asked.plane_form_mm is None else asked.plane_form_mm,
+        asked.certificate,
+        asked.temperature_c,
+    )
 
 
 def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_json: bool) -> bool:
@@ -124,7 +92,7 @@ def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_jso
         if scripted:
             config = moving(config, asked, Path(scratch))
         with open_rig(config) as rig:
-            plan = asked.plan(rig)
+            plan = plan_for(asked, rig)
             result = _tested(rig, plan, output, scripted=scripted, console=console)
     if as_json:
         typer.echo((output / JSON).read_text(encoding="utf-8"), nl=False)
@@ -139,7 +107,7 @@ def moving(config: RigConfig, asked: Asked, folder: Path) -> RigConfig:
     one with a scene of artefacts in place of its own, which is written into `folder`.
     """
     with open_rig(config) as rig:
-        plan = asked.plan(rig)
+        plan = plan_for(asked, rig)
         known = () if rig.positioner is None else tuple(rig.positioner.poses)
     if all(step.name in known for step in plan.steps):
         return config
@@ -148,7 +116,6 @@ def moving(config: RigConfig, asked: Asked, folder: Path) -> RigConfig:
 
 def placed_by_hand(plan: AcceptancePlan, console: Console, *, ask: Callable[[str], str] | None = None) -> Place:
     """A `Place` that tells a person what to do and waits for Enter; q ends the test (ScanCancelledError)."""
-    answer = console.input if ask is None else ask
     names = [step.name for step in plan.steps]
 
     def place(_rig: Rig, step: Step, /) -> None:
@@ -156,11 +123,7 @@ def placed_by_hand(plan: AcceptancePlan, console: Console, *, ask: Callable[[str
         console.print(Text.assemble((f"\n{number} of {len(names)}  ", "bold"), step.words))
         x, y, z = (float(each) for each in step.centre_mm)
         console.print(f"Its middle about x {x:.0f}, y {y:.0f}, z {z:.0f} mm. Keep it still.", style="dim")
-        try:
-            told = answer("[bold]Enter[/bold] measure   [bold]q[/bold] leave > ").strip().lower()
-        except EOFError:
-            told = "q"
-        if told in {"q", "quit"}:
+        if answered(ask or console.input, "[bold]Enter[/bold] measure   [bold]q[/bold] leave > ") == "q":
             message = f"the acceptance test was left before {step.name}; the points of what was measured are kept"
             raise ScanCancelledError(message)
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+import json
+from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+from urllib.parse import urlencode
 
 import typer
 
-from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url, client_of
+from slrig.cli.options import AsJson, BoardOptions, Service, by_beginning, grouped
+from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
+
+if TYPE_CHECKING:
+    from slrig.cli.client import ServiceClient
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -16,45 +23,19 @@ app = typer.Typer(
     epilog="Start with: slrig calibrate board, then slrig calibrate run.",
 )
 
-
-class BoardName(StrEnum):
-    """What is printed on the board."""
-
-    CHARUCO = "charuco"
-    CHESSBOARD = "chessboard"
-    CIRCLES = "circles"
-
-
-class ShapeName(StrEnum):
-    """What a solve takes the board for."""
-
-    AUTO = "auto"
-    FLAT = "flat"
-    BOWED = "bowed"
-
+FILES = {
+    ".json": "calibration.json",
+    ".yml": "calibration.yml",
+    ".yaml": "calibration.yml",
+    ".xml": "calibration.xml",
+    ".html": "report.html",
+}
+"""What a file to be exported holds, by its ending."""
 
 _ID_HELP = "Id of the calibration, or the beginning of it that no other has."
 CalibrationId = Annotated[str, typer.Argument(metavar="ID", help=_ID_HELP)]
-Kind = Annotated[BoardName | None, typer.Option("--board", help="What is printed on the board. Default: charuco.")]
-Corners = Annotated[
-    str | None,
-    typer.Option(help="Inner corners across x down, as 11x8 (default); of circles, those of one row x rows."),
-]
-SquareMm = Annotated[
-    float | None,
-    typer.Option(
-        help="Side of a square, mm, measured on the print (default 12); of circles, the distance of two rows."
-    ),
-]
-MarkerMm = Annotated[
-    float | None, typer.Option(help="Side of a marker of a ChArUco board, mm. Default: 0.75 of the square.")
-]
-Dictionary = Annotated[
-    str | None, typer.Option(help="Markers of a ChArUco board, by OpenCV's name. Default DICT_5X5_250.")
-]
-
 Shape = Annotated[
-    ShapeName,
+    Literal["auto", "flat", "bowed"],
     typer.Option(
         "--board-shape",
         help="flat: it is, for certain, as on glass; bowed: solve for its bend; auto: bowed if held-out poses say so.",
@@ -63,13 +44,10 @@ Shape = Annotated[
 
 
 @app.command()
+@grouped
 def board(
     output: Annotated[Path, typer.Option(help="File for the page: .pdf or .svg.")],
-    kind: Kind = None,
-    corners: Corners = None,
-    square_mm: SquareMm = None,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = None,
+    asked: BoardOptions,
     page: Annotated[
         str, typer.Option(help="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm.")
     ] = "A4",
@@ -78,24 +56,21 @@ def board(
 
     The scales show whether the printer kept the size.
     """
-    from slrig.cli.calibrate_board import write_board
+    from slrig.cli.boards import write_board
 
-    write_board(chosen_board(kind, corners, square_mm, marker_mm, dictionary), output, page=page)
+    write_board(asked.chosen(), output, page=page)
 
 
 @app.command()
+@grouped
 def solve(
     folder: Annotated[
         Path,
         typer.Argument(metavar="FOLDER", help="Folder with one bundle per pose, each a folder with bundle.json."),
     ],
     output: Annotated[Path, typer.Option(help="File for the calibration: .json, or OpenCV's .yml or .xml.")],
-    kind: Kind = None,
-    corners: Corners = None,
-    square_mm: SquareMm = None,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = None,
-    board_shape: Shape = ShapeName.AUTO,
+    asked: BoardOptions,
+    board_shape: Shape = "auto",
     report: Annotated[Path | None, typer.Option(help="Write the report, one HTML page with pictures, as well.")] = None,
     earlier: Annotated[
         Path | None, typer.Option(help="Calibration of the same rig: is the board's size what it was then?")
@@ -106,19 +81,16 @@ def solve(
     from slrig.calibration.board import BoardShape
     from slrig.cli.calibrate_solve import solve_folder
 
-    chosen = chosen_board(kind, corners, square_mm, marker_mm, dictionary)
-    shape = BoardShape(board_shape.value)
-    solve_folder(folder, chosen, output, report=report, earlier=earlier, board_shape=shape, as_json=as_json)
+    shape = BoardShape(board_shape)
+    solve_folder(folder, asked.chosen(), output, report=report, earlier=earlier, board_shape=shape, as_json=as_json)
 
 
 @app.command()
+@grouped
 def run(
-    kind: Kind = None,
-    corners: Corners = None,
-    square_mm: SquareMm = None,
-    marker_mm: MarkerMm = None,
-    dictionary: Dictionary = None,
-    board_shape: Shape = ShapeName.AUTO,
+    *,
+    asked: BoardOptions,
+    board_shape: Shape = "auto",
     cameras_alone: Annotated[
         bool, typer.Option("--cameras-alone", help="Calibrate cameras, or one, without the projector: light is white.")
     ] = False,
@@ -135,129 +107,175 @@ def run(
     exposure_s: Annotated[
         float | None, typer.Option(help="Exposure of every camera, seconds. Default: as the rig file says.")
     ] = None,
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    service: Service,
 ) -> None:
     """Walk through a calibration with a running service.
 
     Shoot, be told what to move and why, and solve.
     """
-    from slrig.cli.calibrate_stored import whole_id
     from slrig.cli.calibrate_walk import opened, walk
 
-    chosen = None if resume is not None else chosen_board(kind, corners, square_mm, marker_mm, dictionary)
-    with client_of(url, key_file) as client:
-        session = (
-            opened(client, chosen, label=label, projector=not cameras_alone)
-            if chosen is not None
-            else client.get(f"/calibration/{whole_id(client, str(resume))}")
-        )
+    chosen = asked.chosen() if resume is None else None
+    with service.client() as client:
         walk(
             client,
-            session,
+            client.get(_path(client, str(resume)))
+            if chosen is None
+            else opened(client, chosen, label=label, projector=not cameras_alone),
             scripted=scripted,
             positions=position or (),
             activate=activate,
             exposure_s=exposure_s,
-            board_shape=board_shape.value,
+            board_shape=board_shape,
         )
 
 
 @app.command(name="list")
-def list_stored(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
+@grouped
+def list_stored(service: Service, as_json: AsJson = False) -> None:
     """List the calibrations that a service keeps, from new to old."""
-    from slrig.cli.calibrate_stored import list_calibrations
+    from rich.table import Column
+    from rich.text import Text
 
-    with client_of(url, key_file) as client:
-        list_calibrations(client, as_json=as_json)
+    from slrig.cli.display import print_json, print_table
+
+    with service.client() as client:
+        found = client.get("/calibration")
+    if as_json:
+        print_json(found)
+        return
+    if not found["calibrations"]:
+        typer.echo("no calibrations; shoot one with: slrig calibrate run")
+        return
+    heads = [*(Column(head, no_wrap=True) for head in ("id", "", "when", "poses", "label")), "verdict"]
+    rows = [
+        (
+            each["id"][:8],
+            Text("in use" if each["active"] else "", style="green"),
+            f"{datetime.fromisoformat(each['solved_at'] or each['created_at']).astimezone():%Y-%m-%d %H:%M}",
+            "" if each["imported"] else str(each["poses"]),
+            each["label"] or "",
+            each["verdict"] or ("imported" if each["imported"] else each["state"]),
+        )
+        for each in found["calibrations"]
+    ]
+    print_table(heads, rows)
+    if found["active"] is None:
+        typer.secho("Scans use the rig's own calibration.", dim=True)
 
 
 @app.command()
-def show(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
+@grouped
+def show(calibration: CalibrationId, service: Service, as_json: AsJson = False) -> None:
     """Show how good a calibration is, or what its poses still lack."""
-    from slrig.cli.calibrate_stored import show_calibration
+    from slrig.cli.calibration_screen import tell_session
+    from slrig.cli.display import print_json
 
-    with client_of(url, key_file) as client:
-        show_calibration(client, calibration, as_json=as_json)
+    with service.client() as client:
+        session = client.get(_path(client, calibration))
+    (print_json if as_json else tell_session)(session)
 
 
 @app.command()
+@grouped
 def compare(
     first: Annotated[str, typer.Argument(metavar="FIRST", help=_ID_HELP)],
     second: Annotated[str, typer.Argument(metavar="SECOND", help="Id of the one to compare it with.")],
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    service: Service,
     as_json: AsJson = False,
 ) -> None:
     """Compare two calibrations, and say by how much points move.
 
     Tells what the second one says otherwise than the first.
     """
-    from slrig.cli.calibrate_stored import compare_calibrations
+    from slrig.cli.calibration_screen import tell_comparison
+    from slrig.cli.display import print_json
 
-    with client_of(url, key_file) as client:
-        compare_calibrations(client, first, second, as_json=as_json)
+    with service.client() as client:
+        ids = f"first={_whole_id(client, first)}&second={_whole_id(client, second)}"
+        found = client.get(f"/calibration/compare?{ids}")
+    (print_json if as_json else tell_comparison)(found)
 
 
 @app.command()
-def activate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+@grouped
+def activate(calibration: CalibrationId, service: Service) -> None:
     """Have scans use a calibration from now on."""
-    from slrig.cli.calibrate_stored import whole_id
-
-    with client_of(url, key_file) as client:
-        found = client.post(f"/calibration/{whole_id(client, calibration)}/activate", None)
+    with service.client() as client:
+        found = client.post(f"{_path(client, calibration)}/activate", None)
     typer.echo(f"Scans use calibration {found['id'][:8]} from now on.")
 
 
 @app.command()
-def deactivate(calibration: CalibrationId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+@grouped
+def deactivate(calibration: CalibrationId, service: Service) -> None:
     """Have scans use the rig's own calibration again."""
-    from slrig.cli.calibrate_stored import whole_id
-
-    with client_of(url, key_file) as client:
-        client.post(f"/calibration/{whole_id(client, calibration)}/deactivate", None)
+    with service.client() as client:
+        client.post(f"{_path(client, calibration)}/deactivate", None)
     typer.echo("Scans use the rig's own calibration again.")
 
 
 @app.command()
+@grouped
 def export(
     calibration: CalibrationId,
     file: Annotated[
         Path,
         typer.Argument(metavar="FILE", help="File to write: .json, OpenCV's .yml or .xml, or the report as .html."),
     ],
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    service: Service,
 ) -> None:
     """Write a calibration that a service keeps into a file."""
-    from slrig.cli.calibrate_stored import export_calibration
-
-    with client_of(url, key_file) as client:
-        export_calibration(client, calibration, file)
+    name = FILES.get(file.suffix.lower())
+    if name is None:
+        message = (
+            f"{file}: expected a name that ends in .json (slrig's own), .yml or .xml (OpenCV's) or .html (the report), "
+            f"found '{file.suffix}'"
+        )
+        raise ConfigError(message)
+    with service.client() as client:
+        session = client.get(_path(client, calibration))
+        offered = session["links"]["files"]
+        if name not in offered:
+            has = f"It has: {', '.join(offered)}." if offered else f"It is {session['state']}; solve it first."
+            message = f"Calibration {session['id'][:8]} has no {name}. {has}"
+            raise ServiceError(message)
+        client.fetch(offered[name], file)
+    typer.echo(f"{'written':<10}{file}")
 
 
 @app.command(name="import")
+@grouped
 def submit(
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Calibration: slrig's .json, or OpenCV's .yml or .xml.")],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    service: Service,
 ) -> None:
     """Give a service a calibration that was found elsewhere."""
-    from slrig.cli.calibrate_stored import import_calibration
+    import tempfile
 
-    with client_of(url, key_file) as client:
-        import_calibration(client, file, label=label)
+    from slrig.bundle import read_calibration, write_calibration
+
+    with service.client() as client:
+        # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.
+        calibration = read_calibration(file)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "calibration.json"
+            write_calibration(path, calibration)
+            document: Mapping[str, Any] = json.loads(path.read_bytes())
+        query = "" if label is None else f"?{urlencode({'label': label})}"
+        found = client.post(f"/calibration/import{query}", document)
+    typer.echo(f"{'imported':<10}{found['id']}")
+    typer.echo(f"To have scans use it: slrig calibrate activate {found['id'][:8]}")
 
 
-def chosen_board(
-    kind: BoardName | None,
-    corners: str | None,
-    square_mm: float | None,
-    marker_mm: float | None,
-    dictionary: str | None,
-) -> Any:
-    """See `slrig.cli.board_options.chosen_board`, which loads numpy."""
-    from slrig.cli import board_options
+def _path(client: ServiceClient, beginning: str) -> str:
+    return f"/calibration/{_whole_id(client, beginning)}"
 
-    return board_options.chosen_board(None if kind is None else kind.value, corners, square_mm, marker_mm, dictionary)
+
+def _whole_id(client: ServiceClient, beginning: str) -> str:
+    """The id of the one calibration whose id begins so. Raises CalibrationNotFoundError."""
+    known = client.get("/calibration?limit=200")["calibrations"]
+    none = "none; open one with: slrig calibrate run"
+    return str(by_beginning(known, beginning, "calibration", CalibrationNotFoundError, none=none)["id"])

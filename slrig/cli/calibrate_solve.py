@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 from collections import Counter
@@ -23,7 +22,7 @@ from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.poses.checks import check_same_devices
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
-from slrig.cli.display import ProgressDisplay, progress_shown
+from slrig.cli.display import ProgressDisplay, print_json, progress_shown
 from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.model import Calibration, Size
@@ -117,7 +116,7 @@ def solve_folder(
             write_file(report, _report(result, found, folder, bundles, setting).encode())
         display("done", 1.0, "")
     if as_json:
-        typer.echo(json.dumps({**document, "output": str(output), "report": report and str(report)}, indent=1))
+        print_json({**document, "output": str(output), "report": report and str(report)})
         return
     tell_result(document, Console())
     typer.echo(f"\n{'written':<10}{output}")

@@ -15,11 +15,10 @@ from rich.table import Table
 from rich.text import Text
 
 from slrig.calibration.board import Board
-from slrig.cli.calibration_screen import outcome, refused, tell_result
+from slrig.cli.calibration_screen import coverage_picture, outcome, refused, tell_next, tell_result
 from slrig.cli.client import ServiceClient
-from slrig.cli.coverage_screen import coverage_picture, tell_next
 from slrig.cli.demo import still_missing
-from slrig.cli.display import progress_shown
+from slrig.cli.display import answered, progress_shown
 from slrig.errors import CalibrationStateError, PoseRefusedError, ServiceError, SolveRefusedError
 
 FINAL = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
@@ -88,16 +87,14 @@ class Walk:
         exposure_s: float | None = None,
         board_shape: str = "auto",
         ask: Callable[[str], str] | None = None,
-        pause: Callable[[float], None] | None = None,
     ) -> None:
         self._client = client
         self._path: str = session["links"]["self"]
         self._id: str = session["id"]
         self._console = console
         self._exposure = {} if exposure_s is None else {"exposure_s": exposure_s}
-        self._solve = {"board_shape": board_shape}
+        self._board_shape = board_shape
         self._ask = console.input if ask is None else ask
-        self._pause = time.sleep if pause is None else pause
 
     def await_rig(self) -> None:
         """Wait until the rig is open. Raises ServiceError where it cannot be opened."""
@@ -106,7 +103,7 @@ class Walk:
         with progress_shown() as display:
             while (missing := still_missing(self._client)) is not None:
                 display("opening the rig", 0.0, missing)
-                self._pause(_POLL_S)
+                time.sleep(_POLL_S)
                 # Refuses when the service is gone, which `still_missing` takes for one that is still starting.
                 self._client.get("/rig")
 
@@ -121,8 +118,8 @@ class Walk:
         self._stand()
         while True:
             self._console.print()
-            answer = self._answer(f"{_KEYS} > ")
-            if answer in {"q", "quit"}:
+            answer = answered(self._ask, f"{_KEYS} > ")
+            if answer == "q":
                 break
             try:
                 if answer == "":
@@ -130,7 +127,8 @@ class Walk:
                     # A pose that was not taken in changes nothing: what to do next is enough.
                     self._stand(picture=pose["accepted"] is True)
                 elif answer == "s":
-                    if self._solved() and self._offer_activation():
+                    self._solve()
+                    if self._offer_activation():
                         return
                 elif answer == "d":
                     self._drop_last()
@@ -162,7 +160,8 @@ class Walk:
                 break
             pose = self._following(told)
         self._stand()
-        if self._solved() and activate:
+        self._solve()
+        if activate:
             self._activate()
 
     def tell_how_to_go_on(self) -> None:
@@ -182,12 +181,6 @@ class Walk:
     def _session(self) -> dict[str, Any]:
         return self._client.get(self._path)
 
-    def _answer(self, prompt: str) -> str:
-        try:
-            return self._ask(prompt).strip().lower()
-        except EOFError:
-            return "q"
-
     def _shot(self, pose: Mapping[str, Any]) -> Mapping[str, Any]:
         """Follow a pose to its end, and tell what was found of it."""
         with progress_shown() as display:
@@ -195,7 +188,7 @@ class Walk:
                 progress = self._session().get("progress") or {}
                 fraction, detail = progress.get("fraction", 0.0), progress.get("detail", "")
                 display(f"{pose['name']}: {_STATES[pose['state']]}", fraction, detail)
-                self._pause(_POLL_S)
+                time.sleep(_POLL_S)
                 pose = self._client.get(pose["links"]["self"])
             display(f"{pose['name']}: {outcome(pose)}", 1.0, "")
         tell_pose(pose, self._console)
@@ -210,7 +203,7 @@ class Walk:
                 return later[0]
             if not session["script"]:
                 return None
-            self._pause(_POLL_S)
+            time.sleep(_POLL_S)
 
     def _stand(self, *, picture: bool = True) -> None:
         """Show what is covered, and what to do next."""
@@ -236,14 +229,14 @@ class Walk:
         self._client.delete_at(shot[-1]["links"]["self"])
         self._console.print(f"{shot[-1]['name']} is dropped.", markup=False)
 
-    def _solved(self) -> bool:
-        """Solve and tell the result; False where the poses do not allow it, which is told."""
-        session = self._client.post(f"{self._path}/solve", self._solve)
+    def _solve(self) -> None:
+        """Solve and tell the result. Raises SolveRefusedError where the poses do not allow it."""
+        session = self._client.post(f"{self._path}/solve", {"board_shape": self._board_shape})
         with progress_shown() as display:
             while session["state"] == "solving":
                 progress = session.get("progress") or {"stage": "solving", "fraction": 0.0, "detail": ""}
                 display(progress["stage"], progress["fraction"], progress["detail"])
-                self._pause(_POLL_S)
+                time.sleep(_POLL_S)
                 session = self._session()
             display(session["state"], 1.0, "")
         if session["state"] != "solved":
@@ -252,20 +245,16 @@ class Walk:
         tell_result({**session["result"], "refused": refused(session)}, self._console)
         self._console.print()
         self._console.print(f"report: slrig calibrate export {self._id[:8]} report.html", markup=False, style="dim")
-        return True
 
     def _offer_activation(self) -> bool:
         """Ask what to do with a solved calibration; True when the walk is over."""
-        answer = self._answer(
-            "[bold]a[/bold] have scans use it   [bold]Enter[/bold] shoot more   [bold]q[/bold] leave > "
-        )
+        keys = "[bold]a[/bold] have scans use it   [bold]Enter[/bold] shoot more   [bold]q[/bold] leave > "
+        answer = answered(self._ask, keys)
         if answer == "a":
             self._activate()
-            return True
-        if answer in {"q", "quit"}:
+        elif answer == "q":
             self.tell_how_to_go_on()
-            return True
-        return False
+        return answer in {"a", "q"}
 
     def _activate(self) -> None:
         self._client.post(f"{self._path}/activate", None)

@@ -7,18 +7,26 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 import typer.core
 
-from slrig.cli import acceptance_command, calibrate, schedule, verify_command
-from slrig.cli.options import USUAL_URL, AsJson, KeyFile, RigFile, Url, client_of
+from slrig.cli import acceptance_command, calibrate, schedule
+from slrig.cli.options import AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
+
+
+class FurtherFormat(StrEnum):
+    """Formats of the mesh that are written only when they are asked for."""
+
+    STL = "stl"
+    OBJ = "obj"
 
 
 class _Commands(typer.core.TyperGroup):
@@ -63,44 +71,6 @@ def slrig(
     """Options that stand before any command; what `slrig --help` says is `app`'s."""
 
 
-KeepHoles = Annotated[
-    bool | None,
-    typer.Option("--keep-holes/--close-holes", help="Leave gaps within a stripe open, or close them (default)."),
-]
-DepthEdgeRatio = Annotated[
-    float | None,
-    typer.Option(help="Longest triangle edge, in sampling distances, above 1. Default 6; longer skins cliffs."),
-]
-MaxCodeGap = Annotated[int | None, typer.Option(help="Mesh stripes up to this many columns apart. Default 1.")]
-FlipRuleName = Annotated[
-    str | None,
-    typer.Option("--flip-rule", help="How edges of the mesh are flipped: constrained (default) or delaunay."),
-]
-LightAxis = Annotated[
-    str | None, typer.Option("--axis", help="Triangulate by column or row. Default: what crosses the baseline.")
-]
-SmoothBoundary = Annotated[
-    bool | None,
-    typer.Option(
-        "--smooth-boundary/--raw-boundary", help="Shrink and smooth the mesh's boundary (default), or leave it."
-    ),
-]
-
-
-class FurtherFormat(StrEnum):
-    """Formats of the mesh that are written only when they are asked for."""
-
-    STL = "stl"
-    OBJ = "obj"
-
-
-class WatchedBy(StrEnum):
-    """How a camera that watches flashes is triggered."""
-
-    FREE = "free"
-    SOFTWARE = "software"
-
-
 @app.command()
 def demo(
     rig: Annotated[
@@ -140,19 +110,21 @@ def serve(
     from slrig.api.server import serve as run_service
     from slrig.config import read_rig, read_settings
 
-    given: dict[str, object] = {"host": host, "port": port, "data_dir": data}
-    if allow_host:
-        given["allowed_hosts"] = tuple(allow_host)
-    if no_key:
-        given["require_key"] = False
-    chosen = read_settings(settings, **_given(**given))
-    run_service(chosen, read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
+    told = given(
+        host=host,
+        port=port,
+        data_dir=data,
+        allowed_hosts=tuple(allow_host or ()) or None,
+        require_key=False if no_key else None,
+    )
+    run_service(read_settings(settings, **told), read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
 
 
 @app.command()
+@grouped
 def scan(
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    *,
+    service: Service,
     output: Annotated[Path, typer.Option(help="Folder for the files of the scan.")] = Path("scans/latest"),
     file: Annotated[
         list[str] | None,
@@ -173,18 +145,13 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
-    keep_holes: KeepHoles = None,
-    depth_edge_ratio: DepthEdgeRatio = None,
-    max_code_gap: MaxCodeGap = None,
-    flip_rule: FlipRuleName = None,
-    smooth_boundary: SmoothBoundary = None,
-    axis: LightAxis = None,
+    mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
     from slrig.cli.scan import FILES, scan_with, tell_result
 
-    patterns = _given(
+    patterns = given(
         line_shift_period_px=period_px,
         line_width_px=line_width_px,
         gray_cell_px=gray_cell_px,
@@ -193,26 +160,26 @@ def scan(
     )
     request = {
         "label": label,
-        **_exposure(exposure_s or []),
+        # One exposure time is one, several are a bracket.
+        **(
+            {"exposures_s": exposure_s}
+            if len(exposure_s or ()) > 1
+            else {"exposure_s": next(iter(exposure_s or ()), None)}
+        ),
         "if_busy": "queue" if queue else "reject",
         "patterns": patterns,
-        "reconstruction": _given(
-            keep_holes=keep_holes,
-            depth_edge_ratio=depth_edge_ratio,
-            max_code_gap=max_code_gap,
-            flip_rule=flip_rule,
-            smooth_boundary=smooth_boundary,
-            axis=axis,
-        ),
+        "reconstruction": given(**asdict(mesh)),
     }
-    with client_of(url, key_file) as client:
-        files = tuple(file or FILES)
+    files = tuple(file or FILES)
+    with service.client() as client:
         result = scan_with(client, request, output, files=files)
     tell_result(result, output, files=files)
 
 
 @app.command()
+@grouped
 def reconstruct(
+    *,
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder with bundle.json and its frames.")],
     output: Annotated[Path, typer.Option(help="Folder for mesh, points, report and pictures.")],
     calibration: Annotated[
@@ -222,12 +189,7 @@ def reconstruct(
         list[FurtherFormat] | None,
         typer.Option("--format", help="Write the mesh in this format as well as PLY and GLB; may be repeated."),
     ] = None,
-    keep_holes: KeepHoles = None,
-    depth_edge_ratio: DepthEdgeRatio = None,
-    max_code_gap: MaxCodeGap = None,
-    flip_rule: FlipRuleName = None,
-    smooth_boundary: SmoothBoundary = None,
-    axis: LightAxis = None,
+    mesh: MeshOptions,
     decode_only: Annotated[
         bool,
         typer.Option("--decode-only", help="Only decode: positions, causes, what to change. Needs no calibration."),
@@ -239,15 +201,7 @@ def reconstruct(
     if decode_only:
         decode_and_tell(bundle, output)
         return
-    options = _given(
-        keep_holes=keep_holes,
-        depth_edge_ratio=depth_edge_ratio,
-        max_code_gap=max_code_gap,
-        flip_rule=flip_rule,
-        smooth_boundary=smooth_boundary,
-        axis=axis,
-    )
-    formats = [each.value for each in mesh_format or ()]
+    formats, options = mesh_format or (), given(**asdict(mesh))
     reconstruct_with_progress(bundle, output, calibration=calibration, formats=formats, options=options)
 
 
@@ -335,7 +289,8 @@ def latency(
         float | None, typer.Option(help="Exposure of every camera for this test. Default: the rig file's.")
     ] = None,
     trigger: Annotated[
-        WatchedBy | None, typer.Option(help="How exposures are started. Default: free where a camera can.")
+        Literal["free", "software"] | None,
+        typer.Option(help="How exposures are started. Default: free where a camera can."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -345,13 +300,7 @@ def latency(
     """
     from slrig.cli.latency import tell_latency
 
-    kind = None if trigger is None else trigger.value
-    tell_latency(rig, trials=flashes, search_s=search_s, exposure_s=exposure_s, trigger=kind, as_json=as_json)
-
-
-def _exposure(times_s: list[float]) -> dict[str, object]:
-    """One exposure time is one, several are a bracket."""
-    return {"exposures_s": times_s} if len(times_s) > 1 else {"exposure_s": times_s[0] if times_s else None}
+    tell_latency(rig, trials=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger, as_json=as_json)
 
 
 @app.command()
@@ -372,15 +321,33 @@ def doctor(
         raise typer.Exit(1)
 
 
-app.command()(verify_command.verify)
+@app.command()
+@grouped
+def verify(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="SOURCE", help="A recorded pose of the board, a bundle; or a rig file to shoot one."),
+    ],
+    board: BoardOptions,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Calibration to verify. Default: the bundle's, or the rig file's.")
+    ] = None,
+    position: Annotated[int | None, typer.Option(min=0, help="Pose of the rig's positioner, by number.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Look at the board once: does the calibration still hold?
+
+    Exit code 1 if it is stale.
+    """
+    from slrig.cli.verify import verify as look
+
+    if not look(source, board.chosen(), calibration, position=position, as_json=as_json):
+        raise typer.Exit(1)
+
+
 app.command()(acceptance_command.accept)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
-
-
-def _given(**options: object) -> dict[str, object]:
-    """The options that were given; the service, or the plan, knows the others' defaults."""
-    return {name: value for name, value in options.items() if value is not None}
 
 
 def main() -> None:

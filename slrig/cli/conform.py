@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.cli.display import progress_shown
+from slrig.cli.display import print_json, progress_shown
 from slrig.config import RigConfig, read_rig
 from slrig.conformance import Outcome, Report, run
 from slrig.discovery import open_rig
@@ -42,7 +40,7 @@ def conform(rig: Path, *, as_json: bool) -> bool:
         sequence = _sequence(config)
         report = run(lambda: open_rig(config), sequence, progress=display)
     if as_json:
-        typer.echo(json.dumps(report.document(), indent=2, ensure_ascii=False))
+        print_json(report.document())
     else:
         tell(report, Console())
     return report.conforms

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from slrig.cli.display import print_json
 from slrig.discovery import Findings, InstalledDriver, found_devices, installed_drivers
 
 _STDOUT, _STDERR = 1, 2
@@ -44,7 +44,7 @@ def list_devices(*, as_json: bool) -> None:
             "elsewhere": [asdict(driver) for driver in found.elsewhere],
             "faults": [str(fault) for fault in found.faults],
         }
-        typer.echo(json.dumps(document, indent=2))
+        print_json(document)
         return
     console = Console()
     _tell_drivers(drivers, found, console)

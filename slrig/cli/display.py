@@ -1,16 +1,20 @@
-"""Progress for people: a bar on a terminal, a line per stage elsewhere."""
+"""What commands show: progress, a bar on a terminal and a line per stage elsewhere; tables; JSON."""
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TextIO
+from typing import Any, TextIO
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.table import Column, Table
+from rich.text import Text
 
 EVERY_S = 2.0
 """How often a line tells of a stage that goes on, where there is no bar."""
@@ -96,3 +100,39 @@ def progress_shown() -> Iterator[ProgressDisplay]:
         yield display
     finally:
         display.stop()
+
+
+def plain_table(*heads: Column | str, **options: Any) -> Table:
+    """A table without lines, made flush with what stands above it. options : of `rich.table.Table`."""
+    return Table(*heads, box=None, pad_edge=False, header_style="bold", **options)
+
+
+def print_table(heads: Sequence[Column | str], rows: Iterable[Sequence[Text | str]]) -> None:
+    """Print rows as they are, without rich's markup."""
+    table = plain_table(*heads)
+    for row in rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    Console().print(table)
+
+
+def print_json(document: Any) -> None:
+    """Print what `--json` asks for."""
+    typer.echo(json.dumps(document, indent=2, ensure_ascii=False))
+
+
+def counted(count: int, what: str) -> str:
+    """A number of things.
+
+    >>> counted(0, "fault"), counted(1, "turn"), counted(3, "turn")
+    ('0 faults', '1 turn', '3 turns')
+    """
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
+def answered(ask: Callable[[str], str], prompt: str) -> str:
+    """What a person typed, in lower case; "q" for the end of input and "quit"."""
+    try:
+        answer = ask(prompt).strip().lower()
+    except EOFError:
+        return "q"
+    return "q" if answer == "quit" else answer

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.api.schemas import ScanRequest, scan_plan
-from slrig.cli.display import progress_shown
+from slrig.cli.display import print_json, progress_shown
 from slrig.config import RigConfig, read_rig
 from slrig.devices import FoundDevice, Rig
 from slrig.discovery import found_devices, installed_drivers, open_rig
@@ -56,7 +54,7 @@ def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float,
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
     if as_json:
-        typer.echo(json.dumps(diagnosis.document(), indent=2, ensure_ascii=False))
+        print_json(diagnosis.document())
     else:
         tell(diagnosis, Console(), rig_file=rig_file, output=output)
     return diagnosis.healthy

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,6 +10,7 @@ from typing import Any
 
 import typer
 
+from slrig.cli.display import print_json
 from slrig.option_models import kinds_of, option_model
 
 Schema = Mapping[str, Any]
@@ -57,7 +57,7 @@ def tell_options(driver: str, *, as_json: bool) -> None:
     """
     kinds, model = kinds_of(driver), option_model(driver)
     if as_json:
-        typer.echo(json.dumps({} if model is None else model.model_json_schema(), indent=2, ensure_ascii=False))
+        print_json({} if model is None else model.model_json_schema())
         return
     if model is None:
         typer.echo(f"driver '{driver}' does not describe its options; they are in the manual of its package")

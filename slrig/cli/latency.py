@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,7 @@ import typer
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.capture.latency import LatencyMeasurement, measure_latency
 from slrig.capture.latency_fit import CameraLatency
-from slrig.cli.display import progress_shown
+from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig
 from slrig.devices import Synchronisation, Trigger
 from slrig.discovery import open_rig
@@ -37,7 +36,7 @@ def tell_latency(
             "synchronisation": asdict(measured.synchronisation),
             "cameras": {name: _document(found) for name, found in measured.cameras.items()},
         }
-        typer.echo(json.dumps(document, indent=2))
+        print_json(document)
         return
     typer.echo(in_words(measured))
     table = rig_table(measured.synchronisation)

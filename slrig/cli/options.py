@@ -1,24 +1,145 @@
-"""Options that several commands share."""
+"""Options that several commands share. Loads nothing heavy: `slrig --help` reads this file."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-USUAL_URL = "http://127.0.0.1:8731"
+from slrig.errors import SlrigError
 
-Url = Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")]
-KeyFile = Annotated[
-    Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
-]
+if TYPE_CHECKING:
+    from slrig.calibration.board import Board
+    from slrig.cli.client import ServiceClient
+
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
-def client_of(url: str, key_file: Path | None) -> Any:
-    """A client of the service that the options name. Raises ConfigError."""
-    from slrig.cli.client import ServiceClient, read_key
+@dataclass(frozen=True, slots=True)
+class Service:
+    """Where a running service is, and its key."""
 
-    return ServiceClient(url, read_key(key_file))
+    url: Annotated[str, typer.Option(envvar="SLRIG_URL", help="Where the service is.")] = "http://127.0.0.1:8731"
+    key_file: Annotated[
+        Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
+    ] = None
+
+    def client(self) -> ServiceClient:
+        """A client of it. Raises ConfigError."""
+        from slrig.cli.client import ServiceClient, read_key
+
+        return ServiceClient(self.url, read_key(self.key_file))
+
+
+@dataclass(frozen=True, slots=True)
+class BoardOptions:
+    """A calibration board as far as the command line names it."""
+
+    kind: Annotated[
+        Literal["charuco", "chessboard", "circles"] | None,
+        typer.Option("--board", help="What is printed on the board. Default: charuco."),
+    ] = None
+    corners: Annotated[
+        str | None,
+        typer.Option(help="Inner corners across x down, as 11x8 (default); of circles, those of one row x rows."),
+    ] = None
+    square_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="Side of a square, mm, measured on the print (default 12); of circles, the distance of two rows."
+        ),
+    ] = None
+    marker_mm: Annotated[
+        float | None, typer.Option(help="Side of a marker of a ChArUco board, mm. Default: 0.75 of the square.")
+    ] = None
+    dictionary: Annotated[
+        str | None, typer.Option(help="Markers of a ChArUco board, by OpenCV's name. Default DICT_5X5_250.")
+    ] = None
+
+    def chosen(self) -> Board:
+        """The board that is meant; see `slrig.cli.boards.chosen_board`. Raises CalibrationError."""
+        from slrig.cli.boards import chosen_board
+
+        return chosen_board(self)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshOptions:
+    """How a mesh is made, as far as the command line says it."""
+
+    keep_holes: Annotated[
+        bool | None,
+        typer.Option("--keep-holes/--close-holes", help="Leave gaps within a stripe open, or close them (default)."),
+    ] = None
+    depth_edge_ratio: Annotated[
+        float | None,
+        typer.Option(help="Longest triangle edge, in sampling distances, above 1. Default 6; longer skins cliffs."),
+    ] = None
+    max_code_gap: Annotated[int | None, typer.Option(help="Mesh stripes up to this many columns apart. Default 1.")] = (
+        None
+    )
+    flip_rule: Annotated[
+        str | None, typer.Option(help="How edges of the mesh are flipped: constrained (default) or delaunay.")
+    ] = None
+    smooth_boundary: Annotated[
+        bool | None,
+        typer.Option(
+            "--smooth-boundary/--raw-boundary", help="Shrink and smooth the mesh's boundary (default), or leave it."
+        ),
+    ] = None
+    axis: Annotated[
+        str | None, typer.Option(help="Triangulate by column or row. Default: what crosses the baseline.")
+    ] = None
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """A command as typer reads it: an option for each field of a parameter that is a dataclass."""
+    parameters = []
+    groups: dict[str, type] = {}
+    hints = get_type_hints(command, include_extras=True)
+    for name, parameter in inspect.signature(command).parameters.items():
+        if not is_dataclass(hints[name]):
+            parameters.append(parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY))
+            continue
+        groups[name] = hints[name]
+        options = get_type_hints(hints[name], include_extras=True)
+        parameters += [
+            inspect.Parameter(
+                each.name, inspect.Parameter.KEYWORD_ONLY, default=each.default, annotation=options[each.name]
+            )
+            for each in fields(hints[name])
+        ]
+
+    @functools.wraps(command)
+    def flat(**told: Any) -> None:
+        made = {
+            name: kind(**{each.name: told.pop(each.name) for each in fields(kind)}) for name, kind in groups.items()
+        }
+        command(**told, **made)
+
+    flat.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return flat
+
+
+def given(**options: object) -> dict[str, object]:
+    """The options that were given; the service, or the plan, knows the others' defaults."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def by_beginning(
+    known: Sequence[Mapping[str, Any]], beginning: str, noun: str, refusal: type[SlrigError], *, none: str = "none"
+) -> Mapping[str, Any]:
+    """The one of what a service keeps whose id begins so. Raises `refusal`, with `none` where it keeps nothing."""
+    found = [each for each in known if each["id"].startswith(beginning)]
+    if len(found) == 1:
+        return found[0]
+    what = f"{len(found)} {noun}s'" if found else f"no {noun}'s"
+    ids = ", ".join(each["id"][:8] for each in known[:10]) or none
+    message = f"'{beginning}' is the beginning of {what} id; there are: {ids}"
+    raise refusal(message)

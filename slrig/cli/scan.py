@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,51 +40,39 @@ def scan_with(
         Somebody else cancelled it.
     """
     _require_offered(client, files)
-    if display is not None:
-        return _scanned(client, request, output, files, display)
-    with progress_shown() as own:
-        return _scanned(client, request, output, files, own)
-
-
-def _scanned(
-    client: ServiceClient,
-    request: Mapping[str, Any],
-    output: Path,
-    files: tuple[str, ...],
-    display: Callable[[str, float, str], None],
-) -> dict[str, Any]:
-    started = client.start(request)
-    fraction = 0.0
-    try:
-        for event in client.follow(started):
-            if event["kind"] == "progress":
-                fraction = event["fraction"]
-                display(event["stage"], fraction, event["detail"])
-            elif event["state"] in _STATES:
-                display(_STATES[event["state"]], fraction, "")
-    except KeyboardInterrupt:
-        with suppress(ServiceError):
-            client.cancel(started)
-        raise
-    scan = client.get(started["links"]["self"])
-    if scan["state"] == "cancelled":
-        message = f"Scan {scan['id']} was cancelled by another client."
-        raise ScanCancelledError(message)
-    if scan["state"] != "succeeded":
-        message = f"Scan {scan['id']} {scan['state']}: {scan['error']['detail']}"
-        raise ServiceError(message)
-    offered = scan["links"]["files"]
-    missing = [name for name in files if name not in offered]
-    if missing:
-        message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
-        raise ServiceError(message)
-    with refusals_of(output):
-        output.mkdir(parents=True, exist_ok=True)
-    for name in files:
-        display(f"fetching {name}", 1.0, "")
-        client.fetch(offered[name], output / name)
-    display("done", 1.0, "")
-    return scan
+    with progress_shown() if display is None else nullcontext(display) as told:
+        started = client.start(request)
+        fraction = 0.0
+        try:
+            for event in client.follow(started):
+                if event["kind"] == "progress":
+                    fraction = event["fraction"]
+                    told(event["stage"], fraction, event["detail"])
+                elif event["state"] in _STATES:
+                    told(_STATES[event["state"]], fraction, "")
+        except KeyboardInterrupt:
+            with suppress(ServiceError):
+                client.cancel(started)
+            raise
+        scan = client.get(started["links"]["self"])
+        if scan["state"] == "cancelled":
+            message = f"Scan {scan['id']} was cancelled by another client."
+            raise ScanCancelledError(message)
+        if scan["state"] != "succeeded":
+            message = f"Scan {scan['id']} {scan['state']}: {scan['error']['detail']}"
+            raise ServiceError(message)
+        offered = scan["links"]["files"]
+        missing = [name for name in files if name not in offered]
+        if missing:
+            message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
+            raise ServiceError(message)
+        with refusals_of(output):
+            output.mkdir(parents=True, exist_ok=True)
+        for name in files:
+            told(f"fetching {name}", 1.0, "")
+            client.fetch(offered[name], output / name)
+        told("done", 1.0, "")
+        return scan
 
 
 def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:

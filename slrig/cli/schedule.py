@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Mapping
 from datetime import datetime
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from slrig.cli.options import USUAL_URL, AsJson, KeyFile, Url, client_of
+from slrig.cli.options import AsJson, Service, by_beginning, given, grouped
+from slrig.errors import ScheduleError, ScheduleNotFoundError
+
+if TYPE_CHECKING:
+    from slrig.cli.client import ServiceClient
 
 app = typer.Typer(no_args_is_help=True, help="Work for the rig at set times.")
 
@@ -18,7 +23,9 @@ ScheduleId = Annotated[
 
 
 @app.command()
+@grouped
 def add(
+    *,
     cron: Annotated[
         str, typer.Argument(metavar="CRON", help="Five fields: '30 6 * * mon-fri' is 06:30 on working days.")
     ],
@@ -36,8 +43,7 @@ def add(
         bool, typer.Option("--catch-up/--no-catch-up", help="After a long pause, run once for what was missed.")
     ] = True,
     paused: Annotated[bool, typer.Option("--paused", help="Put it on record without starting it.")] = False,
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    service: Service,
     as_json: AsJson = False,
 ) -> None:
     """Have a service do something by the clock.
@@ -51,23 +57,22 @@ def add(
         "catch_up": catch_up,
         "enabled": not paused,
         "options": _options(option or []),
-        **{
-            name: value
-            for name, value in (("label", label), ("grace_s", grace_s), ("retry_s", retry_s))
-            if value is not None
-        },
+        **given(label=label, grace_s=grace_s, retry_s=retry_s),
     }
-    with client_of(url, key_file) as client:
+    with service.client() as client:
         _tell_schedule(client.post("/schedule", request), as_json=as_json)
 
 
 @app.command(name="list")
-def list_schedules(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJson = False) -> None:
+@grouped
+def list_schedules(service: Service, as_json: AsJson = False) -> None:
     """List schedules with the time that each is due next."""
-    with client_of(url, key_file) as client:
+    from slrig.cli.display import print_json, print_table
+
+    with service.client() as client:
         found = client.get("/schedule")
     if as_json:
-        _print_json(found)
+        print_json(found)
         return
     if not found["schedules"]:
         typer.echo("no schedules; add one with: slrig schedule add '30 6 * * mon-fri' verification")
@@ -82,23 +87,26 @@ def list_schedules(url: Url = USUAL_URL, key_file: KeyFile = None, as_json: AsJs
         )
         for each in found["schedules"]
     ]
-    _print_table(("id", "task", "when", "next", "label"), rows)
+    print_table(("id", "task", "when", "next", "label"), rows)
 
 
 @app.command()
+@grouped
 def runs(
+    *,
     schedule: ScheduleId,
     limit: Annotated[int, typer.Option(min=1, max=200, help="How many, from the newest.")] = 20,
-    url: Url = USUAL_URL,
-    key_file: KeyFile = None,
+    service: Service,
     as_json: AsJson = False,
 ) -> None:
     """List what became of a schedule's due times, from new to old."""
-    with client_of(url, key_file) as client:
+    from slrig.cli.display import print_json, print_table
+
+    with service.client() as client:
         chosen = _chosen(client, schedule)
         found = client.get(f"{chosen['links']['runs']}?limit={limit}")
     if as_json:
-        _print_json(found)
+        print_json(found)
         return
     if not found["runs"]:
         typer.echo("nothing was due yet")
@@ -111,47 +119,47 @@ def runs(
         )
         for run in found["runs"]
     ]
-    _print_table((f"due ({chosen['time_zone']})", "what became of it", "why"), rows)
+    print_table((f"due ({chosen['time_zone']})", "what became of it", "why"), rows)
 
 
 @app.command()
-def pause(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+@grouped
+def pause(schedule: ScheduleId, service: Service) -> None:
     """Let nothing become due until the schedule is resumed."""
-    with client_of(url, key_file) as client:
+    with service.client() as client:
         client.post(f"{_path(client, schedule)}/pause", None)
     typer.echo("paused")
 
 
 @app.command()
-def resume(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+@grouped
+def resume(schedule: ScheduleId, service: Service) -> None:
     """Go on after a pause."""
-    with client_of(url, key_file) as client:
-        _tell_schedule(client.post(f"{_path(client, schedule)}/resume", None), as_json=False)
+    with service.client() as client:
+        _tell_schedule(client.post(f"{_path(client, schedule)}/resume", None))
 
 
 @app.command()
-def cancel(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+@grouped
+def cancel(schedule: ScheduleId, service: Service) -> None:
     """Have the run under way end early. The schedule stays as it is."""
-    with client_of(url, key_file) as client:
+    with service.client() as client:
         client.post(f"{_path(client, schedule)}/cancel", None)
     typer.echo("the run was asked to end")
 
 
 @app.command()
-def remove(schedule: ScheduleId, url: Url = USUAL_URL, key_file: KeyFile = None) -> None:
+@grouped
+def remove(schedule: ScheduleId, service: Service) -> None:
     """Forget a schedule and its runs."""
-    with client_of(url, key_file) as client:
+    with service.client() as client:
         client.delete_at(_path(client, schedule))
     typer.echo("removed")
 
 
-def _options(given: list[str]) -> dict[str, Any]:
-    import json
-
-    from slrig.errors import ScheduleError
-
+def _options(told: list[str]) -> dict[str, Any]:
     options: dict[str, Any] = {}
-    for each in given:
+    for each in told:
         name, equals, value = each.partition("=")
         if not name or not equals:
             message = f"--option: expected name=value, found '{each}'"
@@ -163,28 +171,20 @@ def _options(given: list[str]) -> dict[str, Any]:
     return options
 
 
-def _path(client: Any, beginning: str) -> str:
+def _path(client: ServiceClient, beginning: str) -> str:
     return str(_chosen(client, beginning)["links"]["self"])
 
 
-def _chosen(client: Any, beginning: str) -> Mapping[str, Any]:
+def _chosen(client: ServiceClient, beginning: str) -> Mapping[str, Any]:
     """The schedule whose id begins so."""
-    from slrig.errors import ScheduleNotFoundError
-
-    schedules: list[Mapping[str, Any]] = client.get("/schedule")["schedules"]
-    ids = [each["id"] for each in schedules]
-    found = [each for each in schedules if each["id"].startswith(beginning)]
-    if len(found) == 1:
-        return found[0]
-    what = "no schedule's" if not found else f"{len(found)} schedules'"
-    known = ", ".join(each[:8] for each in ids) or "none"
-    message = f"'{beginning}' is the beginning of {what} id; there are: {known}"
-    raise ScheduleNotFoundError(message)
+    return by_beginning(client.get("/schedule")["schedules"], beginning, "schedule", ScheduleNotFoundError)
 
 
-def _tell_schedule(schedule: Mapping[str, Any], *, as_json: bool) -> None:
+def _tell_schedule(schedule: Mapping[str, Any], *, as_json: bool = False) -> None:
     if as_json:
-        _print_json(schedule)
+        from slrig.cli.display import print_json
+
+        print_json(schedule)
         return
     state = "" if schedule["enabled"] else ", paused"
     typer.echo(f"{schedule['id']}: {schedule['task']} at '{schedule['cron']}' in {schedule['time_zone']}{state}")
@@ -195,20 +195,3 @@ def _tell_schedule(schedule: Mapping[str, Any], *, as_json: bool) -> None:
 def _clock(stamp: str) -> str:
     """A time as the service states it: by the clocks of the schedule's own time zone."""
     return f"{datetime.fromisoformat(stamp):%a %Y-%m-%d %H:%M}"
-
-
-def _print_table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(*heads, box=None, pad_edge=False, header_style="bold")
-    for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
-
-
-def _print_json(document: Mapping[str, Any]) -> None:
-    import json
-
-    typer.echo(json.dumps(document, indent=1))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 
@@ -17,7 +15,7 @@ from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import Health, HealthState, judged
 from slrig.calibration.health.verification import Verification
-from slrig.cli.display import progress_shown
+from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import CalibrationError
@@ -50,7 +48,7 @@ def verify(source: Path, board: Board, calibration_file: Path | None, *, positio
     health = judged([verification])
     if as_json:
         found = {"state": str(health.state), "reasons": list(health.reasons), "remedy": health.remedy}
-        typer.echo(json.dumps({**found, **verification.document()}, indent=1, ensure_ascii=False))
+        print_json({**found, **verification.document()})
     else:
         tell(verification, health, Console())
     return health.state is not HealthState.STALE

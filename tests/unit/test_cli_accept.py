@@ -18,8 +18,8 @@ from slrig.accept.scene import scripted_config
 from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
-from slrig.cli.accept import Asked, moving, placed_by_hand
-from slrig.cli.acceptance_command import accept
+from slrig.cli.accept import moving, placed_by_hand, plan_for
+from slrig.cli.acceptance_command import Asked, accept
 from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
@@ -35,7 +35,7 @@ app.command()(accept)
 @pytest.fixture(scope="module")
 def plan() -> AcceptancePlan:
     with open_rig(read_rig(BALL_BAR)) as rig:
-        return Asked().plan(rig)
+        return plan_for(Asked(), rig)
 
 
 def test_a_rendered_rig_needs_no_artefacts_and_states_exact_ones(plan: AcceptancePlan) -> None:
@@ -49,18 +49,18 @@ def test_metal_needs_the_certificates() -> None:
     with open_rig(read_rig(BALL_BAR)) as rig:
         metal = replace(rig, head=None)
         with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
-            Asked().plan(metal)
+            plan_for(Asked(), metal)
         given = Asked(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
         with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
-            given.plan(metal)
+            plan_for(given, metal)
         certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
-        assert certain.plan(metal).limits.spacing_mm == 0.05
-        assert not certain.plan(metal).rendered
+        assert plan_for(certain, metal).limits.spacing_mm == 0.05
+        assert not plan_for(certain, metal).rendered
 
 
 def test_a_given_volume_is_used() -> None:
     with open_rig(read_rig(BALL_BAR)) as rig:
-        plan = Asked(volume_mm=(-50, -40, -25, 50, 40, 25)).plan(rig)
+        plan = plan_for(Asked(volume_mm=(-50, -40, -25, 50, 40, 25)), rig)
     assert plan.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
 
 

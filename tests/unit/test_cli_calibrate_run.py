@@ -9,14 +9,19 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from slrig.cli import calibrate
 from slrig.cli.calibrate_walk import Walk, opened
 from slrig.cli.commands import INTERRUPTED, app
+from slrig.cli.options import Service
 from tests.unit.calibrate.solved import BOARD
 from tests.unit.calibrate_command import refused, run
 from tests.unit.calibration_desk import ID, Desk, client_of
 
 BOARD_OPTIONS = ["--board", "chessboard", "--corners", "11x8", "--square-mm", "12"]
+
+
+@pytest.fixture(autouse=True)
+def _without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", lambda _s: None)
 
 
 class Hand:
@@ -39,7 +44,7 @@ def walked(desk: Desk, *answers: str | BaseException) -> tuple[str, Hand]:
     stream, hand = io.StringIO(), Hand(*answers)
     with client_of(desk) as client:
         session = opened(client, BOARD, label=None)
-        Walk(client, session, Console(file=stream, width=120), ask=hand, pause=lambda _s: None).by_hand()
+        Walk(client, session, Console(file=stream, width=120), ask=hand).by_hand()
     return stream.getvalue(), hand
 
 
@@ -117,7 +122,7 @@ def test_ctrl_c_cancels_the_pose_under_way_and_keeps_the_session(monkeypatch: py
         raise KeyboardInterrupt
 
     monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", interrupted)
-    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(Service, "client", lambda _self: client_of(desk))
     result = CliRunner().invoke(app, ["calibrate", "run", *BOARD_OPTIONS], input="\n")
     assert result.exit_code == INTERRUPTED
     assert desk.asked[-1][:2] == ("POST", f"/calibration/{ID}/pose/1/cancel")
@@ -126,17 +131,17 @@ def test_ctrl_c_cancels_the_pose_under_way_and_keeps_the_session(monkeypatch: py
 
 def test_session_is_taken_up_by_the_beginning_of_its_id(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
-    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(Service, "client", lambda _self: client_of(desk))
     result = CliRunner().invoke(app, ["calibrate", "run", "--id", ID[:6]], input="q\n")
     assert result.exit_code == 0, result.output
     assert desk.asked == []
     assert BOARD.title in result.stdout
-    assert f"'999' is the beginning of no calibration's id. There are: {ID[:8]}" in refused(run("run", "--id", "999"))
+    assert f"'999' is the beginning of no calibration's id; there are: {ID[:8]}" in refused(run("run", "--id", "999"))
 
 
 def test_walk_without_a_board_takes_the_usual_one_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
-    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(Service, "client", lambda _self: client_of(desk))
     result = run("run")
     assert result.exit_code == 0, result.output
     board = desk.asked[0][2]["board"]
@@ -146,8 +151,7 @@ def test_walk_without_a_board_takes_the_usual_one_and_says_so(monkeypatch: pytes
 
 def test_script_shoots_every_position_then_solves(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk()
-    monkeypatch.setattr("slrig.cli.calibrate_walk.time.sleep", lambda _s: None)
-    monkeypatch.setattr(calibrate, "client_of", lambda _url, _key: client_of(desk))
+    monkeypatch.setattr(Service, "client", lambda _self: client_of(desk))
     result = run("run", *BOARD_OPTIONS, "--scripted", "--position", "pose 1", "--activate", "--exposure-s", "0.02",
                  "--board-shape", "bowed")  # fmt: skip
     assert result.exit_code == 0, result.output

@@ -12,8 +12,8 @@ import pytest
 
 from slrig.api.calibration_schemas import ComparisonBody
 from slrig.bundle import write_calibration, write_opencv_calibration
-from slrig.cli import calibrate
 from slrig.cli.client import ServiceClient
+from slrig.cli.options import Service
 from tests.unit.calibrate.solved import solved_result
 from tests.unit.calibrate_command import refused, run
 from tests.unit.calibration_desk import ID, Desk
@@ -70,9 +70,9 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
         return httpx2.Response(200, json=first)
 
     monkeypatch.setattr(
-        calibrate,
-        "client_of",
-        lambda _url, _key: ServiceClient("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
+        Service,
+        "client",
+        lambda _self: ServiceClient("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
     )
     return asked
 

@@ -7,7 +7,6 @@ import re
 import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
 
@@ -17,9 +16,9 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from slrig.cli import schedule
 from slrig.cli.client import ServiceClient
 from slrig.cli.commands import app
+from slrig.cli.options import Service
 from tests.unit.api.conftest import KEY, ServedBench
 from tests.unit.calibrate_command import refused
 
@@ -44,10 +43,10 @@ def reached(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
         kept = {"content-type": told.headers.get("content-type", "")}
         return httpx2.Response(told.status_code, content=told.content, headers=kept)
 
-    def client(_url: str, _key_file: Path | None) -> ServiceClient:
+    def client(_service: Service) -> ServiceClient:
         return ServiceClient("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
 
-    monkeypatch.setattr(schedule, "client_of", client)
+    monkeypatch.setattr(Service, "client", client)
     yield
     for each in kept(service):
         service.delete(each["links"]["self"])

@@ -10,7 +10,7 @@ from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.artwork import artwork, charuco_board
 from slrig.calibration.boards.lattice import equivalent_views, turned_half
 from slrig.calibration.observations import BoardView
-from slrig.cli.board_options import board_option
+from slrig.cli.boards import board_option
 from slrig.errors import CalibrationError
 from tests.unit.calibration.boards.painted import board_points
 
@@ -105,10 +105,9 @@ def test_the_options_of_a_command_describe_a_board() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("chess", "11x8", 12.0), "charuco, chessboard or circles"),
         (("chessboard", "11", 12.0), "COLUMNSxROWS"),
         (("chessboard", "11x8", 0.0), "--square-mm"),
-        (("chess", "11", -1.0), r"--board.*--corners.*--square-mm"),
+        (("chessboard", "11", -1.0), r"--corners.*--square-mm"),
         (("chessboard", "2x8", 12.0), "3 to 60"),
         (("chessboard", "11x8", 12.0, 9.0), "belong to a ChArUco board"),
         (("charuco", "11x8", 12.0, 13.0), "less than the square's 12 mm"),

@@ -13,7 +13,7 @@ import pytest
 from slrig.calibration.board import Board, BoardKind
 from slrig.calibration.boards.detection import find_board
 from slrig.calibration.boards.printing import FIT, PAGES_MM, board_pdf, board_svg
-from slrig.cli.calibrate_board import write_board
+from slrig.cli.boards import write_board
 from slrig.errors import CalibrationError
 from tests.unit.calibration.boards.painted import board_points
 
