@@ -225,7 +225,7 @@ class PlainErrorsToProblems:
             elif message["type"] == "http.response.body":
                 body.extend(message.get("body", b""))
                 if not message.get("more_body", False):
-                    await _as_problem(refused, body)(scope, receive, send)
+                    await _as_problem(refused, bytes(body))(scope, receive, send)
 
         await self._app(scope, receive, rewrite)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -105,9 +106,7 @@ def device_figures(result: CalibrationResult) -> tuple[DeviceFigures, ...]:
             for each, number, sigma in zip(_INNER, numbers, sigmas, strict=False)
             if each not in LENS_TERMS or each in terms
         }
-        x, y, z = (
-            _propagated([device], covariance, lambda one, axis=axis: float(one[0][1][axis])) for axis in range(3)
-        )  # type: ignore[misc]
+        x, y, z = (_propagated([device], covariance, partial(_centre_mm, axis)) for axis in range(3))
         found.append(DeviceFigures(name, device.size, terms, values, (x, y, z), result.solution.residuals[name]))
     return tuple(found)
 
@@ -162,6 +161,11 @@ def _placed(calibration: Calibration) -> list[tuple[str, Pinhole, slice]]:
 
 Posed = tuple[FloatArray, FloatArray]
 """A device's rotation, world to device, and its centre in the world, mm."""
+
+
+def _centre_mm(axis: int, devices: Sequence[Posed]) -> float:
+    """One coordinate of the first device's centre in the world."""
+    return float(devices[0][1][axis])
 
 
 def _propagated(

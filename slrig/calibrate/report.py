@@ -14,10 +14,9 @@ from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibrate.words import rounded
 from slrig.calibration.board import Board
 from slrig.calibration.judging.verdict import board_words
-from slrig.calibration.poses.coverage import device_title
 from slrig.calibration.poses.light_view import lit_board
 from slrig.calibration.poses.pictures import pose_picture
-from slrig.calibration.solution import PROJECTOR
+from slrig.calibration.solution import PROJECTOR, device_title
 from slrig.model import Pixels
 from slrig.reports.drawing import legend
 from slrig.reports.page import filled, jpeg_uri

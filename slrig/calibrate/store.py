@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from uuid import UUID
 
 import numpy as np
@@ -232,7 +232,7 @@ def reading_bytes(pose: ReadPose) -> bytes:
         f"{part}/{camera}/{field}": np.asarray(value)
         for part, cameras in parts
         for camera, found in cameras.items()
-        for field, value in asdict(found).items()
+        for field, value in asdict(cast("Any", found)).items()
     }
     buffer = io.BytesIO()
     np.savez(buffer, name=np.array(pose.observation.name), **arrays)  # type: ignore[arg-type] # none is allow_pickle

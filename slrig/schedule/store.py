@@ -203,7 +203,7 @@ class ScheduleStore:
         return self._closed(query, RunState.SKIPPED, now, reason)
 
     def _closed(
-        self, query: Select[tuple[RunRow]], state: RunState, now: datetime, reason: Callable[[RunRow], str]
+        self, query: Select[RunRow], state: RunState, now: datetime, reason: Callable[[RunRow], str]
     ) -> Sequence[Run]:
         with self.database.changing() as session:
             rows = list(session.scalars(query))

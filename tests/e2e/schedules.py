@@ -43,10 +43,14 @@ def at_once(caller: Caller, service: ServiceProcess, schedule: dict[str, Any]) -
     minute = datetime.now(UTC).replace(second=0, microsecond=0)
     _rewrite(service, schedule, f"{minute:%M %H %d %m} *", minute)
     caller.post(schedule["links"]["resume"], 200)
-    runs = lambda: caller.get(schedule["links"]["runs"])["runs"]  # noqa: E731 - of one line
-    awaited(lambda: any(datetime.fromisoformat(run["due"]) == minute for run in runs()), "the run")
+    awaited(lambda: _is_due(caller, schedule, minute), "the run")
     caller.post(schedule["links"]["pause"], 200)
     _rewrite(service, schedule, "* * * * *", datetime.now(UTC).replace(second=0, microsecond=0) + timedelta(minutes=1))
+
+
+def _is_due(caller: Caller, schedule: dict[str, Any], at: datetime) -> bool:
+    runs = caller.get(schedule["links"]["runs"])["runs"]
+    return any(datetime.fromisoformat(run["due"]) == at for run in runs)
 
 
 def _rewrite(service: ServiceProcess, schedule: dict[str, Any], cron: str, due: datetime) -> None:

@@ -39,9 +39,7 @@ def test_given_key_that_protects_nothing_is_refused(tmp_path: Path) -> None:
 
 
 def test_openapi_document_in_config_is_up_to_date() -> None:
-    assert OPENAPI.read_text(encoding="utf-8") == text(bare_app()), (
-        "run: python -m slrig.api > config/openapi.json"
-    )
+    assert OPENAPI.read_text(encoding="utf-8") == text(bare_app()), "run: python -m slrig.api > config/openapi.json"
 
 
 def test_every_refusal_is_documented_as_a_problem() -> None:
