@@ -28,7 +28,7 @@ from slrig.errors import (
 )
 from slrig.failure import disk_errors, failure_of
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
+from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.rig_jobs import RigJobs
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
@@ -47,10 +47,7 @@ class Calibrations:
 
     jobs : those of poses and solves. `poses` shoots, `solves` solves, `register` has the records.
 
-    Raises
-    ------
-    StorageError
-        The folder cannot be read, or the active calibration is gone.
+    Raises StorageError if the folder cannot be read, or the active calibration is gone.
     """
 
     def __init__(
@@ -135,23 +132,14 @@ class Calibrations:
 
     def open(self, board: Board, *, label: str | None = None, patterns: PatternPlan = USUAL_PATTERNS) -> SessionRecord:
         """Open a session for a board. Touches no device. Raises StorageError."""
-        with self.register.lock:
-            record = SessionRecord(
-                self.register.next_number(), uuid4(), utc_now(), self._rig_name, label, board, patterns
-            )
-            self.register.add(record)
+        record = self.register.add(uuid4(), self._rig_name, label, board=board, patterns=patterns)
         self.poses.warm()
         return record
 
     def submit(self, text: bytes, ending: str, *, label: str | None = None) -> SessionRecord:
         """Make a calibration of a file's text: ours, or OpenCV's. `ending` is that of one of `EXPORTS`.
 
-        Raises
-        ------
-        CalibrationError
-            The text is no calibration.
-        StorageError
-            The disk refused.
+        Raises CalibrationError if the text is no calibration, StorageError if the disk refused.
         """
         session_id = uuid4()
         staged = self.store.stage_solve(session_id)
@@ -166,17 +154,10 @@ class Calibrations:
                 raise CalibrationError(message) from error
             source.unlink()
             write_calibration(staged / CALIBRATION, calibration)
+            cameras = {name: device.size for name, device in calibration.cameras.items()}
+            projector = None if calibration.projector is None else calibration.projector.size
             with self.register.lock:
-                record = SessionRecord(
-                    self.register.next_number(),
-                    session_id,
-                    utc_now(),
-                    self._rig_name,
-                    label,
-                    cameras={name: device.size for name, device in calibration.cameras.items()},
-                    projector=None if calibration.projector is None else calibration.projector.size,
-                )
-                self.register.add(record)
+                self.register.add(session_id, self._rig_name, label, cameras=cameras, projector=projector)
                 try:
                     self.store.commit_solve(session_id, 1, staged)
                     self.register.change(session_id, state=SessionState.SOLVED, solve=1)
@@ -190,14 +171,8 @@ class Calibrations:
     def activate(self, session_id: UUID) -> SessionRecord:
         """Scan with what this session's last solve gave, from the next scan on, and after a restart.
 
-        Raises
-        ------
-        CalibrationNotFoundError, CalibrationStateError
-            There is no such calibration, or it was never solved.
-        CalibrationError
-            It is for other devices than the rig has.
-        StorageError
-            The disk refused.
+        Raises as `calibration` does, CalibrationError also if it is for other devices than the rig has, and
+        StorageError.
         """
         with self.register.lock:
             record = self.register.get(session_id)
@@ -230,12 +205,7 @@ class Calibrations:
     def delete(self, session_id: UUID) -> None:
         """Remove a calibration with all its poses.
 
-        Raises
-        ------
-        CalibrationNotFoundError
-            There is no such calibration.
-        CalibrationStateError
-            It is in use, or something is under way in it.
+        Raises CalibrationNotFoundError, and CalibrationStateError if it is in use or something is under way in it.
         """
         with self.register.lock:
             record = self.register.get(session_id)
@@ -252,7 +222,11 @@ class Calibrations:
         _log.info("calibration deleted", calibration=str(session_id))
 
     def calibration(self, session_id: UUID) -> Calibration:
-        """Return what the last solve gave. Raises CalibrationNotFoundError, CalibrationStateError, CalibrationError."""
+        """Return what the last solve gave.
+
+        Raises CalibrationNotFoundError, CalibrationStateError if it was never solved, CalibrationError if it cannot be
+        read.
+        """
         record = self.register.get(session_id)
         if not record.solve:
             message = (
@@ -287,12 +261,8 @@ class Calibrations:
     def coverage_picture(self, session_id: UUID, device: str | None) -> bytes:
         """Return a PNG of what a device has seen of the board so far; None means the first camera.
 
-        Raises
-        ------
-        CalibrationNotFoundError, ArtefactNotReadyError
-            There is no such session, or it has no pose yet.
-        CameraNotFoundError
-            It has no such device.
+        Raises CalibrationNotFoundError, ArtefactNotReadyError if it has no pose yet, and CameraNotFoundError if it has
+        no such device.
         """
         record = self.register.get(session_id)
         if not record.cameras or record.board is None:

@@ -9,7 +9,7 @@ import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
@@ -21,15 +21,9 @@ from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, pos
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solving import ReadPose
 from slrig.calibrate.store import ANSWER, BUNDLE, READING, picture_name, reading_bytes
-from slrig.calibrate.tools import CalibrationTools, Judgement, Standing, setting_of
+from slrig.calibrate.tools import CalibrationTools, Judgement, setting_of
 from slrig.devices import Rig
-from slrig.errors import (
-    CalibrationError,
-    CalibrationStateError,
-    PoseRefusedError,
-    SlrigError,
-    UnsupportedByDeviceError,
-)
+from slrig.errors import CalibrationError, CalibrationStateError, PoseRefusedError, SlrigError, UnsupportedByDeviceError
 from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
@@ -68,13 +62,14 @@ class PoseDesk:
 
     def warm(self) -> None:
         """Load, on a thread of its own, what reading a pose needs."""
-        threading.Thread(target=self._warm, name="slrig-warm", daemon=True).start()
 
-    def _warm(self) -> None:
-        try:
-            self.tools.warm()
-        except Exception:  # noqa: BLE001 - the first pose will tell
-            _log.exception("what reads poses cannot be loaded")
+        def load() -> None:
+            try:
+                self.tools.warm()
+            except Exception:  # noqa: BLE001 - the first pose will tell
+                _log.exception("what reads poses cannot be loaded")
+
+        threading.Thread(target=load, name="slrig-warm", daemon=True).start()
 
     def shoot(
         self,
@@ -97,9 +92,7 @@ class PoseDesk:
             The rig has no positioner, or not that position, or a camera cannot expose so long.
         CalibrationError
             The rig is not the one of the session's other poses.
-        StorageError
-            There is too little room, or the disk refused.
-        RigBusyError, QueueFullError, DeviceError
+        RigBusyError, QueueFullError, DeviceError, StorageError
             As a scan.
         """
         with self.register.lock:
@@ -110,22 +103,21 @@ class PoseDesk:
                 raise CalibrationStateError(message)
             status = self.queue.status()
             place, name = _position(request.position, status.facts)
-            scan = _scan(record, request.exposure_s)
+            scan = ScanPlan(patterns=record.patterns, exposure_s=request.exposure_s)
             if status.facts is not None:
                 _require_same_rig(record, status.facts)
                 self.folder.require_space(2 * check_plan(scan, status.facts) + self.spare_bytes)
             number = record.latest_pose + 1
-            job_id = uuid4()
-            pose = PoseRecord(number, job_id, JobState.QUEUED, utc_now(), place, name, request.exposure_s)
+            pose = PoseRecord(number, uuid4(), JobState.QUEUED, utc_now(), place, name, request.exposure_s)
 
             def begun() -> None:
                 self.register.change(session_id, latest_pose=number)
                 self.register.jobs.create(
-                    pose.plan, rig=status.rig, label=None, key=key, job_id=job_id, kind=JobKind.POSE, parent=session_id
+                    pose.plan, rig=status.rig, label=None, key=key, job_id=pose.id, kind=JobKind.POSE, parent=session_id
                 )
 
             parts = self._parts(session_id, pose, scan)
-            self.work.submit(job_id, parts, holder=holder or _holder(session_id, number), wait=wait, record=begun)
+            self.work.submit(pose.id, parts, holder=holder or _holder(session_id, number), wait=wait, record=begun)
             return self.register.pose(session_id, number)
 
     def take_up(self, session_id: UUID, job: JobRecord) -> None:
@@ -133,7 +125,8 @@ class PoseDesk:
         more, one that had the rig was interrupted.
         """
         pose = pose_of(job)
-        parts = self._parts(session_id, pose, _scan(self.register.get(session_id), pose.exposure_s))
+        scan = ScanPlan(patterns=self.register.get(session_id).patterns, exposure_s=pose.exposure_s)
+        parts = self._parts(session_id, pose, scan)
         whole = (self.folder.staging(job.id) / BUNDLE).is_dir()
         self.work.take_up(job, parts, holder=_holder(session_id, pose.number), resumes=whole)
 
@@ -153,13 +146,12 @@ class PoseDesk:
         """
         with self.register.lock:
             facts = self.queue.status().facts
-            asked = positions or range(len(facts.positions) if facts is not None else 0)
-            indices = [place for place, _ in (_position(each, facts) for each in asked) if place is not None]
-            if not indices:
-                _position(0, facts)
-            first = self.shoot(session_id, replace(request, position=indices[0]), wait=wait, key=key)
-            self._set_script(session_id, *indices[1:])
-            return first
+            # Of a rig without positions, the first is asked for, and refused.
+            asked = positions or range(max(len(facts.positions) if facts is not None else 0, 1))
+            first, *others = [place for each in asked if (place := _position(each, facts)[0]) is not None]
+            pose = self.shoot(session_id, replace(request, position=first), wait=wait, key=key)
+            self._set_script(session_id, *others)
+            return pose
 
     def cancel(self, session_id: UUID, number: int) -> PoseRecord:
         """Ask a pose to end early, and the script that it belongs to. Returns at once; a pose that is over stays so."""
@@ -245,9 +237,11 @@ class PoseDesk:
             if reading is not None and not judged.refusals:
                 write_durably(staged / READING, reading_bytes(reading))
         self.register.store.commit_pose(session_id, pose.number, staged)
-        # An accepted pose opens a solved session again; the earlier result stays.
-        state = {} if judged.refusals else {"state": SessionState.OPEN}
-        self.register.change(session_id, must_last=False, **_noted(judged.standing), **state)
+        noted = {} if judged.standing is None else asdict(judged.standing)
+        if not judged.refusals:
+            # A solved session is open again; the earlier result stays.
+            noted["state"] = SessionState.OPEN
+        self.register.change(session_id, must_last=False, **noted)
         seconds = round(time.monotonic() - since_s, 3)
         refused = bool(judged.refusals)
         _log.info("pose read", calibration=str(session_id), pose=pose.number, refused=refused, seconds=seconds)
@@ -257,9 +251,9 @@ class PoseDesk:
         """Bring coverage and advice up to date; they are a help, and nothing fails for want of them."""
         try:
             record = self.register.get(session_id)
-            if record.board is not None and record.cameras:
+            if record.cameras:
                 standing = self.tools.survey(self.register.store.readings(record), setting_of(record))
-                self.register.change(session_id, must_last=False, **_noted(standing))
+                self.register.change(session_id, must_last=False, **asdict(standing))
         except Exception:  # noqa: BLE001 - see above
             _log.exception("coverage could not be told", calibration=str(session_id))
 
@@ -287,11 +281,6 @@ def outcome_of(answer: Mapping[str, Any], *, seconds: float | None = None) -> Ou
     return Outcome({"answer": answer["answer"], "seconds": seconds}, fault)
 
 
-def _noted(standing: Standing | None) -> Mapping[str, Any]:
-    """The fields of a session that say where it stands."""
-    return {} if standing is None else {"coverage": standing.coverage, "next_move": standing.next_move}
-
-
 def _require_same_rig(record: SessionRecord, facts: RigFacts) -> None:
     """Raise CalibrationError unless the rig's devices are those of the session's poses."""
     projector = _projector(record, facts)
@@ -312,11 +301,6 @@ def _projector(record: SessionRecord, facts: RigFacts) -> Size | None:
 def _devices(cameras: Mapping[str, Size], projector: Size | None) -> str:
     had = ", ".join(f"{name} {size}" for name, size in cameras.items())
     return had if projector is None else f"{had} and a projector of {projector}"
-
-
-def _scan(record: SessionRecord, exposure_s: float | None) -> ScanPlan:
-    """What a pose is lit with."""
-    return ScanPlan(patterns=record.patterns, exposure_s=exposure_s)
 
 
 def _holder(session_id: UUID, number: int) -> Holder:

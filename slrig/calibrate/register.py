@@ -13,6 +13,7 @@ import structlog
 from slrig.calibrate.records import PoseRecord, SessionRecord, with_jobs
 from slrig.calibrate.store import CalibrationStore
 from slrig.errors import CalibrationNotFoundError, StorageError
+from slrig.jobs.records import utc_now
 from slrig.jobs.store import JobStore
 
 _log = structlog.get_logger(__name__)
@@ -52,16 +53,14 @@ class CalibrationRegister:
             raise CalibrationNotFoundError(message)
         return poses[number]
 
-    def next_number(self) -> int:
-        """Return the number of the next calibration."""
+    def add(self, session_id: UUID, rig: str, label: str | None, **fields: Any) -> SessionRecord:
+        """Put a new calibration on record, and return it. Raises StorageError."""
         with self.lock:
-            return max((session.number for session in self._sessions.values()), default=0) + 1
-
-    def add(self, session: SessionRecord) -> None:
-        """Put a new calibration on record. Raises StorageError."""
-        with self.lock:
+            number = max((session.number for session in self._sessions.values()), default=0) + 1
+            session = SessionRecord(number, session_id, utc_now(), rig, label, **fields)
             self.store.create(session)
-            self._sessions[session.id] = session
+            self._sessions[session_id] = session
+            return session
 
     def remove(self, session_id: UUID) -> None:
         """Forget a calibration with its jobs, and remove its files. Raises StorageError."""
@@ -76,12 +75,7 @@ class CalibrationRegister:
         Where `must_last` is False, a disk that refuses leaves the change in memory alone, to be saved with the next:
         the way something ended is not lost because the disk is full.
 
-        Raises
-        ------
-        CalibrationNotFoundError
-            It was deleted.
-        StorageError
-            The disk refused; nothing has changed.
+        Raises CalibrationNotFoundError if it was deleted, StorageError if the disk refused and nothing has changed.
         """
         with self.lock:
             before = self._session(session_id)

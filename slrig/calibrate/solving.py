@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from uuid import uuid4
 
 from slrig.calibration.board import Board, BoardShape
@@ -55,7 +54,6 @@ def solve_poses(
     progress: Progress = lambda _stage, _fraction, _detail: None,
     earlier: Calibration | None = None,
     board_shape: BoardShape = BoardShape.AUTO,
-    clock: Callable[[], datetime] = utc_now,
 ) -> CalibrationResult:
     """Solve the poses, say how far the result may be trusted, and give it an identity.
 
@@ -89,7 +87,7 @@ def solve_poses(
     covered = coverage(used, board, sizes)
     solved = Solved(
         id=uuid4().hex[:12],
-        solved_at=clock().astimezone(UTC).isoformat(timespec="seconds"),
+        solved_at=utc_now().isoformat(timespec="seconds"),
         covariance=solution.covariance,
         volume_mm=expected.volume_mm,
         expected_error_mm=expected.point_mm,
