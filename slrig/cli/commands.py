@@ -247,11 +247,18 @@ def init(
 
     Asks what it cannot know. Checks the file by the drivers before it is written; opens no device.
     """
-    from slrig.cli.init import Asked
     from slrig.cli.init import init as write_rig_file
 
-    asked = Asked(name, camera or (), projector, settings or (), exposure_s)
-    write_rig_file(asked, output, yes=yes, force=force)
+    write_rig_file(
+        output,
+        name=name,
+        cameras=camera or (),
+        projector=projector,
+        settings=settings or (),
+        exposure_s=exposure_s,
+        yes=yes,
+        force=force,
+    )
 
 
 @app.command()

@@ -1,70 +1,101 @@
-"""`slrig init`: from what is plugged in to a rig file. What it cannot know it asks, or takes as options."""
+"""`slrig init`: from what is plugged in to a rig file, which the models of its drivers check before it is written.
+
+What it cannot know it asks, or takes as options.
+"""
 
 from __future__ import annotations
 
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import typer
+from pydantic import ValidationError
 
+from slrig.bundle.faults import explain, keys_of
 from slrig.bundle.storage import write_file
-from slrig.cli.rig_draft import Draft, Part, device_key, failure_of, rig_text, split_assignment, split_device, typed
+from slrig.cli.driver_options import explained, option
+from slrig.config import rig_of
 from slrig.devices import FoundDevice
 from slrig.discovery import Findings, found_devices
-from slrig.doctor.rig_file import refuse_existing
+from slrig.doctor.rig_file import refuse_existing, toml_value
 from slrig.errors import ConfigError, DeviceGoneError
-from slrig.option_models import kinds_of
+from slrig.option_models import kinds_of, option_model
 
 Answer = TypeVar("Answer")
 
 _NAMES = {1: ("camera",), 2: ("left", "right")}
+_KINDS = {bool: "boolean", int: "integer", float: "number", str: "string", list: "array", dict: "object"}
+_WIDTH, _WIDEST = 80, 100
+"""Columns of the file, and the most of what is said."""
+_USUAL_EXPOSURE_S = 0.0167
+"""A period of 60 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What the options of the command say. cameras : [NAME=]DRIVER[:DEVICE]; settings : TABLE.KEY=VALUE."""
+class Part:
+    """A table of the rig file: the projector's or a camera's. label : what the device is, for people."""
 
+    kind: str
+    driver: str
+    label: str
+    options: dict[str, Any]
     name: str
-    cameras: Sequence[str]
-    projector: str | None
-    settings: Sequence[str]
-    exposure_s: float | None
+
+    @property
+    def title(self) -> str:
+        """The device in words."""
+        return f"{'camera ' + repr(self.name) if self.kind == 'camera' else 'the projector'} (driver {self.driver})"
 
 
-def init(asked: Asked, output: Path, *, yes: bool, force: bool) -> None:
+def init(
+    output: Path,
+    *,
+    name: str,
+    cameras: Sequence[str],
+    projector: str | None,
+    settings: Sequence[str],
+    exposure_s: float | None,
+    yes: bool,
+    force: bool,
+) -> None:
     """Write a rig file for what is plugged in or named, and say what comes next.
 
-    Raises
-    ------
-    ConfigError
-        A file would be overwritten, an answer is wrong, or something is not known and there is nobody to ask.
-    DeviceGoneError
-        No camera or no projector is plugged in, and none is named.
-    SlrigError
-        A named driver is not installed or broken, or the disk refused.
+    cameras : [NAME=]DRIVER[:DEVICE]; projector : DRIVER[:DEVICE]; settings : TABLE.KEY=VALUE.
+
+    Raises ConfigError where a file would be overwritten, an answer is wrong, or something is not known and there is
+    nobody to ask; DeviceGoneError where no camera or no projector is plugged in, and none is named; another SlrigError
+    where a named driver is not installed or broken, or the disk refused.
     """
     refuse_existing(output, force=force)
     ask = not yes and terminal()
     found = found_devices()
-    cameras = _named_cameras(asked.cameras, found) if asked.cameras else None
-    projector = _named("projector", asked.projector, found, "projector") if asked.projector is not None else None
-    offered = {kind: _of_kind(found, kind) for kind in ("camera", "projector", "head")}
-    _refuse_nothing(offered, found, cameras=cameras is not None, projector=projector is not None)
-    if cameras is None:
-        cameras = _chosen_cameras(offered["camera"], ask=ask)
-    if projector is None:
-        projector = _chosen_projector(offered["projector"], ask=ask)
-    draft = Draft(asked.name, projector, cameras, _exposure_s(asked.exposure_s, ask=ask))
-    draft = draft.with_settings([split_assignment(each, draft) for each in asked.settings])
-    for part in draft.parts:
+    named = {
+        "camera": _named_cameras(cameras, found),
+        "projector": [] if projector is None else [_named("projector", projector, found, "projector")],
+    }
+    offered = {
+        kind: [device for device in found.devices if kind in kinds_of(device.driver)]
+        for kind in ("camera", "projector", "head")
+    }
+    lacking = [kind for kind, parts in named.items() if not parts and not offered[kind]]
+    if lacking:
+        raise DeviceGoneError(_nothing_there(lacking, offered, found))
+    shot = named["camera"] or _chosen_cameras(offered["camera"], ask=ask)
+    (lit,) = named["projector"] or [_chosen_projector(offered["projector"], ask=ask)]
+    exposure_s = _exposure_s(exposure_s, ask=ask)
+    parts = {part.name: part for part in (lit, *shot)}
+    for each in settings:
+        _assign(each, parts)
+    for part in (lit, *shot):
         _complete(part, ask=ask)
-    write_file(output, rig_text(draft, output).encode())
-    _tell(draft, output)
+    write_file(output, rig_text(output, name, lit, shot, exposure_s).encode())
+    _tell(lit, shot, output)
 
 
 def terminal() -> bool:
@@ -72,21 +103,21 @@ def terminal() -> bool:
     return sys.stdin.isatty() and sys.stdout.isatty()
 
 
-def _of_kind(found: Findings, kind: str) -> tuple[FoundDevice, ...]:
-    return tuple(device for device in found.devices if kind in kinds_of(device.driver))
-
-
-def _named_cameras(texts: Sequence[str], found: Findings) -> tuple[Part, ...]:
+def _named_cameras(texts: Sequence[str], found: Findings) -> list[Part]:
     parts = []
     for number, text in enumerate(texts):
         name, _, rest = text.partition("=") if "=" in text.partition(":")[0] else ("", "", text)
         parts.append(_named("camera", rest, found, name or _name(number, len(texts))))
-    return tuple(parts)
+    return parts
 
 
 def _named(kind: str, text: str, found: Findings, name: str) -> Part:
-    """What DRIVER:DEVICE means; a driver alone means its only device."""
-    driver, device = split_device(text, kind)
+    """What DRIVER:DEVICE means; a driver alone means its only device. Raises ConfigError, DriverNotFoundError."""
+    driver, _, device = text.partition(":")
+    kinds = kinds_of(driver)
+    if kind not in kinds:
+        message = f"--{kind} {text}: driver '{driver}' opens a {' and a '.join(kinds)}, no {kind}; see slrig devices"
+        raise ConfigError(message)
     devices = [each for each in found.devices if each.driver == driver]
     if not device and len(devices) > 1:
         message = f"--{kind} {text}: {_listed(devices)}; name one of them: --{kind} {driver}:{devices[0].device}"
@@ -96,24 +127,27 @@ def _named(kind: str, text: str, found: Findings, name: str) -> Part:
 
 
 def _part(kind: str, driver: str, device: str, label: str, name: str) -> Part:
-    options: dict[str, Any] = {}
-    if device:
-        key, kinds = device_key(driver)
-        options[key] = typed(device, kinds)
-    return Part(kind, driver, label, options, name)
+    """The table of a device. It is named by the option of which the driver's model says `json_schema_extra={"takes":
+    "device"}`, else by `device`.
+    """
+    if not device:
+        return Part(kind, driver, label, {}, name)
+    known = _properties(driver)
+    key = next((key for key, part in known.items() if part.get("takes") == "device"), "device")
+    return Part(kind, driver, label, {key: typed(device, json_types(known.get(key, {"type": "string"})))}, name)
 
 
-def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> tuple[Part, ...]:
+def _chosen_cameras(offered: Sequence[FoundDevice], *, ask: bool) -> list[Part]:
     chosen = list(offered)
     if ask:
         _offer("Cameras", offered)
         everyone = " ".join(str(number + 1) for number in range(len(offered)))
         _say("Give the numbers of those of the rig, left to right; one that holds several cameras may be given twice.")
         chosen = _ask("Cameras", everyone, lambda text: [_numbered(offered, each) for each in text.split()])
-    return tuple(
+    return [
         _part("camera", each.driver, each.device, each.label, _name(number, len(chosen)))
         for number, each in enumerate(chosen)
-    )
+    ]
 
 
 def _chosen_projector(offered: Sequence[FoundDevice], *, ask: bool) -> Part:
@@ -130,30 +164,45 @@ def _chosen_projector(offered: Sequence[FoundDevice], *, ask: bool) -> Part:
 
 
 def _exposure_s(given: float | None, *, ask: bool) -> float:
-    usual = 0.0167
     if given is None and ask:
         _say("\nOn a video projector, expose for whole refresh periods: 0.0167 s, 0.0333 s and so on at 60 Hz.")
-        return _ask("Exposure, s", str(usual), float)
-    return usual if given is None else given
+        return _ask("Exposure, s", str(_USUAL_EXPOSURE_S), float)
+    return _USUAL_EXPOSURE_S if given is None else given
+
+
+def _assign(text: str, parts: Mapping[str, Part]) -> None:
+    """Set the option of TABLE.KEY=VALUE. Raises ConfigError."""
+    table, dot, rest = text.partition(".")
+    key, equals, value = rest.partition("=")
+    if not (dot and equals and key) or table not in parts:
+        message = (
+            f"--set {text}: expected TABLE.KEY=VALUE with a table of {', '.join(parts)}; for example "
+            f"--set {[*parts][:2][-1]}.gain=1.5"
+        )
+        raise ConfigError(message)
+    part = parts[table]
+    part.options[key] = typed(value, json_types(_properties(part.driver).get(key, {})))
 
 
 def _complete(part: Part, *, ask: bool) -> None:
-    """Ask for what the driver needs and the rig file does not say."""
-    for needed in part.lacking():
+    """Ask for what the driver needs and the rig file does not say. Raises ConfigError where there is nobody to ask."""
+    model = option_model(part.driver)
+    schema = {} if model is None else model.model_json_schema()
+    for name in [each for each in schema.get("required", ()) if each not in part.options]:
+        needed = schema["properties"][name]
+        told = f"{part.title} needs {name}: {explained(option(name, needed, schema, required=True))}"
         if not ask:
-            message = (
-                f"{part.title} needs {needed.name}: {needed.told}\n  say it with --set {part.name}.{needed.name}=VALUE"
-            )
+            message = f"{told}\n  say it with --set {part.name}.{name}=VALUE"
             raise ConfigError(message)
-        _say(f"\n{part.title} needs {needed.name}: {needed.told}")
+        _say(f"\n{told}")
 
-        def answer(text: str, key: str = needed.name, kinds: frozenset[str] = needed.kinds) -> object:
+        def answer(text: str, key: str = name, kinds: Collection[str] = json_types(needed)) -> object:
             value = typed(text, kinds)
             if fault := failure_of(part.driver, {**part.options, key: value}, key):
                 raise ConfigError(fault)
             return value
 
-        part.options[needed.name] = _ask(needed.name, None, answer)
+        part.options[name] = _ask(name, None, answer)
 
 
 def _ask(question: str, usual: str | None, read: Callable[[str], Answer]) -> Answer:
@@ -170,7 +219,7 @@ def _say(text: str) -> None:
     """Print a sentence that fits the terminal."""
     if text.startswith("\n"):
         typer.echo()
-    typer.echo(textwrap.fill(text.strip(), min(shutil.get_terminal_size().columns, 100)))
+    typer.echo(textwrap.fill(text.strip(), min(shutil.get_terminal_size().columns, _WIDEST)))
 
 
 def _numbered(offered: Sequence[FoundDevice], text: str) -> FoundDevice:
@@ -194,38 +243,31 @@ def _listed(devices: Sequence[FoundDevice]) -> str:
     return "".join(f"\n  {each.driver}:{each.device}  {each.label}" for each in devices) + "\n"
 
 
-def _refuse_nothing(
-    offered: Mapping[str, Sequence[FoundDevice]], found: Findings, *, cameras: bool, projector: bool
-) -> None:
-    """Raise DeviceGoneError, with what to check, where a camera or a projector is neither named nor plugged in."""
-    lacking = [
-        kind for kind, named in (("camera", cameras), ("projector", projector)) if not named and not offered[kind]
-    ]
-    if not lacking:
-        return
+def _nothing_there(lacking: Sequence[str], offered: Mapping[str, Sequence[FoundDevice]], found: Findings) -> str:
+    """Words for a camera or a projector that is neither named nor plugged in, with what to check."""
     there = [f"{each.driver}:{each.device}" for kind in ("camera", "projector") for each in offered[kind]]
+    flags = " ".join(f"--{kind} DRIVER:DEVICE" for kind in lacking)
+    screen = "a projector on HDMI must be switched on and a display of its own, in a session of X (see DISPLAY)"
     lines = [
         f"no {' and no '.join(lacking)} is plugged in that an installed driver can find",
-        *([f"  found: {', '.join(there)}"] if there else []),
-        "  check cable and power, and your right to open the device: slrig devices tells what it sees",
+        *([f"found: {', '.join(there)}"] if there else []),
+        "check cable and power, and your right to open the device: slrig devices tells what it sees",
+        *([screen] if "projector" in lacking else []),
+        *(f"more can be found after, for {each.driver}: {each.install}" for each in found.missing),
+        *(f"not looked for: {fault}" for fault in found.faults),
+        *(
+            f"{head.driver}:{head.device} is camera and projector in one: write a [head] table for it"
+            for head in offered["head"]
+        ),
+        f"name what cannot be found: slrig init {flags}",
+        "without any hardware there is a rendered rig: slrig demo, or slrig serve config/rigs/demo.toml",
     ]
-    if "projector" in lacking:
-        lines.append(
-            "  a projector on HDMI must be switched on and a display of its own, in a session of X (see DISPLAY)"
-        )
-    lines += [f"  more can be found after, for {each.driver}: {each.install}" for each in found.missing]
-    lines += [f"  not looked for: {fault}" for fault in found.faults]
-    for head in offered["head"]:
-        lines.append(f"  {head.driver}:{head.device} is camera and projector in one: write a [head] table for it")
-    flags = " ".join(f"--{kind} DRIVER:DEVICE" for kind in lacking)
-    lines.append(f"  name what cannot be found: slrig init {flags}")
-    lines.append("  without any hardware there is a rendered rig: slrig demo, or slrig serve config/rigs/demo.toml")
-    raise DeviceGoneError("\n".join(lines))
+    return "\n  ".join(lines)
 
 
-def _tell(draft: Draft, output: Path) -> None:
-    cameras = ", ".join(f"{each.name} ({each.driver})" for each in draft.cameras)
-    _say(f"\nWrote {output}: projector ({draft.projector.driver}), {cameras}. No device was opened. Next:")
+def _tell(projector: Part, cameras: Sequence[Part], output: Path) -> None:
+    named = ", ".join(f"{each.name} ({each.driver})" for each in cameras)
+    _say(f"\nWrote {output}: projector ({projector.driver}), {named}. No device was opened. Next:")
     better = output.with_stem(f"{output.stem}-measured")
     steps = (
         (f"slrig doctor {output} --output {better}", "light, focus, timing; a file with what it measured"),
@@ -236,3 +278,97 @@ def _tell(draft: Draft, output: Path) -> None:
     )
     for number, (command, why) in enumerate(steps, 1):
         typer.echo(f"  {number}. {command}\n     {why}")
+
+
+def _properties(driver: str) -> Mapping[str, Any]:
+    """The options of a driver by name, as JSON Schema; none where it does not describe them."""
+    model = option_model(driver)
+    return {} if model is None else model.model_json_schema()["properties"]
+
+
+def json_types(part: Mapping[str, Any]) -> frozenset[str]:
+    """The JSON types that a property takes; none where its schema names none."""
+    several = [json_types(each) for each in part.get("anyOf", ())]
+    return frozenset({part["type"]} if "type" in part else set()).union(*several)
+
+
+def typed(text: str, kinds: Collection[str]) -> object:
+    """What a person wrote as a value: TOML where the option takes such a value, else text.
+
+    >>> typed("0", frozenset({"integer", "string"})), typed("0", frozenset({"string"})), typed("CAM_B", frozenset())
+    (0, '0', 'CAM_B')
+    """
+    try:
+        data = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    kind = _KINDS.get(type(data["value"]))
+    fits = not kinds or kind in kinds or (kind == "integer" and "number" in kinds)
+    return data["value"] if kind is not None and fits and len(data) == 1 else text
+
+
+def failure_of(driver: str, options: Mapping[str, object], key: str = "") -> str:
+    """What the driver's model says against options, of one of them or of all; "" where it takes them."""
+    model = option_model(driver)
+    if model is None:
+        return ""
+    try:
+        model.model_validate(dict(options))
+    except ValidationError as cause:
+        if not key or any(fault["loc"][:1] == (key,) for fault in cause.errors()):
+            return explain(cause, options, keys_of(model))
+    return ""
+
+
+def rig_text(path: Path, name: str, projector: Part, cameras: Sequence[Part], exposure_s: float) -> str:
+    """Return the file's text, which was read again and checked by every driver's model. Raises ConfigError.
+
+    exposure_s : of every camera that has none of its own.
+    """
+    text = "\n".join(_lines(name, projector, cameras, exposure_s)) + "\n"
+    rig = rig_of(tomllib.loads(text), path)
+    tables = {f"camera '{table.name}'": table for table in rig.cameras} | {"the projector": rig.projector}
+    faults = [
+        f"driver '{table.driver}' does not take these options of {what}:\n{fault}"
+        for what, table in tables.items()
+        if table is not None and (fault := failure_of(table.driver, table.options))
+    ]
+    if faults:
+        message = "\n".join([*faults, "nothing was written; every option: slrig devices --options DRIVER"])
+        raise ConfigError(message)
+    return text
+
+
+def _lines(name: str, projector: Part, cameras: Sequence[Part], exposure_s: float) -> Iterator[str]:
+    yield "# Written by slrig init. For every option: slrig devices --options DRIVER"
+    yield f"name = {toml_value(name)}"
+    yield '# calibration = "calibration.json"  # beside this file, once there is one'
+    yield "\n[projector]"
+    yield from _keys(projector)
+    for number, camera in enumerate(cameras):
+        yield "\n[[camera]]"
+        yield f"name = {toml_value(camera.name)}"
+        yield from _keys(camera, without="exposure_s")
+        if number == 0:
+            yield from _comment(
+                "Whole refresh periods of a video projector (1/60 s at 60 Hz): in a part of one, colour wheel and lamp "
+                "light some rows more than others. An engine that flashes its LEDs may take less."
+            )
+        yield f"exposure_s = {toml_value(camera.options.get('exposure_s', exposure_s))}"
+    yield ""
+    yield from _comment(
+        "How late light comes is not known yet. slrig doctor measures it, and writes a rig file with it, in "
+        "[synchronisation], and with the exposures that suit."
+    )
+
+
+def _keys(part: Part, *, without: str = "") -> Iterator[str]:
+    if part.label:
+        yield from _comment(part.label)
+    yield f"driver = {toml_value(part.driver)}"
+    yield from (f"{key} = {toml_value(value)}" for key, value in part.options.items() if key != without)
+
+
+def _comment(text: str) -> list[str]:
+    plain = "".join(each if each.isprintable() else " " for each in text)
+    return textwrap.wrap(plain, _WIDTH, initial_indent="# ", subsequent_indent="# ")

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from slrig.cli import init
 from slrig.cli.commands import app
-from slrig.cli.rig_draft import failure_of, typed
+from slrig.cli.init import failure_of, typed
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Camera, FoundDevice, Projector
 from slrig.discovery import Findings, MissingLibrary, open_rig

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from drivers.serial_projector.device import main as box
-from slrig.cli.rig_draft import failure_of
+from slrig.cli.init import failure_of
 from slrig.config import RigConfig, read_rig
 from slrig.option_models import described_drivers
 
