@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,10 +21,10 @@ from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.poses.checks import check_same_devices
 from slrig.calibration.solution import PROJECTOR
 from slrig.cli.calibration_screen import tell_result
-from slrig.cli.display import ProgressDisplay, print_json, progress_shown
+from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown
+from slrig.cli.reconstruct import keep_kernels
 from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
-from slrig.jobs.worker import prepare_kernel_cache
-from slrig.model import Calibration, Size
+from slrig.model import Size
 
 if TYPE_CHECKING:
     from slrig.calibrate.solving import CalibrationResult, ReadPose
@@ -61,27 +60,15 @@ def solve_folder(
     earlier : file of a calibration of the same devices, to compare the scale with. board_shape : whether the board may
     be bowed.
 
-    Raises
-    ------
-    ConfigError
-        The output cannot be written: another ending, or no such folder.
-    BundleError
-        There are no bundles in the folder.
-    CalibrationError
-        The poses are of different rigs, or the earlier calibration cannot be read.
-    PoseRefusedError
-        None of the poses can be used.
-    SolveRefusedError
-        They determine no calibration.
-    StorageError
-        The disk refused.
+    Raises ConfigError or StorageError where the output cannot be written, BundleError where there are no bundles,
+    CalibrationError where the poses are of different rigs or the earlier calibration cannot be read, PoseRefusedError
+    where none of the poses can be used, SolveRefusedError where they determine no calibration.
     """
     set_up_logs_for_a_person()
     _require_writable(output, report)
     bundles = pose_bundles(folder)
     before = None if earlier is None else read_calibration(earlier)
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    prepare_kernel_cache(Path(base) / "slrig")
+    keep_kernels()
     with progress_shown() as display:
         display("loading", 0.0, "")
         # numba and its kernels: a second or two, and many the first time.
@@ -89,13 +76,11 @@ def solve_folder(
         from slrig.calibrate.solving import solve_poses
         from slrig.calibrate.tools import Setting
 
-        sizes, unreadable = _one_rig(bundles)
-        setting = Setting(
-            board, {name: size for name, size in sizes.items() if name != PROJECTOR}, sizes.get(PROJECTOR)
-        )
-        readable = {name: path for name, path in bundles.items() if name not in unreadable}
-        found = _read(readable, setting, display)
-        found.refused.update(unreadable)
+        found = Readings()
+        cameras = _one_rig(bundles, found)
+        projector = cameras.pop(PROJECTOR, None)
+        setting = Setting(board, cameras, projector)
+        _read(bundles, setting, found, display)
         if not found.poses:
             raise PoseRefusedError(_none_left(folder, board, found.refused))
 
@@ -104,13 +89,13 @@ def solve_folder(
 
         try:
             result = solve_poses(
-                board, setting.cameras, setting.projector, found.poses, progress=solving, earlier=before,
-                board_shape=board_shape,
-            )  # fmt: skip
+                board, cameras, projector, found.poses, progress=solving, earlier=before, board_shape=board_shape
+            )
         except SolveRefusedError as error:
             raise SolveRefusedError(_with_refused(str(error), found.refused)) from error
         document = {**summary(result), "refused": found.refused, "remarks": found.remarks}
-        _write_calibration(output, result.calibration)
+        write = write_calibration if output.suffix.lower() == ".json" else write_opencv_calibration
+        write(output, result.calibration)
         if report is not None:
             display("writing the report", 1.0, "")
             write_file(report, _report(result, found, folder, bundles, setting).encode())
@@ -128,11 +113,7 @@ def pose_bundles(folder: Path) -> dict[str, Path]:
     """The bundles in a folder, one per pose, by name and in the order of their names.
 
     Each is a folder with a bundle.json, or has it in a folder `bundle`, as the service keeps the poses of a session.
-
-    Raises
-    ------
-    BundleError
-        There is no such folder, or no folder with a bundle.json in it.
+    Raises BundleError where there is no such folder, or no folder with a bundle.json in it.
     """
     what = "expected a folder with one bundle per pose, each a folder with a bundle.json"
     if not folder.is_dir():
@@ -146,8 +127,7 @@ def pose_bundles(folder: Path) -> dict[str, Path]:
     }
     if not found:
         inside = sum(path.is_dir() for path in folder.iterdir())
-        folders = "1 folder" if inside == 1 else f"{inside} folders"
-        remedy = f"it holds {folders} without a bundle.json" if inside else "it holds no folders"
+        remedy = f"it holds {counted(inside, 'folder')} without a bundle.json" if inside else "it holds no folders"
         if (folder / DESCRIPTION).is_file():
             remedy = "this is one bundle itself: name the folder that holds it and those of the other poses"
         message = f"{folder}: {what}; {remedy}"
@@ -163,9 +143,7 @@ def _require_writable(output: Path, report: Path | None) -> None:
             f"found '{output.suffix}'"
         )
         raise ConfigError(message)
-    for option, file in (("--output", output), ("--report", report)):
-        if file is None:
-            continue
+    for option, file in [("--output", output), *([] if report is None else [("--report", report)])]:
         if file.is_dir():
             message = f"{option} {file}: expected the name of a file, found a folder; name a file in it"
             raise ConfigError(message)
@@ -174,42 +152,38 @@ def _require_writable(output: Path, report: Path | None) -> None:
             raise ConfigError(message)
 
 
-def _one_rig(bundles: Mapping[str, Path]) -> tuple[Mapping[str, Size], dict[str, str]]:
-    """The devices that most of the bundles are of, and by name those whose description cannot be read, with the cause.
+def _one_rig(bundles: Mapping[str, Path], found: Readings) -> dict[str, Size]:
+    """The devices that most of the bundles are of. Those whose description cannot be read are refused in `found`.
 
-    Raises
-    ------
-    CalibrationError
-        A bundle is of another rig than most.
+    Raises CalibrationError where a bundle is of another rig than most.
     """
     sizes: dict[str, Mapping[str, Size]] = {}
-    unreadable = {}
     for name, path in bundles.items():
         try:
             sizes[name] = bundle_device_sizes(path)
         except BundleError as error:
-            unreadable[name] = _first_line(error)
+            found.refused[name] = _first_lines(error)
     if not sizes:
-        return {}, unreadable
-    counted = Counter(frozenset(each.items()) for each in sizes.values())
-    usual = dict(counted.most_common(1)[0][0])
-    ordered = next(each for each in sizes.values() if dict(each) == usual)
+        return {}
+    usual = Counter(frozenset(each.items()) for each in sizes.values()).most_common(1)[0][0]
+    ordered = next(each for each in sizes.values() if each.items() == usual)
     for name, each in sizes.items():
         check_same_devices(f"pose '{name}'", each, ordered)
-    return ordered, unreadable
+    return dict(ordered)
 
 
-def _read(bundles: Mapping[str, Path], setting: Setting, display: ProgressDisplay) -> Readings:
+def _read(bundles: Mapping[str, Path], setting: Setting, found: Readings, display: ProgressDisplay) -> None:
+    """Read the bundles that are not refused yet."""
     from slrig.calibrate.pose_judging import judgement
     from slrig.calibrate.pose_reading import read_pose
 
-    found = Readings()
-    for at, (name, path) in enumerate(bundles.items()):
-        display(f"reading {name}", _READING_SHARE * at / len(bundles), f"{at + 1} of {len(bundles)}")
+    readable = [name for name in bundles if name not in found.refused]
+    for at, name in enumerate(readable):
+        display(f"reading {name}", _READING_SHARE * at / len(readable), f"{at + 1} of {len(readable)}")
         try:
-            pose = read_pose(path, setting.board, name)
+            pose = read_pose(bundles[name], setting.board, name)
         except (PoseRefusedError, PatternError, BundleError) as error:
-            found.refused[name] = _first_line(error).removeprefix(f"pose '{name}': ")
+            found.refused[name] = _first_lines(error).removeprefix(f"pose '{name}': ")
             continue
         judged = judgement(pose, found.poses, setting)
         if judged.refusals:
@@ -218,7 +192,6 @@ def _read(bundles: Mapping[str, Path], setting: Setting, display: ProgressDispla
         found.poses.append(pose)
         if judged.answer["warnings"]:
             found.remarks[name] = list(judged.answer["warnings"])
-    return found
 
 
 def _none_left(folder: Path, board: Board, refused: Mapping[str, str]) -> str:
@@ -242,24 +215,16 @@ def _with_refused(message: str, refused: Mapping[str, str]) -> str:
         return message
     lines = [f"  {name}: {cause}" for name, cause in list(refused.items())[:_MOST_TOLD]]
     more = [f"  and {len(refused) - _MOST_TOLD} more"] if len(refused) > _MOST_TOLD else []
-    counted = "1 pose was" if len(refused) == 1 else f"{len(refused)} poses were"
-    return "\n".join([message, f"{counted} not used:", *lines, *more])
+    verb = "was" if len(refused) == 1 else "were"
+    return "\n".join([message, f"{counted(len(refused), 'pose')} {verb} not used:", *lines, *more])
 
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= 3 else f"{names[0]} to {names[-1]} ({len(names)})"
 
 
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines()]
-    return " ".join(lines[:3])
-
-
-def _write_calibration(output: Path, calibration: Calibration) -> None:
-    if output.suffix.lower() == ".json":
-        write_calibration(output, calibration)
-    else:
-        write_opencv_calibration(output, calibration)
+def _first_lines(error: Exception) -> str:
+    return " ".join(line.strip() for line in str(error).splitlines()[:3])
 
 
 def _report(

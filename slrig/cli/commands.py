@@ -267,7 +267,7 @@ def warm() -> None:
 
     For images and installers: it takes about a minute once, and a few seconds after that.
     """
-    from slrig.cli.warm import warm as prepare
+    from slrig.cli.reconstruct import warm as prepare
 
     prepare()
 
@@ -281,7 +281,7 @@ def conform(
 
     Exit code 1 unless every check that applies passes.
     """
-    from slrig.cli.conform import conform as examine
+    from slrig.cli.examine import conform as examine
 
     if not examine(rig, as_json=as_json):
         raise typer.Exit(1)
@@ -305,7 +305,7 @@ def latency(
 
     Tells whether the cameras have rolling shutters, too, and what to write into the rig file.
     """
-    from slrig.cli.latency import tell_latency
+    from slrig.cli.examine import tell_latency
 
     tell_latency(rig, trials=flashes, search_s=search_s, exposure_s=exposure_s, trigger=trigger, as_json=as_json)
 
@@ -322,7 +322,7 @@ def doctor(
 
     Light, timing, picture, focus, response and flicker, and what to do about them. Exit code 1 if there is a fault.
     """
-    from slrig.cli.doctor import doctor as examine
+    from slrig.cli.examine import doctor as examine
 
     if not examine(rig, output=output, force=force, search_s=search_s, as_json=as_json):
         raise typer.Exit(1)

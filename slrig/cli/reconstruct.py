@@ -1,7 +1,9 @@
-"""`slrig reconstruct`: a recorded bundle becomes a mesh, in this process."""
+"""`slrig reconstruct`, a recorded bundle becomes a mesh in this process, and `slrig warm`, its kernels are compiled."""
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,10 @@ from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.description import read_description
 from slrig.cli.display import progress_shown
 from slrig.cli.scan import quality_lines
-from slrig.cli.warm import prepare_here
+from slrig.jobs.worker import prepare_kernel_cache
+from slrig.jobs.worker_wait import PREPARING
 from slrig.scan.artefacts import MESH, write_converted
-from slrig.scan.plan import ReconstructionPlan
+from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary
 
 
@@ -51,16 +54,11 @@ def reconstruct_with_progress(
     if calibration is not None:
         read_calibration(calibration)
     with progress_shown() as display:
-        prepare_here(display)
+        prepare_kernels(display)
         from slrig.scan.reconstruct import reconstruct_bundle
 
         report = reconstruct_bundle(
-            bundle,
-            output,
-            plan=plan,
-            calibration=calibration,
-            progress=display,
-            cancelled=lambda: False,
+            bundle, output, plan=plan, calibration=calibration, progress=display, cancelled=lambda: False
         )
         further = [f"mesh.{name}" for name in dict.fromkeys(formats)]
         for name in further:
@@ -71,3 +69,33 @@ def reconstruct_with_progress(
         typer.echo(f"{what:<10}{output / name}")
     for line in quality_lines(report_summary(report)):
         typer.echo(line)
+
+
+def warm() -> None:
+    """Compile or load the kernels of a usual scan, and tell how many there are and where they are kept."""
+    began_s = time.monotonic()
+    with progress_shown() as display:
+        count = prepare_kernels(display)
+    place = os.environ.get("NUMBA_CACHE_DIR") or "beside slrig's own files"
+    typer.echo(f"{count} kernels are ready, kept {place} ({time.monotonic() - began_s:.0f} s)")
+
+
+def prepare_kernels(display: Progress) -> int:
+    """Compile or load the kernels of a usual scan in this process, under progress; return how many."""
+    keep_kernels()
+    display("loading", 0.0, "")
+    # numba itself: a second.
+    from slrig.kernels import Prepared, prepared
+    from slrig.scan.reconstruct import warm_kernels
+
+    def told(now: Prepared) -> None:
+        display(PREPARING, 0.0, f"first time only: {now.done} of {now.total}")
+
+    warm_kernels(told)
+    return prepared().total
+
+
+def keep_kernels() -> None:
+    """Have the kernels of this process kept in the cache of the person who runs it."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    prepare_kernel_cache(Path(base) / "slrig")
