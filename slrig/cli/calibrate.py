@@ -147,10 +147,7 @@ def list_stored(service: Service, as_json: AsJson = False) -> None:
     if not found["calibrations"]:
         typer.echo("no calibrations; shoot one with: slrig calibrate run")
         return
-    heads: list[Column | str] = [
-        *(Column(head, no_wrap=True) for head in ("id", "", "when", "poses", "label")),
-        "verdict",
-    ]
+    heads = [*(Column(head, no_wrap=True) for head in ("id", "", "when", "poses", "label")), Column("verdict")]
     rows = [
         (
             each["id"][:8],

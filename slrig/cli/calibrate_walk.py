@@ -226,7 +226,7 @@ class Walk:
         if not shot:
             self._console.print("There is no accepted pose to drop.")
             return
-        self._client.delete_at(shot[-1]["links"]["self"])
+        self._client.delete(shot[-1]["links"]["self"])
         self._console.print(f"{shot[-1]['name']} is dropped.", markup=False)
 
     def _solve(self) -> None:

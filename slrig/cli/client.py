@@ -123,19 +123,10 @@ class ServiceClient:
         with self._reaching():
             return _content(self._http.post(path, json=None if request is None else dict(request)))
 
-    def delete_at(self, path: str) -> None:
+    def delete(self, path: str) -> None:
         """Delete what is at a path. Raises ServiceError."""
         with self._reaching():
             _refuse_problem(self._http.delete(path))
-
-    def cancel(self, scan: Mapping[str, Any]) -> None:
-        """Ask a scan to stop. Raises ServiceError."""
-        with self._reaching():
-            _content(self._http.post(scan["links"]["cancel"]))
-
-    def delete(self, scan: Mapping[str, Any]) -> None:
-        """Delete a finished scan. Raises ServiceError."""
-        self.delete_at(scan["links"]["self"])
 
     def follow(self, scan: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         """Yield what happens to a scan, from its first event to its last, whatever happens to the connection.

@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,9 +20,10 @@ import slrig
 from slrig import KEY_VARIABLE
 from slrig.bundle.storage import refusals_of
 from slrig.cli.client import ServiceClient
-from slrig.cli.display import progress_shown
+from slrig.cli.display import counted, progress_shown
 from slrig.cli.scan import scan_with, tell_result
 from slrig.errors import ConfigError, ServiceError
+from slrig.scan.plan import Progress
 
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 10.0
@@ -34,12 +35,7 @@ LABEL = "demo"
 def run_demo(rig: Path | None, output: Path) -> None:
     """Start a service, scan, fetch, compare, tell; the service is gone afterwards.
 
-    Raises
-    ------
-    ConfigError
-        There is no such rig file.
-    ServiceError
-        The service did not start, or the scan failed.
+    Raises ConfigError where there is no such rig file, ServiceError where no service starts or the scan fails.
     """
     rig = _rig_file(rig)
     data = output / "service"
@@ -58,24 +54,18 @@ def run_demo(rig: Path | None, output: Path) -> None:
             removed = remove_earlier(client, scan)
     tell_result(scan, output)
     if removed:
-        noun = "demo scan" if removed == 1 else "demo scans"
-        typer.echo(f"{'removed':<10}{removed} earlier {noun} of rig '{scan['rig']}' from {data}")
+        typer.echo(f"{'removed':<10}{counted(removed, 'earlier demo scan')} of rig '{scan['rig']}' from {data}")
     bundle = data / "scans" / scan["id"] / "bundle"
     _tell_next(rig, bundle, output)
 
 
 def _rig_file(given: Path | None) -> Path:
-    if given is not None:
-        candidates = [given]
-    else:
-        here = Path("config/rigs/demo.toml")
-        candidates = [here, Path(slrig.__file__).resolve().parent.parent / here]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    message = (
-        f"There is no rig file {candidates[0]}. Run the demo in slrig's checkout, or name a rig file: slrig demo RIG."
-    )
+    wanted = given or Path("config/rigs/demo.toml")
+    checkout = Path(slrig.__file__).resolve().parent.parent
+    for folder in (Path(), checkout) if given is None else (Path(),):
+        if (folder / wanted).is_file():
+            return folder / wanted
+    message = f"There is no rig file {wanted}. Run the demo in slrig's checkout, or name a rig file: slrig demo RIG."
     raise ConfigError(message)
 
 
@@ -117,9 +107,7 @@ def _url(process: subprocess.Popen[bytes], data: Path) -> str:
     return url
 
 
-def _await_ready(
-    process: subprocess.Popen[bytes], client: ServiceClient, data: Path, display: Callable[[str, float, str], None]
-) -> None:
+def _await_ready(process: subprocess.Popen[bytes], client: ServiceClient, data: Path, display: Progress) -> None:
     deadline = time.monotonic() + START_LIMIT_S
     told = ""
     while (missing := still_missing(client)) is not None:
@@ -151,17 +139,14 @@ def still_missing(client: ServiceClient) -> str | None:
 def remove_earlier(client: ServiceClient, scan: Mapping[str, Any]) -> int:
     """Delete the scans that earlier demos made with the same rig, and no others; return how many."""
     page: dict[str, Any] = {"next": "/scan?limit=200"}
-    earlier: list[dict[str, Any]] = []
+    scans: list[dict[str, Any]] = []
     while page["next"] is not None:
         page = client.get(page["next"])
-        earlier += [
-            each
-            for each in page["scans"]
-            if (each["label"], each["rig"]) == (LABEL, scan["rig"]) and each["id"] != scan["id"]
-        ]
-    for old in earlier:
-        client.delete(old)
-    return len(earlier)
+        scans += page["scans"]
+    ours = [each for each in scans if (each["label"], each["rig"]) == (LABEL, scan["rig"]) and each["id"] != scan["id"]]
+    for old in ours:
+        client.delete(old["links"]["self"])
+    return len(ours)
 
 
 def _require_alive(process: subprocess.Popen[bytes], data: Path, deadline: float) -> None:
@@ -176,13 +161,11 @@ def _require_alive(process: subprocess.Popen[bytes], data: Path, deadline: float
 
 
 def _tell_next(rig: Path, bundle: Path, output: Path) -> None:
-    again = output.parent / f"{output.name}-again"
-    live = output.parent / f"{output.name}-live"
+    live, again = (shlex.quote(str(output.parent / f"{output.name}-{end}")) for end in ("live", "again"))
     # Paths in a rig file are relative to it, so that a copy belongs beside it.
-    own = shlex.quote(str(rig.with_name("my-rig.toml")))
+    rig_text, own, bundle_text = (shlex.quote(str(path)) for path in (rig, rig.with_name("my-rig.toml"), bundle))
     # As it was called: in a fresh checkout that is .venv/bin/slrig, and no slrig is on the path.
     program = shlex.quote(sys.argv[0]) if Path(sys.argv[0]).name == "slrig" else "slrig"
-    rig_text, bundle_text = shlex.quote(str(rig)), shlex.quote(str(bundle))
     typer.echo(
         f"""
 Next:
@@ -191,7 +174,7 @@ Next:
        {program} demo {own}
   2. A live service: start it, and scan with it from another terminal, with the key that it prints.
        {program} serve {rig_text}
-       {KEY_VARIABLE}=KEY {program} scan --output {shlex.quote(str(live))}
+       {KEY_VARIABLE}=KEY {program} scan --output {live}
   3. A recorded bundle: reconstruct this scan, or one of yours, again.
-       {program} reconstruct {bundle_text} --output {shlex.quote(str(again))}"""
+       {program} reconstruct {bundle_text} --output {again}"""
     )

@@ -52,7 +52,7 @@ def scan_with(
                     told(_STATES[event["state"]], fraction, "")
         except KeyboardInterrupt:
             with suppress(ServiceError):
-                client.cancel(started)
+                client.post(started["links"]["cancel"], None)
             raise
         scan = client.get(started["links"]["self"])
         if scan["state"] == "cancelled":

@@ -153,7 +153,7 @@ def cancel(schedule: ScheduleId, service: Service) -> None:
 def remove(schedule: ScheduleId, service: Service) -> None:
     """Forget a schedule and its runs."""
     with service.client() as client:
-        client.delete_at(_path(client, schedule))
+        client.delete(_path(client, schedule))
     typer.echo("removed")
 
 
