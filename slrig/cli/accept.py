@@ -22,8 +22,8 @@ from slrig.accept.store import HTML, JSON
 from slrig.accept.verdicts import AcceptanceResult
 from slrig.api.logs import set_up_logs_for_a_person
 from slrig.calibration.artefacts import Decision
-from slrig.cli.acceptance_command import Asked
 from slrig.cli.display import answered, progress_shown
+from slrig.cli.options import AcceptanceOptions
 from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
@@ -32,7 +32,7 @@ from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 
 
-def plan_for(asked: Asked, rig: Rig) -> AcceptancePlan:
+def plan_for(asked: AcceptanceOptions, rig: Rig) -> AcceptancePlan:
     """The test of an open rig. Raises CalibrationError, InvalidInputError."""
     calibration = required_calibration(rig)
     rendered = rig.truth() is not None
@@ -55,7 +55,7 @@ def plan_for(asked: Asked, rig: Rig) -> AcceptancePlan:
     )
 
 
-def _artefacts(asked: Asked, made: Artefacts | None) -> Artefacts:
+def _artefacts(asked: AcceptanceOptions, made: Artefacts | None) -> Artefacts:
     if made is not None and (asked.sphere_mm, asked.bar_mm, asked.plane_mm) == (None, None, None):
         return replace(made, temperature_c=asked.temperature_c)
     if asked.sphere_mm is None or asked.bar_mm is None or asked.plane_mm is None:
@@ -77,7 +77,7 @@ def _artefacts(asked: Asked, made: Artefacts | None) -> Artefacts:
     )
 
 
-def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_json: bool) -> bool:
+def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: bool, as_json: bool) -> bool:
     """Do the test, print what was decided, and return whether the rig passes.
 
     Raises
@@ -102,7 +102,7 @@ def accept(rig_file: Path, asked: Asked, *, output: Path, scripted: bool, as_jso
     return result.decision is Decision.PASSES
 
 
-def moving(config: RigConfig, asked: Asked, folder: Path) -> RigConfig:
+def moving(config: RigConfig, asked: AcceptanceOptions, folder: Path) -> RigConfig:
     """The rig by which the artefacts are moved: itself if its positioner knows the positions, else, of a rendered rig,
     one with a scene of artefacts in place of its own, which is written into `folder`.
     """

@@ -56,9 +56,9 @@ def board(
 
     The scales show whether the printer kept the size.
     """
-    from slrig.cli.boards import write_board
+    from slrig.cli.boards import chosen_board, write_board
 
-    write_board(asked.chosen(), output, page=page)
+    write_board(chosen_board(asked), output, page=page)
 
 
 @app.command()
@@ -79,10 +79,13 @@ def solve(
 ) -> None:
     """Calibrate from recorded poses. Needs no service and no rig."""
     from slrig.calibration.board import BoardShape
+    from slrig.cli.boards import chosen_board
     from slrig.cli.calibrate_solve import solve_folder
 
     shape = BoardShape(board_shape)
-    solve_folder(folder, asked.chosen(), output, report=report, earlier=earlier, board_shape=shape, as_json=as_json)
+    solve_folder(
+        folder, chosen_board(asked), output, report=report, earlier=earlier, board_shape=shape, as_json=as_json
+    )
 
 
 @app.command()
@@ -113,9 +116,10 @@ def run(
 
     Shoot, be told what to move and why, and solve.
     """
+    from slrig.cli.boards import chosen_board
     from slrig.cli.calibrate_walk import opened, walk
 
-    chosen = asked.chosen() if resume is None else None
+    chosen = chosen_board(asked) if resume is None else None
     with service.client() as client:
         walk(
             client,

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal
 import typer
 import typer.core
 
-from slrig.cli import acceptance_command, calibrate, schedule
-from slrig.cli.options import AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
+from slrig.cli import calibrate, schedule
+from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -346,13 +346,35 @@ def verify(
 
     Exit code 1 if it is stale.
     """
+    from slrig.cli.boards import chosen_board
     from slrig.cli.verify import verify as look
 
-    if not look(source, board.chosen(), calibration, position=position, as_json=as_json):
+    if not look(source, chosen_board(board), calibration, position=position, as_json=as_json):
         raise typer.Exit(1)
 
 
-app.command()(acceptance_command.accept)
+@app.command()
+@grouped
+def accept(
+    *,
+    rig: RigFile,
+    output: Annotated[Path, typer.Option(help="New folder for report.html, report.json and the points.")],
+    scripted: Annotated[
+        bool, typer.Option("--scripted", help="The rig's positioner places the artefacts; a rendered rig always can.")
+    ] = False,
+    asked: AcceptanceOptions,
+    as_json: AsJson = False,
+) -> None:
+    """Test a rig with a sphere, a ball bar and a plane.
+
+    In the manner of VDI/VDE 2634-2. Exit code 1 unless it passes.
+    """
+    from slrig.cli.accept import accept as test
+
+    if not test(rig, asked, output=output, scripted=scripted, as_json=as_json):
+        raise typer.Exit(1)
+
+
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
 

@@ -14,7 +14,6 @@ import typer
 from slrig.errors import SlrigError
 
 if TYPE_CHECKING:
-    from slrig.calibration.board import Board
     from slrig.cli.client import ServiceClient
 
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
@@ -62,12 +61,6 @@ class BoardOptions:
         str | None, typer.Option(help="Markers of a ChArUco board, by OpenCV's name. Default DICT_5X5_250.")
     ] = None
 
-    def chosen(self) -> Board:
-        """The board that is meant; see `slrig.cli.boards.chosen_board`. Raises CalibrationError."""
-        from slrig.cli.boards import chosen_board
-
-        return chosen_board(self)
-
 
 @dataclass(frozen=True, slots=True)
 class MeshOptions:
@@ -96,6 +89,62 @@ class MeshOptions:
     axis: Annotated[
         str | None, typer.Option(help="Triangulate by column or row. Default: what crosses the baseline.")
     ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceOptions:
+    """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm."""
+
+    sphere_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--sphere",
+            metavar="MM MM",
+            help="Certified diameter of the sphere and its expanded uncertainty (k = 2), mm.",
+        ),
+    ] = None
+    bar_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--bar",
+            metavar="MM MM",
+            help="Certified distance of the ball bar's centres and its expanded uncertainty, mm.",
+        ),
+    ] = None
+    plane_mm: Annotated[
+        tuple[float, float] | None, typer.Option("--plane", metavar="MM MM", help="Length and width of the plane, mm.")
+    ] = None
+    ball_mm: Annotated[float | None, typer.Option(help="Diameter of the bar's balls. Default: the sphere's.")] = None
+    sphere_form_mm: Annotated[
+        float | None, typer.Option(help="By how much the sphere itself is out of round, from its certificate.")
+    ] = None
+    plane_form_mm: Annotated[
+        float | None, typer.Option(help="By how much the plane itself is out of flat, from its certificate.")
+    ] = None
+    volume_mm: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            "--volume",
+            metavar="X Y Z X Y Z",
+            help="Working volume in the world: x y z of its least corner, then of its greatest, mm. "
+            "Default: that of the calibration.",
+        ),
+    ] = None
+    spacing_limit_mm: Annotated[
+        float | None, typer.Option(help="Limit of sphere spacing. Default: 1/10000 of the volume's diagonal.")
+    ] = None
+    form_limit_mm: Annotated[
+        float | None, typer.Option(help="Limit of probing form. Default: 6.5 standard deviations of a point.")
+    ] = None
+    size_limit_mm: Annotated[float | None, typer.Option(help="Limit of probing size. Default: as of form.")] = None
+    flatness_limit_mm: Annotated[float | None, typer.Option(help="Limit of flatness. Default: as of form.")] = None
+    repeats: Annotated[
+        int, typer.Option(min=1, max=50, help="Captures of the first position of each artefact, for the scatter.")
+    ] = 3
+    exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera. Default: the rig file's.")] = None
+    certificate: Annotated[str, typer.Option(help="Numbers of the artefacts' certificates, for the report.")] = ""
+    temperature_c: Annotated[float | None, typer.Option(help="Temperature of the room, for the report.")] = None
+    notes: Annotated[str, typer.Option(help="Free text for the report.")] = ""
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:

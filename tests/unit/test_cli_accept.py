@@ -19,7 +19,8 @@ from slrig.accept.verdicts import AcceptanceResult
 from slrig.calibration.artefacts import Decision
 from slrig.cli import accept as accepting
 from slrig.cli.accept import moving, placed_by_hand, plan_for
-from slrig.cli.acceptance_command import Asked, accept
+from slrig.cli.commands import accept
+from slrig.cli.options import AcceptanceOptions
 from slrig.config import read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
@@ -35,7 +36,7 @@ app.command()(accept)
 @pytest.fixture(scope="module")
 def plan() -> AcceptancePlan:
     with open_rig(read_rig(BALL_BAR)) as rig:
-        return plan_for(Asked(), rig)
+        return plan_for(AcceptanceOptions(), rig)
 
 
 def test_a_rendered_rig_needs_no_artefacts_and_states_exact_ones(plan: AcceptancePlan) -> None:
@@ -49,8 +50,8 @@ def test_metal_needs_the_certificates() -> None:
     with open_rig(read_rig(BALL_BAR)) as rig:
         metal = replace(rig, head=None)
         with pytest.raises(InvalidInputError, match="needs --sphere DIAMETER U"):
-            plan_for(Asked(), metal)
-        given = Asked(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
+            plan_for(AcceptanceOptions(), metal)
+        given = AcceptanceOptions(sphere_mm=(17.5, 0.001), bar_mm=(64.0, 0.002), plane_mm=(95.0, 67.0))
         with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
             plan_for(given, metal)
         certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
@@ -60,15 +61,15 @@ def test_metal_needs_the_certificates() -> None:
 
 def test_a_given_volume_is_used() -> None:
     with open_rig(read_rig(BALL_BAR)) as rig:
-        plan = plan_for(Asked(volume_mm=(-50, -40, -25, 50, 40, 25)), rig)
+        plan = plan_for(AcceptanceOptions(volume_mm=(-50, -40, -25, 50, 40, 25)), rig)
     assert plan.volume_mm.tolist() == [[-50, -40, -25], [50, 40, 25]]
 
 
 @pytest.mark.slow
 def test_a_rig_whose_script_has_the_positions_moves_its_own_artefacts(tmp_path: Path) -> None:
     config = read_rig(RIGS / "rendered-acceptance.toml")
-    assert moving(config, Asked(), tmp_path) is config
-    other = moving(read_rig(BALL_BAR), Asked(), tmp_path)
+    assert moving(config, AcceptanceOptions(), tmp_path) is config
+    other = moving(read_rig(BALL_BAR), AcceptanceOptions(), tmp_path)
     with open_rig(other) as rig:
         assert rig.positioner is not None
         assert len(rig.positioner.poses) == 23
