@@ -97,7 +97,7 @@ def open_acceptance(
             service.keys.tie(key, made)
         return made
 
-    record = service.acceptance.get(once(service.keys, idempotency_key, request, start))
+    record = service.acceptance.get(once(service.keys, idempotency_key, "/acceptance", request, start))
     response.headers["Location"] = f"/acceptance/{record.id}"
     # As it was when it was opened, so that a repeated request gets the same answer.
     opened = replace(record, state=AcceptanceState.OPEN, readings=(), fault=None, progress=None, decision=None)
@@ -129,7 +129,7 @@ def measure_position(
     def start(key: str | None) -> UUID:
         return desk.measure(test_id, wait=wait, scripted=request.scripted, key=key).id
 
-    started_once(service.keys, desk.jobs, idempotency_key, request, start, parent=test_id)
+    started_once(service.keys, desk.jobs, idempotency_key, f"/acceptance/{test_id}/position", request, start)
     return _body(desk.get(test_id))
 
 

@@ -162,7 +162,7 @@ def shoot_pose(
     def shoot(key: str | None) -> PoseRecord:
         return service.calibrations.poses.shoot(calibration_id, asked, wait=wait, key=key)
 
-    return _accepted(service, response, calibration_id, idempotency_key, request, shoot)
+    return _accepted(service, response, calibration_id, "pose", idempotency_key, request, shoot)
 
 
 @router.post("/{calibration_id}/script", status_code=202, responses=problems(409, 429, 502, 503, 507))
@@ -181,13 +181,14 @@ def shoot_script(
     def shoot(key: str | None) -> PoseRecord:
         return service.calibrations.poses.script(calibration_id, request.positions, asked, wait=wait, key=key)
 
-    return _accepted(service, response, calibration_id, idempotency_key, request, shoot)
+    return _accepted(service, response, calibration_id, "script", idempotency_key, request, shoot)
 
 
 def _accepted(
     service: Service,
     response: Response,
     calibration_id: UUID,
+    what: str,
     key: str | None,
     request: BaseModel,
     shoot: Callable[[str | None], PoseRecord],
@@ -195,7 +196,8 @@ def _accepted(
     """The pose as it was when it was made, so that a repeated request gets the same answer."""
     register = service.calibrations.register
     cameras = register.get(calibration_id).cameras
-    job = started_once(service.keys, register.jobs, key, request, lambda key: shoot(key).id, parent=calibration_id)
+    path = f"/calibration/{calibration_id}/{what}"
+    job = started_once(service.keys, register.jobs, key, path, request, lambda key: shoot(key).id)
     body = pose_body(calibration_id, pose_of(job), cameras)
     response.headers["Location"] = body.links.self
     return body

@@ -167,7 +167,7 @@ def verify_rig(
     def start(key: str | None) -> UUID:
         return desk.shoot(board, position=request.position, exposure_s=request.exposure_s, wait=wait, key=key).id
 
-    body = _body(started_once(service.keys, desk.jobs, idempotency_key, request, start))
+    body = _body(started_once(service.keys, desk.jobs, idempotency_key, "/rig/verification", request, start))
     response.headers["Location"] = body.links["self"]
     return body
 

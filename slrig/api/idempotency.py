@@ -29,15 +29,14 @@ IdempotencyKey = Annotated[
 def once(
     keys: RequestKeys,
     key: str | None,
+    path: str,
     request: BaseModel,
     start: Callable[[str | None], UUID],
-    *,
-    parent: UUID | None = None,
 ) -> UUID:
     """The id of what a request makes, or made before with this key.
 
-    start : makes it, and ties it to the key that it is given; what it raises leaves the key free. parent : to which it
-    belongs.
+    path : where the request was sent; the same key may be sent elsewhere. start : makes it, and ties it to the key that
+    it is given; what it raises leaves the key free.
 
     Raises
     ------
@@ -46,7 +45,7 @@ def once(
     """
     if key is None:
         return start(None)
-    mine = own_key(key, request, parent)
+    mine = own_key(key, path)
     earlier = keys.reserve(mine, fingerprint(request))
     if earlier is not None:
         return earlier
@@ -61,14 +60,13 @@ def started_once(
     keys: RequestKeys,
     store: JobStore,
     key: str | None,
+    path: str,
     request: BaseModel,
     start: Callable[[str | None], UUID],
-    *,
-    parent: UUID | None = None,
 ) -> JobRecord:
     """The job that a request makes, or made before with this key, as it was when it was made. See `once`."""
     return replace(
-        store.get(once(keys, key, request, start, parent=parent)),
+        store.get(once(keys, key, path, request, start)),
         state=JobState.QUEUED,
         started_at=None,
         finished_at=None,
@@ -78,9 +76,9 @@ def started_once(
     )
 
 
-def own_key(key: str, request: BaseModel, parent: UUID | None = None) -> str:
-    """A key as it is on record: that of one kind of request, below one parent."""
-    return " ".join([type(request).__name__, *([] if parent is None else [str(parent)]), key])
+def own_key(key: str, path: str) -> str:
+    """A key as it is on record: that of the requests to one path."""
+    return f"{path} {key}"
 
 
 def fingerprint(request: BaseModel) -> str:

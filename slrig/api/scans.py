@@ -33,7 +33,7 @@ def start_scan(
         require_healthy(health, refuse_when_stale=service.refuse_when_stale)
         return service.runner.submit(plan, label=request.label, wait=request.if_busy == "queue", key=key).id
 
-    record = started_once(service.keys, service.store, idempotency_key, request, start)
+    record = started_once(service.keys, service.store, idempotency_key, "/scan", request, start)
     response.headers["Location"] = f"/scan/{record.id}"
     return scan_body(record, {})
 

@@ -216,24 +216,24 @@ class _Examination:
             self.findings += findings
             self.findings += focus(name, self.sequence, seen, shown, period_px=self.period_px)
 
-    def _witness(self) -> Seen | None:
+    def _best_lit(self) -> Seen | None:
         """What the camera sees that is asked about the projector: the one whose image it lights most."""
         return max(self.seen.values(), key=lambda each: each.levels.lit_share, default=None)
 
     def _response(self) -> None:
-        if (witness := self._witness()) is not None:
-            self.curve, findings = response(self._viewer(witness.name), witness)
+        if (best_lit := self._best_lit()) is not None:
+            self.curve, findings = response(self._viewer(best_lit.name), best_lit)
             self.findings += findings
 
     def _flicker(self) -> None:
-        if (witness := self._witness()) is None:
+        if (best_lit := self._best_lit()) is None:
             return
-        viewer = self._viewer(witness.name)
+        viewer = self._viewer(best_lit.name)
         rows = viewer.camera.info.format.size.height_px
-        line_time_s = witness.skew_s / max(rows - 1, 1)
+        line_time_s = best_lit.skew_s / max(rows - 1, 1)
         if self.measured is not None:
-            line_time_s = self.measured.line_time_s.get(witness.name, line_time_s)
-        self.flickers, findings = flicker(viewer, witness, line_time_s=line_time_s)
+            line_time_s = self.measured.line_time_s.get(best_lit.name, line_time_s)
+        self.flickers, findings = flicker(viewer, best_lit, line_time_s=line_time_s)
         self.findings += findings
 
     def _advise(self) -> None:

@@ -27,9 +27,9 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Frames of this outline will come, and then what they have proven."""
+    """Frames of this header will come, and then what they have proven."""
 
-    outline: CaptureHeader
+    header: CaptureHeader
     calibration: Calibration
 
 
@@ -41,7 +41,7 @@ class Abandon:
 class FrameSink(Protocol):
     """Is shown the frames of a capture as they are taken."""
 
-    def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
+    def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
         """Take note of what will come."""
         ...
 
@@ -69,12 +69,12 @@ class FrameFeed:
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
+    def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
         """Start the thread. Without a calibration nothing can be reconstructed, and nothing is sent."""
         if calibration is None:
             self.abandon()
             return
-        self._waiting.put(Begin(outline, calibration))
+        self._waiting.put(Begin(header, calibration))
         self._thread = threading.Thread(target=self._carry, name="slrig-feed", daemon=True)
         self._thread.start()
 
@@ -141,8 +141,8 @@ class FedFrames:
         """Take a message of a feed. Frames that cannot be used are forgotten: reading the bundle will tell why."""
         try:
             match message:
-                case Begin(outline, calibration):
-                    self._live = self._begin(outline, calibration)
+                case Begin(header, calibration):
+                    self._live = self._begin(header, calibration)
                 case Shot() if self._live is not None:
                     self._live.take(message)
                 case EvidenceSummary() if self._live is not None:

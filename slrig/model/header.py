@@ -19,7 +19,7 @@ class CaptureHeader:
 
     @classmethod
     def of(cls, capture: Capture) -> CaptureHeader:
-        """The outline of frames that are there already."""
+        """The header of frames that are there already."""
         frames = tuple((shot.pattern, shot.camera) for shot in capture.shots)
         return cls(capture.projector, capture.patterns, capture.cameras, frames)
 

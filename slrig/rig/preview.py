@@ -133,7 +133,7 @@ class Previews:
 
         Raises whatever the devices raise. The projector is dark and the cameras are disarmed afterwards.
         """
-        eyes: dict[str, _Eye] = {}
+        shown: dict[str, _CameraPreview] = {}
         light: Light | None = None
         try:
             while not stop():
@@ -145,18 +145,18 @@ class Previews:
                 if wanted is not light:
                     light = wanted
                     _set_light(rig, light)
-                for name in [name for name in eyes if name not in asked]:
-                    eyes.pop(name).close()
+                for name in [name for name in shown if name not in asked]:
+                    shown.pop(name).close()
                 for name in asked:
-                    if name not in eyes:
-                        eyes[name] = _Eye(rig, name)
-                    frame = eyes[name].frame(rig.clock.now_ns())
+                    if name not in shown:
+                        shown[name] = _CameraPreview(rig, name)
+                    frame = shown[name].frame(rig.clock.now_ns())
                     self._put(name, _picture(frame, rig.cameras[name].info.format.full_scale))
                 self._rest(began_s + 1 / PICTURES_PER_S, stop)
         finally:
-            for eye in eyes.values():
+            for each in shown.values():
                 with suppress(Exception):
-                    eye.close()
+                    each.close()
             rig.projector.blank()
 
     def _asked(self) -> Mapping[str, Light]:
@@ -185,7 +185,7 @@ class Previews:
             self._changed.notify_all()
 
 
-class _Eye:
+class _CameraPreview:
     """A camera that is armed for pictures."""
 
     def __init__(self, rig: Rig, name: str) -> None:

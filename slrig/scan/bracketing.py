@@ -105,9 +105,9 @@ class Exposing:
             Also: no exposure of a bracket is of use to a camera, or something moved between two of them.
         """
         since_ns = self._rig.clock.now_ns() if self._bracket else None
-        eyes = list(self._rig.cameras)
+        cameras = list(self._rig.cameras)
         for exposure_s in self._exposures_s:
-            yield from self._exposed(exposure_s, eyes, since_ns)
+            yield from self._exposed(exposure_s, cameras, since_ns)
         unseen = [name for name in self._formats if name not in self._compared]
         if self._bracket and unseen:
             message = f"no exposure of the bracket is of use to camera '{unseen[0]}': {self._causes[unseen[0]]}"
@@ -120,12 +120,12 @@ class Exposing:
         parts = [(run.exposure_s or 0.0, run.evidence.summary()) for run in self._runs]
         return bracket_summary(parts, self._refused, (), self._sequence.patterns)
 
-    def _exposed(self, exposure_s: float | None, eyes: list[str], since_ns: int | None) -> Iterator[Shot]:
+    def _exposed(self, exposure_s: float | None, cameras: list[str], since_ns: int | None) -> Iterator[Shot]:
         """One sequence at one exposure, without the cameras that it is of no use to; those for which it is too long
-        are taken from `eyes`.
+        are taken from `cameras`.
         """
-        taking = list(eyes)
-        self._skip(exposure_s, set(self._formats) - set(eyes))
+        taking = list(cameras)
+        self._skip(exposure_s, set(self._formats) - set(cameras))
         while taking:
             formats = {name: self._formats[name] for name in taking}
             run = _Run(exposure_s, Evidence(self._sequence.patterns, formats))
@@ -137,7 +137,7 @@ class Exposing:
                     raise self._placed(error, run) from error
                 self._leave_out(run, unfit)
                 taking = [name for name in taking if name not in unfit]
-                eyes[:] = [n for n in eyes if n not in unfit or unfit[n].unfit is not Unfit.TOO_BRIGHT]
+                cameras[:] = [n for n in cameras if n not in unfit or unfit[n].unfit is not Unfit.TOO_BRIGHT]
                 continue
             self._compare(run, taking)
             # Whole images: nobody asks for them again.

@@ -179,7 +179,7 @@ def _walked(
         and axis in (None, live.axis)
         and _is_of(live, folder, calibration_file)
     ):
-        names += live.outline.cameras
+        names += live.header.cameras
         devices, evidence = live.calibration, live.evidence
         stream: ScanStream = live
         _require_calibration(folder, names, devices)
@@ -202,9 +202,9 @@ def _walked(
         entered("check frames", 0.58, "")
         evidence = check_exposures(capture, read_refused(folder))
     sections = capture_report(stream.capture, stream.axis, evidence)
-    step, cell = (each(stream.outline.shown, stream.axis) for each in (step_px, cell_px))
+    step, cell = (each(stream.header.shown, stream.axis) for each in (step_px, cell_px))
     notes = [*cut_short, *capture_notes(stream.capture, stream.axis, evidence), *unresolved_notes(seen, step, cell)]
-    return Walked(devices, stream.axis, stream.outline.axes, seen, step, cell, sections, notes)
+    return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes)
 
 
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:

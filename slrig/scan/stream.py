@@ -68,14 +68,14 @@ class ScanStream:
     """
 
     def __init__(
-        self, outline: CaptureHeader, calibration: Calibration, *, entered: Entered, axis: Axis | None = None
+        self, header: CaptureHeader, calibration: Calibration, *, entered: Entered, axis: Axis | None = None
     ) -> None:
-        self.outline = outline
-        devices = [calibration.cameras[name] for name in outline.cameras]
-        self.axis = axis or chosen_axis(outline.axes, devices, calibration.projector)
+        self.header = header
+        devices = [calibration.cameras[name] for name in header.cameras]
+        self.axis = axis or chosen_axis(header.axes, devices, calibration.projector)
         self.calibration = calibration
         self._shots: list[Shot] = []
-        self._cameras = {name: _CameraFrames(name, outline, self.axis, entered) for name in outline.cameras}
+        self._cameras = {name: _CameraFrames(name, header, self.axis, entered) for name in header.cameras}
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
@@ -85,8 +85,8 @@ class ScanStream:
     @property
     def capture(self) -> Capture:
         """The frames taken so far."""
-        outline = self.outline
-        return Capture(outline.projector, outline.patterns, outline.cameras, tuple(self._shots))
+        header = self.header
+        return Capture(header.projector, header.patterns, header.cameras, tuple(self._shots))
 
     def finish(self) -> list[CameraResult]:
         """The curves of every camera, once all frames are in.
@@ -122,24 +122,24 @@ class _CameraFrames:
     before all of them are in, so they wait for `finish`.
     """
 
-    def __init__(self, name: str, outline: CaptureHeader, axis: Axis, entered: Entered) -> None:
+    def __init__(self, name: str, header: CaptureHeader, axis: Axis, entered: Entered) -> None:
         self._name = name
         self._axis = axis
-        self._patterns = outline.patterns
-        self._projector = outline.projector
+        self._patterns = header.patterns
+        self._projector = header.projector
         self._entered = lambda stage: entered(stage, name)
         self._exposures_s: set[float | None] = set()
         self._repeats: dict[Pattern, list[Pixels]] = {}
-        listed = [index for index, camera in outline.frames if camera == name]
-        shown = [outline.patterns[index] for index in listed]
+        listed = [index for index, camera in header.frames if camera == name]
+        shown = [header.patterns[index] for index in listed]
         tells = telling(shown, [None] * len(shown))
         self._waiting = Counter(index for index, used in zip(listed, tells, strict=True) if used)
-        used = [outline.patterns[index] for index in self._waiting.elements()]
+        used = [header.patterns[index] for index in self._waiting.elements()]
         self._wanted = Counter(used)
         self._stream: CameraStream | None = None
         patterns = axis_patterns(self._wanted, name, axis)
         if all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
-            form = outline.cameras[name]
+            form = header.cameras[name]
             stacks = FrameStacks(
                 patterns,
                 form.size.shape,
@@ -147,7 +147,7 @@ class _CameraFrames:
                 ends_repeats=ends_repeats(used, axis),
                 compression_dn=form.compression_dn,
             )
-            tables = _tables(patterns.gray, patterns.lines, outline.projector)
+            tables = _tables(patterns.gray, patterns.lines, header.projector)
             self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered)
 
     def take(self, shot: Shot) -> None:
@@ -179,11 +179,11 @@ class _CameraFrames:
 class LiveScan(ScanStream):
     """A stream that is fed while the scan is captured, with the seconds it took so far."""
 
-    def __init__(self, outline: CaptureHeader, calibration: Calibration) -> None:
+    def __init__(self, header: CaptureHeader, calibration: Calibration) -> None:
         self.evidence: EvidenceSummary | None = None
         self.watch = Stopwatch()
         self._told: Entered = lambda stage, _camera: self.watch.enter(stage)
-        super().__init__(outline, calibration, entered=lambda stage, camera: self._told(stage, camera))
+        super().__init__(header, calibration, entered=lambda stage, camera: self._told(stage, camera))
         self.watch.enter(WAITING)
 
     def take(self, shot: Shot) -> None:

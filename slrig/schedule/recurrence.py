@@ -23,14 +23,14 @@ class DueRun:
 
 
 @dataclass(frozen=True, slots=True)
-class Reckoning:
+class Due:
     """What one look at the clock gives: rows, old to new, and the due time to look out for next."""
 
     runs: tuple[DueRun, ...]
     next_due: datetime
 
 
-def reckon(order: Order, next_due: datetime, now: datetime) -> Reckoning:
+def due_runs(order: Order, next_due: datetime, now: datetime) -> Due:
     """What became due since, and what is to be done about it.
 
     One due time within its grace runs. After a pause the newest is the one that counts: it runs if it is still within
@@ -39,10 +39,10 @@ def reckon(order: Order, next_due: datetime, now: datetime) -> Reckoning:
     """
     following = order.cron.after(now)
     if next_due > now:
-        return Reckoning((), min(next_due, following))
+        return Due((), min(next_due, following))
     newest = order.cron.newest(next_due, now)
     if newest is None:
-        return Reckoning((), following)
+        return Due((), following)
     grace = timedelta(seconds=order.grace_s)
     late = now - newest
     in_time = late <= grace
@@ -59,7 +59,7 @@ def reckon(order: Order, next_due: datetime, now: datetime) -> Reckoning:
     else:
         reason = f"made up for: due at {_clock(order, newest)}, nobody was there until {_clock(order, now)}"
         rows.append(DueRun(newest, RunState.WAITING, reason, 1, now + grace))
-    return Reckoning(tuple(rows), following)
+    return Due(tuple(rows), following)
 
 
 def _older(first: datetime, newest: datetime, count: int, *, coalesced: bool) -> DueRun:

@@ -111,7 +111,7 @@ class Scheduler:
             self._tell(store.interrupt_own(now))
         store.beat(now)
         self._tell(store.interrupt_dead(now))
-        self._tell(run for run in store.reckon(now) if run.state.final)
+        self._tell(run for run in store.record_due(now) if run.state.final)
         self._tell(store.expire(now))
         for run in store.startable(now):
             if self._stop.is_set() or not self._idle.is_set():

@@ -21,7 +21,7 @@ from slrig.jobs.database import Database
 from slrig.jobs.records import stamp
 from slrig.jobs.tables import RunRow, ScheduleRow
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
-from slrig.schedule.recurrence import DueRun, reckon
+from slrig.schedule.recurrence import DueRun, due_runs
 
 LIFE_S = 60.0
 """How long a run counts as alive after its process last said so."""
@@ -67,7 +67,7 @@ class ScheduleStore:
             return [_schedule(row) for row in session.scalars(query)]
 
     def enable(self, schedule_id: UUID, *, enabled: bool) -> Schedule:
-        """Pause a schedule, or let it go on. What was due during the pause is then reckoned as after any other.
+        """Pause a schedule, or let it go on. What was due during the pause is then judged as after any other.
 
         Raises ScheduleNotFoundError.
         """
@@ -100,13 +100,13 @@ class ScheduleStore:
         with self.database.reading() as session:
             return {(TaskKind(task), RunState(state)): int(count) for task, state, count in session.execute(query)}
 
-    def reckon(self, now: datetime) -> Sequence[Run]:
+    def record_due(self, now: datetime) -> Sequence[Run]:
         """Record what has become due. Returns the rows made."""
         made: list[RunRow] = []
         with self.database.changing() as session:
             for row in session.scalars(select(ScheduleRow).where(ScheduleRow.enabled)):
                 order = _order(row)
-                found = reckon(order, datetime.fromisoformat(row.next_due), now)
+                found = due_runs(order, datetime.fromisoformat(row.next_due), now)
                 for due in found.runs:
                     made += self._recorded(session, row, due, now)
                 following = found.next_due

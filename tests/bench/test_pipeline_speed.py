@@ -95,9 +95,9 @@ class Run:
             stream.take(shot)
         seen = stream.finish()
         watch.enter("triangulate")
-        step, cell = (each(stream.outline.shown, stream.axis) for each in (step_px, cell_px))
+        step, cell = (each(stream.header.shown, stream.axis) for each in (step_px, cell_px))
         found = triangulated(seen, calibration.projector, stream.axis)
-        walked = Walked(calibration, stream.axis, stream.outline.axes, seen, step, cell, {}, [])
+        walked = Walked(calibration, stream.axis, stream.header.axes, seen, step, cell, {}, [])
         meshed = _meshed(
             folder, found, walked, ReconstructionPlan(), lambda stage, _fraction, _detail: watch.enter(stage)
         )  # fmt: skip

@@ -54,9 +54,9 @@ class Watching:
     def __init__(self) -> None:
         self.live: LiveScan | None = None
 
-    def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
+    def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
         assert calibration is not None
-        self.live = LiveScan(outline, calibration)
+        self.live = LiveScan(header, calibration)
 
     def take(self, shot: Shot) -> None:
         assert self.live is not None

@@ -109,7 +109,7 @@ def test_times_are_those_of_the_schedules_own_zone(service: TestClient) -> None:
     assert re.search(r"30 6 \* \* \*  \w{3} \d{4}-\d\d-\d\d 06:30  Asia/Tokyo", running)
     assert "paused  America/Lima" in paused
     schedules = cast("FastAPI", service.app).state.service.schedules
-    schedules.reckon(datetime.now(UTC) + timedelta(days=3))
+    schedules.record_due(datetime.now(UTC) + timedelta(days=3))
     (tokyo, _) = kept(service)
     heads, *rows = done("runs", tokyo["id"][:8]).splitlines()
     assert heads.startswith("due (Asia/Tokyo)")

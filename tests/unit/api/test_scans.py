@@ -211,7 +211,7 @@ def test_refused_request_leaves_its_key_free(client: TestClient, served: ServedB
 
 
 def test_key_in_flight_is_refused_for_a_moment(client: TestClient, served: ServedBench) -> None:
-    served.service.keys.reserve(own_key("slow", ScanRequest()), fingerprint(ScanRequest()))
+    served.service.keys.reserve(own_key("slow", "/scan"), fingerprint(ScanRequest()))
     refused = client.post("/scan", headers={"Idempotency-Key": "slow"})
     assert (refused.status_code, refused.json()["type"]) == (409, "/problems/key-in-flight")
     assert refused.headers["Retry-After"] == "1"

@@ -84,7 +84,7 @@ def test_runs_are_listed_page_by_page(client: TestClient, served: ServedBench) -
     for _ in range(3):
         # Days on which nobody was there, each later than its grace.
         later += timedelta(days=7)
-        schedules.reckon(later + timedelta(hours=5))
+        schedules.record_due(later + timedelta(hours=5))
     schedules.enable(schedule.id, enabled=False)
     whole = client.get(made["links"]["runs"]).json()["runs"]
     assert len(whole) >= 3

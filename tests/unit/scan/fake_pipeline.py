@@ -35,8 +35,8 @@ TRIANGLE = Mesh(
 class LiveScan:
     """Counts the frames that come. The first pixel of a frame says what else to do: die (1), raise (2), hang (3)."""
 
-    def __init__(self, outline: CaptureHeader, _calibration: Calibration) -> None:
-        self.listed = len(outline.frames)
+    def __init__(self, header: CaptureHeader, _calibration: Calibration) -> None:
+        self.listed = len(header.frames)
         self.taken = 0
         self.ended = False
 

@@ -37,12 +37,12 @@ class Sink:
     """Hears what a reconstruction would."""
 
     def __init__(self) -> None:
-        self.outline: CaptureHeader | None = None
+        self.header: CaptureHeader | None = None
         self.shots: list[Shot] = []
         self.evidence: EvidenceSummary | None = None
 
-    def begin(self, outline: CaptureHeader, _calibration: Calibration | None) -> None:
-        self.outline = outline
+    def begin(self, header: CaptureHeader, _calibration: Calibration | None) -> None:
+        self.header = header
 
     def take(self, shot: Shot) -> None:
         self.shots.append(shot)

@@ -117,12 +117,12 @@ class Sink:
     """Hears what a reconstruction would."""
 
     def __init__(self) -> None:
-        self.outline: CaptureHeader | None = None
+        self.header: CaptureHeader | None = None
         self.shots: list[Shot] = []
         self.evidence: EvidenceSummary | None = None
 
-    def begin(self, outline: CaptureHeader, _calibration: Calibration | None) -> None:
-        self.outline = outline
+    def begin(self, header: CaptureHeader, _calibration: Calibration | None) -> None:
+        self.header = header
 
     def take(self, shot: Shot) -> None:
         self.shots.append(shot)
@@ -182,7 +182,7 @@ def test_the_sequence_is_played_once_for_each_exposure_from_short_to_long(tmp_pa
     times_s = [shot.time_s for shot in capture.shots if shot.camera == "left"]
     assert times_s[0] == 0.0
     assert all(a is not None and b is not None and a < b for a, b in pairwise(times_s))
-    assert CaptureHeader.of(capture) == sink.outline == CaptureHeader.of(replace(capture, shots=tuple(sink.shots)))
+    assert CaptureHeader.of(capture) == sink.header == CaptureHeader.of(replace(capture, shots=tuple(sink.shots)))
     assert sink.evidence == check_exposures(capture)
     assert str(sink.evidence) == f"{COUNT}/{COUNT} patterns verified"
     assert told[-1] == (1.0, f"frame {6 * COUNT} of {6 * COUNT}")

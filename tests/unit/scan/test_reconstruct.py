@@ -365,8 +365,8 @@ def test_capture_shows_each_frame_that_it_records(tmp_path: Path) -> None:
         def __init__(self) -> None:
             self.told: list[object] = []
 
-        def begin(self, outline: CaptureHeader, calibration: Calibration | None) -> None:
-            self.told += [outline, calibration]
+        def begin(self, header: CaptureHeader, calibration: Calibration | None) -> None:
+            self.told += [header, calibration]
 
         def take(self, shot: Shot) -> None:
             self.told.append(shot)
@@ -381,8 +381,8 @@ def test_capture_shows_each_frame_that_it_records(tmp_path: Path) -> None:
             rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False, frames=sink
         )
     written = read_bundle(tmp_path / "bundle").capture
-    outline, known, *shots, evidence = sink.told
-    assert outline == CaptureHeader.of(written)
+    header, known, *shots, evidence = sink.told
+    assert header == CaptureHeader.of(written)
     assert known is calibration
     assert evidence == check_capture(written)
     for shot, again in zip(shots, written.shots, strict=True):

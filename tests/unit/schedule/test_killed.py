@@ -41,7 +41,7 @@ def test_kill_at_sixty_random_instants_leaves_every_due_time_with_one_row(tmp_pa
         assert process.exitcode == -signal.SIGKILL
     store.interrupt_dead(victim.moment(), alone=True)
     now = victim.moment()
-    store.reckon(now)
+    store.record_due(now)
     runs = store.runs(schedule.id, limit=5000)
     # Every due time is accounted for, once.
     assert sum(run.count for run in runs) == cron.count(begun, store.get(schedule.id).next_due, most=100_000) - 1

@@ -282,7 +282,7 @@ def test_a_run_of_a_dead_process_is_interrupted_when_it_is_silent_for_long(new_d
     one, other = new_desk(alone=False), new_desk(alone=False)
     daily = one.daily()
     one.now += timedelta(hours=1)
-    one.store.reckon(one.now)
+    one.store.record_due(one.now)
     assert one.store.start(one.run(daily), one.now)
     other.now = one.now
     other.look(seconds=30)
@@ -300,7 +300,7 @@ def test_a_service_that_starts_alone_ends_what_was_left(new_desk: NewDesk) -> No
     one = new_desk()
     daily = one.daily()
     one.now += timedelta(hours=1)
-    one.store.reckon(one.now)
+    one.store.record_due(one.now)
     assert one.store.start(one.run(daily), one.now)
     other = new_desk(now=one.now)
     other.scheduler.start()
