@@ -1,6 +1,6 @@
 """Campaign: service and worker killed or stopped at random instants of work of every kind.
 
-Run it by name: `SLRIG_ENDS=100 pytest -s tests/bench/test_random_ends.py`.
+Run it by name: `SLRIG_ENDS=100 pytest -s -o faulthandler_timeout=0 tests/bench/test_random_ends.py`.
 """
 
 from __future__ import annotations

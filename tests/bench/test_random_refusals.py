@@ -3,7 +3,7 @@
 Records that are read-only are refused within the process by `tests/unit/scan/test_refused_records.py`: a file that the
 kernel makes read-only under SQLite's shared memory ends the process with SIGBUS, which no service can take.
 
-Run it by name: `SLRIG_REFUSALS=30 pytest -s tests/bench/test_random_refusals.py`.
+Run it by name: `SLRIG_REFUSALS=30 pytest -s -o faulthandler_timeout=0 tests/bench/test_random_refusals.py`.
 """
 
 from __future__ import annotations
