@@ -55,21 +55,8 @@ class JobStore:
         """Record a new job as queued and, in the same transaction, tie its idempotency key to it. kind : one of the
         store's, its first by default.
         """
-        row = JobRow(
-            id=str(job_id or uuid4()),
-            kind=kind or self.kinds[0],
-            parent=None if parent is None else str(parent),
-            state=JobState.QUEUED,
-            label=label,
-            rig=rig,
-            plan=dict(plan),
-            created_at=self._now(),
-            stage="waiting",
-            fraction=0.0,
-            detail="",
-            last_event=0,
-            pinned=False,
-        )
+        row = _new_row(job_id or uuid4(), kind or self.kinds[0], plan, rig=rig, label=label, parent=parent)
+        row.state, row.created_at, row.stage, row.pinned = JobState.QUEUED, self._now(), "waiting", False
         with self.database.changing() as session:
             session.add(row)
             session.flush()
@@ -97,22 +84,9 @@ class JobStore:
         """Put a job that ended on record again. How it went is not known any more; its end is taken for now. Whether it
         was pinned is not known either: it is pinned. fault : why it failed, None where it succeeded.
         """
-        row = JobRow(
-            id=str(job_id),
-            kind=self.kinds[0],
-            parent=None if parent is None else str(parent),
-            state=JobState.SUCCEEDED,
-            label=label,
-            rig=rig,
-            plan=dict(plan),
-            created_at=stamp(created_at),
-            started_at=stamp(started_at),
-            stage="",
-            fraction=0.0,
-            detail="",
-            last_event=0,
-            pinned=True,
-        )
+        row = _new_row(job_id, self.kinds[0], plan, rig=rig, label=label, parent=parent)
+        row.state, row.created_at, row.stage, row.pinned = JobState.SUCCEEDED, stamp(created_at), "", True
+        row.started_at = stamp(started_at)
         with self.database.changing() as session:
             session.add(row)
             session.flush()
@@ -317,6 +291,23 @@ class JobStore:
             watchers = [wake for each in woken for wake in self._watchers.get(each, ())]
         for wake in watchers:
             wake()
+
+
+def _new_row(
+    job_id: UUID, kind: JobKind, plan: Mapping[str, Any], *, rig: str, label: str | None, parent: UUID | None
+) -> JobRow:
+    """A job that nothing has happened to; where it stands is for the caller to say."""
+    return JobRow(
+        id=str(job_id),
+        kind=kind,
+        parent=None if parent is None else str(parent),
+        label=label,
+        rig=rig,
+        plan=dict(plan),
+        fraction=0.0,
+        detail="",
+        last_event=0,
+    )
 
 
 def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> None:
