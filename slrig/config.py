@@ -239,6 +239,8 @@ class ServiceSettings(BaseSettings):
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
     max_event_streams: Annotated[int, Field(ge=1)] = 32
+    max_connections: Annotated[int, Field(ge=16, le=1536)] = 512
+    max_connections_per_address: Annotated[int, Field(ge=1)] = 64
     keepalive_s: Annotated[float, Field(gt=0)] = 15.0
     shutdown_s: Annotated[float, Field(gt=0)] = 3.0
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -17,6 +18,7 @@ from starlette.concurrency import run_in_threadpool
 
 from slrig import KEY_VARIABLE
 from slrig.api.app import create_app
+from slrig.api.connections import ConnectionConfig, Deadlines, listening_socket, quiet_accepts, room_for
 from slrig.api.logs import set_up_logs
 from slrig.api.security import claim_key
 from slrig.api.service import Service
@@ -160,11 +162,11 @@ def serve(
         if not is_loopback(settings.host):
             say("Other machines can reach it. Keys and scans travel unencrypted: put a TLS proxy in front.")
         write_file(address, json.dumps({"url": url, "process_id": os.getpid()}).encode())
-        config = uvicorn.Config(
+        config = ConnectionConfig(
             create_app(service, key_digest=key_digest),
+            deadlines=Deadlines(),
+            room=room_for(settings.max_connections, most_per_address=settings.max_connections_per_address),
             log_level="warning",
-            access_log=False,
-            server_header=False,
             # Streams end by themselves once their scans have; this is for every other request under way.
             timeout_graceful_shutdown=1,
         )
@@ -189,6 +191,11 @@ class _Server(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
         self._service = service
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """See `uvicorn.Server`."""
+        quiet_accepts(asyncio.get_running_loop())
+        await super().startup(sockets)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """See `uvicorn.Server`."""
@@ -224,17 +231,11 @@ def _terminate() -> None:
 
 
 def _listener(settings: ServiceSettings) -> socket.socket:
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    if sys.platform != "win32":
-        # There it would let two programs listen at one address.
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((settings.host, settings.port))
+        listener = listening_socket(settings.host, settings.port)
         # From now on a client that was told the address may connect: it is answered once the service is up.
         listener.listen()
     except OSError as error:
-        listener.close()
         message = (
             f"The service cannot listen on {settings.host} port {settings.port}: {error.strerror}. Stop what uses that "
             "port, choose another with --port, or any free one with --port 0."
