@@ -221,8 +221,9 @@ class ServiceSettings(BaseSettings):
     the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
     are removed with their poses, but for the one in use and those that a scan or an acceptance test names. Scans are
     kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes` sets a limit: beyond it the oldest are
-    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `log_format`
-    auto is text on a terminal, and JSON lines elsewhere.
+    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. Nobody but the
+    service's own user may read the data, and the users of `data_group`, if it is set. `log_format` auto is text on a
+    terminal, and JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -232,6 +233,7 @@ class ServiceSettings(BaseSettings):
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8731
     data_dir: Path = Field(default_factory=default_data_dir)
+    data_group: Annotated[str, Field(min_length=1)] | None = None
     rig: Path | None = None
     require_key: bool = True
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
@@ -239,6 +241,7 @@ class ServiceSettings(BaseSettings):
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
     max_event_streams: Annotated[int, Field(ge=1)] = 32
+    requests_per_s: Annotated[float, Field(gt=0)] = 50.0
     max_connections: Annotated[int, Field(ge=16, le=1536)] = 512
     max_connections_per_address: Annotated[int, Field(ge=1)] = 64
     keepalive_s: Annotated[float, Field(gt=0)] = 15.0
@@ -255,8 +258,8 @@ class ServiceSettings(BaseSettings):
 
     @property
     def key_path(self) -> Path:
-        """The file that holds the hash of the service's key."""
-        return self.data_dir / "key.sha256"
+        """The file that holds the hashes of the service's keys."""
+        return self.data_dir / "keys.json"
 
     @field_validator("data_dir", "rig")
     @classmethod

@@ -10,13 +10,29 @@ from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from slrig.api import acceptance, artefacts, calibration, events, health, rig, scans, schedules, system
+from slrig.api import (
+    acceptance,
+    artefacts,
+    audit,
+    calibration,
+    docs,
+    events,
+    health,
+    rig,
+    scans,
+    schedules,
+    sessions,
+    system,
+)
+from slrig.api.access import Access
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.events import OpenStreams
+from slrig.api.keys import KeyRing
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
-from slrig.api.security import LOCAL_NAMES, BodyLimits, KeyCheck
+from slrig.api.security import LOCAL_NAMES, BodyLimits, SecurityHeaders
 from slrig.api.service import Service
+from slrig.api.sessions import Sessions
 
 _TITLE = "slrig"
 _SUMMARY = "Structured-light scans over HTTP: from POST /scan to a triangle mesh in millimetres"
@@ -34,28 +50,47 @@ def bare_app() -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         lifespan=_life,
     )
-    for part in (scans, events, artefacts, rig, calibration, health, acceptance, schedules, system):
+    for part in (
+        scans,
+        events,
+        artefacts,
+        rig,
+        calibration,
+        health,
+        acceptance,
+        schedules,
+        sessions,
+        audit,
+        system,
+        docs,
+    ):
         app.include_router(part.router)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)
     return app
 
 
-def create_app(service: Service, *, key_digest: str | None) -> FastAPI:
-    """The application over a service, which it starts and closes. `key_digest` None leaves it open to all."""
+def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_session") -> FastAPI:
+    """The application over a service, which it starts and closes.
+
+    ring : its keys; None leaves it open to all. cookie : the name of what a browser that is logged in sends.
+    """
     settings = service.settings
     app = bare_app()
     app.state.service = service
     app.state.streams = OpenStreams(settings.max_event_streams)
-    # The last one added is the outermost: every refusal becomes a problem, Host comes first, then the key, then the
-    # body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
+    app.state.sessions = None if ring is None else Sessions(ring, cookie=cookie)
+    # The last one added is the outermost: every refusal becomes a problem, Host comes first, then page and key, then
+    # the body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
     longer = {IMPORT_PATH: max(MOST_IMPORT_BYTES, settings.max_body_bytes)}
     app.add_middleware(BodyLimits, most_bytes=settings.max_body_bytes, longer=longer)
-    if key_digest is not None:
-        app.add_middleware(KeyCheck, key_digest=key_digest)
+    app.add_middleware(
+        Access, ring=ring, sessions=app.state.sessions, audit=service.audit, per_second=settings.requests_per_s
+    )
     hosts = [*LOCAL_NAMES, settings.host, *settings.allowed_hosts]
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)
     app.add_middleware(PlainErrorsToProblems)
+    app.add_middleware(SecurityHeaders)
     return app
 
 

@@ -10,9 +10,10 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from slrig.api.problems import MEDIA_TYPE, Problem
+from slrig.api.scopes import needed_scope
 
 _PROBLEM = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-_EVERYWHERE = (400, 401, 413, 500)
+_EVERYWHERE = (400, 401, 403, 413, 429, 500)
 
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -29,7 +30,7 @@ def file_of(media_type: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document of the service: every refusal is a problem, and everything but the probes needs the key."""
+    """The OpenAPI document of the service: every refusal is a problem, and what needs a key says what for."""
     if app.openapi_schema:
         return app.openapi_schema
     document = get_openapi(title=app.title, version=app.version, summary=app.summary, routes=app.routes)
@@ -44,9 +45,10 @@ def describe(app: FastAPI) -> dict[str, Any]:
         "bearer": {"type": "http", "scheme": "bearer"},
         "header": {"type": "apiKey", "in": "header", "name": "X-API-Key"},
     }
-    document["security"] = [{"bearer": []}, {"header": []}]
+    components["securitySchemes"]["session"] = {"type": "apiKey", "in": "cookie", "name": "slrig_session_PORT"}
+    document["security"] = [{"bearer": []}, {"header": []}, {"session": []}]
     for path, operations in document["paths"].items():
-        for operation in operations.values():
+        for method, operation in operations.items():
             answers = operation["responses"]
             for status, found in list(answers.items()):
                 if "HTTPValidationError" in json.dumps(found):
@@ -56,9 +58,13 @@ def describe(app: FastAPI) -> dict[str, Any]:
                 needed.append(422)
             if "{" in path:
                 needed.append(404)
+            if method not in {"get", "head"}:
+                needed.append(415)
             for status in needed:
                 answers.setdefault(str(status), problems(status)[status])
             operation["responses"] = dict(sorted(answers.items()))
+            if operation.get("security") != []:
+                operation["x-scope"] = str(needed_scope(method.upper(), path))
     app.openapi_schema = document
     return document
 

@@ -103,7 +103,9 @@ def explanations() -> dict[str, str]:
     tree = {code: " ".join((error.__doc__ or "").split()) for code, error in errors_by_code().items()}
     own = {
         "invalid-request": "The request does not fit what is documented in /openapi.json. `errors` has every fault.",
-        "unauthorized": "The request carries no API key, or a wrong one. The key was printed at the first start.",
+        "unauthorized": "The request carries no API key or session, or one that is wrong, over or revoked.",
+        "scope": "The key is not for this: its scopes say what for.",
+        "foreign-page": "The request was sent by the page of another site, or of another service of this machine.",
         "unexpected": "slrig met an error it did not expect. The service's log has the details.",
         "not-ready": "The service runs and cannot scan. `checks` says why.",
     }
@@ -128,10 +130,10 @@ async def _slrig_error(_request: Request, error: Exception) -> JSONResponse:
     return answer(document, headers=None if wait_s is None else {"Retry-After": str(wait_s)})
 
 
-async def _invalid_request(request: Request, error: Exception) -> JSONResponse:
+async def _invalid_request(_request: Request, error: Exception) -> JSONResponse:
     if not isinstance(error, RequestValidationError):
         raise error
-    found = field_faults(error.errors(), is_json="json" in request.headers.get("content-type", "").lower())
+    found = field_faults(error.errors())
     names = ", ".join(fault["field"] for fault in found)
     noun = "fault" if len(found) == 1 else "faults"
     detail = f"The request has {len(found)} {noun}: {names}. See errors."
@@ -155,20 +157,14 @@ async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
     return answer(problem(500, UNEXPECTED, detail))
 
 
-def field_faults(found: Sequence[Any], *, is_json: bool = True) -> list[dict[str, Any]]:
-    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short.
-
-    `is_json` says whether the request called its body JSON.
-    """
-    return [_field_fault(entry, is_json=is_json) for entry in found]
+def field_faults(found: Sequence[Any]) -> list[dict[str, Any]]:
+    """What pydantic found, as the `errors` of a problem. What was sent is shown only where it is short."""
+    return [_field_fault(entry) for entry in found]
 
 
-def _field_fault(entry: Any, *, is_json: bool) -> dict[str, Any]:
+def _field_fault(entry: Any) -> dict[str, Any]:
     if entry["type"] == "json_invalid":
         message = f"is no JSON: {entry['ctx']['error']} at character {entry['loc'][-1]}"
-        return {"field": "body", "message": message}
-    if entry["loc"] == ("body",) and not is_json:
-        message = "expected a JSON object; send it with Content-Type: application/json"
         return {"field": "body", "message": message}
     place = [printable(str(part)) for part in entry["loc"] if part != "body"]
     sent = entry.get("input")

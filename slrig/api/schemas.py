@@ -192,6 +192,7 @@ class ScanBody(BaseModel):
     error: FaultBody
     summary: dict[str, Any] | None = Field(description="the plain figures and the notes of report.json")
     pinned: bool = Field(description="kept, whatever the settings say of old scans")
+    requested_by: str | None = Field(description="the name of the key, or the schedule, that asked for it")
     links: ScanLinks
 
 

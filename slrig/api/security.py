@@ -1,102 +1,48 @@
-"""Who may talk to the service, by which name, and how much at once: whoever has the key."""
+"""What every answer carries for the browser's sake, and how much a request may bring."""
 
 from __future__ import annotations
 
-import hashlib
-import hmac
-import secrets
 from collections.abc import Mapping
-from pathlib import Path
 
-from starlette.datastructures import Headers
+from starlette.datastructures import MutableHeaders
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
-from starlette.types import ASGIApp, Receive, Scope, Send
-
-from slrig import KEY_VARIABLE
-from slrig.api.problems import answer, problem
-from slrig.bundle.storage import write_file
-from slrig.errors import ConfigError
-
-OPEN_PATHS = frozenset({"/livez", "/readyz"})
-"""What answers without a key: probes, which tell nothing about scans."""
-
-LEAST_KEY_LENGTH = 16
-"""A key that people made up and that is shorter than this can be guessed."""
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
 
-
-def digest(key: str) -> str:
-    """What is kept of a key: its SHA-256. A key has 256 random bits, so it needs no salt and no slow hash."""
-    return hashlib.sha256(key.encode()).hexdigest()
-
-
-def claim_key(path: Path, *, given: str | None, fresh: bool) -> tuple[str, str | None]:
-    """Return the digest of the service's key, and the key itself if it was made just now, to be shown once.
-
-    `given` is a key from the environment, used as it is and kept nowhere; else the digest in `path`; `fresh`, or no
-    such file, makes a new key.
-
-    Raises
-    ------
-    ConfigError
-        The given key is too short or cannot travel in a header, or a fresh one is asked for beside it.
-    StorageError
-        The digest cannot be written.
-    """
-    if given:
-        _refuse_bad_key(given, fresh=fresh)
-        return digest(given), None
-    if not fresh and path.is_file():
-        return path.read_text(encoding="ascii").strip(), None
-    key = secrets.token_urlsafe(32)
-    write_file(path, f"{digest(key)}\n".encode("ascii"))
-    path.chmod(0o600)
-    return digest(key), key
+_HEADERS = {
+    # What is sent as a picture or as text is never run.
+    "X-Content-Type-Options": "nosniff",
+    # Our pages load from here alone, and nobody frames them.
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; "
+    "object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    # No other site's page shows our pictures, holds our window, or is told which page a link was on.
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
 
 
-def _refuse_bad_key(given: str, *, fresh: bool) -> None:
-    if fresh:
-        message = f"--new-key asks for a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
-        raise ConfigError(message)
-    sendable = given.isascii() and given.isprintable()
-    if len(given) < LEAST_KEY_LENGTH or not sendable:
-        others = "" if sendable else ", and others among them"
-        message = (
-            f"{KEY_VARIABLE}: expected a key of {LEAST_KEY_LENGTH} or more printable ASCII characters, found "
-            f"{len(given)}{others}. Unset it, and the service makes a key of its own."
-        )
-        raise ConfigError(message)
+class SecurityHeaders:
+    """Middleware that adds them, where an answer says nothing of its own."""
 
-
-class KeyCheck:
-    """Middleware that lets only requests with the key pass: `Authorization: Bearer KEY` or `X-API-Key: KEY`."""
-
-    def __init__(self, app: ASGIApp, *, key_digest: str) -> None:
+    def __init__(self, app: ASGIApp) -> None:
         self._app = app
-        self._digest = key_digest
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request, or refuse it."""
-        if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
-            sent = _sent_key(Headers(scope=scope))
-            if sent is None or not hmac.compare_digest(digest(sent), self._digest):
-                detail = (
-                    f"This service needs its API key, and the request has {'none' if sent is None else 'another one'}. "
-                    "Send the key that was printed at the first start as 'Authorization: Bearer KEY' or 'X-API-Key: "
-                    "KEY'; if it is lost, start the service with --new-key."
-                )
-                refusal = answer(problem(401, "unauthorized", detail), headers={"WWW-Authenticate": "Bearer"})
-                await refusal(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        """Serve one request."""
 
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                # A report has a stricter policy of its own.
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
 
-def _sent_key(headers: Headers) -> str | None:
-    scheme, _, token = headers.get("authorization", "").partition(" ")
-    if scheme.lower() == "bearer" and token.strip():
-        return token.strip()
-    return headers.get("x-api-key")
+        await self._app(scope, receive, with_headers if scope["type"] == "http" else send)
 
 
 class BodyLimits:

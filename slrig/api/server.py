@@ -19,16 +19,17 @@ from starlette.concurrency import run_in_threadpool
 from slrig import KEY_VARIABLE
 from slrig.api.app import create_app
 from slrig.api.connections import ConnectionConfig, Deadlines, listening_socket, quiet_accepts, room_for
+from slrig.api.keys import KeyRing, first_key
 from slrig.api.logs import set_up_logs
-from slrig.api.security import claim_key
 from slrig.api.service import Service
+from slrig.api.sessions import LINK_PATH, Sessions
 from slrig.bundle.storage import write_file
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
-from slrig.errors import InvalidInputError, ServiceError
+from slrig.errors import ConfigError, InvalidInputError, ServiceError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.records import JobKind
+from slrig.jobs.records import JobKind, utc_now
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
 from slrig.rig.session import RigSession
@@ -39,6 +40,8 @@ from slrig.scan.sweep import sweep
 
 ADDRESS_FILE = "service.json"
 """Where in the data folder a running service tells its URL and process id."""
+
+_FIRST_KEY_FILE = "first-key"
 
 _TELL_S = 2.5
 """How often a person is told how far the kernels are."""
@@ -58,7 +61,7 @@ def open_service(
     StorageError
         The folder is in use, or the disk refused.
     """
-    folder = DataFolder(settings.data_dir)
+    folder = DataFolder(settings.data_dir, group=settings.data_group)
     try:
         prepare_kernel_cache(folder.root / "cache")
         store = JobStore(Database(folder.database), JobKind.SCAN)
@@ -127,6 +130,8 @@ def serve(
         The address is taken.
     """
     set_up_logs(settings.log_level, settings.log_format)
+    # Whatever is written from now on is for the service's user alone, or may be read by one group.
+    os.umask(0o077 if settings.data_group is None else 0o027)
     # uvicorn catches SIGTERM while it serves, ends in good order, and then raises it again: here it must not kill the
     # process before the rest of this function has run.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -153,17 +158,16 @@ def serve(
         raise
     address, ended = service.folder.root / ADDRESS_FILE, threading.Event()
     try:
-        key_digest, key = None, None
-        if settings.require_key:
-            key_digest, key = claim_key(settings.key_path, given=os.environ.get(KEY_VARIABLE), fresh=new_key)
+        ring = _keys(settings, fresh=new_key) if settings.require_key else None
+        app = create_app(service, ring=ring, cookie=f"slrig_session_{port}")
         say(f"slrig serves rig '{rig.name}' at {url}, data in {service.folder.root}. Ctrl-C stops it.")
-        if key is not None:
-            say(f"API key, shown only now: {key}\nIn the terminal of the client: export {KEY_VARIABLE}={key}")
+        if ring is not None:
+            _tell_keys(ring, app.state.sessions, url, service.folder, fresh=new_key, say=say)
         if not is_loopback(settings.host):
             say("Other machines can reach it. Keys and scans travel unencrypted: put a TLS proxy in front.")
         write_file(address, json.dumps({"url": url, "process_id": os.getpid()}).encode())
         config = ConnectionConfig(
-            create_app(service, key_digest=key_digest),
+            app,
             deadlines=Deadlines(),
             room=room_for(settings.max_connections, most_per_address=settings.max_connections_per_address),
             log_level="warning",
@@ -213,6 +217,34 @@ def _tell_preparation(service: Service, say: Callable[[str], None], ended: threa
         ended.wait(_TELL_S)
     if told and not status.ending:
         say("kernels are ready" if status.reconstruction == READY else status.reconstruction)
+
+
+def _keys(settings: ServiceSettings, *, fresh: bool) -> KeyRing:
+    given = os.environ.get(KEY_VARIABLE)
+    if given and fresh:
+        message = f"--new-key asks for a new key, and {KEY_VARIABLE} holds the one to use. Leave out one of the two."
+        raise ConfigError(message)
+    return KeyRing(settings.key_path, given=given or None)
+
+
+def _tell_keys(
+    ring: KeyRing, sessions: Sessions, url: str, folder: DataFolder, *, fresh: bool, say: Callable[[str], None]
+) -> None:
+    """Make the first key, if there is none, and tell a person; what is not a terminal may be kept for years as a log,
+    and is told where the key lies instead.
+    """
+    key = first_key(ring, fresh=fresh)
+    if sys.stdout.isatty():
+        if key is not None:
+            say(f"API key, shown only now: {key}\nIn the terminal of the client: export {KEY_VARIABLE}={key}")
+        owner = next((each.name for each in ring.everybody if each.fault(utc_now()) is None), None)
+        if owner is not None:
+            say(f"In a browser, once, within a quarter of an hour: {url}{LINK_PATH}?token={sessions.link(owner)}")
+    elif key is not None:
+        path = folder.root / _FIRST_KEY_FILE
+        write_file(path, f"{key}\n".encode("ascii"))
+        path.chmod(0o600)
+        say(f"A first API key was made; read it in {path}, then remove that file.")
 
 
 def _stop_at_eof() -> None:

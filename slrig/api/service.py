@@ -14,6 +14,7 @@ from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
+from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobRecord
@@ -67,6 +68,7 @@ class Service:
         database, spare_bytes = store.database, settings.min_free_bytes
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
+        self.audit = Audit(database)
         self.calibrations = Calibrations(
             folder,
             runner,
@@ -144,7 +146,7 @@ Serving = Annotated[Service, Depends(_of_request)]
 
 Cursor = Annotated[int | None, Query(ge=1, le=2**53, description="`next` of the page before")]
 PageLength = Annotated[int, Query(ge=1, le=200)]
-Shown = TypeVar("Shown", JobRecord, Run)
+Shown = TypeVar("Shown", JobRecord, Run, AuditEntry)
 
 
 def paged(

@@ -28,7 +28,7 @@ from slrig.failure import JobFailure, disk_errors
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Holder
 from slrig.jobs.progress import ProgressRecorder
-from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
+from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as, actor, utc_now
 from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
 from slrig.model import Size
 from slrig.rig.session import RigFacts
@@ -116,7 +116,7 @@ class PoseDesk:
                     pose.plan, rig=status.rig, label=None, key=key, job_id=pose.id, kind=JobKind.POSE, parent=session_id
                 )
 
-            parts = self._parts(session_id, pose, scan)
+            parts = self._parts(session_id, pose, scan, asked_by=actor())
             self.work.submit(pose.id, parts, holder=holder or _holder(session_id, number), wait=wait, record=begun)
             return self.register.pose(session_id, number)
 
@@ -126,7 +126,7 @@ class PoseDesk:
         """
         pose = pose_of(job)
         scan = ScanPlan(patterns=self.register.get(session_id).patterns, exposure_s=pose.exposure_s)
-        parts = self._parts(session_id, pose, scan)
+        parts = self._parts(session_id, pose, scan, asked_by=job.requested_by)
         whole = (self.folder.staging(job.id) / BUNDLE).is_dir()
         self.work.take_up(job, parts, holder=_holder(session_id, pose.number), resumes=whole)
 
@@ -176,8 +176,8 @@ class PoseDesk:
             self.register.jobs.delete(pose.id)
         self._survey(session_id)
 
-    def _parts(self, session_id: UUID, pose: PoseRecord, scan: ScanPlan) -> Parts:
-        """The two parts of a pose."""
+    def _parts(self, session_id: UUID, pose: PoseRecord, scan: ScanPlan, *, asked_by: str | None) -> Parts:
+        """The two parts of a pose. asked_by : who asks for the next one of its script, too."""
         staged = self.folder.staging(pose.id)
         last_frame_s = time.monotonic()
 
@@ -193,6 +193,10 @@ class PoseDesk:
             self.tools.capture(bare, scan, staged / BUNDLE, progress=progress, cancelled=cancelled)
             last_frame_s = time.monotonic()
 
+        def captured() -> None:
+            with acting_as(asked_by):
+                self._go_on(session_id, pose.exposure_s)
+
         def ended(state: JobState, fault: JobFailure | None) -> None:
             """Remove a pose that came to nothing, and end the script with it."""
             if state is not JobState.SUCCEEDED and (fault is None or fault.code != PoseRefusedError.code):
@@ -201,7 +205,7 @@ class PoseDesk:
 
         return Parts(
             capture=capture,
-            captured=lambda: self._go_on(session_id, pose.exposure_s),
+            captured=captured,
             compute=lambda _: self._read(session_id, pose, staged, last_frame_s),
             ended=ended,
         )

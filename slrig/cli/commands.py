@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 import typer
 import typer.core
 
-from slrig.cli import calibrate, schedule
+from slrig.cli import calibrate, key, schedule
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.errors import SlrigError
 
@@ -377,6 +377,7 @@ def accept(
 
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
+app.add_typer(key.app, name="key")
 
 
 def main() -> None:

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
 
+import structlog
 from filelock import FileLock, Timeout
 
 from slrig.bundle.storage import sync_file, sync_folder
@@ -26,6 +27,8 @@ from slrig.errors import StorageError
 from slrig.failure import disk_errors
 
 _HOLDER = "holder"
+
+_log = structlog.get_logger(__name__)
 
 _PROMISED = ("mesh.ply", "report.json")
 """What every scan has that succeeded."""
@@ -37,7 +40,8 @@ def free_bytes(folder: Path) -> int:
 
 
 class DataFolder:
-    """The data folder, held by this process from construction until `release`.
+    """The data folder, held by this process from construction until `release`, and closed to other users of the
+    machine, but for those of `group`, who may read it.
 
     Raises
     ------
@@ -45,12 +49,13 @@ class DataFolder:
         Another process holds it, or it cannot be made.
     """
 
-    def __init__(self, root: Path, *, free: Callable[[Path], int] = free_bytes) -> None:
+    def __init__(self, root: Path, *, free: Callable[[Path], int] = free_bytes, group: str | None = None) -> None:
         self.root = root.resolve()
         self._free = free
         with disk_errors(self.root):
             for folder in (self.root, self.scans, self.calibrations, self.incoming):
                 folder.mkdir(parents=True, exist_ok=True)
+            self._close_to_others(group)
             # Whichever thread ends the service lets it go; a kernel that cannot lock is a refusal, not a makeshift.
             self._lock = FileLock(self.root / "lock", mode=0o600, thread_local=False, fallback_to_soft=False)
             try:
@@ -67,6 +72,27 @@ class DataFolder:
             except BaseException:
                 self._lock.release()
                 raise
+
+    def _close_to_others(self, group: str | None) -> None:
+        if os.name == "nt":
+            return
+        try:
+            if group is not None:
+                shutil.chown(self.root, group=group)
+            # What is made below belongs to the group of its folder (set-group-ID).
+            self.root.chmod(0o700 if group is None else 0o2750)
+        except LookupError as error:
+            message = f"There is no group '{group}' on this machine. Make it, or name another with data_group."
+            raise StorageError(message) from error
+        except PermissionError as error:
+            if group is not None:
+                message = (
+                    f"The data folder {self.root} cannot be given to the group '{group}': {error.strerror}. Let the "
+                    "user of the service own the folder and be in the group, or leave data_group out."
+                )
+                raise StorageError(message) from error
+            # A disk without users, or somebody else's folder.
+            _log.warning("other users of this machine may be able to read the data folder", folder=str(self.root))
 
     def _holder(self) -> str:
         """The process id of who holds the folder."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -18,6 +20,24 @@ Clock = Callable[[], datetime]
 def utc_now() -> datetime:
     """The present moment, UTC. For records only: durations are measured with a monotonic clock."""
     return datetime.now(UTC)
+
+
+_actor: ContextVar[str | None] = ContextVar("actor", default=None)
+
+
+@contextmanager
+def acting_as(name: str | None) -> Iterator[None]:
+    """Jobs that are made within the block, on this thread or one that it waits for, were asked for by `name`."""
+    before = _actor.set(name)
+    try:
+        yield
+    finally:
+        _actor.reset(before)
+
+
+def actor() -> str | None:
+    """Who asks for what is being made now."""
+    return _actor.get()
 
 
 class JobKind(StrEnum):
@@ -70,6 +90,7 @@ class JobRecord:
 
     parent : the calibration of a pose or a solve, the acceptance test of a position. summary : what came of it, as far
     as a list shows it; None before. pinned : no retention removes it.
+    requested_by : the name of the key, or the schedule, that asked for it, where that is known.
     """
 
     number: int
@@ -87,6 +108,7 @@ class JobRecord:
     summary: Mapping[str, Any] | None
     pinned: bool = False
     parent: UUID | None = None
+    requested_by: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

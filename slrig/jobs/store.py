@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from slrig.errors import JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
-from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, stamp, utc_now
+from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, actor, stamp, utc_now
 from slrig.jobs.tables import EventRow, JobRow, KeyRow
 
 _LISTED = {
@@ -307,6 +307,7 @@ def _new_row(
         fraction=0.0,
         detail="",
         last_event=0,
+        requested_by=actor(),
     )
 
 
@@ -332,6 +333,7 @@ def _record(row: JobRow) -> JobRecord:
         summary=row.summary,
         pinned=row.pinned,
         parent=None if row.parent is None else UUID(row.parent),
+        requested_by=row.requested_by,
     )
 
 

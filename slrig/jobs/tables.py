@@ -17,7 +17,7 @@ class Base(DeclarativeBase):
 
 class JobRow(Base):
     """One job of any kind. parent : the calibration or the acceptance test that it belongs to, if it belongs to one.
-    pinned : no retention removes it.
+    pinned : no retention removes it. requested_by : the name of the key, or the schedule, that asked for it.
     """
 
     __tablename__ = "job"
@@ -41,6 +41,7 @@ class JobRow(Base):
     summary: Mapped[dict[str, Any] | None] = mapped_column(JSON(none_as_null=True))
     last_event: Mapped[int] = mapped_column(Integer)
     pinned: Mapped[bool] = mapped_column(Boolean)
+    requested_by: Mapped[str | None] = mapped_column(String(80))
 
     __table_args__ = (
         Index("ix_job_kind_state", "kind", "state"),
@@ -76,6 +77,23 @@ class KeyRow(Base):
     fingerprint: Mapped[str] = mapped_column(String(64))
     job_id: Mapped[str | None] = mapped_column(String(36))
     created_at: Mapped[str] = mapped_column(String(32))
+
+
+class AuditRow(Base):
+    """One request that changed something, or tried to, and who sent it from where."""
+
+    __tablename__ = "audit"
+
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    at: Mapped[str] = mapped_column(String(32))
+    who: Mapped[str] = mapped_column(String(80))
+    address: Mapped[str] = mapped_column(String(64))
+    method: Mapped[str] = mapped_column(String(16))
+    path: Mapped[str] = mapped_column(String(400))
+    status: Mapped[int] = mapped_column(Integer)
+    made: Mapped[str] = mapped_column(String(400))
+
+    __table_args__ = ({"sqlite_autoincrement": True},)
 
 
 class ScheduleRow(Base):

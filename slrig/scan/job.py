@@ -198,7 +198,12 @@ class _Scan:
         report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=job.stop.is_set, feed=feed)
         _require_promised(staged / "result")
         record = self._record
-        write_record(staged, KeptRecord(self._id, record.rig, record.label, self._plan, record.created_at, job.since))
+        write_record(
+            staged,
+            KeptRecord(
+                self._id, record.rig, record.label, self._plan, record.created_at, job.since, record.requested_by
+            ),
+        )
         tools.folder.commit(self._id)
         if tools.health is not None:
             try:

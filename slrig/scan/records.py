@@ -30,6 +30,7 @@ class KeptRecord:
     plan: ScanPlan
     created_at: datetime
     started_at: datetime
+    requested_by: str | None = None
 
 
 _record_adapter = TypeAdapter(KeptRecord)

@@ -11,7 +11,7 @@ from uuid import UUID
 from slrig.errors import StorageError
 from slrig.failure import failure_of, interruption
 from slrig.jobs.data_folder import DataFolder, missing_files
-from slrig.jobs.records import JobState
+from slrig.jobs.records import JobState, acting_as
 from slrig.jobs.store import JobStore, unfinished_ids
 from slrig.scan.records import plan_json, read_record, report_summary
 
@@ -81,15 +81,16 @@ def _restored(store: JobStore, folder: DataFolder) -> list[UUID]:
     kept = [record for path in whole if (record := read_record(path)) is not None and str(record.id) == path.name]
     for record in sorted(kept, key=lambda each: each.created_at):
         report = json.loads((folder.scan(record.id) / "report.json").read_bytes())
-        store.restore(
-            record.id,
-            plan_json(record.plan),
-            report_summary(report),
-            rig=record.rig,
-            label=record.label,
-            created_at=record.created_at,
-            started_at=record.started_at,
-        )
+        with acting_as(record.requested_by):
+            store.restore(
+                record.id,
+                plan_json(record.plan),
+                report_summary(report),
+                rig=record.rig,
+                label=record.label,
+                created_at=record.created_at,
+                started_at=record.started_at,
+            )
     return [record.id for record in kept]
 
 

@@ -18,7 +18,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
     WorkerLostError,
 )
-from slrig.jobs.records import Clock, utc_now
+from slrig.jobs.records import Clock, acting_as, utc_now
 from slrig.schedule.records import Run, RunState, Schedule
 from slrig.schedule.store import ScheduleStore
 
@@ -127,7 +127,8 @@ class Scheduler:
 
         def do() -> None:
             try:
-                self._end(schedule, run)
+                with acting_as(f"schedule {schedule.id}"):
+                    self._end(schedule, run)
             except SlrigError:
                 # A full disk: the next look takes down that it is over.
                 _log.exception("the end of a scheduled run could not be put on record", schedule=str(schedule.id))

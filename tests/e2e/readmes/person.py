@@ -9,7 +9,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -84,12 +86,16 @@ class Person:
         self.stop_service()
         # The key was exported in the client's terminal only.
         environment = {name: text for name, text in self._environment.items() if name != "SLRIG_API_KEY"}
-        with self._log.open("wb") as log:
-            self._service = subprocess.Popen(  # noqa: S603 - the commands of our own READMEs
-                ["bash", "-c", f"exec {command}"],  # noqa: S607
-                cwd=self.folder, env=environment | {"PYTHONUNBUFFERED": "1"}, stdin=subprocess.DEVNULL,
-                stdout=log, stderr=subprocess.STDOUT,
-            )  # fmt: skip
+        # A terminal: keys are shown on no other output.
+        screen, terminal = os.openpty()
+        self._service = subprocess.Popen(  # noqa: S603 - the commands of our own READMEs
+            ["bash", "-c", f"exec {command}"],  # noqa: S607
+            cwd=self.folder, env=environment | {"PYTHONUNBUFFERED": "1"}, stdin=subprocess.DEVNULL,
+            stdout=terminal, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        os.close(terminal)
+        self._log.write_bytes(b"")
+        threading.Thread(target=_copy, args=(screen, self._log), daemon=True).start()
         give_up = time.monotonic() + _START_LIMIT_S
         while not self._answers():
             said = self._log.read_text(errors="replace")
@@ -123,6 +129,14 @@ class Person:
             return httpx2.get(f"http://{self.address}/livez", timeout=2).status_code == 200
         except httpx2.TransportError:
             return False
+
+
+def _copy(screen: int, log: Path) -> None:
+    """Write down what a terminal shows, until the last program leaves it."""
+    with log.open("ab", buffering=0) as file, suppress(OSError):
+        while shown := os.read(screen, 65536):
+            file.write(shown.replace(b"\r", b""))
+    os.close(screen)
 
 
 def _lay_out_environment(folder: Path) -> None:

@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
 from slrig.api.app import create_app
-from slrig.api.security import digest
+from slrig.api.keys import KeyRing
 from slrig.api.service import Service
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.data_folder import DataFolder
@@ -33,7 +33,9 @@ class ServedBench(TameBench):
     def __init__(self, root: Path, **settings: Any) -> None:
         super().__init__()
         self.free_bytes = 10**12
-        chosen = ServiceSettings(data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, **settings)
+        chosen = ServiceSettings(
+            data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, requests_per_s=1e6, **settings
+        )
         folder = DataFolder(root, free=lambda _: self.free_bytes)
         store = JobStore(Database(folder.database), JobKind.SCAN)
         self.worker = Worker("tests.unit.scan.fake_pipeline")
@@ -51,7 +53,7 @@ class ServedBench(TameBench):
             rig_name="bench",
             calibration_tools=self.tame.tools(),
         )
-        self.app: FastAPI = create_app(self.service, key_digest=digest(KEY))
+        self.app: FastAPI = create_app(self.service, ring=KeyRing(root / "keys.json", given=KEY))
 
     def held(self, client: TestClient) -> dict[str, Any]:
         """Start a scan that captures until `gate` is set."""

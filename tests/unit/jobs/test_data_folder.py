@@ -256,3 +256,24 @@ def test_sweep_of_a_sound_folder_changes_nothing(store: JobStore, folder: DataFo
     swept = sweep(store, folder)
     assert (swept.interrupted, swept.recovered, swept.lost, swept.put_aside) == ((), (), (), ())
     assert store.get(scan_id) == before
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps who may read a folder elsewhere")
+def test_other_users_of_the_machine_cannot_look_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = tmp_path / "data"
+    root.mkdir(mode=0o755)
+    DataFolder(root).release()
+    assert root.stat().st_mode & 0o7777 == 0o700
+    group = root.group()
+    DataFolder(root, group=group).release()
+    assert root.stat().st_mode & 0o7777 == 0o2750
+    with pytest.raises(StorageError, match="no group 'none-such' on this machine"):
+        DataFolder(root, group="none-such")
+
+    def refused(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "chmod", refused)
+    DataFolder(root).release()
+    with pytest.raises(StorageError, match=f"cannot be given to the group '{group}'"):
+        DataFolder(root, group=group)

@@ -1,0 +1,273 @@
+"""Who may send what, from which page, how often; and what is put on record of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import timedelta
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from slrig.api import access
+from slrig.api.access import Rates, Refused
+from slrig.api.app import bare_app, create_app
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import READING, Scope, needed_scope
+from slrig.api.sessions import LINK_PATH, Sessions
+from tests.unit.api.conftest import KEY, ServedBench, ended
+
+HERE = "http://127.0.0.1"
+OWN_PAGE = {"Sec-Fetch-Site": "same-origin", "Origin": HERE, "Referer": f"{HERE}/docs"}
+
+
+@pytest.fixture
+def ring(served: ServedBench) -> Iterator[KeyRing]:
+    path = served.service.settings.key_path
+    yield KeyRing(path)
+    path.unlink(missing_ok=True)
+
+
+def stranger(served: ServedBench, key: str | None = None) -> TestClient:
+    headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+    return TestClient(served.app, base_url=HERE, headers=headers, raise_server_exceptions=False)
+
+
+def sessions(served: ServedBench) -> Sessions:
+    found: Sessions = served.app.state.sessions
+    return found
+
+
+def logged_in(served: ServedBench) -> TestClient:
+    """A browser with a session and without the key."""
+    browser = stranger(served)
+    assert browser.post("/session", headers={"Authorization": f"Bearer {KEY}"}).status_code == 201
+    return browser
+
+
+@pytest.mark.usefixtures("client")
+@pytest.mark.parametrize("scope", list(Scope))
+def test_each_key_does_what_it_is_for_and_nothing_else(served: ServedBench, ring: KeyRing, scope: Scope) -> None:
+    mine = stranger(served, ring.add("Ann", [scope]))
+    asked = {
+        Scope.LOOK: ("GET", "/scan"),
+        Scope.SCAN: ("POST", "/scan/00000000-0000-4000-8000-000000000000/cancel"),
+        Scope.CALIBRATE: ("POST", "/calibration/00000000-0000-4000-8000-000000000000/solve"),
+        Scope.ADMINISTER: ("GET", "/audit"),
+    }
+    for needed, (method, path) in asked.items():
+        response = mine.request(method, path)
+        if needed in {Scope.LOOK, scope}:
+            assert response.status_code in {200, 404}, (method, path)
+        else:
+            assert response.status_code == 403, (method, path)
+            assert response.json()["type"] == "/problems/scope"
+            assert f"--scope {needed}" in response.json()["detail"]
+    assert mine.get("/session").json() == {
+        "name": "Ann",
+        "scopes": sorted({Scope.LOOK, scope}, key=list(Scope).index),
+        "expires_at": None,
+    }
+
+
+def test_every_operation_has_a_scope_that_its_path_tells() -> None:
+    for path, operations in bare_app().openapi()["paths"].items():
+        for method, operation in operations.items():
+            scope = needed_scope(method.upper(), path)
+            assert operation.get("x-scope", scope) == scope
+            if method.upper() in READING:
+                moving = path.startswith("/preview/")
+                assert scope is (Scope.SCAN if moving else Scope.ADMINISTER if path == "/audit" else Scope.LOOK)
+            elif not path.startswith(("/session", "/schedule")):
+                assert scope in {Scope.SCAN, Scope.CALIBRATE}, (method, path)
+
+
+@pytest.mark.usefixtures("client")
+def test_a_key_that_is_over_opens_nothing(served: ServedBench, ring: KeyRing) -> None:
+    mine = stranger(served, ring.add("Ann", [], life=timedelta(seconds=-1)))
+    assert "one that expired on" in mine.get("/scan").json()["detail"]
+    mine = stranger(served, ring.add("Bob", []))
+    assert mine.get("/scan").status_code == 200
+    ring.revoke("Bob")
+    assert mine.get("/scan").status_code == 401
+
+
+@pytest.mark.usefixtures("client")
+def test_a_browser_logs_in_and_out(served: ServedBench) -> None:
+    browser = stranger(served)
+    response = browser.post("/session", headers={"Authorization": f"Bearer {KEY}"})
+    cookie = response.headers["set-cookie"]
+    for part in ("HttpOnly", "SameSite=strict", "Path=/", "Max-Age=43200"):
+        assert part in cookie
+    assert "Secure" not in cookie
+    assert KEY not in cookie
+    assert browser.get("/scan").status_code == 200
+    assert browser.get("/session").json()["name"] == "environment"
+    assert browser.delete("/session", headers=OWN_PAGE).status_code == 204
+    assert browser.get("/scan").status_code == 401
+    told = stranger(served).post("/session", headers={"Authorization": f"Bearer {KEY}", "Origin": "https://127.0.0.1"})
+    assert "Secure" in told.headers["set-cookie"]
+
+
+@pytest.mark.usefixtures("client")
+def test_the_link_works_once_and_not_for_long(served: ServedBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    token = sessions(served).link("environment")
+    browser = stranger(served)
+    response = browser.get(f"{LINK_PATH}?token={token}", follow_redirects=False)
+    assert (response.status_code, response.headers["location"]) == (303, "/docs")
+    assert browser.get("/docs").status_code == 200
+    for used in (token, "none-such", ""):
+        refused = stranger(served).get(f"{LINK_PATH}?token={used}", follow_redirects=False)
+        assert (refused.status_code, refused.headers["content-type"]) == (401, "application/problem+json")
+    late = sessions(served).link("environment")
+    now = sessions(served)._clock()
+    monkeypatch.setattr(sessions(served), "_clock", lambda: now + timedelta(minutes=16))
+    assert stranger(served).get(f"{LINK_PATH}?token={late}", follow_redirects=False).status_code == 401
+
+
+@pytest.mark.usefixtures("client")
+def test_a_session_ends_with_its_time_and_with_its_key(
+    served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser = stranger(served)
+    browser.post("/session", headers={"Authorization": f"Bearer {ring.add('Ann', [])}"})
+    assert browser.get("/scan").status_code == 200
+    ring.revoke("Ann")
+    assert browser.get("/scan").status_code == 401
+    other = logged_in(served)
+    now = sessions(served)._clock()
+    monkeypatch.setattr(sessions(served), "_clock", lambda: now + timedelta(hours=12))
+    assert "a session that is over" in other.get("/scan").json()["detail"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Sec-Fetch-Site": "cross-site"},
+        {"Sec-Fetch-Site": "same-site", "Origin": "http://127.0.0.1:3000"},
+        {"Origin": "https://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:3000"},
+        {"Origin": "http://127.0.0.1.evil.example"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"},
+    ],
+)
+@pytest.mark.parametrize("keyed", [True, False])
+def test_what_a_foreign_page_sends_moves_nothing(
+    client: TestClient, served: ServedBench, headers: dict[str, str], keyed: bool
+) -> None:
+    browser = logged_in(served)
+    if not keyed:
+        browser = TestClient(create_app(served.service, ring=None), base_url=HERE)
+    before = client.get("/scan").json()
+    for method, path in (("POST", "/scan"), ("POST", "/session"), ("GET", "/preview/cam0?light=white")):
+        response = browser.request(method, path, headers=headers)
+        assert (response.status_code, response.json()["type"]) == (403, "/problems/foreign-page"), path
+    assert client.get("/scan").json() == before
+    if "Sec-Fetch-Mode" in headers:
+        # A link on another page may lead here.
+        assert browser.get("/scan", headers=headers).status_code == 200
+    elif "Origin" in headers or "Sec-Fetch-Site" in headers:
+        assert browser.get("/scan", headers=headers).status_code == 403
+
+
+def test_a_picture_that_moves_light_says_which_page_it_is_on(client: TestClient, served: ServedBench) -> None:
+    # Browsers send neither Sec-Fetch-Site nor Origin with a picture of an address that is neither local nor encrypted.
+    browser = logged_in(served)
+    assert browser.get("/preview/none?light=white").status_code == 403
+    assert browser.get("/preview/none?light=white", headers={"Referer": "http://127.0.0.1:3000/"}).status_code == 403
+    assert browser.get("/preview/none?light=white", headers={"Referer": f"{HERE}/docs"}).status_code == 404
+    assert client.get("/preview/none?light=white").status_code == 404
+
+
+def test_own_pages_and_programs_are_served(client: TestClient, served: ServedBench) -> None:
+    browser = logged_in(served)
+    for headers in (OWN_PAGE, {"Origin": HERE}, {"Sec-Fetch-Site": "none"}):
+        assert browser.get("/scan", headers=headers).status_code == 200
+        scan = browser.post("/scan", headers=headers)
+        assert scan.status_code == 202
+        ended(client, scan.json()["id"])
+
+
+def test_who_asked_for_a_scan_is_on_record(client: TestClient, served: ServedBench, ring: KeyRing) -> None:
+    scan = stranger(served, ring.add("Ann", [Scope.SCAN])).post("/scan").json()
+    assert scan["requested_by"] == "Ann"
+    assert ended(client, scan["id"])["requested_by"] == "Ann"
+    assert stranger(served, ring.add("Bob", [])).post("/scan").status_code == 403
+    entries: list[dict[str, Any]] = client.get("/audit?limit=2").json()["entries"]
+    assert [(each["who"], each["method"], each["path"], each["status"], each["made"]) for each in entries] == [
+        ("Bob", "POST", "/scan", 403, ""),
+        ("Ann", "POST", "/scan", 202, f"/scan/{scan['id']}"),
+    ]
+    older = client.get(client.get("/audit?limit=1").json()["next"]).json()["entries"]
+    assert older[0]["who"] == "Ann"
+
+
+def test_strangers_and_readers_are_not_put_on_record(client: TestClient, served: ServedBench) -> None:
+    before = client.get("/audit").json()
+    stranger(served).post("/scan")
+    client.get("/scan")
+    assert client.get("/audit").json() == before
+
+
+@pytest.mark.usefixtures("client")
+def test_too_many_requests_of_one_name_wait(
+    served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = served.service.settings.model_copy(update={"requests_per_s": 1.0})
+    monkeypatch.setattr(served.service, "settings", slow)
+    app = create_app(served.service, ring=ring)
+    ann = TestClient(app, base_url=HERE, headers={"X-API-Key": ring.add("Ann", [])})
+    bob = TestClient(app, base_url=HERE, headers={"X-API-Key": ring.add("Bob", [])})
+    statuses = [ann.get("/session").status_code for _ in range(8)]
+    assert (statuses[0], statuses[-1]) == (200, 429)
+    assert ann.get("/session").headers["Retry-After"] == "1"
+    assert bob.get("/session").status_code == 200
+    unknown = [TestClient(app, base_url=HERE).get("/scan").status_code for _ in range(8)]
+    assert (unknown[0], unknown[-1]) == (401, 429)
+
+
+def test_rates_come_back_with_time_and_forget_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    rates = Rates(2, clock=lambda: now)
+    for _ in range(8):
+        rates.count("ann")
+    with pytest.raises(Refused):
+        rates.count("ann")
+    now = 1.0
+    rates.count("ann")
+    rates.count("ann")
+    with pytest.raises(Refused):
+        rates.count("ann")
+    monkeypatch.setattr(access, "_MOST_COUNTED", 10)
+    for number in range(100):
+        rates.count(f"name {number}")
+    assert len(rates._left) <= 10
+
+
+def test_every_answer_tells_browsers_to_be_careful(client: TestClient, served: ServedBench) -> None:
+    for response in (client.get("/scan"), client.get("/docs"), stranger(served).get("/scan"), client.get("/nothing")):
+        assert response.headers["X-Content-Type-Options"] == "nosniff"
+        assert "frame-ancestors 'none'" in response.headers["Content-Security-Policy"]
+        assert response.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert response.headers["Referrer-Policy"] == "same-origin"
+        assert response.headers["Cache-Control"] == "no-store"
+
+
+def test_the_description_is_a_page_of_our_own(client: TestClient, served: ServedBench) -> None:
+    page = client.get("/docs").text
+    assert "http" not in page.replace("<!doctype html>", "")
+    for part in ("swagger-ui-bundle.js", "swagger-ui.css", "favicon.png", "start.js"):
+        assert f"/docs/{part}" in page
+        assert client.get(f"/docs/{part}").status_code == 200
+        assert stranger(served).get(f"/docs/{part}").status_code == 401
+
+
+def test_keys_that_cannot_be_read_are_told(client: TestClient, served: ServedBench) -> None:
+    path = served.service.settings.key_path
+    path.write_text("{}")
+    try:
+        response = client.get("/scan")
+        assert (response.status_code, response.json()["type"]) == (507, "/problems/storage")
+    finally:
+        path.unlink()
