@@ -221,9 +221,10 @@ class ServiceSettings(BaseSettings):
     the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
     are removed with their poses, but for the one in use and those that a scan or an acceptance test names. Scans are
     kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes` sets a limit: beyond it the oldest are
-    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. Nobody but the
-    service's own user may read the data, and the users of `data_group`, if it is set. `log_format` auto is text on a
-    terminal, and JSON lines elsewhere.
+    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `drain_s` is how
+    long, after SIGTERM, the job that has the rig may take to come to its end before it is interrupted; what waits or
+    computes goes on at the next start. Nobody but the service's own user may read the data, and the users of
+    `data_group`, if it is set. `log_format` auto is text on a terminal, and JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -245,6 +246,7 @@ class ServiceSettings(BaseSettings):
     max_connections: Annotated[int, Field(ge=16, le=1536)] = 512
     max_connections_per_address: Annotated[int, Field(ge=1)] = 64
     keepalive_s: Annotated[float, Field(gt=0)] = 15.0
+    drain_s: Annotated[float, Field(ge=0)] = 0.0
     shutdown_s: Annotated[float, Field(gt=0)] = 3.0
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200

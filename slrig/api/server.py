@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from types import FrameType
 
 import structlog
 import uvicorn
@@ -196,6 +197,12 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._service = service
 
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """See `uvicorn.Server`. A second signal ends what the first one waits for."""
+        if self.should_exit:
+            self._service.hurry.set()
+        super().handle_exit(sig, frame)
+
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """See `uvicorn.Server`."""
         quiet_accepts(asyncio.get_running_loop())
@@ -203,6 +210,8 @@ class _Server(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """See `uvicorn.Server`."""
+        if signal.SIGTERM in self._captured_signals:
+            await run_in_threadpool(self._service.drain)
         await run_in_threadpool(self._service.end_work)
         await super().shutdown(sockets)
 

@@ -65,6 +65,7 @@ class Service:
         self.store = store
         self.runner = runner
         self.refuse_when_stale = refuse_when_stale
+        self.hurry = threading.Event()
         database, spare_bytes = store.database, settings.min_free_bytes
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
@@ -117,6 +118,12 @@ class Service:
         # It reads the report of every scan, and nobody waits for it.
         self.scan_retention.start()
         threading.Thread(target=self.retention, name="slrig-retention", daemon=True).start()
+
+    def drain(self) -> None:
+        """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until
+        `hurry`.
+        """
+        self.runner.drain(self.settings.drain_s, self.hurry)
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,9 @@ from slrig.jobs.job import Holder, Job, busy
 from slrig.rig.preview import Light, Previews, Watch
 from slrig.rig.session import RigSession, driver_errors
 from slrig.rig.watchdog import Call, Watchdog
+
+_LOOK_S = 0.1
+"""How often a drain looks whether it is over, or to be cut short."""
 
 _log = structlog.get_logger(__name__)
 
@@ -155,6 +159,17 @@ class JobQueue:
     def ending(self) -> bool:
         """Whether the service is ending."""
         return self._ending
+
+    def drain(self, timeout_s: float, hurry: threading.Event) -> None:
+        """Begin no further job, and wait until the one that has the rig is over, for so long, or until `hurry`.
+
+        What waits stays on record as it is: the next start of the service goes on with it. `end` has to follow.
+        """
+        give_up = time.monotonic() + timeout_s
+        with self._changed:
+            self._ending = True
+            while self._active is not None and not hurry.is_set() and time.monotonic() < give_up:
+                self._changed.wait(_LOOK_S)
 
     def end(self) -> None:
         """Take nothing in any more, and have what is under way end early. `join` has to follow."""

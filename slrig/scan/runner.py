@@ -267,6 +267,10 @@ class Runner:
             ending=held.ending,
         )
 
+    def drain(self, timeout_s: float, hurry: threading.Event) -> None:
+        """Let what has the rig come to its end: see `JobQueue.drain`."""
+        self._queue.drain(timeout_s, hurry)
+
     def close(self, *, timeout_s: float = 3.0) -> None:
         """Stop scanning, darken and close the rig, and record what was cut off as interrupted. Idempotent.
 

@@ -13,6 +13,7 @@ import structlog
 from slrig.errors import (
     DeviceError,
     RigBusyError,
+    ScanInterruptedError,
     ScheduleNotFoundError,
     SlrigError,
     UnsupportedByDeviceError,
@@ -140,12 +141,13 @@ class Scheduler:
 
     def _end(self, schedule: Schedule, run: Run) -> None:
         state, reason, result = RunState.FAILED, None, None
+        cut_off = False
         try:
             result = self._work(schedule, run, self._stop.is_set)
             state = RunState.SUCCEEDED
             reason = f"at try {run.attempts + 1}" if run.attempts else run.reason
         except SlrigError as error:
-            busy = isinstance(error, RigBusyError)
+            busy, cut_off = isinstance(error, RigBusyError), isinstance(error, ScanInterruptedError)
             reason = f"rig busy: {error}" if busy else str(error)
             again = self._clock() + timedelta(seconds=schedule.order.retry_s)
             if passes(error) and again <= run.deadline and not self._stop.is_set():
@@ -155,7 +157,7 @@ class Scheduler:
         except Exception as error:  # noqa: BLE001 - the schedule outlives whatever happens in one run
             _log.exception("a scheduled run failed", schedule=str(schedule.id), due=run.due.isoformat())
             reason = f"an error of its own: {error!r}"
-        if self._stop.is_set() and state is not RunState.SUCCEEDED:
+        if (self._stop.is_set() or cut_off) and state is not RunState.SUCCEEDED:
             state, reason = RunState.INTERRUPTED, "the service ended in the middle of it"
         self._store.finish(run, state, self._clock(), reason=reason, result=result)
         # It may have been removed meanwhile.

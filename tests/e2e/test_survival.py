@@ -151,6 +151,31 @@ def ended_by_rig(rig: Path, words: str) -> None:
     assert not (data / "service.json").exists()
 
 
+def test_told_to_end_it_lets_the_scan_come_to_its_end_and_keeps_the_queue(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SLRIG_DRAIN_S", "60")
+    rig = write_rig(tmp_path / "rig", head=SLOW)
+    first = start(rig)
+    with first.client() as client:
+        under_way = client.start({})
+        waiting = client.start({"if_busy": "queue"})
+        followed_to(client, under_way, "capture")
+        first.process.send_signal(signal.SIGTERM)
+        # It is told to everybody while it comes to its end.
+        assert ended(client, under_way)["state"] == "succeeded"
+    assert first._gone(STOP_LIMIT_S) == 0
+    second = start(rig)
+    with second.client() as client:
+        assert client.get(under_way["links"]["self"])["state"] == "succeeded"
+        assert ended(client, waiting)["state"] == "succeeded"
+        followed_to(client, client.start({}), "capture")
+    # Told twice, it waits no longer.
+    second.process.send_signal(signal.SIGTERM)
+    second.process.send_signal(signal.SIGTERM)
+    assert second.stop() == 0
+
+
 def test_service_does_not_outlive_the_program_that_started_it(tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig")
     command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(tmp_path / "data")]
