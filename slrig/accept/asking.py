@@ -18,6 +18,7 @@ from slrig.accept.plan import (
 )
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.bundle.faults import Strict
+from slrig.bundle.free_text import SafeText
 from slrig.errors import InvalidInputError
 from slrig.model import Calibration
 
@@ -44,7 +45,7 @@ class ArtefactsRequest(Strict):
     sphere_form_mm: Uncertainty = Field(description="by how much the sphere itself is out of round")
     plane_form_mm: Uncertainty = Field(description="by how much the plane itself is out of flat")
     ball_mm: Length | None = Field(default=None, description="diameter of the bar's balls; absent, the sphere's")
-    certificate: Annotated[str, Field(max_length=200)] = ""
+    certificate: Annotated[SafeText, Field(max_length=200)] = ""
     temperature_c: Annotated[float, Field(ge=-50, le=100)] | None = None
 
     def artefacts(self) -> Artefacts:

@@ -32,6 +32,7 @@ from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
 from slrig.bundle.description import CAMERA_NAME
+from slrig.bundle.free_text import FreeText
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, pose_of
@@ -54,7 +55,7 @@ _ENDINGS = {
 
 router = APIRouter(prefix="/calibration", tags=["calibration"])
 
-Label = Annotated[str | None, Query(min_length=1, max_length=200, description="free text, to find it again")]
+Label = Annotated[FreeText | None, Query(description="free text, to find it again")]
 
 
 def _answered(service: Service, record: SessionRecord) -> CalibrationBody:

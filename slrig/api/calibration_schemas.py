@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, Field
 
 from slrig.api.schemas import MOST_EXPOSURE_S, FaultBody, PatternRequest, ProgressBody, filled
 from slrig.bundle.faults import Strict
+from slrig.bundle.free_text import FreeText, SafeText
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, plain
 from slrig.calibration.board import USUAL_BOARD, BoardKind, BoardShape
 from slrig.jobs.records import JobState
@@ -35,7 +36,7 @@ class BoardRequest(BoardOptions):
         description="side of a square as measured on the print; of circles, the distance of two neighbouring rows"
     )
     marker_mm: Millimetres | None = Field(default=None, description="of a ChArUco board. Default 0.75 of square_mm")
-    dictionary: Annotated[str, Field(min_length=1, max_length=64)] | None = Field(
+    dictionary: Annotated[SafeText, Field(min_length=1, max_length=64)] | None = Field(
         default=None, description="of a ChArUco board's markers, by OpenCV's name. Default DICT_5X5_250"
     )
 
@@ -44,7 +45,7 @@ class CalibrationRequest(Strict):
     """A calibration session. An empty request opens one for the usual board."""
 
     board: BoardRequest | None = Field(default=None, description=f"Default: {USUAL_BOARD.description}")
-    label: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    label: FreeText | None = None
     patterns: PatternRequest = Field(
         default_factory=PatternRequest,
         description="what each pose is lit with. Default: as the rig file says, with both axes",
@@ -58,10 +59,8 @@ class CalibrationRequest(Strict):
 class PoseRequestBody(Strict):
     """A pose. An empty request shoots the board where it is held."""
 
-    position: Annotated[int, Field(ge=0, le=10_000)] | Annotated[str, Field(min_length=1, max_length=200)] | None = (
-        Field(
-            default=None, description="of the positioner, by its number from 0 or its name. Default: a person holds it"
-        )
+    position: Annotated[int, Field(ge=0, le=10_000)] | FreeText | None = Field(
+        default=None, description="of the positioner, by its number from 0 or its name. Default: a person holds it"
     )
     exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = Field(
         default=None, description="of every camera, seconds. Default: as the rig file says per camera"
@@ -75,7 +74,7 @@ class ScriptRequest(Strict):
     """Poses of the positioner, one after the other. An empty request shoots all of them."""
 
     positions: Annotated[
-        list[Annotated[int, Field(ge=0, le=10_000)] | Annotated[str, Field(min_length=1, max_length=200)]],
+        list[Annotated[int, Field(ge=0, le=10_000)] | FreeText],
         Field(max_length=1000),
     ] = Field(default_factory=list, description="by number from 0 or by name. Default: all, in their order")
     exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = None

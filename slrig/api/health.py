@@ -15,6 +15,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
 from slrig.bundle.faults import Strict
+from slrig.bundle.moments import AwareMoment
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import HealthState
 from slrig.errors import CalibrationError
@@ -132,12 +133,9 @@ def look_at_health(service: Serving) -> HealthBody:
 def list_health(
     service: Serving,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
-    since: Annotated[datetime | None, Query(description="ISO 8601, with its offset from UTC")] = None,
+    since: Annotated[AwareMoment | None, Query(description="ISO 8601, with its offset from UTC")] = None,
 ) -> HealthPage:
     """List verifications, newest first."""
-    if since is not None and since.tzinfo is None:
-        message = f"since: expected a time with its offset from UTC, as 2026-11-20T06:00:00Z, found {since.isoformat()}"
-        raise CalibrationError(message)
     found = service.verifications.store.history(limit=limit, since=since)
     return HealthPage(verifications=[VerificationFigures.model_validate(record.document()) for record in found])
 

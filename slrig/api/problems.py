@@ -15,6 +15,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from slrig.bundle.printable import printable
 from slrig.errors import RigBusyError, SlrigError
 from slrig.failure import UNEXPECTED, JobFailure, errors_by_code
 
@@ -43,6 +44,7 @@ _NAMES = {413: "content-too-large", 416: "range-not-satisfiable", 422: "invalid-
 
 _MESSAGES = {
     "extra_forbidden": "There is no such field here; look at its spelling. /openapi.json lists those that there are.",
+    "timezone_aware": "expected the offset from UTC, too, as in 2026-11-20T06:00:00Z",
 }
 
 _PLAIN_DETAILS = {
@@ -178,15 +180,6 @@ def _field_fault(entry: Any) -> dict[str, Any]:
     elif isinstance(sent, (bool, int, float)):
         fault["found"] = sent
     return fault
-
-
-def printable(text: str) -> str:
-    r"""The text with an escape for what UTF-8 cannot hold: half a surrogate pair, which JSON can.
-
-    >>> printable("\ud800")
-    '\\ud800'
-    """
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _http_problem(status: HTTPStatus, detail: str) -> dict[str, Any]:

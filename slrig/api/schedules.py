@@ -13,6 +13,7 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import filled
 from slrig.api.service import Cursor, PageLength, Serving, paged
 from slrig.bundle.faults import Strict
+from slrig.bundle.free_text import FreeText
 from slrig.jobs.records import utc_now
 from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Order, RunState, Schedule, TaskKind
 
@@ -37,7 +38,7 @@ class ScheduleRequest(Strict):
         "solve; acceptance: the prescribed artefacts"
     )
     options: dict[str, Any] = Field(default_factory=dict, description="of the task, as its own request has them")
-    label: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    label: FreeText | None = None
     grace_s: Annotated[float, Field(ge=0, le=MOST_GRACE_S)] = Field(
         default=3600.0, description="how long after its time a run may still start, a busy rig included"
     )

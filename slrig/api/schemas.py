@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 
 from slrig.api.problems import fault_problem
 from slrig.bundle.faults import Strict
+from slrig.bundle.free_text import FreeText
 from slrig.config import BracketSeconds, ScanDefaults
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
@@ -76,9 +77,7 @@ class ReconstructionRequest(Strict):
 class ScanRequest(Strict):
     """A scan. An empty request is a scan as the rig file describes it."""
 
-    label: Annotated[str, Field(min_length=1, max_length=200)] | None = Field(
-        default=None, description="free text, to find the scan again"
-    )
+    label: FreeText | None = Field(default=None, description="free text, to find the scan again")
     patterns: PatternRequest = Field(default_factory=PatternRequest)
     reconstruction: ReconstructionRequest = Field(default_factory=ReconstructionRequest)
     exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = Field(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import asdict
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +12,7 @@ from pydantic import Field
 
 from slrig.bundle.description import CameraName, Extent
 from slrig.bundle.faults import Strict, read_description_of
+from slrig.bundle.moments import Moment
 from slrig.bundle.opencv_calibration import read_opencv_calibration
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.errors import CalibrationError
@@ -40,7 +40,7 @@ class SolvedEntry(Strict):
     """How the calibration was found: see `slrig.model.Solved`. Absent where it says nothing of its own error."""
 
     id: Annotated[str, Field(min_length=1, max_length=64)]
-    solved_at: Annotated[datetime, Field(description="ISO 8601 with the offset from UTC")]
+    solved_at: Annotated[Moment, Field(description="ISO 8601 with the offset from UTC")]
     covariance: Annotated[
         list[list[float]],
         Field(

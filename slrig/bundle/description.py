@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
 
-from pydantic import AwareDatetime, Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
+from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator, field_validator
 
 from slrig.bundle.faults import MOST_FAULTS, Strict, read_description_of
+from slrig.bundle.moments import AwareMoment
 from slrig.errors import BundleError, PatternError
 from slrig.model import CameraFormat, Pattern, Size
 
@@ -93,7 +94,7 @@ class Description(Strict):
     patterns: Annotated[list[PatternEntry], Field(min_length=1)]
     frames: Annotated[list[FrameEntry], Field(min_length=1)]
     captured_at: Annotated[
-        AwareDatetime | None, Field(description="when the capture began, ISO 8601 with the offset from UTC")
+        AwareMoment | None, Field(description="when the capture began, ISO 8601 with the offset from UTC")
     ] = None
 
     def projector_size(self) -> Size:

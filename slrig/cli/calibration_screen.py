@@ -12,6 +12,7 @@ from rich.console import Console, Group
 from rich.table import Column, Table
 from rich.text import Text
 
+from slrig.bundle.printable import printable
 from slrig.calibrate.words import rounded
 from slrig.calibration.solution import CELLS
 from slrig.cli.display import counted, plain_table
@@ -55,7 +56,7 @@ def tell_session(session: Mapping[str, Any]) -> None:
     console = Console()
     board = "imported" if session["board"] is None else session["board"]["title"]
     heading = [session["id"], session["label"], f"rig '{session['rig']}'", board, session["state"]]
-    console.print(Text(" · ".join(each for each in heading if each), style="bold"))
+    console.print(Text(printable(" · ".join(each for each in heading if each)), style="bold"))
     if session["active"]:
         console.print("Scans use it.", style="green")
     if session["result"] is not None:

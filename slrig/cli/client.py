@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import httpx2
 
 from slrig import KEY_VARIABLE
+from slrig.bundle.printable import printable
 from slrig.bundle.storage import refusals_of, staging_name
 from slrig.errors import ConfigError, ServiceError
 
@@ -199,8 +200,8 @@ def _refuse_problem(response: httpx2.Response) -> None:
         return
     try:
         problem = response.json()
-        lines = [str(problem["detail"])]
-        lines += [f"  {fault['field']}: {fault['message']}" for fault in problem.get("errors", ())]
+        lines = [printable(str(problem["detail"]))]
+        lines += [printable(f"  {fault['field']}: {fault['message']}") for fault in problem.get("errors", ())]
     except (ValueError, KeyError, TypeError, AttributeError):
         lines = [
             f"{response.request.url} answered {response.status_code} {response.reason_phrase}, and not as slrig does. "

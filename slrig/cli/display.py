@@ -16,6 +16,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Column, Table
 from rich.text import Text
 
+from slrig.bundle.printable import printable
+
 EVERY_S = 2.0
 """How often a line tells of a stage that goes on, where there is no bar."""
 
@@ -108,16 +110,18 @@ def plain_table(*heads: Column | str, **options: Any) -> Table:
 
 
 def print_table(heads: Sequence[Column | str], rows: Iterable[Sequence[Text | str]]) -> None:
-    """Print rows as they are, without rich's markup."""
+    """Print rows as they are, without rich's markup; labels of older records may hold what a terminal acts on."""
     table = plain_table(*heads)
     for row in rows:
-        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+        table.add_row(*(Text(printable(cell)) if isinstance(cell, str) else cell for cell in row))
     Console().print(table)
 
 
 def print_json(document: Any) -> None:
     """Print what `--json` asks for."""
-    typer.echo(json.dumps(document, indent=2, ensure_ascii=False))
+    # A line end here is one of the layout; JSON escapes those of the texts, but not all that a terminal acts on.
+    lines = json.dumps(document, indent=2, ensure_ascii=False).split("\n")
+    typer.echo("\n".join(map(printable, lines)))
 
 
 def counted(count: int, what: str) -> str:

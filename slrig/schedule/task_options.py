@@ -8,6 +8,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import Field, ValidationError
 
 from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.bundle.free_text import FreeText
 from slrig.calibration.board import Board, BoardKind
 from slrig.errors import ScheduleError
 from slrig.rig.session import RigFacts
@@ -45,7 +46,7 @@ class CalibrationOptions(Strict):
     """
 
     board: BoardOptions
-    positions: Annotated[list[Position | str], Field(max_length=1000)] = Field(default_factory=list)
+    positions: Annotated[list[Position | FreeText], Field(max_length=1000)] = Field(default_factory=list)
     exposure_s: ExposureSeconds | None = None
     activate: bool = False
 

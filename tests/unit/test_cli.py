@@ -20,7 +20,7 @@ from slrig.cli import client as client_module
 from slrig.cli.client import ServiceClient, read_key
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
-from slrig.cli.display import ProgressDisplay
+from slrig.cli.display import ProgressDisplay, print_json, print_table
 from slrig.cli.scan import quality_lines, scan_with, tell_result
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError, SlrigError
 from slrig.scan.offered import MEDIA_TYPES
@@ -491,3 +491,21 @@ def test_a_stage_that_goes_on_without_a_word_is_told_again_off_a_terminal() -> N
     lines = stream.getvalue().splitlines()
     assert len(lines) >= 3
     assert all(line.endswith("41 of 56") for line in lines)
+
+
+def test_label_of_an_older_record_does_nothing_to_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    label = "a\x1b]0;title\x07\x9b2J\x7f\u202e\nb"
+    print_table(("label",), [(label,)])
+    print_json({"label": label})
+    table, _, document = capsys.readouterr().out.partition("{")
+    assert "\\u001b]0;title" in table
+    for shown in (table, document):
+        assert all(character == "\n" or character.isprintable() for character in shown)
+    assert json.loads("{" + document) == {"label": label}
+
+
+def test_refusal_of_a_service_does_nothing_to_the_terminal() -> None:
+    problem = {"detail": "no \x1b[2J", "errors": [{"field": "label", "message": "found \x9b"}]}
+    with client_of(lambda _: httpx2.Response(422, json=problem)) as client, pytest.raises(ServiceError) as refused:
+        client.get("/scan")
+    assert str(refused.value) == "no \\u001b[2J\n  label: found \\u009b"
