@@ -15,7 +15,7 @@ from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.records import AcceptanceRecord, AcceptanceState
 from slrig.accept.store import HTML, JSON
 from slrig.api.idempotency import IdempotencyKey, once, started_once
-from slrig.api.openapi import problems
+from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import AnyFault, filled
 from slrig.api.service import Serving
 from slrig.bundle.faults import Strict
@@ -145,13 +145,13 @@ def delete_acceptance(service: Serving, test_id: UUID) -> None:
     service.acceptance.delete(test_id)
 
 
-@router.get("/{test_id}/report.html", responses=problems(409))
+@router.get("/{test_id}/report.html", response_class=Response, responses=file_of("text/html", 409))
 def acceptance_page(service: Serving, test_id: UUID) -> FileResponse:
     """Return the report for people."""
     return FileResponse(service.acceptance.file(test_id, HTML), media_type="text/html; charset=utf-8")
 
 
-@router.get("/{test_id}/report.json", responses=problems(409))
+@router.get("/{test_id}/report.json", response_class=Response, responses=file_of("application/json", 409))
 def acceptance_report(service: Serving, test_id: UUID) -> FileResponse:
     """Return the report for machines."""
     return FileResponse(service.acceptance.file(test_id, JSON), media_type="application/json")

@@ -28,6 +28,7 @@ from slrig.api.access import Access
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.events import OpenStreams
 from slrig.api.keys import KeyRing
+from slrig.api.methods import Methods
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
 from slrig.api.security import LOCAL_NAMES, BodyLimits, SecurityHeaders
@@ -67,6 +68,7 @@ def bare_app() -> FastAPI:
         app.include_router(part.router)
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)
+    app.add_middleware(Methods, routes=app.routes)
     return app
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Header, Request, Response
+from fastapi import APIRouter, Header, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, StreamingResponse
 
-from slrig.api.openapi import file_of
+from slrig.api.openapi import BYTES, file_of
 from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
@@ -98,13 +98,13 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
     return fetch
 
 
+_UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file is the one whose ETag was sent"}}
+
+
 def _answers(media_type: str) -> dict[int | str, dict[str, Any]]:
-    whole = file_of(media_type, 409, 416)
-    return {
-        **whole,
-        206: {**whole[200], "description": "the range that was asked for"},
-        304: {"description": "the file is the one whose ETag was sent"},
-    }
+    # A part of a JSON file is no JSON.
+    part = {"description": "the range that was asked for", "content": {media_type: {"schema": BYTES}}}
+    return {**file_of(media_type, 409, 416), 206: part, **_UNCHANGED}
 
 
 for _name, _media_type in MEDIA_TYPES.items():
@@ -118,10 +118,8 @@ for _name, _media_type in MEDIA_TYPES.items():
         operation_id=f"fetch_{_name.replace('.', '_')}",
         summary=f"Fetch {_name}",
     )
-    router.add_api_route(f"/{_name}", _fetch, methods=["HEAD"], response_class=Response, include_in_schema=False)
 
 
-@router.head(f"/{rejected_picture('{camera}')}", response_class=Response, include_in_schema=False)
 @router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
 def fetch_rejected(
     service: Serving,
@@ -133,9 +131,8 @@ def fetch_rejected(
     return _file(service, scan_id, rejected_picture(camera), "image/png", known)
 
 
-@router.head(f"/{BUNDLE_ZIP}", response_class=Response, include_in_schema=False)
-@router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses=_answers("application/zip"))
-def fetch_bundle(request: Request, service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+@router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses={**file_of("application/zip", 409), **_UNCHANGED})
+def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return the recorded frames and all that belongs to them; unzipped, `slrig reconstruct` reads them.
 
     A scan whose reconstruction failed has its bundle, too.
@@ -148,9 +145,6 @@ def fetch_bundle(request: Request, service: Serving, scan_id: UUID, known: Known
     headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
-    if request.method == "HEAD":
-        # No length: how long it is shows only once it was made.
-        return StreamingResponse(iter(()), media_type="application/zip", headers=headers)
     return StreamingResponse(zipped(bundle), media_type="application/zip", headers=headers)
 
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Header, Request, Response
+from fastapi import APIRouter, Depends, Header, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.exceptions import HTTPException
@@ -45,26 +45,44 @@ LastEventId = Annotated[
 router = APIRouter()
 
 
+@dataclass(slots=True)
 class OpenStreams:
-    """How many event streams are open. Lives on the event loop's thread."""
+    """How many streams are open, and may be. Lives on the event loop's thread."""
 
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._count = 0
+    limit: int
+    count: int = 0
 
-    def require_room(self) -> None:
-        """Raise HTTPException 429 when as many streams are open as may."""
-        if self._count >= self._limit:
+
+@dataclass(slots=True)
+class Place:
+    """A request's place among the open streams, once it is taken."""
+
+    streams: OpenStreams
+    taken: bool = False
+
+    def take(self) -> None:
+        """Count as open from now until the answer is over. Raises HTTPException 429: as many are open as may."""
+        if self.streams.count >= self.streams.limit:
             detail = (
-                f"{self._count} event streams are open, as many as may. Close one, or ask for GET /scan/ID instead."
+                f"{self.streams.count} streams of events or pictures are open, as many as may. Close one, or ask for "
+                "GET /scan/ID instead."
             )
             raise HTTPException(429, detail, headers={"Retry-After": "5"})
+        self.streams.count += 1
+        self.taken = True
 
-    def __enter__(self) -> None:
-        self._count += 1
 
-    def __exit__(self, *_: object) -> None:
-        self._count -= 1
+async def _place(request: Request) -> AsyncIterator[Place]:
+    place = Place(request.app.state.streams)
+    try:
+        yield place
+    finally:
+        # The answer is over, also one whose client was gone before it began.
+        place.streams.count -= place.taken
+
+
+StreamPlace = Annotated[Place, Depends(_place)]
+"""A handler's parameter: the place that its stream has to take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,24 +121,24 @@ _CALIBRATION = _answers(
 
 
 @router.get("/scan/{scan_id}/events", tags=["scan"], response_class=Response, responses=_JOB)
-async def follow_scan(request: Request, service: Serving, scan_id: UUID, last_event_id: LastEventId = 0) -> Response:
+async def follow_scan(place: StreamPlace, service: Serving, scan_id: UUID, last_event_id: LastEventId = 0) -> Response:
     """Follow a scan until it is over. Events that happened before come first."""
-    return await _follow_job(request, service, service.store, scan_id, last_event_id)
+    return await _follow_job(place, service, service.store, scan_id, last_event_id)
 
 
 @router.get("/rig/verification/{verification_id}/events", tags=["health"], response_class=Response, responses=_JOB)
 async def follow_verification(
-    request: Request, service: Serving, verification_id: UUID, last_event_id: LastEventId = 0
+    place: StreamPlace, service: Serving, verification_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
     """Follow a verification until it is over. Events that happened before come first."""
-    return await _follow_job(request, service, service.verifications.jobs, verification_id, last_event_id)
+    return await _follow_job(place, service, service.verifications.jobs, verification_id, last_event_id)
 
 
 @router.get(
     "/calibration/{calibration_id}/events", tags=["calibration"], response_class=Response, responses=_CALIBRATION
 )
 async def follow_calibration(
-    request: Request, service: Serving, calibration_id: UUID, last_event_id: LastEventId = 0
+    place: StreamPlace, service: Serving, calibration_id: UUID, last_event_id: LastEventId = 0
 ) -> Response:
     """Follow a calibration while something is under way. Events that happened before come first."""
     register = service.calibrations.register
@@ -130,13 +148,13 @@ async def follow_calibration(
         partial(register.jobs.watch, calibration_id),
         partial(register.jobs.last_event_of, calibration_id),
     )
-    return await _stream(request, service.settings, followed, last_event_id)
+    return await _stream(place, service.settings, followed, last_event_id)
 
 
-async def _follow_job(request: Request, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
+async def _follow_job(place: Place, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
     await run_in_threadpool(jobs.get, job_id)
-    return await _stream(request, service.settings, followed_job(jobs, job_id), after)
+    return await _stream(place, service.settings, followed_job(jobs, job_id), after)
 
 
 def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
@@ -183,16 +201,15 @@ def _of_calibration(event: JobEvent, pose: int | None) -> JobEvent:
     return replace(event, data={**event.data, "state": _SOLVES[event.data["state"]]})
 
 
-async def _stream(request: Request, settings: ServiceSettings, followed: Followed, after: int) -> Response:
+async def _stream(place: Place, settings: ServiceSettings, followed: Followed, after: int) -> Response:
     """The events after one, and those that follow until no more will come. Raises HTTPException 429."""
-    streams: OpenStreams = request.app.state.streams
     events, over = await run_in_threadpool(followed.look, after)
     if over and not events:
         # An EventSource that reconnects after the last event is told by 204 to stop trying.
         return Response(status_code=204)
-    streams.require_room()
+    place.take()
     return EventSourceResponse(
-        told(followed, after, streams),
+        told(followed, after),
         ping=settings.keepalive_s,
         sep="\n",
         # At the end of the service all work ends, and its stream by that; without this the stream would end first.
@@ -200,7 +217,7 @@ async def _stream(request: Request, settings: ServiceSettings, followed: Followe
     )
 
 
-async def told(followed: Followed, after: int, streams: OpenStreams) -> AsyncIterator[ServerSentEvent]:
+async def told(followed: Followed, after: int) -> AsyncIterator[ServerSentEvent]:
     """Each event after one, as it comes, until no more will."""
     loop = asyncio.get_running_loop()
     news = asyncio.Event()
@@ -209,21 +226,20 @@ async def told(followed: Followed, after: int, streams: OpenStreams) -> AsyncIte
         loop.call_soon_threadsafe(news.set)
 
     unwatch = followed.watch(wake)
-    with streams:
-        try:
-            # A client that names an event that has not come yet would never be told that it has.
-            after = min(after, await run_in_threadpool(followed.last))
-            over = False
-            while not over:
-                news.clear()
-                events, over = await run_in_threadpool(followed.look, after)
-                for event in events:
-                    after = event.number
-                    yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(after), sep="\n")
-                if not over:
-                    await news.wait()
-        finally:
-            unwatch()
+    try:
+        # A client that names an event that has not come yet would never be told that it has.
+        after = min(after, await run_in_threadpool(followed.last))
+        over = False
+        while not over:
+            news.clear()
+            events, over = await run_in_threadpool(followed.look, after)
+            for event in events:
+                after = event.number
+                yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(after), sep="\n")
+            if not over:
+                await news.wait()
+    finally:
+        unwatch()
 
 
 def _data(event: JobEvent) -> dict[str, Any]:

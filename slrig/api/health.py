@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from slrig.api.calibration_schemas import BoardRequest, IfBusy
 from slrig.api.idempotency import IdempotencyKey, started_once
-from slrig.api.openapi import problems
+from slrig.api.openapi import file_of, problems
 from slrig.api.schemas import MOST_EXPOSURE_S, AnyFault, filled
 from slrig.api.service import Service, Serving
 from slrig.bundle.faults import Strict
@@ -143,7 +143,7 @@ def list_health(
 @router.get(
     "/health.svg",
     response_class=Response,
-    responses={200: {"content": {"image/svg+xml": {}}, "description": "the plot"}},
+    responses=file_of("image/svg+xml"),
 )
 def plot_health(service: Serving, limit: Annotated[int, Query(ge=1, le=2000)] = 500) -> Response:
     """Draw the newest verifications over time."""

@@ -15,6 +15,14 @@ from slrig.api.scopes import needed_scope
 _PROBLEM = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 _EVERYWHERE = (400, 401, 403, 413, 429, 500)
 
+BYTES = {"type": "string", "format": "binary"}
+"""A body that is neither JSON nor text."""
+
+_TEXTS = {
+    "application/json": {"type": "object"},
+    **{kind: {"type": "string"} for kind in ("application/xml", "application/yaml", "image/svg+xml", "text/html")},
+}
+
 
 def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """The `responses` of a route that may answer with problems of these statuses. `describe` adds those of every route
@@ -25,7 +33,7 @@ def problems(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 def file_of(media_type: str, *statuses: int) -> dict[int | str, dict[str, Any]]:
     """The `responses` of a route that answers with a file, or with problems of these statuses."""
-    content = {media_type: {"schema": {"type": "string", "format": "binary"}}}
+    content = {media_type: {"schema": _TEXTS.get(media_type, BYTES)}}
     return {200: {"description": "the file", "content": content}, **problems(*statuses)}
 
 

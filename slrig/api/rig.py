@@ -9,12 +9,12 @@ from uuid import UUID
 
 import cv2
 import numpy as np
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
 from starlette.responses import StreamingResponse
 
-from slrig.api.events import OpenStreams
+from slrig.api.events import StreamPlace
 from slrig.api.openapi import problems
 from slrig.api.schemas import CalibrationInUse, CameraBody, DeviceList, ProjectorBody, RigBody, filled
 from slrig.api.service import Serving
@@ -95,25 +95,24 @@ def _camera(name: str, camera: CameraInfo) -> CameraBody:
 
 @router.get("/preview/{camera}", response_class=Response, responses={**_STREAM, **problems(409, 429, 502, 503)})
 async def look_through_camera(
-    request: Request,
+    place: StreamPlace,
     service: Serving,
     camera: Annotated[str, Path(max_length=64, description="name of a camera of the rig")],
     light: Annotated[Light, Query(description="what the projector does meanwhile: dark, or all white")] = Light.OFF,
 ) -> Response:
     """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
-    streams: OpenStreams = request.app.state.streams
-    streams.require_room()
+    place.take()
     watch = await run_in_threadpool(service.runner.watch, camera, light)
     return StreamingResponse(
-        _parts(watch, streams),
+        _parts(watch),
         media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}",
         headers={"Cache-Control": "no-store"},
     )
 
 
-async def _parts(watch: Watch, streams: OpenStreams) -> AsyncIterator[bytes]:
+async def _parts(watch: Watch) -> AsyncIterator[bytes]:
     number = 0
-    with streams, watch:
+    with watch:
         while True:
             try:
                 picture = await run_in_threadpool(watch.picture, number, _LOOK_S)
