@@ -190,6 +190,10 @@ class StorageError(SlrigError, code="storage"):
     """The disk refused: full, read-only, gone. What was being written has been removed."""
 
 
+class DataFolderGoneError(StorageError, code="data-folder-gone"):
+    """The service's data folder is not where it was: removed, renamed, or its disk is not mounted any more."""
+
+
 class ServiceError(SlrigError, code="service"):
     """The slrig service, asked as a client, could not be reached or answered with an error of its own."""
 

@@ -53,6 +53,7 @@ class AcceptanceDesk:
         """`evaluate` : as `slrig.accept.running.evaluated`. report : writes the reports of a test. jobs : those of
         positions.
         """
+        self._data = folder
         self._store = AcceptanceStore(folder)
         self._queue = queue
         self.jobs = jobs
@@ -157,7 +158,7 @@ class AcceptanceDesk:
         """Return where a report lies. Raises JobNotFoundError, ArtefactNotReadyError."""
         record = self.get(test_id)
         path = self._store.folder(test_id) / name
-        if record.state is not AcceptanceState.FINISHED or not path.is_file():
+        if record.state is not AcceptanceState.FINISHED or not self._data.owns(path):
             reason = f"has no {name} before every position is measured."
             message = f"Acceptance test {test_id} is {record.state}, and {reason}"
             raise ArtefactNotReadyError(message)

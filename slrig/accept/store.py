@@ -25,7 +25,7 @@ from slrig.bundle.storage import refusals_of, write_file
 from slrig.calibration.artefacts import Decision
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import DataFolder, remove
 
 RECORD, HTML, JSON = "test.json", "report.html", "report.json"
 
@@ -52,9 +52,9 @@ class AcceptanceStore:
         found: list[AcceptanceRecord] = []
         with disk_errors(self._root):
             self._root.mkdir(exist_ok=True)
-            for place in sorted(each for each in self._root.iterdir() if each.is_dir()):
+            for place in sorted(each for each in self._root.iterdir() if each.is_dir() and not each.is_symlink()):
                 try:
-                    record = record_from_json((place / RECORD).read_bytes(), str(place / RECORD))
+                    record = record_from_json(self._data.read(place / RECORD), str(place / RECORD))
                 except (StorageError, FileNotFoundError) as error:
                     _log.warning("an acceptance test is put aside", folder=place.name, cause=str(error))
                     self._data.orphans.mkdir(exist_ok=True)
@@ -62,7 +62,7 @@ class AcceptanceStore:
                     continue
                 for stray in place.glob(".*"):
                     # Frames of a capture that was cut off, or a part of a file.
-                    shutil.rmtree(stray) if stray.is_dir() else stray.unlink()
+                    remove(stray)
                 settled = self._settled(record)
                 if settled is not record:
                     self.save(settled)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
@@ -36,12 +37,13 @@ KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an E
 def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
     """Name to URL path of each file of a scan that can be fetched now."""
     place = folder.scan(record.id)
-    if not record.state.final or not place.is_dir():
+    if not record.state.final or not (place.is_dir() and folder.owns(place)):
         return {}
-    names = {path.name for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png"}
+    known = [path for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png"]
+    names = {path.name for path in known if not path.is_symlink()}
     if MESH in names:
         names |= set(ON_REQUEST)
-    if (place / "bundle").is_dir():
+    if folder.owns(place / "bundle"):
         names.add(BUNDLE_ZIP)
     return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
 
@@ -65,11 +67,11 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
     service.scan_retention.reading(scan_id)
     place = service.folder.scan(scan_id)
     path = place / name
-    if record.state.final and name in ON_REQUEST and (place / MESH).is_file():
+    if record.state.final and name in ON_REQUEST and service.folder.owns(place / MESH):
         with _converting:
-            if not path.is_file():
+            if not os.path.lexists(path):
                 write_converted(place, name)
-    if not record.state.final or not path.is_file():
+    if not record.state.final or not service.folder.owns(path):
         _refuse_absent(record, name)
     headers = _headers(scan_id, name)
     if _still_known(known, headers["ETag"]):
@@ -140,7 +142,7 @@ def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Res
     record = service.store.get(scan_id)
     service.scan_retention.reading(scan_id)
     bundle = service.folder.scan(scan_id) / "bundle"
-    if not record.state.final or not bundle.is_dir():
+    if not record.state.final or not service.folder.owns(bundle):
         _refuse_absent(record, BUNDLE_ZIP)
     headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
     if _still_known(known, headers["ETag"]):
@@ -172,7 +174,8 @@ def zipped(folder: Path) -> Iterator[bytes]:
     outlet = _Outlet()
     with zipfile.ZipFile(outlet, "w") as archive:  # type: ignore[call-overload] # write and flush are enough
         for path in sorted(folder.rglob("*")):
-            if not path.is_file():
+            # What a link leads to was not recorded here.
+            if path.is_symlink() or not path.is_file():
                 continue
             entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), _ZIP_EPOCH)
             entry.external_attr = 0o644 << 16

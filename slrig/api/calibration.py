@@ -300,7 +300,7 @@ def fetch_pose_picture(
     if cameras and chosen not in cameras:
         message = f"Calibration {calibration_id} has no camera '{chosen}'; it has {', '.join(cameras)}."
         raise CameraNotFoundError(message)
-    if not path.is_file():
+    if not service.folder.owns(path):
         message = f"{pose.name} of calibration {calibration_id} is {pose.state} and has no picture."
         raise ArtefactNotReadyError(message)
     return FileResponse(path, media_type="image/png", headers={"Cache-Control": "private, no-cache"})

@@ -29,7 +29,7 @@ _CODES = {
     429: "queue-full",
     500: "slrig device-state worker-lost out-of-memory",
     502: "scan-evidence device service",
-    503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted",
+    503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted data-folder-gone",
     504: "frame-timeout",
     507: "storage",
 }

@@ -143,13 +143,21 @@ class Service:
         self.folder.release()
 
 
-def _of_request(request: Request) -> Service:
+async def _of_request(request: Request) -> Service:
     service: Service = request.app.state.service
     return service
 
 
-Serving = Annotated[Service, Depends(_of_request)]
-"""A handler's parameter: the service that it serves."""
+def _whole(service: Annotated[Service, Depends(_of_request)]) -> Service:
+    service.folder.require_present()
+    return service
+
+
+Serving = Annotated[Service, Depends(_whole)]
+"""A handler's parameter: the service that it serves. Without its data folder it serves nothing: 503."""
+
+Probed = Annotated[Service, Depends(_of_request)]
+"""The service whatever has become of its data folder, for what tells about that."""
 
 Cursor = Annotated[int | None, Query(ge=1, le=2**53, description="`next` of the page before")]
 PageLength = Annotated[int, Query(ge=1, le=200)]

@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 from slrig.api.openapi import problems
 from slrig.api.problems import answer, explanations, problem
 from slrig.api.schemas import Explanation, Probe
-from slrig.api.service import Service, Serving
+from slrig.api.service import Probed, Service, Serving
 from slrig.calibration.health.verdict import HealthState
 from slrig.errors import StorageError
 from slrig.jobs.records import JobState, utc_now
@@ -112,7 +112,7 @@ async def livez() -> Probe:
 
 
 @router.get("/readyz", response_model=Probe, responses=problems(503), openapi_extra={"security": []})
-def readyz(service: Serving) -> Response | Probe:
+def readyz(service: Probed) -> Response | Probe:
     """Tell whether a scan could start and end well: records, disk, rig, reconstruction. Touches no device.
 
     A rig that is held is well. `pending` names what is not ready yet and gets there by itself: the rig while it is

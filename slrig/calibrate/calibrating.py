@@ -60,6 +60,7 @@ class Calibrations:
         tools: CalibrationTools,
         spare_bytes: int = 0,
     ) -> None:
+        self._data = folder
         self.store = CalibrationStore(folder)
         self.register = CalibrationRegister(self.store, jobs)
         self._work = RigJobs(jobs, runner, folder)
@@ -240,7 +241,7 @@ class Calibrations:
         """Return where a file of the last solve lies. Raises CalibrationNotFoundError, ArtefactNotReadyError."""
         record = self.register.get(session_id)
         path = self.store.solve(session_id, record.solve) / name
-        if not record.solve or not path.is_file():
+        if not record.solve or not self._data.owns(path):
             what = "was imported, and" if record.board is None else "has no solve yet that went well, and"
             message = f"Calibration {session_id} {what} has no {name}."
             raise ArtefactNotReadyError(message)

@@ -127,7 +127,7 @@ class PoseDesk:
         pose = pose_of(job)
         scan = ScanPlan(patterns=self.register.get(session_id).patterns, exposure_s=pose.exposure_s)
         parts = self._parts(session_id, pose, scan, asked_by=job.requested_by)
-        whole = (self.folder.staging(job.id) / BUNDLE).is_dir()
+        whole = self.folder.owns(self.folder.staging(job.id) / BUNDLE)
         self.work.take_up(job, parts, holder=_holder(session_id, pose.number), resumes=whole)
 
     def script(

@@ -80,7 +80,7 @@ def named_by_scans(scans: Path) -> set[str]:
     A scan whose files cannot be read names none.
     """
     names = set()
-    for scan in scans.iterdir():
+    for scan in (place for place in scans.iterdir() if not place.is_symlink()):
         with suppress(OSError, ValueError, KeyError, TypeError):
             names.add(_session_of(json.loads((scan / "report.json").read_bytes())["calibration"]["id"]))
             continue

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
 import uuid
 import zipfile
@@ -82,11 +83,10 @@ class CalibrationStore:
         """Return every calibration on record, oldest first. A folder that cannot be read is put aside."""
         found: list[SessionRecord] = []
         for place in sorted(self._folder.calibrations.iterdir()):
-            if not place.is_dir():
+            if not place.is_dir() or place.is_symlink():
                 continue
             try:
-                with disk_errors(place):
-                    text = (place / SESSION).read_bytes()
+                text = self._folder.read(place / SESSION)
                 found.append(session_from_json(text, str(place / SESSION)))
             except (StorageError, FileNotFoundError):
                 self._folder.orphans.mkdir(exist_ok=True)
@@ -125,7 +125,7 @@ class CalibrationStore:
     def pose_numbers(self, session_id: UUID) -> list[int]:
         """The numbers of the poses that are in place."""
         places = (self.folder(session_id) / "poses").iterdir()
-        return sorted(int(place.name) for place in places if place.name.isdigit())
+        return sorted(int(place.name) for place in places if place.name.isdigit() and not place.is_symlink())
 
     def answer(self, session_id: UUID, number: int) -> dict[str, Any] | None:
         """What the pose in place says of itself; None where it cannot be read."""
@@ -159,7 +159,11 @@ class CalibrationStore:
 
     def calibration(self, session_id: UUID, solve: int) -> Calibration:
         """Return what a solve gave. Raises CalibrationError."""
-        return read_calibration(self.solve(session_id, solve) / CALIBRATION)
+        path = self.solve(session_id, solve) / CALIBRATION
+        if path.is_symlink():
+            message = f"{path} is a link, and what it leads to is not ours. Put the file itself there."
+            raise CalibrationError(message)
+        return read_calibration(path)
 
     def active(self) -> ActivePointer | None:
         """Return which calibration is in use; None where none is. Raises StorageError if that cannot be read."""
@@ -214,7 +218,7 @@ class CalibrationStore:
             sync_folder(place.parent)
 
     def _remove(self, place: Path) -> None:
-        if not place.is_dir():
+        if not os.path.lexists(place):
             return
         gone = self._folder.incoming / f"gone-{uuid.uuid4().hex}"
         with disk_errors(place):

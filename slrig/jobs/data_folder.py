@@ -23,7 +23,7 @@ import structlog
 from filelock import FileLock, Timeout
 
 from slrig.bundle.storage import sync_file, sync_folder
-from slrig.errors import StorageError
+from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 
 _HOLDER = "holder"
@@ -130,8 +130,37 @@ class DataFolder:
         """Let another process have the folder. Idempotent."""
         self._lock.release()
 
+    def require_present(self) -> None:
+        """Raise DataFolderGoneError unless the folder is there; where its disk is not mounted, an empty one may be."""
+        if not (self.scans.is_dir() and self.incoming.is_dir()):
+            message = (
+                f"The data folder {self.root} is gone, or empty: removed, renamed, or its disk is not mounted. Bring "
+                "it back, and start the service again."
+            )
+            raise DataFolderGoneError(message)
+
+    def owns(self, path: Path) -> bool:
+        """Whether something lies at a path below one of the folders here, and no link leads to it. What the folders
+        themselves are is the operator's choice: `scans` may be a link to another disk.
+        """
+        top, *below = path.relative_to(self.root).parts
+        return path.exists() and path.resolve() == (self.root / top).resolve().joinpath(*below)
+
+    def read(self, path: Path) -> bytes:
+        """Return the bytes of a file below one of the folders here. Raises StorageError, also where a link leads to it;
+        FileNotFoundError.
+        """
+        with disk_errors(path):
+            if path.exists() and not self.owns(path):
+                message = (
+                    f"{path} is a link, or below one, and what that leads to is not ours. Put the file itself there."
+                )
+                raise StorageError(message)
+            return path.read_bytes()
+
     def require_space(self, needed_bytes: int) -> None:
-        """Raise StorageError unless `needed_bytes` can be written."""
+        """Raise StorageError unless the folder is there, and `needed_bytes` can be written."""
+        self.require_present()
         free = self._free(self.root)
         if free < needed_bytes:
             message = (
@@ -186,7 +215,7 @@ class DataFolder:
         staged = self.staging(scan_id)
         for other in staged.iterdir():
             if other.name != "bundle":
-                shutil.rmtree(other) if other.is_dir() else other.unlink()
+                remove(other)
         return staged
 
     def discard(self, scan_id: UUID) -> None:
@@ -195,19 +224,30 @@ class DataFolder:
 
     def withdraw(self, scan_id: UUID) -> None:
         """Take a finished scan's files back into staging by one rename: the first half of a deletion."""
-        if self.scan(scan_id).is_dir():
+        if os.path.lexists(self.scan(scan_id)):
             with disk_errors(self.scans):
                 self.scan(scan_id).rename(self.staging(scan_id))
 
 
 def missing_files(scan: Path) -> list[str]:
-    """What a scan that succeeded must have, and is not in its folder."""
-    return [name for name in _PROMISED if not (scan / name).is_file()]
+    """What a scan that succeeded must have, and is not in its folder. A link is no file and no folder of ours."""
+    is_ours = not scan.is_symlink()
+    return [name for name in _PROMISED if not (is_ours and (scan / name).is_file() and not (scan / name).is_symlink())]
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a folder with all that is in it, or a link and not what it leads to. Raises OSError."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def sync_tree(folder: Path) -> None:
     """Make every file below `folder`, and every folder, durable."""
     for place, _, files in os.walk(folder):
-        for name in files:
-            sync_file(Path(place, name))
+        for file in (Path(place, name) for name in files):
+            # What a link leads to is not ours.
+            if not file.is_symlink():
+                sync_file(file)
         sync_folder(Path(place))

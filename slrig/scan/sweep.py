@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import UUID
 
 from slrig.errors import StorageError
 from slrig.failure import failure_of, interruption
-from slrig.jobs.data_folder import DataFolder, missing_files
+from slrig.jobs.data_folder import DataFolder, missing_files, remove
 from slrig.jobs.records import JobState, acting_as
 from slrig.jobs.store import JobStore, unfinished_ids
 from slrig.scan.records import plan_json, read_record, report_summary
@@ -50,7 +49,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
             recovered.append(record.id)
             continue
         # Reconstruction starts only after the bundle was made durable, so this bundle is whole.
-        whole = record.state is JobState.COMPUTING and (folder.staging(record.id) / "bundle").is_dir()
+        whole = record.state is JobState.COMPUTING and folder.owns(folder.staging(record.id) / "bundle")
         if record.state is JobState.QUEUED or (whole and store.attempts(record.id) == 1):
             resumed.append(record.id)
             continue
@@ -60,7 +59,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
         interrupted.append(record.id)
     for scan_id, state in store.states().items():
         if state is JobState.SUCCEEDED and (missing := missing_files(folder.scan(scan_id))):
-            if folder.staging(scan_id).is_dir():
+            if folder.owns(folder.staging(scan_id)):
                 store.delete(scan_id)
                 continue
             message = f"{' and '.join(missing)} of this scan is gone from {folder.scan(scan_id)}. Scan again."
@@ -70,7 +69,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
     going_on = unfinished_ids(store.database)
     for leftover in folder.incoming.iterdir():
         if leftover.name not in going_on:
-            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
+            remove(leftover)
     recovered += _restored(store, folder)
     return Swept(tuple(interrupted), tuple(resumed), tuple(recovered), tuple(lost), _put_aside(store, folder))
 

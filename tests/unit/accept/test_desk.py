@@ -336,6 +336,21 @@ def test_what_cannot_be_read_is_put_aside(desks: Desks, tmp_path: Path) -> None:
     assert (tmp_path / ".orphans" / f"acceptance-{test.id}" / "test.json").is_file()
 
 
+def test_links_among_the_tests_are_not_followed(desks: Desks, tmp_path: Path) -> None:
+    test = desks().open(the_plan)
+    root, elsewhere = tmp_path / "acceptance", tmp_path / "elsewhere"
+    (root / str(test.id)).rename(elsewhere)
+    (root / str(test.id)).symlink_to(elsewhere)
+    (root / "nowhere").symlink_to(tmp_path / "absent")
+    assert desks().latest() == ()
+    (root / str(test.id)).unlink()
+    (root / str(test.id)).mkdir()
+    (root / str(test.id) / "test.json").symlink_to(elsewhere / "test.json")
+    assert desks().latest() == ()
+    assert (tmp_path / ".orphans" / f"acceptance-{test.id}" / "test.json").is_symlink()
+    assert (elsewhere / "test.json").is_file()
+
+
 def test_positions_of_one_test_are_measured_with_one_calibration(desk: Desk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=False)

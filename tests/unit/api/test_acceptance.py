@@ -36,7 +36,7 @@ def client(desk: AcceptanceDesk) -> TestClient:
     app.include_router(router_module.router)
     install_problems(app)
     app.dependency_overrides[_of_request] = lambda: SimpleNamespace(
-        acceptance=desk, keys=RequestKeys(desk.jobs.database)
+        acceptance=desk, keys=RequestKeys(desk.jobs.database), folder=SimpleNamespace(require_present=lambda: None)
     )
     return TestClient(app)
 

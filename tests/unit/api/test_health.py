@@ -37,7 +37,7 @@ def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
     store = HealthStore(Database(folder.database))
     desk = VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), tools=TAME)
     service = SimpleNamespace(
-        verifications=desk, keys=RequestKeys(store.database), refuse_when_stale=True,
+        folder=folder, verifications=desk, keys=RequestKeys(store.database), refuse_when_stale=True,
         calibrations=SimpleNamespace(active=None),
     )  # fmt: skip
     app = FastAPI()

@@ -509,6 +509,23 @@ def test_folder_that_is_no_session_is_put_aside(bench: CalibrationBench) -> None
     assert (bench.folder.orphans / stray.name / "session.json").is_file()
 
 
+def test_links_among_the_calibrations_are_not_followed(bench: CalibrationBench, tmp_path: Path) -> None:
+    session_id, store = bench.solved(), bench.calibrations.store
+    place, elsewhere = store.folder(session_id), tmp_path / "elsewhere"
+    solved = store.solve(session_id, 1) / "calibration.json"
+    solved.rename(tmp_path / "calibration.json")
+    solved.symlink_to(tmp_path / "calibration.json")
+    with pytest.raises(CalibrationError, match="is a link"):
+        store.calibration(session_id, 1)
+    place.rename(elsewhere)
+    place.symlink_to(elsewhere)
+    (bench.folder.calibrations / "nowhere").symlink_to(tmp_path / "absent")
+    assert CalibrationStore(bench.folder).load() == []
+    store.delete(session_id)
+    assert not place.is_symlink()
+    assert (elsewhere / "session.json").is_file()
+
+
 def test_active_calibration_that_is_gone_ends_the_start(bench: CalibrationBench) -> None:
     session_id = bench.solved()
     bench.calibrations.activate(session_id)

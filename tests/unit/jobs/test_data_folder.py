@@ -15,7 +15,7 @@ from uuid import UUID, uuid4
 
 import pytest
 
-from slrig.errors import StorageError
+from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
@@ -277,3 +277,68 @@ def test_other_users_of_the_machine_cannot_look_in(tmp_path: Path, monkeypatch: 
     DataFolder(root).release()
     with pytest.raises(StorageError, match=f"cannot be given to the group '{group}'"):
         DataFolder(root, group=group)
+
+
+@pytest.fixture
+def elsewhere(tmp_path: Path) -> Path:
+    """A folder of somebody else's that looks like a scan."""
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    for name in ("mesh.ply", "report.json"):
+        (other / name).write_text("{}")
+    return other
+
+
+def test_links_in_the_data_folder_are_neither_followed_nor_fatal(
+    folder: DataFolder, store: JobStore, elsewhere: Path
+) -> None:
+    (folder.incoming / "to-a-folder").symlink_to(elsewhere)
+    (folder.incoming / "to-nothing").symlink_to(elsewhere / "absent")
+    cut = running(store, JobState.COMPUTING)
+    (staged_bundle(folder, cut) / "frame.png").symlink_to(elsewhere / "absent")
+    store.advance(cut, JobState.COMPUTING)
+    stray, linked, hollow = uuid4(), running(store, JobState.COMPUTING), running(store, JobState.COMPUTING)
+    write_record(elsewhere, KeptRecord(stray, "bench", None, ScanPlan(), datetime.now(UTC), datetime.now(UTC)))
+    folder.scan(stray).symlink_to(elsewhere)
+    folder.scan(linked).symlink_to(elsewhere)
+    store.finish(linked, JobState.SUCCEEDED)
+    folder.scan(hollow).mkdir()
+    for name in ("mesh.ply", "report.json"):
+        (folder.scan(hollow) / name).symlink_to(elsewhere / name)
+    before = sorted(elsewhere.iterdir())
+    swept = sweep(store, folder)
+    assert list(folder.incoming.iterdir()) == []
+    assert sorted(elsewhere.iterdir()) == before
+    assert (swept.lost, swept.recovered, swept.put_aside) == ((linked,), (), (str(stray),))
+    assert set(swept.interrupted) == {cut, hollow}
+    assert (folder.scan(cut) / "bundle" / "bundle.json").is_file()
+
+
+def test_what_a_link_leads_to_is_not_ours(folder: DataFolder, elsewhere: Path) -> None:
+    scan = folder.scan(uuid4())
+    scan.mkdir()
+    (scan / "mesh.ply").write_text("ply")
+    (scan / "report.json").symlink_to(elsewhere / "report.json")
+    (scan / "bundle").symlink_to(elsewhere)
+    assert folder.owns(scan / "mesh.ply")
+    assert folder.read(scan / "mesh.ply") == b"ply"
+    for path in (scan / "report.json", scan / "bundle", scan / "bundle" / "mesh.ply", scan / "absent"):
+        assert not folder.owns(path), path
+    with pytest.raises(StorageError, match="is a link, or below one"):
+        folder.read(scan / "report.json")
+    # Scans that lie on another disk are the operator's choice.
+    moved = elsewhere / "scans"
+    folder.scans.rename(moved)
+    folder.scans.symlink_to(moved)
+    assert folder.owns(scan / "mesh.ply")
+
+
+def test_folder_that_is_gone_is_told_as_that(folder: DataFolder) -> None:
+    folder.require_present()
+    folder.root.rename(folder.root.with_name("away"))
+    for ask in (folder.require_present, lambda: folder.require_space(0)):
+        with pytest.raises(DataFolderGoneError, match="is gone, or empty"):
+            ask()
+    folder.root.mkdir()
+    with pytest.raises(DataFolderGoneError, match="its disk is not mounted"):
+        folder.require_present()
