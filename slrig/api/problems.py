@@ -15,9 +15,9 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from slrig.bundle.printable import printable
 from slrig.errors import RigBusyError, SlrigError
 from slrig.failure import UNEXPECTED, JobFailure, errors_by_code
+from slrig.printable import printable
 
 MEDIA_TYPE = "application/problem+json"
 

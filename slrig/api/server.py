@@ -21,7 +21,6 @@ from slrig import KEY_VARIABLE
 from slrig.api.app import create_app
 from slrig.api.connections import ConnectionConfig, Deadlines, listening_socket, quiet_accepts, room_for
 from slrig.api.keys import KeyRing, first_key
-from slrig.api.logs import set_up_logs
 from slrig.api.service import Service
 from slrig.api.sessions import LINK_PATH, Sessions
 from slrig.bundle.storage import write_file
@@ -33,6 +32,7 @@ from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind, utc_now
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
+from slrig.logs import set_up_logs
 from slrig.rig.session import RigSession
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.job import PIPELINE
@@ -172,6 +172,8 @@ def serve(
             deadlines=Deadlines(),
             room=room_for(settings.max_connections, most_per_address=settings.max_connections_per_address),
             log_level="warning",
+            # Its lines go the way of all others.
+            log_config=None,
             # Streams end by themselves once their scans have; this is for every other request under way.
             timeout_graceful_shutdown=1,
         )

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from slrig.bundle.printable import UNSAFE, unsafe
+from slrig.printable import UNSAFE, unsafe
 
 
 def _refuse_unsafe(text: str) -> str:

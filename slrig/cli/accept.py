@@ -20,7 +20,6 @@ from slrig.accept.running import Place, required_calibration, run_acceptance
 from slrig.accept.scene import scripted_config
 from slrig.accept.store import HTML, JSON
 from slrig.accept.verdicts import AcceptanceResult
-from slrig.api.logs import set_up_logs_for_a_person
 from slrig.calibration.artefacts import Decision
 from slrig.cli.display import answered, progress_shown
 from slrig.cli.options import AcceptanceOptions
@@ -28,6 +27,7 @@ from slrig.config import RigConfig, read_rig
 from slrig.devices import Rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError, ScanCancelledError, SlrigError
+from slrig.logs import set_up_logs_for_a_person
 
 _COLOURS = {Decision.PASSES: "green", Decision.UNDECIDED: "yellow", Decision.FAILS: "bold red"}
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import typer
 from rich.console import Console
 
-from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration, write_calibration, write_opencv_calibration
 from slrig.bundle.storage import write_file
 from slrig.calibrate.pose_frames import bundle_device_sizes
@@ -24,6 +23,7 @@ from slrig.cli.calibration_screen import tell_result
 from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown
 from slrig.cli.reconstruct import keep_kernels
 from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
+from slrig.logs import set_up_logs_for_a_person
 from slrig.model import Size
 
 if TYPE_CHECKING:

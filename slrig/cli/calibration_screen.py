@@ -12,10 +12,10 @@ from rich.console import Console, Group
 from rich.table import Column, Table
 from rich.text import Text
 
-from slrig.bundle.printable import printable
 from slrig.calibrate.words import rounded
 from slrig.calibration.solution import CELLS
 from slrig.cli.display import counted, plain_table
+from slrig.printable import printable
 
 _COLOURS = {"good": "green", "usable": "yellow"}
 _NAMES = {

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import httpx2
 
 from slrig import KEY_VARIABLE
-from slrig.bundle.printable import printable
 from slrig.bundle.storage import refusals_of, staging_name
 from slrig.errors import ConfigError, ServiceError
+from slrig.printable import printable
 
 PATIENCE_S = 30.0
 """How long a connection that broke is tried again before the service counts as gone."""

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Column, Table
 from rich.text import Text
 
-from slrig.bundle.printable import printable
+from slrig.printable import printable
 
 EVERY_S = 2.0
 """How often a line tells of a stage that goes on, where there is no bar."""

@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from slrig.api.logs import set_up_logs_for_a_person
 from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.capture.latency import measure_latency
 from slrig.capture.latency_fit import STEADY, CameraLatency
@@ -24,6 +23,7 @@ from slrig.discovery import found_devices, installed_drivers, open_rig
 from slrig.doctor.doctor import Diagnosis, examine
 from slrig.doctor.findings import Severity
 from slrig.doctor.rig_file import refuse_existing, write_rig_file
+from slrig.logs import set_up_logs_for_a_person
 from slrig.model import PatternSequence
 from slrig.scan.plan import PatternPlan
 from slrig.scan.plan_check import pattern_sequence

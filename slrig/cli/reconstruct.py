@@ -10,13 +10,13 @@ from typing import Any
 
 import typer
 
-from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.description import read_description
 from slrig.cli.display import progress_shown
 from slrig.cli.scan import quality_lines
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
+from slrig.logs import set_up_logs_for_a_person
 from slrig.scan.artefacts import MESH, write_converted
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary

@@ -9,7 +9,6 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from slrig.api.logs import set_up_logs_for_a_person
 from slrig.bundle import read_calibration
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
@@ -19,6 +18,7 @@ from slrig.cli.display import print_json, progress_shown
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import CalibrationError
+from slrig.logs import set_up_logs_for_a_person
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_bundle
 from slrig.scan.plan import Progress, ScanPlan

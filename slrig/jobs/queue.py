@@ -251,7 +251,8 @@ class JobQueue:
         error: Exception | None = RuntimeError("the thread that owns the rig was ended")
         try:
             try:
-                job.work(self.rig, job)
+                with structlog.contextvars.bound_contextvars(job=str(job.id)):
+                    job.work(self.rig, job)
                 error = None
             except Exception as raised:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
                 error = interruption() if self._ending else raised

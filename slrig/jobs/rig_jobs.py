@@ -160,7 +160,7 @@ class RigJobs:
 
     def _compute(self, job_id: UUID, parts: Parts) -> None:
         try:
-            with self._computing:
+            with self._computing, structlog.contextvars.bound_contextvars(job=str(job_id)):
                 found = parts.compute(self._recorder(job_id))
         except Exception as error:  # noqa: BLE001 - whatever goes wrong, the job gets its end
             self._interrupted(job_id, parts, error)

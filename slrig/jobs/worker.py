@@ -23,6 +23,7 @@ from typing import Any
 
 import structlog
 
+from slrig import logs
 from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.failure import errors_by_code, interruption
 from slrig.jobs.frame_feed import FrameFeed
@@ -139,7 +140,10 @@ class Worker:
             stops, self._stops = self._spawning.Pipe(duplex=False)
             self._heartbeat = RawValue(c_double, time.monotonic())
             self._process = self._spawning.Process(
-                target=serve, args=(far_end, stops, self._heartbeat, self.module), name="slrig-worker", daemon=True
+                target=serve,
+                args=(far_end, stops, self._heartbeat, self.module, logs.chosen()),
+                name="slrig-worker",
+                daemon=True,
             )
             self._process.start()
             # The child holds the only other ends now, so its death reads as end of file here.
@@ -202,7 +206,7 @@ class Worker:
                 if fed and feed is not None:
                     fed = job.settled(feed)
                 with self._sending:
-                    begun = sent(pipe, Run(number, task, fed))
+                    begun = sent(pipe, Run(number, task, fed, structlog.contextvars.get_contextvars()))
                 if not begun:
                     # What it last said may lie in the pipe still: why it could not be loaded.
                     self._noted(received(pipe))

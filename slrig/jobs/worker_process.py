@@ -20,7 +20,12 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import structlog
+
 from slrig.failure import JobFailure, failure_of
+from slrig.logs import LogSettings, set_up_logs
+
+_log = structlog.get_logger(__name__)
 
 HEARTBEAT_S = 0.5
 """How often the process says that it runs: often enough that a person who asks `/readyz` sees a stop within seconds."""
@@ -44,11 +49,15 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Parent to child: do this, with the frames that were sent under the same number if `fed`."""
+    """Parent to child: do this, with the frames that were sent under the same number if `fed`.
+
+    named : what the lines of the log carry meanwhile, as the job's id.
+    """
 
     number: int
     task: Task
     fed: bool
+    named: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,13 +136,17 @@ def received(pipe: Connection) -> object | None:
     return message
 
 
-def serve(pipe: Connection, stops: Connection, heartbeat: c_double, module: str) -> None:
+def serve(
+    pipe: Connection, stops: Connection, heartbeat: c_double, module: str, logs: LogSettings | None = None
+) -> None:
     """The child's life: prepare, then do jobs until the parent's end of the pipe is gone.
 
     stops : brings the numbers of jobs that are not wanted any more, past whatever waits in the pipe. heartbeat : takes
     the time of the last sign of life, `time.monotonic`. module : offers `warm_kernels(told)`, and `frame_receiver()`,
-    what the frames of a capture are told to.
+    what the frames of a capture are told to. logs : how the parent logs.
     """
+    if logs is not None:
+        set_up_logs(logs.level, logs.form)
     # Ctrl-C reaches the whole foreground group; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "SIGHUP"):  # not on Windows
@@ -144,10 +157,10 @@ def serve(pipe: Connection, stops: Connection, heartbeat: c_double, module: str)
         loaded = importlib.import_module(module)
         frames = loaded.frame_receiver()
         loaded.warm_kernels(lambda prepared: sent(pipe, Preparing(prepared.done, prepared.total)))
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - whatever it is, the parent and the log are told
         sent(pipe, Unloadable(f"{type(error).__name__}: {error}"))
-        # The traceback goes to the service's log.
-        raise
+        _log.exception("the worker cannot load what it computes with", module=module)
+        raise SystemExit(1) from None
     sent(pipe, Ready())
     capture = 0
     while (message := received(pipe)) is not None:
@@ -155,7 +168,8 @@ def serve(pipe: Connection, stops: Connection, heartbeat: c_double, module: str)
             live = frames.taken() if message.fed and message.number == capture else None
             frames.forget()
             try:
-                answer = _answer(pipe, stops, message, live)
+                with structlog.contextvars.bound_contextvars(**message.named):
+                    answer = _answer(pipe, stops, message, live)
             except (ConnectionError, EOFError):
                 return
             del live

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle.free_text import FreeText
 from slrig.bundle.moments import AwareMoment, Moment
-from slrig.bundle.printable import printable
+from slrig.printable import printable
 
 LABEL: TypeAdapter[str] = TypeAdapter(FreeText)
 ACTING = [

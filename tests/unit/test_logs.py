@@ -2,17 +2,35 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
+import logging
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import structlog
 from typer.testing import CliRunner
 
-from slrig.api.logs import LogFormat, set_up_logs, set_up_logs_for_a_person
+from slrig import logs
 from slrig.cli.commands import app
+from slrig.logs import LogFormat, set_up_logs, set_up_logs_for_a_person
+
+
+@pytest.fixture(autouse=True)
+def _as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What tells of errors in these tests is pytest's, and is again afterwards."""
+    root = logging.getLogger()
+    monkeypatch.setattr(logs, "_chosen", None)
+    for owner, name in ((sys, "excepthook"), (sys, "unraisablehook"), (threading, "excepthook"), (root, "handlers")):
+        monkeypatch.setattr(owner, name, getattr(owner, name))
+    level = root.level
+    yield
+    logging.captureWarnings(capture=False)
+    root.setLevel(level)
 
 
 class Stream(io.StringIO):
@@ -89,3 +107,47 @@ def test_a_person_is_told_warnings_and_no_more(capsys: pytest.CaptureFixture[str
     assert written.out == ""
     assert "the projector may still be lit" in written.err
     assert "a frame was shot again" not in written.err
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "Authorization: Bearer {}",
+        "authorization: Basic {}",
+        "illegal header line: bytearray(b'X-API-Key:{}')",
+        "headers [(b'authorization', b'Bearer {}'), (b'cookie', b'slrig={}')]",
+        "{{'x-api-key': '{}', 'Set-Cookie': 'slrig_session={}; HttpOnly'}}",
+        "SLRIG_API_KEY={}",
+    ],
+)
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_key_is_in_no_line(monkeypatch: pytest.MonkeyPatch, said: str, form: LogFormat) -> None:
+    key = "5tYw-Zm9v_YmFy.0x~Q=="
+    stream = Stream(terminal=False)
+    monkeypatch.setattr(sys, "stderr", stream)
+    set_up_logs("info", form)
+    logging.getLogger("uvicorn.error").error("refused %s", said.format(key, key))
+    structlog.get_logger().warning("refused", request=said.format(key, key))
+    assert stream.getvalue().count("refused") == 2
+    assert "5tYw" not in stream.getvalue()
+
+
+def test_text_moves_no_cursor(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Stream(terminal=False)
+    monkeypatch.setattr(sys, "stderr", stream)
+    set_up_logs("info", "text")
+    structlog.get_logger().warning("removed", label="a\x1b[2Jb")
+    logging.getLogger("uvicorn.error").error("\x1b[2J")
+    assert "\x1b" not in stream.getvalue()
+    assert stream.getvalue().count("u001b[2J") == 2
+
+
+def test_log_that_cannot_be_written_fails_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(Stream):
+        def write(self, _text: str) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sys, "stderr", Full(terminal=False))
+    set_up_logs("info", "json")
+    structlog.get_logger().error("lost")
+    logging.getLogger("asyncio").error("lost")
