@@ -28,6 +28,7 @@ from slrig.api.access import Access
 from slrig.api.calibration import IMPORT_PATH, MOST_IMPORT_BYTES
 from slrig.api.events import OpenStreams
 from slrig.api.keys import KeyRing
+from slrig.api.latency import Latency
 from slrig.api.methods import Methods
 from slrig.api.openapi import describe
 from slrig.api.problems import PlainErrorsToProblems, install_problems
@@ -93,6 +94,7 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False)
     app.add_middleware(PlainErrorsToProblems)
     app.add_middleware(SecurityHeaders)
+    app.add_middleware(Latency, durations=service.durations)
     return app
 
 

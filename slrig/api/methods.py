@@ -49,8 +49,9 @@ class Methods:
             refusal = answer(problem(405, "method-not-allowed", detail), headers={"Allow": listed})
             await refusal(scope, receive, send)
         elif method == "HEAD":
+            asked = {**scope, "method": "GET"}
             try:
-                await self._app({**scope, "method": "GET"}, receive, _head_only(send))
+                await self._app(asked, receive, _head_only(asked, scope, send))
             except _HeadSentError:
                 return
         else:
@@ -67,8 +68,10 @@ class _HeadSentError(Exception):
     """Ends the making of an answer of which only the head was asked for."""
 
 
-def _head_only(send: Send) -> Send:
+def _head_only(asked: Scope, scope: Scope, send: Send) -> Send:
     async def head(message: Message) -> None:
+        # Whoever measures outside of this looks for it there.
+        scope["route"] = asked.get("route")
         await send(message)
         await send({"type": "http.response.body"})
         raise _HeadSentError

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Annotated, TypeVar
 
+import structlog
 from fastapi import Depends, Query, Request, Response
 
 from slrig.accept.desk import AcceptanceDesk
+from slrig.api.latency import Durations
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
@@ -29,6 +32,8 @@ from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
 from slrig.verify.job import VerificationDesk
 from slrig.verify.verification import verification_tools
+
+_log = structlog.get_logger(__name__)
 
 _SCHEDULE_END_S = 1.0
 """How long a scheduled run may take to end by itself before the runner ends it."""
@@ -95,6 +100,10 @@ class Service:
             evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
         )
+        self.durations = Durations()
+        stores = (store, self.calibrations.register.jobs, self.verifications.jobs, self.acceptance.jobs)
+        for jobs in stores:
+            jobs.after_end = partial(self._ended, jobs)
         for desk in (self.verifications, self.calibrations, self.acceptance):
             desk.take_up()
         self.retention = Retention(
@@ -110,6 +119,13 @@ class Service:
         self.tasks = Tasks(runner, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True, notice=self.notices.run)
+
+    def _ended(self, jobs: JobStore, record: JobRecord) -> None:
+        """Measure a job that is over."""
+        try:
+            self.durations.ended(record, jobs.events(record.id, after=0))
+        except Exception:  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
+            _log.exception("how long a job took could not be noted", job=str(record.id))
 
     def start(self) -> None:
         """Open the rig, look at the clock, and remove what is old."""

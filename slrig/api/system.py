@@ -34,15 +34,17 @@ router = APIRouter(tags=["system"])
 )
 def read_metrics(service: Serving) -> Response:
     """Return the service's figures in the text format of Prometheus: scans and scheduled runs by state, whether the rig
-    is held, the calibration's age and expected error, the rig's health, and when each schedule is due next.
+    is held, the calibration's age and expected error, the rig's health, and when each schedule is due next; and, since
+    the start of this process, how long answers, jobs and their stages took.
     """
     registry = CollectorRegistry()
     registry.register(_Figures(service))
-    return Response(generate_latest(registry), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    text = generate_latest(registry) + generate_latest(service.durations.registry)
+    return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 class _Figures(Collector):
-    """What a service says of itself now. Nothing is counted beside the records."""
+    """What a service says of itself now, by its records."""
 
     def __init__(self, service: Service) -> None:
         self._service = service

@@ -35,6 +35,8 @@ class JobStore:
         self._watching = threading.Lock()
         self._watchers: dict[UUID, list[Callable[[], None]]] = defaultdict(list)
         self.database = database
+        self.after_end: Callable[[JobRecord], None] = lambda _: None
+        """Told of each job of this store that comes to its end, once that is on record. It must not raise."""
 
     def check(self) -> None:
         """Raise StorageError unless the database answers."""
@@ -181,7 +183,9 @@ class JobStore:
             if JobState(row.state).final:
                 return False
             self._close_row(session, row, state, fault, summary)
+            ended = _record(row)
         self._wake(job_id, row.parent)
+        self.after_end(ended)
         return True
 
     def lose_files(self, job_id: UUID, fault: JobFailure) -> None:

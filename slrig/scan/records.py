@@ -13,6 +13,7 @@ from uuid import UUID
 from pydantic import TypeAdapter, ValidationError
 
 from slrig.bundle.storage import write_file
+from slrig.jobs.timeline import STAGES_S
 from slrig.scan.plan import ScanPlan
 
 _RECORD = "record.json"
@@ -65,7 +66,8 @@ def read_record(folder: Path) -> KeptRecord | None:
 
 
 def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a report that is worth a row in a list: its plain values, and the whole of "truth", "mesh", "notes".
+    """The part of a report that is worth a row in a list: its plain values, and the whole of "truth", "mesh",
+    "notes", and the seconds of each stage.
 
     >>> report_summary({"method": "Gray-only", "stages": {"decode": 0.1}, "truth": {"rms_mm": float("nan")}})
     {'method': 'Gray-only', 'truth': {'rms_mm': None}}
@@ -73,7 +75,7 @@ def report_summary(report: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: _finite(value)
         for name, value in report.items()
-        if name in {"truth", "mesh", "notes"} or value is None or isinstance(value, (bool, int, float, str))
+        if name in {"truth", "mesh", "notes", STAGES_S} or value is None or isinstance(value, (bool, int, float, str))
     }
 
 
