@@ -12,7 +12,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal
+from typing import Literal, TextIO
 
 import structlog
 from structlog.typing import EventDict, Processor, WrappedLogger
@@ -45,7 +45,7 @@ def chosen() -> LogSettings | None:
     return _chosen
 
 
-class _Lines(logging.StreamHandler[object]):
+class _Lines(logging.StreamHandler[TextIO]):
     """A log that never fails whoever writes it: a full disk, a reader that is gone. The line is lost, not the work."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the standard library's own name

@@ -12,6 +12,7 @@ from fastapi import Depends, Query, Request, Response
 
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api.latency import Durations
+from slrig.api.traces import traces_by_environment
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
@@ -49,6 +50,8 @@ class Service:
     ------
     StorageError
         The disk refused. What was given is still the caller's to close.
+    ConfigError
+        The environment asks for traces, and the library that sends them is not installed.
     """
 
     def __init__(
@@ -101,6 +104,7 @@ class Service:
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
         )
         self.durations = Durations()
+        self.traces = traces_by_environment()
         stores = (store, self.calibrations.register.jobs, self.verifications.jobs, self.acceptance.jobs)
         for jobs in stores:
             jobs.after_end = partial(self._ended, jobs)
@@ -123,7 +127,10 @@ class Service:
     def _ended(self, jobs: JobStore, record: JobRecord) -> None:
         """Measure a job that is over."""
         try:
-            self.durations.ended(record, jobs.events(record.id, after=0))
+            events = jobs.events(record.id, after=0)
+            self.durations.ended(record, events)
+            if self.traces is not None:
+                self.traces.ended(record, events)
         except Exception:  # noqa: BLE001 - the job is over, and on record, whatever becomes of its figures
             _log.exception("how long a job took could not be noted", job=str(record.id))
 
@@ -155,6 +162,8 @@ class Service:
         """Stop scanning, then let records and data folder go. Idempotent."""
         self.end_work()
         self.notices.close()
+        if self.traces is not None:
+            self.traces.close()
         self.store.database.close()
         self.folder.release()
 

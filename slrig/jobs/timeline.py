@@ -1,4 +1,4 @@
-"""What a job did when, from its own record: how long it waited, captured, computed, and what of that each stage took."""
+"""What a job did when, from its own record: how long it waited, captured and computed, and what each stage took."""
 
 from __future__ import annotations
 

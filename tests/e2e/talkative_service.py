@@ -50,7 +50,7 @@ def speak() -> None:
     gc.collect()
 
 
-class Server(server._Server):  # type: ignore[misc] # it is ours, in another room
+class Server(server._Server):
     """Speaks once it has started."""
 
     async def startup(self, sockets: list[Any] | None = None) -> None:
@@ -77,7 +77,7 @@ def main(data: Path) -> None:
     """Serve from a data folder until SIGTERM, and end by an error that nobody catches."""
     bench = ServedBench(data)
     bench.gate.set()
-    server._Server = Server
+    server._Server = Server  # type: ignore[misc] # whoever serves makes one of these
     server.open_service = lambda *_, **__: bench.service
     settings = ServiceSettings(data_dir=data, port=0, log_format="json")
     rig = rig_of({"name": "bench", "head": {"driver": "none"}}, data / "rig.toml")
