@@ -58,7 +58,7 @@ def test_service_whose_data_folder_is_gone_says_so(idle: ServedBench) -> None:
     root.rename(away)
     for path, operations in DOCUMENT.items():
         for method in operations:
-            if path in {"/livez", "/device", "/problems/{name}"}:
+            if path in {"/livez", "/device", "/problems/{name}"} or path.startswith("/session"):
                 continue
             answer = client.request(method, filled(path))
             assert answer.status_code in ({422, 503} if method in {"post", "get"} else {503}), (method, path)
