@@ -12,7 +12,7 @@ from pydantic import Field
 
 from slrig.bundle.description import CameraName, Extent
 from slrig.bundle.faults import Strict, read_description_of
-from slrig.bundle.moments import Moment
+from slrig.bundle.moments import AwareMoment
 from slrig.bundle.opencv_calibration import read_opencv_calibration
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.errors import CalibrationError
@@ -40,7 +40,7 @@ class SolvedEntry(Strict):
     """How the calibration was found: see `slrig.model.Solved`. Absent where it says nothing of its own error."""
 
     id: Annotated[str, Field(min_length=1, max_length=64)]
-    solved_at: Annotated[Moment, Field(description="ISO 8601 with the offset from UTC")]
+    solved_at: Annotated[AwareMoment, Field(description="ISO 8601 with the offset from UTC")]
     covariance: Annotated[
         list[list[float]],
         Field(

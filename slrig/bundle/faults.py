@@ -65,7 +65,9 @@ def read_json(text: str, source: Path, error: type[InvalidInputError]) -> Any:
         if len(data) != len(pairs):
             keys = [key for key, _ in pairs]
             twice = sorted({key for key in keys if keys.count(key) > 1})
-            raise ValueError(f"found the key {', '.join(map(repr, twice))} twice in one object; keep one of them")
+            raise ValueError(
+                f"found the key {', '.join(map(shorten, twice[:MOST_FAULTS]))} twice in one object; keep one of them"
+            )
         return data
 
     try:
@@ -87,6 +89,9 @@ def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
     text = read_text(path, most_bytes, ConfigError)
     try:
         return tomllib.loads(text)
+    except RecursionError as cause:
+        message = f"{path}: expected a description, found TOML nested too deeply; check that this is the right file"
+        raise ConfigError(message) from cause
     except tomllib.TOMLDecodeError as cause:
         raise ConfigError(f"{path}: expected TOML, found a fault: {cause}; correct that line") from cause
 

@@ -27,13 +27,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeGuard
 
 import cv2
 import numpy as np
 
-from slrig.bundle.faults import read_text
+from slrig.bundle.description import CAMERA_NAME, MOST_SIDE_PX
+from slrig.bundle.faults import MOST_FAULTS, read_text, shorten
+from slrig.bundle.file_storage import Value, read_file_storage
 from slrig.bundle.storage import write_file
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
@@ -41,6 +44,7 @@ from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
 MOST_FILE_BYTES = 4 * 2**20
 PROJECTOR = "projector"
 SOLVED = "solved"
+MOST_ID_LENGTH = 64
 NODE_NAME = re.compile(r"^[A-Za-z_][A-Za-z0-9_-]*$")
 DEVICE_KEYS = (
     "image_width",
@@ -60,22 +64,15 @@ def read_opencv_calibration(path: Path) -> Calibration:
     Raises CalibrationError: the file is missing, cut, has an unknown key, a number that is not finite, or distortion
     terms beyond k3.
     """
-    text = read_text(path, MOST_FILE_BYTES, CalibrationError)
-    try:
-        storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    except (cv2.error, SystemError) as cause:
-        message = f"{path}: expected OpenCV FileStorage (YAML or XML), found text it cannot parse; export it again"
-        raise CalibrationError(message) from cause
-    try:
-        root = storage.root()
-        names = list(root.keys()) if root.isMap() else []
-        devices = {name: _read_device(root.getNode(name), path, name) for name in names if name != SOLVED}
-        solved = _read_solved(root.getNode(SOLVED), path) if SOLVED in names else None
-    finally:
-        storage.release()
+    root = read_file_storage(read_text(path, MOST_FILE_BYTES, CalibrationError), path)
+    devices = {name: _read_device(found, path, name) for name, found in root.items() if name != SOLVED}
+    solved = _read_solved(root[SOLVED], path) if SOLVED in root else None
     cameras = {name: device for name, device in devices.items() if name != PROJECTOR}
     if not cameras:
-        _refuse(path, "one map per device", f"{', '.join(names) or 'nothing'}", "name each camera and its six keys")
+        _refuse(path, "one map per device", f"{', '.join(root) or 'nothing'}", "name each camera and its six keys")
+    for name in cameras:
+        if not re.match(CAMERA_NAME, name):
+            _refuse(path, "camera names that begin with a letter or digit", f"'{name}'", "rename the camera")
     try:
         return Calibration(cameras, devices.get(PROJECTOR), solved)
     except CalibrationError as cause:
@@ -113,68 +110,81 @@ def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
     raise CalibrationError(f"{path}: expected {expected}, found {found}; {remedy}")
 
 
-def _require_keys(node: Any, wanted: tuple[str, ...], path: Path, name: str, remedy: str) -> None:
-    keys = set(node.keys()) if node.isMap() else set()
-    if keys != set(wanted):
-        wrong = [f"no {key}" for key in wanted if key not in keys]
-        wrong += [f"the unknown key {key}" for key in sorted(keys - set(wanted))]
-        _refuse(path, f"{', '.join(wanted)} in '{name}'", ", ".join(wrong), remedy)
+def _require_keys(found: Value, wanted: tuple[str, ...], path: Path, name: str, remedy: str) -> dict[str, Value]:
+    entries = found if isinstance(found, dict) else {}
+    if set(entries) != set(wanted):
+        wrong = [f"no {key}" for key in wanted if key not in entries]
+        wrong += [f"the unknown key {key}" for key in sorted(set(entries) - set(wanted))]
+        _refuse(path, f"{', '.join(wanted)} in '{name}'", ", ".join(wrong[:MOST_FAULTS]), remedy)
+    return entries
 
 
-def _read_device(node: Any, path: Path, name: str) -> Pinhole:
-    _require_keys(node, DEVICE_KEYS, path, name, "write one map per device")
-    extent = [node.getNode(key) for key in ("image_width", "image_height")]
-    if not all(part.isInt() and part.real() >= 1 for part in extent):
-        _refuse(path, f"whole numbers as extent of '{name}'", "something else", "correct image_width and image_height")
-    distortion = _matrix(node, "distortion_coefficients", path, name).ravel()
+def _read_device(found: Value, path: Path, name: str) -> Pinhole:
+    entries = _require_keys(found, DEVICE_KEYS, path, name, "write one map per device")
+    width_px, height_px = entries["image_width"], entries["image_height"]
+    if not _is_side(width_px) or not _is_side(height_px):
+        _refuse(path, f"whole numbers as extent of '{name}', from 1 to {MOST_SIDE_PX}", "something else",
+                "correct image_width and image_height")  # fmt: skip
+    distortion = _matrix(entries, "distortion_coefficients", path, name).ravel()
     if distortion.size < 4 or distortion[5:].any():
         _refuse(
             path,
             f"k1, k2, p1, p2 and at most k3 as distortion of '{name}'",
-            f"{distortion.tolist()}",
+            shorten(distortion[:14].tolist()),
             "calibrate without the rational, thin prism and tilt models",
         )
     five = np.zeros(5)
     five[: min(distortion.size, 5)] = distortion[:5]
     try:
         return Pinhole(
-            Size(*(int(part.real()) for part in extent)),
-            _matrix(node, "camera_matrix", path, name),
+            Size(width_px, height_px),
+            _matrix(entries, "camera_matrix", path, name),
             five,
-            _matrix(node, "rotation", path, name),
-            _matrix(node, "translation_mm", path, name).ravel(),
+            _matrix(entries, "rotation", path, name),
+            _matrix(entries, "translation_mm", path, name).ravel(),
         )
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {name}.{cause}") from cause
 
 
-def _read_solved(node: Any, path: Path) -> Solved:
-    _require_keys(node, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
-    words = [node.getNode(key) for key in ("id", "solved_at")]
-    number = node.getNode("expected_error_mm")
-    if not all(each.isString() and each.string() for each in words) or not (number.isReal() or number.isInt()):
+def _is_side(value: Value) -> TypeGuard[int]:
+    return isinstance(value, int) and 1 <= value <= MOST_SIDE_PX
+
+
+def _read_solved(found: Value, path: Path) -> Solved:
+    entries = _require_keys(found, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
+    name, solved_at, error_mm = entries["id"], entries["solved_at"], entries["expected_error_mm"]
+    if not isinstance(name, str) or not isinstance(solved_at, str) or not isinstance(error_mm, int | float):
         _refuse(path, f"text as id and solved_at of '{SOLVED}' and a number as expected_error_mm", "something else",
                 "export it again, or leave the whole map out")  # fmt: skip
-    error_mm = number.real()
+    if not 1 <= len(name) <= MOST_ID_LENGTH:
+        _refuse(path, f"a text of 1 to {MOST_ID_LENGTH} characters as {SOLVED}.id", shorten(name), "export it again")
+    if not _is_moment(solved_at):
+        _refuse(path, f"ISO 8601 with the offset from UTC as {SOLVED}.solved_at", shorten(solved_at), "correct it")
     if not 0 <= error_mm < np.inf:
         _refuse(path, f"{SOLVED}.expected_error_mm of 0 or more", f"{error_mm}", "export it again")
-    covariance = _matrix(node, "covariance", path, SOLVED)
-    volume_mm = _matrix(node, "volume_mm", path, SOLVED)
+    covariance = _matrix(entries, "covariance", path, SOLVED)
+    volume_mm = _matrix(entries, "volume_mm", path, SOLVED)
+    if not np.isfinite(volume_mm).all():
+        _refuse(path, f"finite numbers in {SOLVED}.volume_mm", "others", "export it again")
     try:
-        return Solved(words[0].string(), words[1].string(), covariance, volume_mm, error_mm)
+        return Solved(name, solved_at, covariance, volume_mm, float(error_mm))
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 
 
-def _matrix(node: Any, key: str, path: Path, name: str) -> FloatArray:
+def _is_moment(text: str) -> bool:
     try:
-        found = node.getNode(key).mat()
-    except cv2.error as cause:
-        message = f"{path}: {name}.{key}: expected an !!opencv-matrix, found something else; export it again"
-        raise CalibrationError(message) from cause
-    if found is None:
+        return datetime.fromisoformat(text).tzinfo is not None
+    except ValueError:
+        return False
+
+
+def _matrix(entries: dict[str, Value], key: str, path: Path, name: str) -> FloatArray:
+    found = entries[key]
+    if not isinstance(found, np.ndarray):
         _refuse(path, f"an !!opencv-matrix at {name}.{key}", "something else", "export it again")
-    return np.asarray(found, dtype=np.float64)
+    return found
 
 
 def _write_device(storage: Any, name: str, device: Pinhole) -> None:
@@ -186,5 +196,6 @@ def _write_device(storage: Any, name: str, device: Pinhole) -> None:
 def _write_map(storage: Any, name: str, values: Mapping[str, Any]) -> None:
     storage.startWriteStruct(name, cv2.FileNode_MAP)
     for key, value in values.items():
-        storage.write(key, value)
+        # OpenCV 5 writes an array of one dimension as an opencv-nd-matrix, which few programs read.
+        storage.write(key, value[:, None] if isinstance(value, np.ndarray) and value.ndim == 1 else value)
     storage.endWriteStruct()
