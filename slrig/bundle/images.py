@@ -25,8 +25,11 @@ from slrig.model import CameraFormat, Pixels
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-PNG_GREY, PNG_COLOUR = 0, 2
+PNG_GREY, PNG_COLOUR, PNG_FILTERS = 0, 2, 4
 TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
+TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
+MOST_TIFF_TAGS = 256
+MOST_TIFF_PAGES = 65536  # as many as a page's number in bundle.json can name
 MOST_FILE_BYTES = 2**31
 TIFF_FAULTS = (
     tifffile.TiffFileError,
@@ -118,23 +121,47 @@ def _check_header(path: Path, width: int, height: int, bits: int, camera: Camera
 def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
-    width, height, bits, colour = struct.unpack(">IIBB", data[16:26])
+    width, height, bits, colour, _, _, interlaced = struct.unpack(">IIBBBBB", data[16:29])
     if colour not in (PNG_GREY, PNG_COLOUR):
         kind = "a palette" if colour == 3 else "an alpha channel"
         _refuse(path, "a grey or colour PNG", f"one with {kind}", "save the frame as grey")
+    if interlaced:
+        _refuse(path, "a PNG line by line", "an interlaced one", "save the frame without interlacing")
     _check_header(path, width, height, bits, camera)
     place = len(PNG_SIGNATURE)
-    view = memoryview(data)
+    packed = bytearray()
     while True:
         length, kind_of_chunk = struct.unpack(">I4s", data[place : place + 8].ljust(8, b"\xff"))
         end = place + 12 + length
         if end > len(data):
             _refuse(path, "a whole PNG file", f"one cut after {len(data)} bytes", "copy the frame again")
-        if zlib.crc32(view[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+        if zlib.crc32(memoryview(data)[place + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
             _refuse(path, "a sound PNG file", f"a wrong checksum at byte {end - 4}", "copy the frame again")
+        if kind_of_chunk == b"tRNS":
+            _refuse(path, "a grey or colour PNG", "one with a transparent colour", "save the frame as grey")
+        if kind_of_chunk == b"IDAT":
+            packed += memoryview(data)[place + 8 : end - 4]
         if kind_of_chunk == b"IEND":
-            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            break
         place = end
+    row_bytes = 1 + width * bits // 8 * (3 if colour == PNG_COLOUR else 1)
+    rows = _inflated(packed, row_bytes * height)
+    if rows is None or max(rows[::row_bytes]) > PNG_FILTERS:
+        return None
+    # The decoder gets a file of these rows alone: nothing that a stranger packed, and no chunk that the walk passed.
+    parts = (b"IHDR" + data[16:29], b"IDAT" + zlib.compress(rows, 0), b"IEND")
+    plain = b"".join(struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in parts)
+    return cv2.imdecode(np.frombuffer(PNG_SIGNATURE + plain, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def _inflated(packed: bytes | bytearray | memoryview, size_bytes: int) -> bytes | None:
+    """What a zlib stream unpacks to, if it is whole, sound, and of exactly this size."""
+    unpacker = zlib.decompressobj()
+    try:
+        found = unpacker.decompress(packed, size_bytes + 1)
+    except zlib.error:
+        return None
+    return found if unpacker.eof and len(found) == size_bytes else None
 
 
 def _bitmap(path: Path, data: bytes, camera: CameraFormat) -> Pixels:
@@ -152,13 +179,15 @@ def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     except ValueError as cause:
         _refuse(path, "a whole JPEG of 8 bits, grey or in colour", str(cause), "copy the frame again")
     _check_header(path, found.width, found.height, 8, camera)
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return cv2.imdecode(np.frombuffer(found.plain(data), np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
     try:
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             count = len(tiff.pages)
+            if count > MOST_TIFF_PAGES:
+                _refuse(path, f"at most {MOST_TIFF_PAGES} pages", f"{count}", "split the file")
             if max(pages) >= count:
                 _refuse(path, f"a page {max(pages)}", f"{count} pages", "correct `page`, which counts from 0")
             for index in dict.fromkeys(pages):
@@ -172,6 +201,12 @@ def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFor
                         "save the frame as grey",
                     )
                 _check_header(path, page.imagewidth, page.imagelength, page.bitspersample, camera)
+                if page.compression not in TIFF_COMPRESSIONS:
+                    kind = getattr(page.compression, "name", str(page.compression))
+                    _refuse(path, "a TIFF without compression, or with zlib or LZW", kind, "save the frame as PNG")
+                codes = [tag.code for tag in page.tags]
+                if len(codes) > MOST_TIFF_TAGS or len(set(codes)) < len(codes):
+                    _refuse(path, f"up to {MOST_TIFF_TAGS} tags, each once", f"{len(codes)}", "save the frame as PNG")
                 ends = (offset + size for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True))
                 if max(ends, default=0) > len(data):
                     _refuse(path, "a whole TIFF file", f"one cut after {len(data)} bytes", "copy the frame again")
