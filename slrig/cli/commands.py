@@ -16,6 +16,7 @@ import typer
 import typer.core
 
 from slrig.cli import calibrate, key, schedule
+from slrig.cli.backup import backup, restore
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.errors import SlrigError
 
@@ -375,6 +376,8 @@ def accept(
         raise typer.Exit(1)
 
 
+app.command()(backup)
+app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
 app.add_typer(key.app, name="key")

@@ -26,6 +26,8 @@ from slrig.bundle.storage import sync_file, sync_folder
 from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 
+DATABASE, SCANS, ORPHANS = "slrig.sqlite", "scans", ".orphans"
+
 _HOLDER = "holder"
 
 _log = structlog.get_logger(__name__)
@@ -104,7 +106,7 @@ class DataFolder:
     @property
     def scans(self) -> Path:
         """Where finished scans lie."""
-        return self.root / "scans"
+        return self.root / SCANS
 
     @property
     def calibrations(self) -> Path:
@@ -119,12 +121,12 @@ class DataFolder:
     @property
     def orphans(self) -> Path:
         """Where files without a record are put aside."""
-        return self.root / ".orphans"
+        return self.root / ORPHANS
 
     @property
     def database(self) -> Path:
         """The records."""
-        return self.root / "slrig.sqlite"
+        return self.root / DATABASE
 
     def release(self) -> None:
         """Let another process have the folder. Idempotent."""
