@@ -83,7 +83,7 @@ def back_up(root: Path, to: Path, *, previous: Path | None = None) -> Manifest:
     root, to = root.resolve(), to.resolve()
     with _refusals(root):
         if not (root / DATABASE).is_file():
-            message = f"{root} holds no {DATABASE}: it is no data folder of slrig. Name one with --data."
+            message = f"{root} holds no {DATABASE}: it is no data folder of slrig. Name the one that slrig serve was given."
             raise StorageError(message)
         if to.is_relative_to(root) or to.exists():
             why = "exists already" if to.exists() else "lies in the data folder itself"
@@ -123,7 +123,7 @@ def restore(backup: Path, root: Path) -> Manifest:
         if root.exists() and (not root.is_dir() or any(root.iterdir())):
             message = (
                 f"{root} holds something already, or a service uses it: a backup is restored into a folder that is new "
-                "or empty. Name another with --data; or stop the service, move that folder away, and restore again."
+                "or empty. Name another; or stop the service, move that folder away, and restore again."
             )
             raise StorageError(message)
         manifest = read_manifest(backup)
