@@ -45,7 +45,7 @@ def restore(
     """
     from slrig.jobs.backup import restore as restore_backup
 
-    _tell(restore_backup(source, data), f"{data} restored from {source}", as_json=as_json)
+    _tell(restore_backup(source, data), f"{data} made from {source}", as_json=as_json)
 
 
 def _tell(manifest: Manifest, what: str, *, as_json: bool) -> None:
