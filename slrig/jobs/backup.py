@@ -83,7 +83,9 @@ def back_up(root: Path, to: Path, *, previous: Path | None = None) -> Manifest:
     root, to = root.resolve(), to.resolve()
     with _refusals(root):
         if not (root / DATABASE).is_file():
-            message = f"{root} holds no {DATABASE}: it is no data folder of slrig. Name the one that slrig serve was given."
+            message = (
+                f"{root} holds no {DATABASE}: it is no data folder of slrig. Name the one that slrig serve was given."
+            )
             raise StorageError(message)
         if to.is_relative_to(root) or to.exists():
             why = "exists already" if to.exists() else "lies in the data folder itself"
