@@ -30,8 +30,8 @@ from slrig.jobs.records import JobKind, JobState, utc_now
 
 MANIFEST, DATA = "backup.json", "data"
 
-OF_ONE_RUN = frozenset({"lock", "holder", "service.json", "cache"})
-"""What only the process that holds a data folder, or only this machine, can use."""
+OF_ONE_RUN = frozenset({"lock", "holder", "service.json", "cache", "keys.lock", "first-key"})
+"""What only the process that holds a data folder, or only this machine, can use; and a key that nobody took yet."""
 
 _CHUNK_BYTES = 2**20
 _MOST_TRIES = 5
