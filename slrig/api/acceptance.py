@@ -82,7 +82,7 @@ class AcceptanceBody(AcceptanceSummary):
     error: AnyFault = Field(description="why the last position was not measured; it may be measured again")
 
 
-@router.post("", status_code=201, responses=problems(409, 503, 507))
+@router.post("", status_code=201, responses=problems(404, 409, 503, 507))
 def open_acceptance(
     service: Serving,
     response: Response,
