@@ -148,7 +148,7 @@ def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     # The decoder gets a file of these rows alone: nothing that a stranger packed, and no chunk that the walk passed.
     parts = (b"IHDR" + data[16:29], b"IDAT" + zlib.compress(rows, 0), b"IEND")
     plain = b"".join(struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in parts)
-    return cv2.imdecode(np.frombuffer(PNG_SIGNATURE + plain, np.uint8), cv2.IMREAD_UNCHANGED)
+    return _decoded(PNG_SIGNATURE + plain)
 
 
 def _inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
@@ -176,7 +176,7 @@ def _jpeg(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     except ValueError as cause:
         _refuse(path, "a whole JPEG of 8 bits, grey or in colour", str(cause), "copy the frame again")
     _check_header(path, found.width, found.height, 8, camera)
-    return cv2.imdecode(np.frombuffer(found.plain(data), np.uint8), cv2.IMREAD_UNCHANGED)
+    return _decoded(found.plain(data))
 
 
 def _check_tiff(path: Path, data: bytes, pages: Sequence[int], camera: CameraFormat) -> None:
@@ -225,8 +225,21 @@ def _check_zlib(path: Path, index: int, data: bytes, page: Any) -> None:
         left -= len(unpacked)
 
 
+def _decoded(data: bytes) -> Pixels | None:
+    """The one image of a file whose header was checked; None where OpenCV cannot decode it."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+
+
 def _tiff_page(data: bytes, page: int) -> Pixels | None:
-    decoded, images = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED, None, (page, page + 1))
+    pages = (page, page + 1)
+    try:
+        decoded, images = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED, None, pages)
+    except cv2.error:
+        # libtiff is stricter than the header's check in some tags.
+        return None
     return images[0] if decoded and images else None
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import statistics
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,13 +36,17 @@ class Held:
     def of(cls, service: ServiceProcess) -> Held:
         """As the kernel and the disk tell it now."""
         serving, working = Path(f"/proc/{service.process.pid}"), Path(f"/proc/{service.worker_id()}")
-        files = [path for path in service.data.rglob("*") if path.is_file()]
+        # The next scan is not begun yet; what retention removes meanwhile may be gone.
+        sizes = []
+        for path in service.data.rglob("*"):
+            with suppress(FileNotFoundError):
+                sizes.append(path.stat().st_size)
         return cls(
             _resident_mb(serving),
             _resident_mb(working),
             len(list((serving / "fd").iterdir())) + len(list((working / "fd").iterdir())),
             len(list((serving / "task").iterdir())),
-            sum(path.stat().st_size for path in files) / 1e6,
+            sum(sizes) / 1e6,
         )
 
 

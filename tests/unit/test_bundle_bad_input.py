@@ -386,3 +386,14 @@ def test_a_bad_calibration_does_not_stop_who_only_needs_frames(folder: Path) -> 
 def test_a_bundle_without_calibration_is_read(folder: Path) -> None:
     (folder / "calibration.json").unlink()
     assert read_bundle(folder).calibration is None
+
+
+def test_what_opencv_refuses_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # libtiff is stricter than our check of the header in a tag or two; harmed files of the campaign met it.
+    def refuse(*_: object) -> None:
+        message = "OpenCV TIFF: failed TIFFGetField(tif, TIFFTAG_PHOTOMETRIC, &photometric)"
+        raise cv2.error(message)
+
+    _with_tiff(folder, 0)
+    monkeypatch.setattr(cv2, "imdecodemulti", refuse)
+    _fault(folder, "data that cannot be decoded")
