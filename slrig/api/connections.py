@@ -232,10 +232,11 @@ def room_for(most: int, *, most_per_address: int) -> Room:
 
 def raise_descriptor_limit() -> int | None:
     """Raise the soft limit of open files to what the service wants, and return it; None where there is none."""
-    if sys.platform == "win32":
+    try:
+        import resource
+    except ImportError:
+        # Windows, and systems like it.
         return None
-    import resource
-
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = resource.RLIM_INFINITY
     if soft == unlimited:
