@@ -15,6 +15,7 @@ from starlette.datastructures import Headers
 from starlette.requests import cookie_parser
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from slrig.api.calibration import IMPORT_PATH
 from slrig.api.keys import ALL_SCOPES, Key, KeyRing
 from slrig.api.problems import answer, problem
 from slrig.api.scopes import READING, moves, needed_scope
@@ -41,7 +42,7 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who sent a request, what for their key is, and how long it, or their session, is good."""
+    """Who sent a request, what their key is for, and until when it, or their session, is good."""
 
     name: str
     scopes: tuple[KeyScope, ...] = ALL_SCOPES
@@ -196,7 +197,7 @@ def refuse_other_types(headers: Headers, method: str, path: str) -> None:
     """Refuse a body that a form of any page could send: what is no JSON, and no file to import. Raises Refused."""
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     has_body = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
-    if method in READING or path == "/calibration/import" or kind in _JSON_TYPES or not (kind or has_body):
+    if method in READING or path == IMPORT_PATH or kind in _JSON_TYPES or not (kind or has_body):
         return
     found = f"'{kind}'" if kind else "none"
     raise Refused(415, "unsupported-media-type", f"Content-Type: expected application/json, found {found}.")

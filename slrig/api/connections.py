@@ -23,7 +23,7 @@ import structlog
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from slrig.api.problems import MEDIA_TYPE, problem
+from slrig.api.problems import MEDIA_TYPE, http_problem
 from slrig.config import is_loopback
 
 KEPT_DESCRIPTORS = 256
@@ -85,7 +85,10 @@ class Room:
     def _make_room(self, candidates: Iterator[Connection]) -> None:
         chosen = next(candidates)
         self._owing.pop(chosen)
-        chosen.leave(503, "As many connections are open as this service allows. Try again in a moment.")
+        chosen.leave(
+            HTTPStatus.SERVICE_UNAVAILABLE,
+            "As many connections are open as this service allows. Try again in a moment.",
+        )
 
     def owes(self, connection: Connection, *, owing: bool) -> None:
         """Note whether a connection owes the service something from now on."""
@@ -183,16 +186,19 @@ class Connection(H11Protocol):
             self._deadline = self.loop.call_later(wait_s, self._too_late, part, wait_s)
 
     def _too_late(self, part: str, wait_s: float) -> None:
-        self.leave(408, f"The {part} of the request did not arrive within {wait_s:g} s. Send it at once.")
+        self.leave(
+            HTTPStatus.REQUEST_TIMEOUT,
+            f"The {part} of the request did not arrive within {wait_s:g} s. Send it at once.",
+        )
 
-    def leave(self, status: int, detail: str) -> None:
+    def leave(self, status: HTTPStatus, detail: str) -> None:
         """Close the connection, and say why where no answer has begun."""
         if self.transport.is_closing():
             return
         if self.conn.our_state in {h11.IDLE, h11.SEND_RESPONSE} and self._awaited:
-            body = json.dumps(problem(status, _code(status), detail)).encode()
+            body = json.dumps(http_problem(status, detail)).encode()
             head = (
-                f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\nContent-Type: {MEDIA_TYPE}\r\n"
+                f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: {MEDIA_TYPE}\r\n"
                 f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
             )
             self.transport.write(head.encode() + body)
@@ -216,10 +222,6 @@ class Connection(H11Protocol):
 
     def _unsupported_upgrade_warning(self) -> None:
         """Say nothing: anybody could fill the log with it."""
-
-
-def _code(status: int) -> str:
-    return HTTPStatus(status).name.lower().replace("_", "-")
 
 
 def room_for(most: int, *, most_per_address: int) -> Room:

@@ -148,7 +148,7 @@ async def _http_error(_request: Request, error: Exception) -> JSONResponse:
     status = HTTPStatus(error.status_code)
     text = str(error.detail)
     detail = _PLAIN_DETAILS.get(text, text if text != status.phrase else status.description or status.phrase)
-    return answer(_http_problem(status, detail), headers=error.headers)
+    return answer(http_problem(status, detail), headers=error.headers)
 
 
 async def _unexpected(_request: Request, error: Exception) -> JSONResponse:
@@ -182,7 +182,8 @@ def _field_fault(entry: Any) -> dict[str, Any]:
     return fault
 
 
-def _http_problem(status: HTTPStatus, detail: str) -> dict[str, Any]:
+def http_problem(status: HTTPStatus, detail: str) -> dict[str, Any]:
+    """The problem that stands for a refusal of HTTP's own."""
     return problem(status.value, _http_code(status), detail)
 
 
@@ -226,4 +227,4 @@ def _as_problem(refused: Message, body: bytes) -> Response:
     detail = _PLAIN_DETAILS.get(text, text or status.description or status.phrase)
     dropped = {"content-type", "content-length"}
     headers = {name: value for name, value in Headers(raw=refused.get("headers", [])).items() if name not in dropped}
-    return Response(json.dumps(_http_problem(status, detail)), status, headers, MEDIA_TYPE)
+    return Response(json.dumps(http_problem(status, detail)), status, headers, MEDIA_TYPE)

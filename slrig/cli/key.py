@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from slrig.api.scopes import Scope
-from slrig.cli.options import AsJson, grouped
+from slrig.cli.options import AsJson, given, grouped
 
 if TYPE_CHECKING:
     from slrig.api.keys import KeyRing
@@ -29,7 +29,7 @@ def _ring(data: Path | None) -> KeyRing:
     from slrig.api.keys import KeyRing
     from slrig.config import read_settings
 
-    path = read_settings(**({} if data is None else {"data_dir": data})).key_path
+    path = read_settings(None, **given(data_dir=data)).key_path
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     return KeyRing(path)
 

@@ -8,6 +8,7 @@ import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from http import HTTPStatus
 
 import pytest
 import uvicorn
@@ -194,7 +195,7 @@ class _Peer(Connection):
         self.address = address
         self.left = 0
 
-    def leave(self, status: int, detail: str) -> None:
+    def leave(self, status: HTTPStatus, detail: str) -> None:
         assert "Try again" in detail
         self.left = status
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
 
@@ -22,20 +22,6 @@ from slrig.jobs.store import JobStore
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Iterator[DataFolder]:
-    folder = DataFolder(tmp_path / "data")
-    yield folder
-    folder.release()
-
-
-@pytest.fixture
-def store(folder: DataFolder) -> Iterator[JobStore]:
-    store = JobStore(Database(folder.database), JobKind.SCAN)
-    yield store
-    store.database.close()
 
 
 def scanned(store: JobStore, folder: DataFolder, state: JobState = JobState.SUCCEEDED) -> UUID:

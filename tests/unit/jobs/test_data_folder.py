@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from uuid import UUID, uuid4
@@ -18,26 +17,11 @@ import pytest
 from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.database import Database
-from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.records import JobState
 from slrig.jobs.store import JobStore
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import KeptRecord, plan_from_json, plan_json, write_record
 from slrig.scan.sweep import sweep
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Iterator[DataFolder]:
-    folder = DataFolder(tmp_path / "data")
-    yield folder
-    folder.release()
-
-
-@pytest.fixture
-def store(folder: DataFolder) -> Iterator[JobStore]:
-    store = JobStore(Database(folder.database), JobKind.SCAN)
-    yield store
-    store.database.close()
 
 
 def running(store: JobStore, state: JobState) -> UUID:
