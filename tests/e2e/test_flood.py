@@ -88,7 +88,8 @@ def test_a_scan_succeeds_beside_a_flood_of_connections(start: Start, tmp_path: P
                     statuses.append(0)  # it made room for another
             waits_s.append(answer_s(service))
             descriptors = len(list(Path(f"/proc/{service.process.pid}/fd").iterdir()))
-            assert set(statuses) <= {0, 200, 429}
+            # 503 is what a connection is told that makes room, if it still hears it.
+            assert set(statuses) <= {0, 200, 429, 503}
             final = ended(client, scan)
         assert final["state"] == "succeeded", final
         assert max(waits_s) < MOST_ANSWER_S
