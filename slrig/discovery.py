@@ -240,7 +240,9 @@ def _synchronisation(config: RigConfig, cameras: Mapping[str, Camera]) -> Synchr
             f"rig '{config.name}': synchronisation.line_time_s names {', '.join(unknown)}, the rig's cameras are "
             f"{', '.join(sorted(cameras))}; correct it, or measure again: slrig latency"
         )
-    return Synchronisation(table.latency_s, table.latency_error_s, dict(table.line_time_s))
+    return Synchronisation(
+        table.latency_s, table.latency_error_s, dict(table.line_time_s), table.trigger_period_s, table.earliest_s
+    )
 
 
 def _calibration(

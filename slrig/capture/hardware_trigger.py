@@ -31,10 +31,18 @@ class _Play:
     """One play: what was delivered of it, each camera's frames by their brightness, and what is wrong with it."""
 
     levels: dict[str, list[float]]
+    lit_s: float
+    period_s: float
+    starts_ns: dict[str, list[int]] = field(default_factory=dict)
     delivered: list[tuple[int, str]] = field(default_factory=list)
     withheld: list[Shot] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     missing: int = 0
+
+    def halved(self, camera: str) -> bool:
+        """Whether a camera took every second pulse only: its exposures begin two periods apart."""
+        apart_ns = np.diff(self.starts_ns.get(camera, ()))
+        return len(apart_ns) > 1 and 1.5 < float(np.median(apart_ns)) / (self.period_s * 1e9) < 2.5
 
 
 def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]:
@@ -52,6 +60,7 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
             "write exposure_s into their tables of the rig file"
         )
     rig.projector.load(session.sequence)
+    lit_s, period_s = play_times_s(session)
     last: dict[str, Frame] = {}
     causes: list[str] = []
     timed_out = 0
@@ -59,7 +68,7 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
         for camera in rig.cameras.values():
             # Room for one more than there should be: it would tell.
             camera.arm(count + 1, Trigger.HARDWARE)
-        play = _Play({name: [] for name in rig.cameras})
+        play = _Play({name: [] for name in rig.cameras}, lit_s, period_s)
         yield from _frames(session, retries, play, last)
         rig.projector.stop()
         if not play.faults:
@@ -68,6 +77,8 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
             camera.disarm()
         causes.append(_cause(play, session.sequence))
         timed_out += play.missing == len(play.faults)
+        # Slow enough is better than not at all: the cause says what to write into the rig file.
+        period_s *= 2 if any(play.halved(name) for name in rig.cameras) else 1
         retries.evidence.forget()
         for index, name in play.delivered:
             retries.refuse(Refused(index, name, number, causes[-1], delivered=True))
@@ -77,14 +88,45 @@ def hardware_triggered(session: Session, retries: RetryPolicy) -> Iterator[Shot]
     raise FrameTimeoutError(message) if timed_out == len(causes) else ScanEvidenceError(message)
 
 
-def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
-    rig, count = session.rig, len(session.sequence)
-    exposure_s = max(applied.exposure_s for applied in session.applied.values())
-    skew_s = max(shutter_skew_s(camera, name, rig.synchronisation) for name, camera in rig.cameras.items())
+def play_times_s(session: Session) -> tuple[float, float]:
+    """Return how long each pattern is lit, and the time from one trigger pulse to the next, s.
+
+    The longest wins: what the projector needs between patterns, what each camera says that it needs from one exposure
+    to the next (one that does not say is given as long again as its exposure for read-out, unless the rig file knows),
+    and `trigger_period_s` of the rig file.
+    """
+    rig, applied = session.rig, session.applied
+    known = rig.synchronisation
+    asked_s = None if known is None else known.trigger_period_s
+    exposure_s = max(each.exposure_s for each in applied.values())
+    skew_s = max(shutter_skew_s(camera, name, known) for name, camera in rig.cameras.items())
     # The last row of a rolling shutter must have had the pattern's light as long as the first.
     lit_s = exposure_s + skew_s
-    # As long again for the sensors to be read out: most cannot expose meanwhile.
-    period_s = lit_s + exposure_s
+    unknown_s = lit_s + exposure_s if asked_s is None else asked_s
+    needed_s = [unknown_s if each.least_period_s is None else each.least_period_s for each in applied.values()]
+    projector = rig.projector.info
+    return lit_s, max((lit_s + projector.gap_s) / projector.duty, asked_s or 0.0, *needed_s)
+
+
+def _missed(session: Session, play: _Play, name: str, index: int, error: FrameTimeoutError) -> str:
+    """Words for a frame that did not come."""
+    count = len(session.sequence)
+    if play.halved(name):
+        return (
+            f"camera '{name}' gave {index} of {count} frames and missed every second pulse: it cannot expose every "
+            f"{play.period_s:.6g} s; write trigger_period_s = {2 * play.period_s:.6g} into [synchronisation] of the "
+            "rig file, or shorten its exposure or its region"
+        )
+    return (
+        f"camera '{name}' gave {index} of {count} frames, that of {session.pattern(index)} did not come ({error}): a "
+        f"trigger pulse was missed; check the trigger cable, and that exposure and read-out fit into "
+        f"{play.period_s:.4f} s, or write a longer trigger_period_s into [synchronisation] of the rig file"
+    )
+
+
+def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str, Frame]) -> Iterator[Shot]:
+    rig, count = session.rig, len(session.sequence)
+    lit_s, period_s = play.lit_s, play.period_s
     before: dict[str, Frame] = {}
     waiting_for, spoilt = list(rig.cameras), set[str]()
     session.stop_if_cancelled(0)
@@ -96,15 +138,12 @@ def _frames(session: Session, retries: RetryPolicy, play: _Play, last: dict[str,
             try:
                 frame = session.read(name, after_ns, period_s + session.patience_s(name))
             except FrameTimeoutError as error:
-                play.faults.append(
-                    f"camera '{name}' gave {index} of {count} frames, that of {session.pattern(index)} did not come "
-                    f"({error}): a trigger pulse was missed; check the trigger cable, and that exposure and read-"
-                    f"out fit into {period_s:.4f} s"
-                )
+                play.faults.append(_missed(session, play, name, index, error))
                 play.missing += 1
                 waiting_for.remove(name)
                 continue
             play.levels[name].append(float(frame.image.mean()))
+            play.starts_ns.setdefault(name, []).append(frame.t_start_ns)
             where = place(name, index, session.sequence.patterns[index])
             own = session.own_fault(frame, after_ns, before.get(name)) or _gap(frame, before.get(name))
             last[name] = before[name] = frame

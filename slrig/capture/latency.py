@@ -52,19 +52,24 @@ class LatencyMeasurement:
     def synchronisation(self) -> Synchronisation:
         """What a rig file keeps of it."""
         slowest = self.slowest
-        beyond_s = slowest.latest_s - slowest.latency_s - self.shown_error_s
-        return Synchronisation(slowest.latency_s, max(beyond_s, 3 * slowest.standard_error_s), self.line_time_s)
+        late_s = max(slowest.latest_s - slowest.latency_s, 3 * slowest.standard_error_s)
+        return Synchronisation(
+            slowest.latency_s,
+            late_s - self.shown_error_s,
+            self.line_time_s,
+            earliest_s=min(found.earliest_s for found in self.cameras.values()),
+        )
 
 
 def stable_from_ns(shown: Shown, synchronisation: Synchronisation | None) -> int:
     """Return the instant from which a pattern's light is the only one, the rig's clock, ns.
 
-    It is never earlier than what the projector states: a measured latency below 0 shortens no wait.
+    Where latency was measured, that counts, later or earlier than what the projector states.
     """
     stated_ns = shown.t_visible_ns + shown.t_err_ns
     if synchronisation is None:
         return stated_ns
-    return stated_ns + max(round((synchronisation.latency_s + synchronisation.latency_error_s) * 1e9), 0)
+    return stated_ns + round((synchronisation.latency_s + synchronisation.latency_error_s) * 1e9)
 
 
 def shutter_skew_s(camera: Camera, name: str, synchronisation: Synchronisation | None) -> float:

@@ -121,7 +121,7 @@ class CameraLatency:
 
     latency_s : mean over the flashes, ± standard_error_s; jitter_s : standard deviation; p95 : of the flashes.
     rise_s, fall_s : means of the flashes to white and to black, NaN without any. settle_s : how long the light goes on
-    to change. latest_s : a later end of a change is not to be expected, for any row.
+    to change. latest_s : a later end of a change is not to be expected, for any row; earliest_s : nor an earlier begin.
     line_time_s ± line_time_error_s : as measured; `rolling` says that it is significant, `scanned` that it is so with
     the opposite sign: a projector that builds up its picture row by row. skew_s : of the whole shutter, if rolling.
     flashes : how many were shown; flashes_used, rows_used : were seen as they happened; residual_s : rms of the fit.
@@ -135,6 +135,7 @@ class CameraLatency:
     fall_s: float
     settle_s: float
     latest_s: float
+    earliest_s: float
     line_time_s: float
     line_time_error_s: float
     rolling: bool
@@ -227,7 +228,8 @@ def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLa
     residuals = np.concatenate(
         [rows.y_s - lag + slope_s * rows.row for rows, lag in zip(rows_of_each, latencies, strict=True)]
     )
-    end_s = max(_end(latencies[which]) for which in (rising, ~rising) if which.any())
+    kinds = [latencies[which] for which in (rising, ~rising) if which.any()]
+    end_s = max(_end(each) for each in kinds)
     # A flash that was not seen as it happened has frames right after it all the same: at the latest, it came then.
     known = {id(flash): float(lag) for flash, lag in zip(used, latencies, strict=True)}
     changed_s = [known.get(id(flash), end_s) for flash in flashes]
@@ -243,6 +245,8 @@ def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLa
         fall_s=float(latencies[~rising].mean()) if (~rising).any() else float("nan"),
         settle_s=settle_s,
         latest_s=end_s + settle_s + scanned_s,
+        # The instant of a change is the centroid of its light: it begins before it by no more than it goes on after it.
+        earliest_s=-max(_end(-each) for each in kinds) - settle_s - scanned_s,
         line_time_s=line_time_s,
         line_time_error_s=error_s,
         rolling=significant and line_time_s > 0,
@@ -270,9 +274,12 @@ def _line_time(flashes: Sequence[FlashRows]) -> tuple[float, float]:
 
 
 def _end(latencies_s: FloatArray) -> float:
-    """The upper end of a uniform law, from a sample of it: its unbiased estimate."""
+    """The upper end of a uniform law, from n samples of it: with 95 % it is not beyond that.
+
+    The largest of n lies below 1 - x of the whole with the probability (1 - x)ⁿ: 5 % for x = 3/n.
+    """
     highest, spread = float(latencies_s.max()), float(np.ptp(latencies_s))
-    return highest + spread / (len(latencies_s) - 1) if len(latencies_s) > 1 else highest
+    return highest + 3 * spread / (len(latencies_s) - 1) if len(latencies_s) > 1 else highest
 
 
 def _settle_s(flashes: Sequence[Flash], changed_s: Sequence[float], line_time_s: float, flicker: float) -> float:

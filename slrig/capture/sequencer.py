@@ -7,10 +7,12 @@ from contextlib import ExitStack, suppress
 
 from slrig.bundle.refused import Refused
 from slrig.capture.evidence import Evidence
+from slrig.capture.frame_reader import FrameReader
 from slrig.capture.hardware_trigger import hardware_triggered
 from slrig.capture.retry_policy import RetryPolicy
 from slrig.capture.session import Session, differ
 from slrig.capture.software_trigger import software_triggered
+from slrig.capture.streaming import earliest_change_s, streamed
 from slrig.devices import AppliedSettings, Camera, CameraSettings, Rig, Trigger
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence, Shot
@@ -35,6 +37,7 @@ def capture(
     A generator: nothing moves before the first frame is asked for. However it ends (the last frame, an error, a
     cancel, a consumer that stops or is interrupted) the projector is dark and the cameras are disarmed afterwards.
     Wire triggers are preferred to software triggers, these to free-running cameras, among what all devices declare.
+    Free-running cameras before a projector of measured latency are read beside it: see `slrig.capture.streaming`.
     What the consumer does with a frame takes place while the next one is exposed.
 
     rig : open devices; cameras without settings are left as they are. cancelled : asked before every pattern and every
@@ -52,17 +55,23 @@ def capture(
         evidence = Evidence(sequence.patterns, {name: camera.info.format for name, camera in rig.cameras.items()})
     triggers = choose_triggers(rig)
     with ExitStack() as leaving:
-        # Last in, first out: the light goes off before anything else is tried.
         for camera in rig.cameras.values():
             leaving.callback(_whatever_happens, camera.disarm)
-        leaving.callback(_whatever_happens, rig.projector.blank)
-        session = Session(rig, sequence, _configure(rig), triggers, timeout_s, cancelled)
-        retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns)
-        if Trigger.HARDWARE in triggers.values():
-            leaving.callback(_whatever_happens, rig.projector.stop)
-            yield from hardware_triggered(session, retries)
-        else:
-            yield from software_triggered(session, retries)
+        reader = FrameReader(rig.cameras)
+        leaving.callback(reader.stop)
+        with ExitStack() as lit:
+            # The light goes off before anything else is tried.
+            lit.callback(_whatever_happens, rig.projector.blank)
+            session = Session(rig, sequence, _configure(rig), triggers, timeout_s, cancelled)
+            retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns)
+            if Trigger.HARDWARE in triggers.values():
+                lit.callback(_whatever_happens, rig.projector.stop)
+                yield from hardware_triggered(session, retries)
+            elif (earliest_s := earliest_change_s(rig, triggers)) is not None:
+                yield from streamed(session, retries, reader, earliest_s)
+            else:
+                yield from software_triggered(session, retries)
+            lit.pop_all()
         # Here a projector that will not go dark is an error of its own, not a footnote to another one.
         rig.projector.blank()
 

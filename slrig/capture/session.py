@@ -43,14 +43,12 @@ class Session:
     def settled_ns(self, shown: Shown) -> int:
         """Wait until a pattern's light is the only one, and return since when it is."""
         stable_ns = stable_from_ns(shown, self.rig.synchronisation)
-        if self.rig.synchronisation is not None:
-            self.rig.clock.wait_until(stable_ns, threading.Event())
+        self.rig.clock.wait_until(stable_ns, threading.Event())
         return stable_ns
 
     def read(self, name: str, after_ns: int, timeout_s: float) -> Frame:
         """Return the next frame under the name that the rig gives its camera. Raises as `Camera.read` does."""
-        frame = self.rig.cameras[name].read(after_ns, timeout_s)
-        return frame if frame.camera == name else replace(frame, camera=name)
+        return under_name(name, self.rig.cameras[name].read(after_ns, timeout_s))
 
     def own_fault(self, frame: Frame, after_ns: int, before: Frame | None) -> str | None:
         """Say why a frame was exposed too early, was delivered before, or was exposed otherwise than asked."""
@@ -72,6 +70,11 @@ class Session:
                 "exposure, and scan again"
             )
         return None
+
+
+def under_name(name: str, frame: Frame) -> Frame:
+    """A frame under the name that the rig gives its camera."""
+    return frame if frame.camera == name else replace(frame, camera=name)
 
 
 def differ(got: float, asked: float) -> bool:

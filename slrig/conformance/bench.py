@@ -182,9 +182,7 @@ class View:
         """Show a pattern; the instant from which its light is certain is remembered."""
         shown = self.projector.show(index)
         stable_ns = self.stable_ns(shown)
-        if self.bench.rig.synchronisation is not None:
-            # A display that is known to be slower than its driver says: its light is waited for before a trigger.
-            self.bench.rig.clock.wait_until(stable_ns, threading.Event())
+        self.bench.rig.clock.wait_until(stable_ns, threading.Event())
         self.bench.noted(stable_ns)
         return shown
 

@@ -95,8 +95,8 @@ def a_frame_lies_wholly_in_its_pattern(view: View) -> None:
             view.expose(index),
             index,
             asked="a frame that was read after a pattern became visible shows that pattern alone",
-            do="read returns frames whose whole exposure, all rows, lies after after_ns; show returns once its "
-            "light is on the scene",
+            do="read returns frames whose whole exposure, all rows, lies after after_ns; what show returns "
+            "says from when on its light is on the scene",
         )
 
 

@@ -3,7 +3,7 @@
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
-from slrig.devices.projector import Projector, ProjectorInfo, ProjectorState, Shown
+from slrig.devices.projector import FlashedProjector, Projector, ProjectorInfo, ProjectorState, Shown, UnprovenLight
 from slrig.devices.rig import FoundDevice, Head, Positioner, Positions, Rig, Synchronisation
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "CameraSettings",
     "CameraState",
     "Clock",
+    "FlashedProjector",
     "FoundDevice",
     "Head",
     "KeepsTime",
@@ -29,6 +30,7 @@ __all__ = [
     "Synchronisation",
     "SystemClock",
     "Trigger",
+    "UnprovenLight",
     "progress_heard",
     "progress_reporter",
 ]

@@ -24,7 +24,8 @@ class Trigger(StrEnum):
 class CameraInfo:
     """Declared data about a camera. `triggers` are the ways in which an exposure can be started.
 
-    `limits` say how long its calls may take.
+    `limits` say how long its calls may take. `notes` say what a person should know of how it runs, each in a sentence
+    with what to do about it.
     """
 
     name: str
@@ -35,6 +36,7 @@ class CameraInfo:
     exposure_range_s: tuple[float, float]
     gain_range: tuple[float, float]
     limits: CallLimits = USUAL
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +49,15 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class AppliedSettings:
-    """What the camera says it uses, read back after it was set."""
+    """What the camera says it uses, read back after it was set.
+
+    least_period_s : the least time from the start of one exposure to the start of the next with these settings, which
+    is the period of a camera that runs by itself; None where the device does not tell.
+    """
 
     exposure_s: float
     gain: float
+    least_period_s: float | None = None
 
 
 @runtime_checkable

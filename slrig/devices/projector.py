@@ -15,7 +15,8 @@ from slrig.model import Pattern, PatternSequence, Size
 class ProjectorInfo:
     """Declared data about a projector.
 
-    `plays` says whether it can step through a loaded sequence by itself, triggering the cameras by wire.
+    `plays` says whether it can step through a loaded sequence by itself, triggering the cameras by wire; `gap_s` is
+    then the least time from the end of a pattern's light to the next pulse, and `duty` how much of the time may be lit.
     `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
     is steady over whole ones only; None where exposures may have any length. `limits` say how long its calls may take.
     `recorded` are the patterns of a recording, in its order: a scan that asks for none plays them. Empty where any
@@ -31,11 +32,13 @@ class ProjectorInfo:
     refresh_s: float | None = None
     limits: CallLimits = USUAL
     recorded: tuple[Pattern, ...] = ()
+    gap_s: float = 0.0005
+    duty: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """Pattern `index` has been lighting the whole scene since `t_visible_ns` ± `t_err_ns` (the rig's clock)."""
+    """Pattern `index` lights the whole scene from `t_visible_ns` ± `t_err_ns` on (the rig's clock)."""
 
     index: int
     t_visible_ns: int
@@ -58,7 +61,11 @@ class Projector(Protocol):
         ...
 
     def show(self, index: int) -> Shown:
-        """Show one pattern of the loaded sequence and hold it; return once its light is on the scene.
+        """Show one pattern of the loaded sequence and hold it; return once it is known when its light is on the scene.
+
+        That may be a little later, by `info.latency_s` at most: a display is given its next picture while the one
+        before is still on its way. Whoever needs the light waits for it.
+
         Raises DeviceStateError: nothing is loaded, or the projector is closed.
         """
         ...
@@ -79,6 +86,48 @@ class Projector(Protocol):
 
     def close(self) -> None:
         """Go dark and let the device go. Idempotent; works after an unplug and in every state."""
+        ...
+
+
+@runtime_checkable
+class FlashedProjector(Projector, Protocol):
+    """A projector that shows only the patterns that a person put into its memory."""
+
+    def write_patterns(self, sequence: PatternSequence) -> str:
+        """Write files from which its memory is filled with these patterns, and return where they are and what to do.
+
+        `load` never writes them: what is tried only to see whether the projector takes it must not replace them.
+        Raises UnsupportedByDeviceError: the patterns are for another size, or too many; DeviceError or StorageError:
+        the files cannot be written.
+        """
+        ...
+
+
+@runtime_checkable
+class UnprovenLight(Projector, Protocol):
+    """A projector that may not know yet whether more current means a greater number or a smaller one.
+
+    Until its rig file tells, it is dim whichever it is, with light that pulses. The doctor finds it out.
+    """
+
+    @property
+    def unproven(self) -> bool:
+        """Whether it is not known."""
+        ...
+
+    @property
+    def light_period_s(self) -> float:
+        """From one pulse of the dim light to the next: expose for whole ones."""
+        ...
+
+    def try_current(self, share: float) -> None:
+        """Set the number that stands for the current, 0.4 to 0.6 of the greatest; dark until the next `show`.
+        Raises UnsupportedByDeviceError: another number, or its sense is known.
+        """
+        ...
+
+    def option_for(self, *, rises: bool) -> str:
+        """What to write into the [projector] table, if light rises with the number, or if it falls."""
         ...
 
 

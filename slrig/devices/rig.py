@@ -84,13 +84,18 @@ class Synchronisation:
 
     latency_s : from the instant that the projector states to the change of light, on average, as the cameras' time
     stamps see it; it holds what either of them states wrongly, and may be negative. latency_error_s : how much later
-    than that a change may be, beyond the error that the projector states itself. line_time_s : of each camera with a
-    rolling shutter, from one row's exposure to the next row's; 0 or absent is a global shutter.
+    than that a change may end, beyond the error that the projector states itself; negative where it states more than
+    there is. earliest_s : from the stated instant to the earliest beginning of a change; None where nobody measured it,
+    and then the next pattern is shown only when the frames before it are there. line_time_s : of each camera with a
+    rolling shutter, from one row's exposure to the next row's; 0 or absent is a global shutter. trigger_period_s : what
+    a person wrote: the least time from one trigger pulse to the next, where cameras tell a lower one or none.
     """
 
     latency_s: float
     latency_error_s: float
     line_time_s: Mapping[str, float] = field(default_factory=dict)
+    trigger_period_s: float | None = None
+    earliest_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,8 +70,15 @@ def doctored(data: Mapping[str, Any], diagnosis: Diagnosis, *, source: Path, tar
         comments |= {
             (_WAITS, "latency_s"): "measured by flashes: how much later than the projector says its light comes, on "
             "average",
-            (_WAITS, "latency_error_s"): "and how much later than that it may come; scans wait for both",
+            (_WAITS, "latency_error_s"): "and how much later than that it may come, beyond what the projector states; "
+            "scans wait for both",
         }
+        if found.earliest_s is not None:
+            table["earliest_s"] = round(found.earliest_s, 6)
+            why = "when it begins to change at the earliest: with it, scans wait for no frame before the next pattern"
+            comments[_WAITS, "earliest_s"] = why
+        if "trigger_period_s" in tables.get(_WAITS, {}):
+            table["trigger_period_s"] = tables[_WAITS]["trigger_period_s"]
         if found.line_time_s:
             table["line_time_s"] = {name: round(seconds, 9) for name, seconds in found.line_time_s.items()}
             rolling = "measured: a rolling shutter exposes each row this much later than the row above it"

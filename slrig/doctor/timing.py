@@ -75,7 +75,7 @@ def latency(
         measured = measure_latency(watching, trials=_FLASHES, search_s=search_s, told=told)
     except ScanEvidenceError as error:
         return None, [punctual(watching, each, error) for each in seen.values()]
-    findings = [_late(measured, rig.synchronisation), *_jitter(measured)]
+    findings = [_late(measured, rig.synchronisation), *_jitter(measured, seen)]
     for name, found in measured.cameras.items():
         findings.append(_shutter(name, found, seen[name].skew_s, rig.synchronisation))
     return measured, findings
@@ -109,7 +109,7 @@ def punctual(rig: Rig, seen: Seen, cause: ScanEvidenceError) -> Finding:
 
 def waited_s(synchronisation: Synchronisation | None) -> float:
     """How long a scan waits beyond what the projector states."""
-    return 0.0 if synchronisation is None else max(synchronisation.latency_s + synchronisation.latency_error_s, 0.0)
+    return 0.0 if synchronisation is None else synchronisation.latency_s + synchronisation.latency_error_s
 
 
 def late_s(measured: LatencyMeasurement) -> float:
@@ -127,25 +127,39 @@ def _late(measured: LatencyMeasurement, known: Synchronisation | None) -> Findin
     if late_s(measured) > now_s + LATE_S:
         table = "its rig file has no [synchronisation]" if known is None else f"its rig file waits {ms(now_s)}"
         remedy = (
-            f"write latency_s = {slowest.latency_s:.6f} and latency_error_s = "
-            f"{measured.synchronisation.latency_error_s:.6f} into [synchronisation], as the rig file of --output has "
-            "it; a game or low-latency mode of the projector, and no picture processing, make it faster"
+            "use the table [synchronisation] of the rig file that --output writes; a game or low-latency mode of the "
+            "projector, and no picture processing, make it faster"
         )
         return fault("timing.late", "projector", f"{words}; {table}: frames would show the pattern before", remedy)
-    if known is not None and now_s > waited_s(measured.synchronisation) + _NEEDLESS_S:
-        remedy = "measure again and replace the table [synchronisation]: scans get faster"
-        return note("timing.needless", "projector", f"{words}; its rig file waits {ms(now_s)}", remedy)
+    if now_s > waited_s(measured.synchronisation) + _NEEDLESS_S:
+        remedy = "use the table [synchronisation] of the rig file that --output writes: scans get faster"
+        waits = f"scans wait {ms(now_s - waited_s(measured.synchronisation))} longer than they must"
+        return note("timing.needless", "projector", f"{words}; {waits}", remedy)
     return ok("timing.late", "projector", words)
 
 
-def _jitter(measured: LatencyMeasurement) -> list[Finding]:
-    jitter_s = measured.slowest.jitter_s
+def _jitter(measured: LatencyMeasurement, seen: Mapping[str, Seen]) -> list[Finding]:
+    slowest = measured.slowest
+    jitter_s = slowest.jitter_s
     if jitter_s <= max(_JITTER_S, 2 * measured.shown_error_s):
         return []
     found = (
         f"the instant of light varies by {ms(jitter_s)} (standard deviation), the projector states "
         f"± {ms(measured.shown_error_s)}"
     )
+    [name] = [each for each, of_it in measured.cameras.items() if of_it is slowest]
+    stamp_error_s = seen[name].stamp_error_s
+    if stamp_error_s >= jitter_s:
+        limit = (
+            f"{found}; but the time stamps of {camera_named(name)} are right within ± {ms(stamp_error_s)} only, by its "
+            "driver's word: they are the limit of what can be measured, and nothing says that the projector varies"
+        )
+        remedy = (
+            "scans wait for the latest light and stay right, only slower; to scan faster or to examine the projector, "
+            "use a camera whose frames carry time stamps of its own (drivers v4l2, genicam, depthai), or a trigger by "
+            "wire; with v4l2, readout_s in its table narrows what its stamps leave open"
+        )
+        return [note("timing.stamps", camera_named(name), limit, remedy)]
     remedy = (
         "switch off the desktop's compositor and triple buffering, end other programs that draw; scans wait for "
         "the latest light and stay right"

@@ -39,14 +39,10 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class CameraFormat:
-    """Extent and bit depth of a camera's frames; full scale is 2^bit_depth - 1.
-
-    compression_dn : standard deviation that the frames' files add, where their compression is not lossless.
-    """
+    """Extent and bit depth of a camera's frames; full scale is 2^bit_depth - 1."""
 
     size: Size
     bit_depth: int
-    compression_dn: float = 0.0
 
     def __post_init__(self) -> None:
         if not 1 <= self.bit_depth <= 16:

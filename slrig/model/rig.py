@@ -104,6 +104,7 @@ class Solved:
     volume_mm : (2, 3) float64, opposite corners of the box in the world in which the board was held.
     expected_error_mm : standard deviation of a measured point along the first camera's line of sight in that volume,
     from the calibration alone, root mean square; of one camera alone, of a point of known distance across that line.
+    scale_sigma : standard deviation of the scale, a share, by the size of the board alone; it is in the covariance.
     """
 
     id: str
@@ -111,6 +112,7 @@ class Solved:
     covariance: FloatArray
     volume_mm: FloatArray
     expected_error_mm: float
+    scale_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         require(self.covariance, "Solved.covariance", (None, len(self.covariance)), "f")

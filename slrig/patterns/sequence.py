@@ -70,6 +70,21 @@ def _gray_patterns(axis: Axis, extent_px: int, cell_px: int, offset_px: int) -> 
             yield Gray(axis, bit, bits, cell_px, offset_px, inverted)
 
 
+def united(sequences: Sequence[PatternSequence]) -> PatternSequence:
+    """Return every pattern of some sequences once, in the order in which they come: what lights alike is one pattern.
+    Raises PatternError: there are none, or they are for different projectors.
+    """
+    sizes = {sequence.projector for sequence in sequences}
+    if len(sizes) != 1:
+        raise PatternError(f"asked to unite patterns for one projector, found {len(sizes)}; encode them for one size")
+    kept: dict[tuple[tuple[int, ...], bytes], tuple[Pattern, NDArray[np.uint8]]] = {}
+    for sequence in sequences:
+        for pattern, light in zip(sequence.patterns, sequence.profiles, strict=True):
+            kept.setdefault((light.shape, light.tobytes()), (pattern, light))
+    patterns, profiles = zip(*kept.values(), strict=True)
+    return PatternSequence(sizes.pop(), patterns, profiles)
+
+
 def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
     """Light of one pattern: (1, 1), (1, Wp) or (Hp, 1) uint8. Raises PatternError when it does not fit."""
     match pattern:

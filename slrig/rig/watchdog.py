@@ -95,11 +95,13 @@ class Call:
 
 
 class Calls:
-    """Whatever the thread that owns a rig asks of its devices goes through here; any thread may look."""
+    """Whatever is asked of a rig's devices goes through here: one call at a time by the thread that owns the rig, and
+    beside it one by each thread that reads a camera for it. Any thread may look.
+    """
 
     def __init__(self, *, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
-        self._current: Call | None = None
+        self._current: dict[int, Call] = {}
         self.failure: DeviceError | None = None
         """The last error of a device that leaves its state unknown, also where whoever called passed over it."""
 
@@ -119,7 +121,8 @@ class Calls:
         DeviceError
             The call took so long that it was given up; nobody waits for its result any more.
         """
-        call = self._current = Call(device, step, limit_s, self._now_s(), computed)
+        call = Call(device, step, limit_s, self._now_s(), computed)
+        self._current[threading.get_ident()] = call
 
         def heard(doing: str) -> None:
             call.doing, call.since_s, call.late = doing, self._now_s(), 0
@@ -148,7 +151,7 @@ class Calls:
             self.failure = DriverBrokenError(message)
             raise self.failure from error
         finally:
-            self._current = None
+            self._current.pop(threading.get_ident(), None)
         if call.given_up:
             self.failure = DeviceError(call.hangs())
             raise self.failure
@@ -158,24 +161,28 @@ class Calls:
         """Return the call under way if it has taken too long, once, and give it up. For the watchdog, which looks twice
         before it believes that: the whole process may have been stopped meanwhile.
         """
-        call = self._current
-        if call is None or call.given_up or self._now_s() - call.since_s <= call.limit_s:
-            return None
-        call.late += 1
-        call.given_up = call.late > 1
-        return call if call.given_up else None
+        for call in self._under_way():
+            if call.given_up or self._now_s() - call.since_s <= call.limit_s:
+                continue
+            call.late += 1
+            call.given_up = call.late > 1
+            if call.given_up:
+                return call
+        return None
 
     @property
     def doing(self) -> str:
-        """What the call under way has told that it is at; "" where it has told nothing."""
-        call = self._current
-        return "" if call is None else call.doing
+        """What a call under way has told that it is at; "" where none has told anything."""
+        return next((call.doing for call in self._under_way() if call.doing), "")
 
     @property
     def stuck(self) -> Call | None:
         """The call that was given up, as long as it does not return."""
-        call = self._current
-        return call if call is not None and call.given_up else None
+        return next((call for call in self._under_way() if call.given_up), None)
+
+    def _under_way(self) -> list[Call]:
+        # A copy: other threads begin and end calls meanwhile.
+        return list(self._current.values())
 
     def _note(self, error: SlrigError) -> None:
         # After these the device is as it was before.

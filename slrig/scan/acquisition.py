@@ -19,10 +19,12 @@ from typing import Self
 import structlog
 
 from slrig.bundle import BundleWriter, write_truth
+from slrig.bundle.notes import write_notes
 from slrig.bundle.refused import FOLDER, Refused
 from slrig.capture.exposure import whole_refreshes_s
+from slrig.capture.sequencer import choose_triggers
 from slrig.capture.session import SETTINGS_TOLERANCE
-from slrig.devices import Rig
+from slrig.devices import Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink
 from slrig.model import Shot
@@ -145,6 +147,7 @@ def capture_bundle(
         recorded=rig.projector.info.recorded,
     )
     rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
+    told += _of_the_rig(rig)
     for words in told:
         _log.info(words, rig=rig.name)
         progress("capture", 0.0, words)
@@ -172,9 +175,23 @@ def capture_bundle(
         recorder.finish()
         if frames is not None:
             frames.end(exposing.summary())
+    write_notes(folder, told)
     truth = rig.truth()
     if truth is not None:
         write_truth(folder, truth)
+
+
+def _of_the_rig(rig: Rig) -> list[str]:
+    """What drivers tell of their cameras, and what was not measured."""
+    told = [f"camera '{name}': {words}" for name, camera in rig.cameras.items() for words in camera.info.notes]
+    free = [name for name, trigger in choose_triggers(rig).items() if trigger is Trigger.FREE]
+    if free and rig.synchronisation is None:
+        told.append(
+            "how late the projector's light is was never measured on this rig, and it has cameras that run by "
+            f"themselves ({', '.join(free)}): their frames are matched to patterns by what the drivers state. Run "
+            "slrig latency, and write the [synchronisation] that it prints into the rig file"
+        )
+    return told
 
 
 def _detail(exposing: Exposing) -> str:

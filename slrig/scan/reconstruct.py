@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle import read_truth
 from slrig.bundle.health import read_health
+from slrig.bundle.notes import read_notes
 from slrig.bundle.storage import write_file
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
@@ -125,7 +126,7 @@ def reconstruct_bundle(
         seconds = watch.finished()
         report = {
             **walked.sections,
-            "notes": [*walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
+            "notes": [*read_notes(bundle), *walked.notes, *meshed.notes, *coverage_notes(cameras[0].name, covered)],
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),

@@ -12,7 +12,17 @@ from slrig.bundle import write_bundle
 from slrig.capture.sequencer import capture
 from slrig.model import Capture, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
-from tests.contract import depthai_bench, dlpc350_bench, genicam_bench, opencv_bench, serial_bench, v4l2_bench
+from tests.contract import (
+    depthai_bench,
+    dlpc350_bench,
+    dlpc900_bench,
+    genicam_bench,
+    gentl_bench,
+    opencv_bench,
+    picamera2_bench,
+    serial_bench,
+    v4l2_bench,
+)
 from tests.contract.suite import Bench, rig_of
 
 PROJECTOR = Size(96, 72)
@@ -102,7 +112,10 @@ BENCHES: dict[str, Callable[[Path], Bench]] = {
     "opencv (file)": opencv_bench.file_bench,
     "opencv (umockdev)": opencv_bench.device_bench,
     "genicam (GigE Vision on loopback)": genicam_bench.bench,
+    "gentl (a producer of our own)": gentl_bench.bench,
     "depthai (host-only)": depthai_bench.bench,
+    "picamera2 (a stand-in for the library)": picamera2_bench.bench,
     "dlpc350": dlpc350_bench.bench,
+    "dlpc900": dlpc900_bench.bench,
     "serial projector": serial_bench.bench,
 }

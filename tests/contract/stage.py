@@ -20,6 +20,10 @@ REFERENCE_EXPOSURE_S = 0.01
 """The exposure at which a fake camera is as bright as `Scene` says; brightness grows in proportion."""
 
 
+_REMEMBERED = 500
+"""Changes of light that are kept."""
+
+
 class Stage:
     """What a projector showed when (CLOCK_MONOTONIC, ns), and what a camera sees of it. Safe between threads.
 
@@ -41,11 +45,14 @@ class Stage:
         """The sensor's."""
         return self.scene.format
 
-    def show(self, profile: Pixels | None) -> int:
-        """Change the light to a pattern, or to the dark; return when it will have changed."""
+    def show(self, profile: Pixels | None, *, asked_ns: int | None = None) -> int:
+        """Change the light to a pattern, or to the dark, now or at an instant to come; return when it will change."""
         with self._lock:
             late_s = self.latency_s + self.jitter_s * float(self._rng.random())
-            at_ns = max(time.monotonic_ns() + round(late_s * 1e9), self._changes[-1][0])
+            asked_ns = time.monotonic_ns() if asked_ns is None else asked_ns
+            at_ns = max(asked_ns + round(late_s * 1e9), self._changes[-1][0])
+            # No camera looks back so far.
+            del self._changes[:-_REMEMBERED]
             self._changes.append((at_ns, self._dark if profile is None else profile))
             return at_ns
 

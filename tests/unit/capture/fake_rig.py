@@ -244,6 +244,7 @@ class CameraFaults:
     over_exposed: frozenset[int] = frozenset()
     unplug_at: int | None = None
     readback: float = 1.0
+    least_period_s: float | None = None
 
 
 @dataclass
@@ -271,7 +272,8 @@ class FakeCamera:
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         self.world.calls.append(f"configure {self.name}")
-        return AppliedSettings(settings.exposure_s * self.faults.readback, settings.gain)
+        faults = self.faults
+        return AppliedSettings(settings.exposure_s * faults.readback, settings.gain, faults.least_period_s)
 
     def arm(self, count: int, trigger: Trigger) -> None:
         self.world.calls.append(f"arm {self.name} {trigger}")

@@ -162,3 +162,41 @@ def test_a_pattern_is_lit_until_the_last_row_of_a_rolling_shutter_has_seen_it() 
     exposure_s = max(settings.exposure_s for settings in fake.rig.settings.values())
     assert lit_s == pytest.approx(exposure_s + 40e-6 * (rows - 1), rel=1e-6)
     assert period_s == pytest.approx(lit_s + exposure_s)
+
+
+# ---- the time from pulse to pulse
+
+
+def times_s(fake: FakeRig, *, trigger_period_s: float | None = None, line_s: float = 0.0) -> tuple[float, float]:
+    """What was played: how long each pattern was lit, and how often pulses came, s."""
+    lines = {"right": line_s} if line_s else {}
+    known = Synchronisation(0.0, 0.0, lines, trigger_period_s)
+    list(capture(replace(fake.rig, synchronisation=known), SEQUENCE))
+    return fake.world.periods_s[0]
+
+
+def test_a_camera_that_tells_nothing_gets_as_long_again_for_its_read_out() -> None:
+    assert times_s(wired()) == pytest.approx((0.01, 0.02))
+
+
+def test_a_camera_that_tells_is_believed_and_the_slowest_wins() -> None:
+    fake = wired(least_period_s=0.013)
+    fake.cameras["left"].faults = CameraFaults(least_period_s=0.011)
+    assert times_s(fake) == pytest.approx((0.01, 0.013))
+
+
+def test_the_rig_file_knows_of_cameras_that_tell_nothing_and_may_ask_for_more_than_they_tell() -> None:
+    assert times_s(wired(), trigger_period_s=0.012) == pytest.approx((0.01, 0.012))
+    both = wired(least_period_s=0.013)
+    both.cameras["left"].faults = CameraFaults(least_period_s=0.011)
+    assert times_s(both, trigger_period_s=0.05) == pytest.approx((0.01, 0.05))
+
+
+def test_the_projector_has_its_gap_and_its_share_of_light() -> None:
+    fast = wired(least_period_s=0.01)
+    fast.cameras["left"].faults = CameraFaults(least_period_s=0.01)
+    assert times_s(fast) == pytest.approx((0.01, 0.0105))
+    rolling = wired(least_period_s=0.01)
+    rolling.cameras["left"].faults = CameraFaults(least_period_s=0.01)
+    lit_s = 0.01 + 149 * 1e-5
+    assert times_s(rolling, line_s=1e-5) == pytest.approx((lit_s, lit_s + 0.0005))

@@ -276,8 +276,7 @@ def test_positioner_is_watched_like_the_other_devices() -> None:
         poses = ("home",)
 
         def move(self, index: int) -> None:
-            call = calls._current
-            assert call is not None
+            (call,) = calls._current.values()
             seen.append((call.device, call.step, call.limit_s))
             if index:
                 raise OSError(19, "No such device")

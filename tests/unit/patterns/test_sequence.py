@@ -7,7 +7,7 @@ import pytest
 
 from slrig.errors import PatternError
 from slrig.model import Axis, Black, Gray, LineShift, Pattern, Size, White
-from slrig.patterns.sequence import encode, scan_patterns
+from slrig.patterns.sequence import encode, scan_patterns, united
 
 
 def patterns_of(
@@ -80,3 +80,24 @@ def test_an_empty_sequence_is_refused() -> None:
 def test_a_pattern_for_another_projector_is_refused() -> None:
     with pytest.raises(PatternError, match="smaller than the code"):
         encode(patterns_of(Size(1024, 768)), Size(64, 48))
+
+
+def test_sequences_are_united_with_each_light_once_in_the_order_it_comes() -> None:
+    size = Size(64, 48)
+    columns, both = (encode(patterns_of(size, rows=rows), size) for rows in (False, True))
+    fine = encode(patterns_of(size, line_shift=False, gray_cell_px=1), size)
+    whole = united([columns, both, fine])
+    assert whole.patterns[:18] == columns.patterns[:18]
+    lights = [whole.image(index).tobytes() for index in range(len(whole))]
+    assert len(set(lights)) == len(lights)
+    for each in (columns, both, fine):
+        assert {each.image(index).tobytes() for index in range(len(each))} <= set(lights)
+    # Coarse bits of a fine code light as those of a coarse one: only the two finest, with their inverses, are new.
+    assert len(whole) == len(both) - 2 + 4
+
+
+def test_sequences_of_different_projectors_are_not_united() -> None:
+    with pytest.raises(PatternError, match="found 2"):
+        united([encode((White(),), size) for size in (Size(64, 48), Size(64, 30))])
+    with pytest.raises(PatternError, match="found 0"):
+        united([])

@@ -265,3 +265,30 @@ def test_light_is_put_out_past_a_call_that_hangs() -> None:
     assert projector is held.open().projector, "the rig stays with its owner"
     go.set()
     owner.join(WAIT_S)
+
+
+def test_calls_of_several_threads_are_looked_after_at_once() -> None:
+    now_s, reading, ended = [0.0], threading.Event(), threading.Event()
+    calls = Calls(now_s=lambda: now_s[0])
+
+    def read() -> None:
+        reading.set()
+        ended.wait()
+
+    def reader() -> None:
+        with pytest.raises(DeviceError):
+            calls.make("camera 'left'", "read", 1.0, read)
+
+    thread = threading.Thread(target=reader)
+    thread.start()
+    reading.wait()
+    # Another call that begins and ends beside it changes nothing.
+    assert calls.make("projector 'beamer'", "show", 1.0, lambda: 7) == 7
+    now_s[0] = 1.5
+    found = [calls.overdue(), calls.overdue()]
+    ended.set()
+    thread.join()
+    assert found[0] is None
+    assert found[1] is not None
+    assert (found[1].device, found[1].step) == ("camera 'left'", "read")
+    assert calls.stuck is None

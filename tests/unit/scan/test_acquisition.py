@@ -12,9 +12,18 @@ import numpy as np
 import pytest
 
 from slrig.bundle import read_bundle
+from slrig.bundle.notes import read_notes
 from slrig.bundle.refused import read_refused
 from slrig.capture.evidence import EvidenceSummary, check_capture
-from slrig.errors import DeviceGoneError, FrameTimeoutError, ScanCancelledError, ScanEvidenceError, SlrigError
+from slrig.devices import Synchronisation, Trigger
+from slrig.errors import (
+    BundleError,
+    DeviceGoneError,
+    FrameTimeoutError,
+    ScanCancelledError,
+    ScanEvidenceError,
+    SlrigError,
+)
 from slrig.jobs.frame_feed import Abandon, FrameFeed
 from slrig.model import Calibration, Shot
 from slrig.model.header import CaptureHeader
@@ -26,6 +35,7 @@ from tests.contract.benches import PROJECTOR, simulated
 from tests.contract.suite import rig_of
 from tests.samples import sample_calibration
 from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig
+from tests.unit.doctor.test_doctor import OtherCamera, small_rig
 from tests.unit.scan.fakes import WAIT_S
 
 
@@ -72,6 +82,25 @@ def test_a_sound_capture_is_a_bundle(tmp_path: Path) -> None:
     assert len(capture.shots) == len(sink.shots) == 44
     assert sink.evidence == check_capture(capture)
     assert told[-1] == (1.0, "frame 44 of 44")
+
+
+def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
+    with small_rig(tmp_path) as rig:
+        free = replace(rig, cameras={"eye": OtherCamera(rig.cameras["eye"], frozenset({Trigger.FREE}))})
+        known = replace(free, synchronisation=Synchronisation(0.0, 0.001))
+        for name, each in (("unmeasured", free), ("measured", known), ("triggered", rig)):
+            capture_bundle(each, ScanPlan(), tmp_path / name, progress=lambda *_: None, cancelled=lambda: False)
+    [note] = read_notes(tmp_path / "unmeasured")
+    assert "cameras that run by themselves (eye)" in note
+    assert "Run slrig latency" in note
+    assert read_notes(tmp_path / "measured") == ()
+    assert not (tmp_path / "triggered" / "notes.json").exists()
+
+
+def test_notes_that_are_none_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.json").write_text('{"light": "late"}')
+    with pytest.raises(BundleError, match="expected a JSON list of strings"):
+        read_notes(tmp_path)
 
 
 def test_a_frame_that_was_shot_again_is_right_in_the_bundle_and_kept_beside_it(tmp_path: Path) -> None:

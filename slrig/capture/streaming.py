@@ -1,0 +1,265 @@
+"""Streaming: free-running cameras are read beside the projector, and no frame is waited for before the next pattern.
+
+A pattern is held until every camera must have exposed a frame within its light: their time stamps foretell when. The
+next one is asked for as early before that as its light is known to take. Frames come whenever they come. Each is paired
+with the pattern in whose light its whole exposure lies, by its time stamp alone, between two measured bounds:
+
+    the pattern's own light is whole  ≤  start of the first row,    end of the last row  ≤  the next light begins.
+
+Both are `slrig latency`'s, measured by the same time stamps. A pattern for which no frame of a camera lies between them
+(the frame was lost, damaged, or came otherwise than foretold) is shown again, and then held until its frame is there.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from slrig.capture.cadence import Cadence
+from slrig.capture.frame_reader import FrameReader
+from slrig.capture.latency import shutter_skew_s, stable_from_ns
+from slrig.capture.retry_policy import RetryPolicy
+from slrig.capture.session import Session, under_name
+from slrig.devices import Rig, Shown, Trigger
+from slrig.model import Frame, Shot
+
+MOST_AHEAD = 12
+"""Patterns that may have been shown without any frame of theirs: cameras and links hold back some frames, and one that
+gives none must not be played to for long."""
+
+_JUDGING_S = 0.012
+"""Time to leave before a pattern is due: judging takes about 8 ms for a frame of 1280 x 1024."""
+
+_LOOK_S = 0.05
+"""How often to look whether the scan was cancelled, or a frame has been waited for in vain."""
+
+_MOST_WAITING = 8
+"""Frames that may wait to be judged; beyond that they come before the next pattern."""
+
+
+def earliest_change_s(rig: Rig, triggers: dict[str, Trigger]) -> float | None:
+    """Return when light changes at the earliest after the instant that the projector states, s, where frames can be
+    told apart by that: all cameras run freely on metal, and latency was measured. None where they cannot.
+    """
+    free = all(trigger is Trigger.FREE for trigger in triggers.values())
+    computed = any(camera.info.limits.computed for camera in rig.cameras.values())
+    return rig.synchronisation.earliest_s if rig.synchronisation is not None and free and not computed else None
+
+
+@dataclass(slots=True)
+class _Showing:
+    """A pattern that was shown, and the cameras that gave no frame of it yet.
+
+    stable_ns : its light is whole from then on. end_ns : the light of the next one may begin then; None while it is
+    shown. held : shown until its frames are there.
+    """
+
+    shown: Shown
+    stable_ns: int
+    missing: list[str]
+    held: bool
+    end_ns: int | None = None
+
+
+@dataclass(slots=True)
+class _Eye:
+    """What is known of one camera. waiting : frames whose pattern is still shown, and what each says against itself."""
+
+    skew_ns: int
+    cadence: Cadence = field(default_factory=Cadence)
+    last: Frame | None = None
+    waiting: list[tuple[Frame, str | None]] = field(default_factory=list)
+
+    def end_ns(self, frame: Frame) -> int:
+        """When the last row's exposure has ended; a driver may not know that its shutter rolls."""
+        return frame.t_end_ns + max(self.skew_ns - round(frame.shutter_skew_s * 1e9), 0)
+
+
+def streamed(session: Session, retries: RetryPolicy, reader: FrameReader, earliest_s: float) -> Iterator[Shot]:
+    """Show each pattern, and again where frames failed, until every frame counts. The reader is stopped by the caller.
+
+    earliest_s : see `earliest_change_s`.
+
+    Raises as `RetryPolicy` does, and what the cameras' drivers raise.
+    """
+    rig = session.rig
+    rig.projector.load(session.sequence)
+    for camera in rig.cameras.values():
+        camera.arm(retries.most_shots, Trigger.FREE)
+    reader.start()
+    yield from _Stream(session, retries, reader, round(earliest_s * 1e9)).shots()
+
+
+class _Stream:
+    """One streamed capture under way."""
+
+    def __init__(self, session: Session, retries: RetryPolicy, reader: FrameReader, earliest_ns: int) -> None:
+        self._session = session
+        self._earliest_ns = earliest_ns
+        self._retries = retries
+        self._reader = reader
+        self._clock = session.rig.clock
+        self._eyes = {
+            name: _Eye(round(shutter_skew_s(camera, name, session.rig.synchronisation) * 1e9))
+            for name, camera in session.rig.cameras.items()
+        }
+        self._showings: deque[_Showing] = deque()
+        self._paired: deque[tuple[int, Frame, str | None]] = deque()
+        self._lead_ns: int | None = None
+        self._index = 0
+        self._shown: _Showing | None = None
+
+    def shots(self) -> Iterator[Shot]:
+        """See `streamed`."""
+        retries = self._retries
+        ahead = iter(range(len(self._session.sequence)))
+        while True:
+            again = bool(retries.again)
+            if again:
+                # First what failed, in order.
+                index = min(retries.again)
+                names = retries.again.pop(index)
+            elif (index := next(ahead, -1)) >= 0:
+                names = list(self._eyes)
+            elif self._showings or self._paired:
+                yield from self._until_due(last=True)
+                continue
+            else:
+                return
+            self._show(index, names, held=again)
+            yield from self._until_due(last=False)
+
+    def _show(self, index: int, names: list[str], *, held: bool) -> None:
+        self._index = index
+        self._session.stop_if_cancelled(index)
+        asked_ns = self._clock.now_ns()
+        shown = self._session.rig.projector.show(index)
+        stable_ns = stable_from_ns(shown, self._session.rig.synchronisation)
+        begins_ns = shown.t_visible_ns + self._earliest_ns
+        if self._shown is not None:
+            self._shown.end_ns = begins_ns
+        lead_ns = max(begins_ns - asked_ns, 0)
+        self._lead_ns = lead_ns if self._lead_ns is None else min(lead_ns, self._lead_ns)
+        for name in names:
+            self._retries.begin(name, index)
+        self._shown = _Showing(shown, stable_ns, list(names), held)
+        self._showings.append(self._shown)
+
+    def _until_due(self, *, last: bool) -> Iterator[Shot]:
+        """Take frames, pair and judge them, until the next pattern is due. last : there is none, unless a frame failed.
+
+        Frames that are to be judged do not grow old where they wait; a pattern that is late is late for good.
+        """
+        while True:
+            self._session.stop_if_cancelled(self._index)
+            self._settle()
+            due_ns = self._due_ns(last=last)
+            left_s = _LOOK_S if due_ns is None else (due_ns - self._clock.now_ns()) / 1e9
+            if self._paired and (left_s > _JUDGING_S or len(self._paired) > _MOST_WAITING):
+                yield from self._judged()
+            elif left_s <= 0:
+                return
+            else:
+                arrival = self._reader.next(min(left_s, _LOOK_S))
+                if arrival is not None:
+                    self._take(*arrival)
+
+    def _due_ns(self, *, last: bool) -> int | None:
+        """When to ask for the next pattern; None: that depends on frames that are still to come or to be judged."""
+        if last:
+            ended = not self._showings and not self._paired
+            return 0 if ended or self._failed_at_rest() else None
+        if len(self._showings) > MOST_AHEAD:
+            return None
+        showing = self._shown
+        if showing is None:
+            return 0
+        if showing.held:
+            # What failed before is judged before anything else is shown.
+            return None if showing.missing or self._paired else 0
+        return self._foretold_ns(showing)
+
+    def _failed_at_rest(self) -> bool:
+        """Whether a frame failed, and the pattern that is shown is waited for no more."""
+        return bool(self._retries.again) and (self._shown is None or not self._shown.missing) and not self._paired
+
+    def _foretold_ns(self, showing: _Showing) -> int | None:
+        """When to ask for the next pattern so that its light begins after a frame of each camera that has none."""
+        due_ns = 0
+        for name in showing.missing:
+            eye = self._eyes[name]
+            foretold = eye.cadence.start_after(showing.stable_ns)
+            if foretold is None or eye.last is None:
+                return None
+            start_ns, spare_ns = foretold
+            span_ns = eye.end_ns(eye.last) - eye.last.t_start_ns
+            due_ns = max(due_ns, start_ns + spare_ns + span_ns - (self._lead_ns or 0))
+        return due_ns
+
+    def _judged(self) -> Iterator[Shot]:
+        index, frame, fault = self._paired.popleft()
+        shot = self._retries.took(index, frame, fault)
+        if shot is not None:
+            yield shot
+
+    def _take(self, name: str, came: Frame | Exception) -> None:
+        if isinstance(came, Exception):
+            raise came
+        frame = under_name(name, came)
+        eye = self._eyes[name]
+        eye.waiting.append((frame, self._session.own_fault(frame, frame.t_start_ns, eye.last)))
+        eye.cadence.note(frame)
+        eye.last = frame
+
+    def _settle(self) -> None:
+        """Pair the frames that wait, and find out which patterns have been waited for in vain."""
+        now_ns = self._clock.now_ns()
+        for name, eye in self._eyes.items():
+            still: list[tuple[Frame, str | None]] = []
+            for frame, fault in eye.waiting:
+                showing = self._showing_of(frame)
+                if showing is None:
+                    continue
+                end_ns = showing.end_ns
+                if end_ns is None:
+                    # What is shown next is asked for later than now; so its light begins later than this.
+                    end_ns = now_ns + min(self._earliest_ns, 0)
+                    if eye.end_ns(frame) > end_ns:
+                        still.append((frame, fault))
+                        continue
+                if name in showing.missing and eye.end_ns(frame) <= end_ns:
+                    showing.missing.remove(name)
+                    self._paired.append((showing.shown.index, frame, fault))
+            eye.waiting = still
+        for showing in list(self._showings):
+            self._give_up(showing, now_ns)
+            if not showing.missing:
+                self._showings.remove(showing)
+
+    def _showing_of(self, frame: Frame) -> _Showing | None:
+        """The last pattern whose light was whole when a frame began."""
+        for showing in reversed(self._showings):
+            if frame.t_start_ns >= showing.stable_ns:
+                return showing
+        return None
+
+    def _give_up(self, showing: _Showing, now_ns: int) -> None:
+        """Have a pattern shown again to the cameras that are past it, or gave nothing for too long."""
+        for name in list(showing.missing):
+            last = self._eyes[name].last
+            if showing.end_ns is not None and last is not None and last.t_start_ns >= showing.end_ns:
+                cause = (
+                    "no frame was exposed within its light: one was lost or damaged, or came otherwise than the frames "
+                    "before it; it is shown until a frame is there"
+                )
+            elif now_ns - showing.stable_ns > self._session.patience_s(name) * 1e9:
+                cause = (
+                    f"no frame came within {self._session.patience_s(name):.3f} s of its light, visible since "
+                    f"{showing.shown.t_visible_ns} ns ± {showing.shown.t_err_ns} ns; check the camera's cable, "
+                    "bandwidth and trigger"
+                )
+            else:
+                continue
+            showing.missing.remove(name)
+            self._retries.missed(name, showing.shown.index, cause)

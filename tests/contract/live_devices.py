@@ -1,0 +1,272 @@
+"""A display and webcams in real time on a stage, by the timing rules of the drivers `screen` and `v4l2`.
+
+The display takes a picture at its next refresh, says when that was, and lights it later by a delay of its own. A camera
+runs by itself, stamps a frame when its first packet comes, delivers it later, and keeps four.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivers.display.options import UNMEASURED_S
+from drivers.display.timing import flipped, whole_light
+from drivers.v4l2.timing import Durations, Exposure, Stamp, StampSource, exposure_of
+from slrig.capture.latency import measure_latency
+from slrig.devices import (
+    AppliedSettings,
+    CameraInfo,
+    CameraSettings,
+    CameraState,
+    ProjectorInfo,
+    ProjectorState,
+    Rig,
+    Shown,
+    SystemClock,
+    Trigger,
+)
+from slrig.errors import FrameTimeoutError
+from slrig.model import Frame, PatternSequence, Pixels
+from tests.contract.stage import Stage
+from tests.contract.wired_camera import WiredCamera
+
+BUFFERS = 4
+
+
+class LiveDisplay:
+    """Implements `Projector`: a display of this refresh rate, whose delay is the stage's latency. It states what the
+    driver `screen` states of a display that nobody measured.
+    """
+
+    def __init__(self, stage: Stage, *, refresh_hz: float = 60.0) -> None:
+        self.refresh_ns = round(1e9 / refresh_hz)
+        self._stage = stage
+        self._begun_ns = time.monotonic_ns()
+        self._state = ProjectorState("the live display")
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        refresh_s = self.refresh_ns / 1e9
+        latency_s = 2 * UNMEASURED_S + 2 * refresh_s
+        size = self._stage.scene.projector
+        return ProjectorInfo("display", "live display", "0", size, False, latency_s, refresh_s)
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`."""
+        self._state.require_size(sequence, self._stage.scene.projector)
+        self.blank()
+        self._state.loaded = sequence
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`. Waits for the next refresh."""
+        profile = self._state.require_pattern(index).profiles[index]
+        flip_ns = self._flip(profile)
+        t_visible_ns, t_err_ns = whole_light(
+            flipped(flip_ns),
+            refresh_s=self.refresh_ns / 1e9,
+            latency_s=UNMEASURED_S,
+            latency_error_s=UNMEASURED_S,
+        )
+        return Shown(index, t_visible_ns, t_err_ns)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`."""
+        self._state.refuse_to_play(exposure_s, period_s)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+        self.blank()
+
+    def blank(self) -> None:
+        """See `Projector`."""
+        if not self._state.closed.is_set():
+            self._flip(None)
+
+    def close(self) -> None:
+        """See `Projector`."""
+        self.blank()
+        self._state.loaded = None
+        self._state.closed.set()
+
+    def _flip(self, profile: Pixels | None) -> int:
+        """Hand a picture over, and return at the refresh that takes it, however late this thread wakes up for that."""
+        since_ns = time.monotonic_ns() - self._begun_ns
+        flip_ns = self._begun_ns + -(-since_ns // self.refresh_ns) * self.refresh_ns
+        self._stage.show(profile, asked_ns=flip_ns)
+        SystemClock().wait_until(flip_ns, self._state.closed)
+        return flip_ns
+
+
+class LivePlayer(LiveDisplay):
+    """An engine that plays by itself, and sends a pulse to the cameras with each pattern."""
+
+    def __init__(self, stage: Stage, cameras: Sequence[WiredCamera]) -> None:
+        super().__init__(stage)
+        self._cameras = cameras
+        self.played_s = 0.0
+
+    @property
+    def info(self) -> ProjectorInfo:
+        """See `Projector`."""
+        return replace(super().info, plays=True, refresh_s=None)
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. All of it is written down at once, and comes about by itself."""
+        sequence = self._state.require_loaded("play")
+        begun_ns = time.monotonic_ns() + 5_000_000
+        self.played_s = len(sequence) * period_s
+        for index, profile in enumerate(sequence.profiles):
+            t_ns = begun_ns + round(index * period_s * 1e9)
+            self._stage.show(profile, asked_ns=t_ns)
+            self._stage.show(None, asked_ns=t_ns + round((exposure_s + self.info.gap_s / 2) * 1e9))
+            for camera in self._cameras:
+                camera.pulse(t_ns)
+
+    def stop(self) -> None:
+        """See `Projector`."""
+
+    def blank(self) -> None:
+        """See `Projector`. At once."""
+        self._stage.show(None)
+
+
+@dataclass(frozen=True, slots=True)
+class Webcam:
+    """What a camera on USB is like. Times in s; jitter_s: its stamps come later by up to so much, at random; the
+    probabilities are of one frame. damaged: rows of it are noise, and nothing says so.
+    """
+
+    fps: float = 30.0
+    delivery_s: float = 0.02
+    jitter_s: float = 0.0005
+    lost: float = 0.0
+    damaged: float = 0.0
+
+
+@dataclass(slots=True)
+class _Kept:
+    number: int
+    start_ns: int
+    end_ns: int
+    stamp_ns: int
+
+
+class LiveCamera:
+    """Implements `Camera` on a stage: one thread uses it at a time."""
+
+    def __init__(self, name: str, stage: Stage, webcam: Webcam, *, seed: int = 0) -> None:
+        self.info = CameraInfo(
+            name, "live", "0", stage.format, frozenset({Trigger.FREE}), (1e-3, 1 / webcam.fps), (1.0, 1.0)
+        )
+        self._stage, self._webcam = stage, webcam
+        self._rng = np.random.default_rng(seed)
+        self._state = CameraState(name)
+        self._exposure_ns = 10_000_000
+        self._period_ns = round(1e9 / webcam.fps)
+        self._begun_ns = self._next = self._number = self._dropped = 0
+        self._kept: deque[_Kept] = deque()
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`."""
+        self._state.check_settings(settings, self.info)
+        self._exposure_ns = round(settings.exposure_s * 1e9)
+        return AppliedSettings(settings.exposure_s, settings.gain, self._period_ns / 1e9)
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`. Where in its period it begins is chance."""
+        self._state.check_arming(count, trigger, self.info)
+        self._state.armed = trigger
+        self._begun_ns = time.monotonic_ns() + round(self._period_ns * float(self._rng.random()))
+        self._next, self._number, self._dropped = 0, -1, 0
+        self._kept.clear()
+
+    def trigger(self) -> None:
+        """See `Camera`."""
+        self._state.require_armed(Trigger.SOFTWARE)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`."""
+        give_up_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        while True:
+            self._state.require_armed()
+            self._fill()
+            while self._kept:
+                kept = self._kept.popleft()
+                self._dropped += kept.number - self._number - 1
+                self._number = kept.number
+                exposure = self._claimed(kept)
+                if exposure.earliest_ns >= after_ns:
+                    start_ns, end_ns, error_ns = exposure.centred(self._exposure_ns)
+                    image = self._image(kept)
+                    exposure_s = self._exposure_ns / 1e9
+                    return Frame(
+                        self.info.name, image, start_ns, end_ns, error_ns, self._number, self._dropped, exposure_s, 1.0
+                    )
+            if time.monotonic_ns() >= give_up_ns:
+                message = f"no frame in {timeout_s} s"
+                raise FrameTimeoutError(message)
+            SystemClock().wait_until(min(self._delivered_ns(self._next), give_up_ns), self._state.closed)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        self._state.armed = None
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self._state.close()
+
+    def _delivered_ns(self, number: int) -> int:
+        end_ns = self._begun_ns + number * self._period_ns + self._exposure_ns
+        return end_ns + round(self._webcam.delivery_s * 1e9)
+
+    def _fill(self) -> None:
+        """Take what was delivered until now into the buffers; what finds none is lost."""
+        while self._delivered_ns(self._next) <= time.monotonic_ns():
+            number, self._next = self._next, self._next + 1
+            if self._rng.random() < self._webcam.lost or len(self._kept) == BUFFERS:
+                continue
+            start_ns = self._begun_ns + number * self._period_ns
+            end_ns = start_ns + self._exposure_ns
+            stamp_ns = end_ns + round(self._webcam.jitter_s * float(self._rng.random()) * 1e9)
+            self._kept.append(_Kept(number, start_ns, end_ns, stamp_ns))
+
+    def _claimed(self, kept: _Kept) -> Exposure:
+        stamp = Stamp(StampSource.EXPOSURE_START, kept.stamp_ns, kept.start_ns, time.monotonic_ns())
+        return exposure_of(stamp, Durations(self._exposure_ns, self._period_ns))
+
+    def _image(self, kept: _Kept) -> Pixels:
+        image = self._stage.exposed(kept.start_ns, kept.end_ns)
+        if self._rng.random() < self._webcam.damaged:
+            rows = slice(image.shape[0] // 3, 2 * image.shape[0] // 3)
+            image[rows] = self._rng.integers(0, self.info.format.full_scale, image[rows].shape, image.dtype)
+        return image
+
+
+@dataclass
+class LiveRig:
+    """The devices as a rig, its latency measured on these very devices, by flashes, as `slrig latency` does."""
+
+    stage: Stage
+    webcams: dict[str, Webcam]
+    refresh_hz: float = 60.0
+    exposure_s: float = 1 / 60
+    seed: int = 0
+    rig: Rig = field(init=False)
+
+    def __post_init__(self) -> None:
+        cameras = {
+            name: LiveCamera(name, self.stage, webcam, seed=self.seed + number)
+            for number, (name, webcam) in enumerate(self.webcams.items())
+        }
+        settings = {name: CameraSettings(self.exposure_s) for name in cameras}
+        rig = Rig("live", cameras, LiveDisplay(self.stage, refresh_hz=self.refresh_hz), settings)
+        self.rig = rig
+
+    def measured(self) -> Rig:
+        """The rig with what flashes tell of its latency."""
+        return replace(self.rig, synchronisation=measure_latency(self.rig).synchronisation)
