@@ -37,7 +37,8 @@ class CameraEntry(Strict):
     size_px: Extent
     bit_depth: Annotated[int, Field(ge=1, le=16)]
     compression_dn: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation that compression added to frames on their way here")
+        float,
+        Field(ge=0, le=1000, description="written by earlier versions; the frames tell it"),
     ] = 0.0
 
     @field_validator("size_px")
@@ -103,10 +104,7 @@ class Description(Strict):
 
     def camera_formats(self) -> dict[str, CameraFormat]:
         """Extent and bit depth of each camera."""
-        return {
-            name: CameraFormat(Size(*entry.size_px), entry.bit_depth, entry.compression_dn)
-            for name, entry in self.cameras.items()
-        }
+        return {name: CameraFormat(Size(*entry.size_px), entry.bit_depth) for name, entry in self.cameras.items()}
 
     def pattern_list(self) -> tuple[Pattern, ...]:
         """The patterns in order."""

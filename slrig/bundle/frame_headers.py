@@ -1,9 +1,7 @@
 """Headers of BMP, JPEG and TIFF frames, as the programs of cameras, webcams and phones save them.
 
-BMP frames are uncompressed, of 8 bits with a palette or 24 bits of colour. JPEG frames (ITU-T T.81) are read with what
-their compression errs by: it rounds every coefficient of the cosine transform of 8 x 8 pixels to a multiple of its
-quantiser q. The transform keeps lengths, so that a block whose coefficients are all rounded errs by Σ q²/12 / 64 in
-each pixel, mean square. Most coefficients of smooth blocks are small and err by less than that.
+BMP frames are uncompressed, of 8 bits with a palette or 24 bits of colour. JPEG frames are those of ITU-T T.81. What
+their compression errs by is no matter of headers: reconstruction reads it from the pixels, whatever file they are in.
 """
 
 from __future__ import annotations
@@ -30,11 +28,6 @@ _REMARKS = {*range(0xE1, 0xEE), 0xEF, 0xFE}
 """Applications' own segments but JFIF's and Adobe's, which say how colours are coded, and comments."""
 _NEXT_SCAN, _MOST_SCANS = b"\xff\xda", 64
 """Each scan of a progressive file costs a pass over all pixels; usual are ten."""
-_SHARE = 0.3
-"""Of the greatest error. With it, rendered scans by lines and by Gray code came out with errors of 0.76 to 1.18 times
-what was stated for them, at qualities from 95 to 50; without, up to four times.
-"""
-
 
 TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 MOST_TIFF_PAGES = 65536
@@ -118,14 +111,13 @@ class Bitmap:
 
 @dataclass(frozen=True, slots=True)
 class Jpeg:
-    """A JPEG's header. components : 1 or 3; noise_dn : standard deviation that its compression is taken to add;
-    remarks : first byte and end of each segment that has no part in the picture, as Exif.
+    """A JPEG's header. components : 1 or 3; remarks : first byte and end of each segment that has no part in the
+    picture, as Exif.
     """
 
     width: int
     height: int
     components: int
-    noise_dn: float
     remarks: tuple[tuple[int, int], ...]
 
     def plain(self, data: bytes) -> bytes:
@@ -136,7 +128,7 @@ class Jpeg:
     @classmethod
     def of(cls, data: bytes) -> Jpeg:
         """Read the header. Raises ValueError with words for what it is instead of a JPEG that can be read."""
-        tables: dict[int, float] = {}
+        tables: set[int] = set()
         frame: tuple[int, int, int, int] | None = None
         remarks = []
         place = 2
@@ -150,7 +142,7 @@ class Jpeg:
             if kind in _FRAMES:
                 frame = _frame(segment)
             elif kind == _TABLES:
-                tables |= _mean_squares(segment)
+                tables |= _table_numbers(segment)
             elif kind in _REMARKS:
                 remarks.append((place, place + 2 + length))
             place += 2 + length
@@ -162,8 +154,8 @@ class Jpeg:
             raise ValueError(f"one cut after {len(data)} bytes")
         if data.count(_NEXT_SCAN, place) >= _MOST_SCANS:
             raise ValueError(f"one of more than {_MOST_SCANS} scans")
-        height, width, components, table = frame
-        return cls(width, height, components, _SHARE * (tables[table] / 12) ** 0.5, tuple(remarks))
+        height, width, components, _ = frame
+        return cls(width, height, components, tuple(remarks))
 
 
 def _frame(segment: bytes) -> tuple[int, int, int, int]:
@@ -176,15 +168,13 @@ def _frame(segment: bytes) -> tuple[int, int, int, int]:
     return height, width, components, segment[8]
 
 
-def _mean_squares(segment: bytes) -> dict[int, float]:
-    """By the number of each table of quantisers, the mean of their squares."""
-    found, place = {}, 0
+def _table_numbers(segment: bytes) -> set[int]:
+    """The numbers of the tables of quantisers that a segment holds."""
+    found, place = set(), 0
     while place < len(segment):
-        wide, number = segment[place] >> 4, segment[place] & 15
-        size = 128 if wide else 64
-        values = np.frombuffer(segment[place + 1 : place + 1 + size], ">u2" if wide else np.uint8).astype(np.float64)
-        if len(values) != 64:
+        size = 129 if segment[place] >> 4 else 65
+        if place + size > len(segment):
             raise ValueError("a header with a part of a table")
-        found[number] = float(np.mean(values**2))
-        place += 1 + size
+        found.add(segment[place] & 15)
+        place += size
     return found

@@ -65,20 +65,6 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     return {page: _grey(path, page, image, camera) for page, image in images.items()}
 
 
-def compression_dn(path: Path) -> float:
-    """Standard deviation that the compression of a frame file adds, in its units; 0 where that is lossless.
-
-    A file that cannot be read has none here: `read_pages` says what is wrong with it.
-    """
-    try:
-        with path.open("rb") as file:
-            if file.read(len(JPEG_SIGNATURE)) != JPEG_SIGNATURE:
-                return 0.0
-        return Jpeg.of(path.read_bytes()).noise_dn
-    except (OSError, ValueError):
-        return 0.0
-
-
 def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:
     raise BundleError(f"{path}: expected {expected}, found {found}; {remedy}")
 

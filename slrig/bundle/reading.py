@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from slrig.bundle.calibration_file import check_calibration, read_calibration
 from slrig.bundle.description import Description, read_description
-from slrig.bundle.images import compression_dn, read_pages
+from slrig.bundle.images import read_pages
 from slrig.errors import BundleError
 from slrig.model import Calibration, Capture, Pixels, Shot
 
@@ -69,9 +69,6 @@ def _capture(folder: Path, description: Description) -> Capture:
         Shot(frame.pattern, frame.camera, images[frame.camera, frame.file][frame.page], frame.exposure_s, frame.time_s)
         for frame in description.frames
     )
-    for name, form in cameras.items():
-        files = (compression_dn(paths[file]) for camera, file in pages if camera == name)
-        cameras[name] = replace(form, compression_dn=max([form.compression_dn, *files]))
     return Capture(description.projector_size(), description.pattern_list(), cameras, shots)
 
 

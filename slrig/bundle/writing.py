@@ -154,7 +154,6 @@ class BundleWriter:
             "projector": {"size_px": _extent(self._projector)},
             "cameras": {
                 name: {"size_px": _extent(camera.size), "bit_depth": camera.bit_depth}
-                | ({"compression_dn": camera.compression_dn} if camera.compression_dn else {})
                 for name, camera in self._cameras.items()
             },
             "patterns": [_pattern(pattern) for pattern in self._patterns],

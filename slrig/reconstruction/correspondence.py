@@ -21,6 +21,7 @@ from slrig.model import Axis, FloatArray, Refusal
 from slrig.reconstruction.camera import CodeTables
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.code_edges import EdgeCrossings, edge_crossings
+from slrig.reconstruction.compression import compression_loss
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
@@ -91,6 +92,9 @@ def projector_positions(
     noise = estimate_noise(frames) if noise is None else noise
     code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits.decoding)
     lit = np.asarray(code.refusal != Refusal.NOT_LIT)
+    # Each pixel stands alone here, so that what compression took from all waves counts alike.
+    told_by = frames.lines if has_phase(frames) else frames.bits
+    noise = noise.with_more(float(np.mean(compression_loss(told_by, frames.bits, lit, frames.full_scale))))
     decoded = np.asarray(code.refusal == Refusal.NONE)
     contrast = frames.contrast
     ends = noise.variance(frames.white) + noise.variance(frames.black)

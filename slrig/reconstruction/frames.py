@@ -28,7 +28,6 @@ class AxisFrames:
     full_scale : the value of a saturated sample of one exposure.
     ends_repeats : white and black are means of so many times more frames than the others.
     exposure_ratio : the light of a bracket's longest exposure over that of its shortest; 1 without a bracket.
-    compression_dn : as of `CameraFormat`.
     """
 
     axis: Axis
@@ -42,7 +41,6 @@ class AxisFrames:
     full_scale: float
     exposure_ratio: float = 1.0
     ends_repeats: float = 1.0
-    compression_dn: float = 0.0
 
     @property
     def clipped_at(self) -> float:
@@ -161,13 +159,9 @@ class FrameStacks:
         full_scale: float,
         exposure_ratio: float = 1.0,
         ends_repeats: float = 1.0,
-        compression_dn: float = 0.0,
     ) -> None:
         self.patterns = patterns
-        self._scales = {
-            "full_scale": full_scale, "exposure_ratio": exposure_ratio, "ends_repeats": ends_repeats,
-            "compression_dn": compression_dn,
-        }  # fmt: skip
+        self._scales = {"full_scale": full_scale, "exposure_ratio": exposure_ratio, "ends_repeats": ends_repeats}
         bits = patterns.gray.bits
         self._bits = np.zeros((bits, *shape), dtype=np.float32)
         self._inverses = np.zeros((bits if patterns.inverted else 0, *shape), dtype=np.float32)
@@ -185,7 +179,7 @@ class FrameStacks:
                 frozenset((White(), Black())),
             ),
             (0, 0), full_scale=frames.full_scale, exposure_ratio=frames.exposure_ratio,
-            ends_repeats=frames.ends_repeats, compression_dn=frames.compression_dn,
+            ends_repeats=frames.ends_repeats,
         )  # fmt: skip
         stacks._bits, stacks._lines = frames.bits, frames.lines
         stacks._inverses = stacks._inverses if frames.inverses is None else frames.inverses
@@ -266,7 +260,6 @@ def axis_frames(capture: Capture, camera: str, axis: Axis) -> AxisFrames:
         capture.cameras[camera].size.shape,
         full_scale=float(capture.cameras[camera].full_scale),
         ends_repeats=ends_repeats([capture.patterns[shot.pattern] for shot in shots], axis),
-        compression_dn=capture.cameras[camera].compression_dn,
     )
     for pattern, images in repeats.items():
         if not stacks.has(pattern):

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Capture, FloatArray, Pattern, exposure_groups
+from slrig.model import Axis, Capture, FloatArray, Gray, Pattern, exposure_groups
+from slrig.reconstruction.compression import compression_loss
 from slrig.reconstruction.frames import (
     AxisFrames,
     AxisPatterns,
@@ -108,17 +109,30 @@ def fused_frames(capture: Capture, camera: str, axis: Axis) -> FusedFrames:
         repeats = {pattern: by_exposure[time_s] for pattern, by_exposure in seen.items()}
         exposed.append(_exposed(repeats, patterns, unseen, **scales))
         unseen &= ~exposed[-1].usable
-    noise = fitted_noise((each.samples for each in exposed), compression_dn=form.compression_dn)
+    noise = fitted_noise(each.samples for each in exposed)
     light = _measured_light(exposed, exposures_s, noise)
     weights = _weights(exposed, 1 / light, noise)
     gains = weights * (1 / light).astype(np.float32)[:, np.newaxis, np.newaxis]
     stacks = FrameStacks(patterns, form.size.shape, **scales, exposure_ratio=float(np.float32(1 / light[-1])))
     for pattern in patterns.needed:
         stacks.put(pattern, _fused([each.images[pattern] for each in exposed], gains))
+    loss = _loss(exposed[0], patterns, noise, float(form.full_scale))
     shares = np.einsum("kij,kij->ij", gains, gains), np.einsum("kij,kij->ij", weights, gains)
     return FusedFrames(
-        stacks.frames(), replace(noise, read_share=shares[0], shot_share=shares[1]), exposures_s, light, weights
+        stacks.frames(),
+        replace(noise, read_share=shares[0], shot_share=shares[1], loss=loss),
+        exposures_s,
+        light,
+        weights,
     )
+
+
+def _loss(longest: _Exposed, patterns: AxisPatterns, noise: NoiseModel, full_scale: float) -> FloatArray:
+    """What compression took from the longest exposure, whose light tells most where it is not clipped."""
+    spread = np.sqrt(noise.variance(longest.white) + noise.variance(longest.black))
+    lit = longest.usable & (longest.white - longest.black > _CLEAR_SIGMA * spread)
+    code = [longest.images[each] for each in patterns.needed if isinstance(each, Gray)]
+    return compression_loss([longest.images[each] for each in patterns.lines] or code, code, lit, full_scale)
 
 
 def _common_exposures(seen: Mapping[Pattern, Mapping[float | None, object]], camera: str) -> FloatArray:

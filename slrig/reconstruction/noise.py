@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.model import FloatArray
 from slrig.reconstruction.frames import AxisFrames
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
@@ -33,12 +34,17 @@ class NoiseModel:
     read_variance, slope : of a frame as the camera gives it.
     read_share, shot_share : (H, W) float32, what is left of them at each pixel of frames that are fused of several
     exposures (`slrig.reconstruction.fusion`); None for frames as the camera gives them, where both are 1.
+    falls : bright samples have less noise than dark ones, as with no sensor: the camera bent them (gamma), and what is
+    fitted to all levels is too much for the bright ones. loss : of a bracket, as `compression.compression_loss` gives
+    it; fused frames do not show it any more.
     """
 
     read_variance: float
     slope: float
     read_share: NDArray[np.float32] | None = None
     shot_share: NDArray[np.float32] | None = None
+    falls: bool = False
+    loss: FloatArray | None = None
 
     def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """(H, W) float32: the variance expected of each sample of `image`."""
@@ -46,6 +52,10 @@ class NoiseModel:
             return np.asarray(self.read_variance + self.slope * np.maximum(image, 0), dtype=np.float32)
         read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
         return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
+
+    def with_more(self, variance: float) -> NoiseModel:
+        """The same with that much more variance in every sample of a frame, whatever its level."""
+        return replace(self, read_variance=self.read_variance + variance)
 
 
 def estimate_noise(frames: AxisFrames) -> NoiseModel:
@@ -58,20 +68,13 @@ def estimate_noise(frames: AxisFrames) -> NoiseModel:
     (Immerkær 1996, DOI 10.1006/cviu.1996.0060) tells the noise of the dark. Without inverses that scatter of white and
     black stands alone.
     """
-    return fitted_noise([noise_samples(frames)], compression_dn=frames.compression_dn)
+    return fitted_noise([noise_samples(frames)])
 
 
-def fitted_noise(
-    samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]], *, compression_dn: float = 0.0
-) -> NoiseModel:
-    """Fit the noise model to what `noise_samples` found in the frames of each exposure of one camera.
-
-    compression_dn : of `CameraFormat`. A compressed frame errs where light changes, and alike wherever it does not:
-    scatter tells nothing of that.
-    """
+def fitted_noise(samples: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> NoiseModel:
+    """Fit the noise model to what `noise_samples` found in the frames of each exposure of one camera."""
     levels, variances = zip(*samples, strict=True)
-    found = _fitted(np.concatenate(levels), np.concatenate(variances))
-    return replace(found, read_variance=found.read_variance + compression_dn**2)
+    return _fitted(np.concatenate(levels), np.concatenate(variances))
 
 
 def noise_samples(
@@ -157,6 +160,6 @@ def _fitted(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseM
     # Weighted by 1/variance: the scatter of a variance grows with the variance.
     root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)
     slope, read = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * root[:, None], y * root, rcond=None)[0]
-    slope = max(float(slope), 0.0)
-    read = float(read) if slope > 0 else float(np.average(y, weights=weight))
-    return NoiseModel(max(read, _QUANTISATION_VARIANCE), slope)
+    if slope <= 0:
+        return NoiseModel(max(float(np.average(y, weights=weight)), _QUANTISATION_VARIANCE), 0.0, falls=True)
+    return NoiseModel(max(float(read), _QUANTISATION_VARIANCE), float(slope))

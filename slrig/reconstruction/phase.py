@@ -18,7 +18,7 @@ from slrig.model import FloatArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.surface_fit import stencils
+from slrig.reconstruction.surface_fit import scatter, stencils
 
 
 class PositionMap(NamedTuple):
@@ -72,6 +72,18 @@ def _phases(lines: NDArray[np.float32], *given: Any) -> tuple[NDArray[np.float32
     position, sigma = (np.full(lines.shape[1:], np.nan, dtype=np.float32) for _ in range(2))
     in_bands(_phase_kernel, len(position), lines, *given, position, sigma)
     return position, sigma
+
+
+def by_scatter(seen: PositionMap, usable: NDArray[np.bool_], compressed: float) -> PositionMap:
+    """The map with deviations that its own scatter tells, of a camera whose noise falls where light rises.
+
+    What is fitted to the noise of all levels is too much for the bright ones, which tell a position. compressed : the
+    share of the variance that compression adds, which scatters less than it errs, and stays.
+    """
+    found = scatter(seen.position, seen.sigma, windows(seen, usable)[3])
+    if not np.isfinite(found):
+        return seen
+    return seen._replace(sigma=seen.sigma * np.float32(np.sqrt(min(found, 1 - compressed) + compressed)))
 
 
 @kernel
@@ -134,12 +146,16 @@ def _add_variance(line: Any, cosine: float, sine: float, read: float, slope: flo
 
 
 class FittedPoints(NamedTuple):
-    """What `fit_kernel` fills in: points (n, 2), normals (n, 2) along the gradient, sigma_px (n,), found (n,) bool."""
+    """What `fit_kernel` fills in: points (n, 2), normals (n, 2) along the gradient, sigma_px (n,), found (n,) bool.
+
+    noise_px : (n,) float64, what noise alone makes of sigma_px, which is larger where pixels scatter more than that.
+    """
 
     points: FloatArray
     normals: FloatArray
     sigma_px: FloatArray
     found: NDArray[np.bool_]
+    noise_px: FloatArray
 
 
 def windows(seen: PositionMap, usable: NDArray[np.bool_]) -> tuple[Any, ...]:
@@ -151,4 +167,5 @@ def windows(seen: PositionMap, usable: NDArray[np.bool_]) -> tuple[Any, ...]:
 
 def no_points(count: int) -> FittedPoints:
     """Room for what `fit_kernel` fills in."""
-    return FittedPoints(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), np.zeros(count, dtype=np.bool_))
+    found = np.zeros(count, dtype=np.bool_)
+    return FittedPoints(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), found, np.zeros(count))

@@ -172,7 +172,9 @@ def refined(
     for index, (points, part) in enumerate(zip(found, parts, strict=True)):
         starts = np.ascontiguousarray(points.points_px)
         in_bands(_target_kernel, len(starts), starts, code, position_of[index], targets[part])
-        fitted = FittedPoints(old.points[part], old.normals[part], old.sigma_px[part], old.found[part])
+        fitted = FittedPoints(
+            old.points[part], old.normals[part], old.sigma_px[part], old.found[part], old.noise_px[part]
+        )  # fmt: skip
         in_bands(fit_kernel, len(starts), *given, starts, targets[part], fitted, rows_at_least=POINTS)
         own = np.ascontiguousarray(points.sigma_px)
         in_bands(_settle_kernel, len(starts), starts, own, clear, coarsest_px, fitted, away[part])
@@ -230,14 +232,15 @@ def _settle_kernel(
 
     Where the camera's pixels are finer than the projector's, five of them hold but a part of a stripe, and the stripe's
     own frame may know better: its part in the mean is its share of the inverse variance. A filter is trusted clear of
-    borders only, and where both agree.
+    borders only, where both agree, and where it is better than the fit by noise alone: what makes pixels scatter more
+    than that, an edge of a print for example, displaces a filter, too, which does not know of it.
     """
-    moved, normals, sigma, good = fitted
+    moved, normals, sigma, good, noise = fitted
     for i in range(first, last):
         good[i] = good[i] and sigma[i] < coarsest
         x, y = starts[i, 0], starts[i, 1]
         away[i] = (moved[i, 0] - x) * normals[i, 0] + (moved[i, 1] - y) * normals[i, 1]
-        if not good[i] or not own_sigma[i] < sigma[i] or not clear[int(np.rint(y)), int(np.rint(x))]:
+        if not good[i] or not own_sigma[i] < noise[i] or not clear[int(np.rint(y)), int(np.rint(x))]:
             continue
         variance = sigma[i] * sigma[i]
         both = variance + own_sigma[i] * own_sigma[i]
@@ -277,7 +280,7 @@ def _taken_kernel(starts: Any, moved: Any, good: Any, first: int, slot: int, sta
 @kernel
 def _new_kernel(first: int, last: int, frame: Any, coarsest: float, landed: Any, fitted: Any) -> None:
     """Leave good only points that are fine enough and land where their line has none."""
-    points, _, sigma, good = fitted
+    points, _, sigma, good, _ = fitted
     for i in range(first, last):
         x, y = int(np.rint(points[i, 0])), int(np.rint(points[i, 1]))
         good[i] = good[i] and sigma[i] < coarsest and not landed[frame[i], y, x]

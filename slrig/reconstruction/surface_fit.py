@@ -18,6 +18,7 @@ _LEAST_FOR_LINEAR = 5  # pixels: two more than a plane has numbers, to tell its 
 _LONGEST_MOVE_PX = 1.0  # chosen; half and double change the rms error of a rendered vase by 2 and 1 %
 LEAST_GRADIENT = 0.05  # projector px per camera px; the deviation of a point is that of the position over it
 _LEAST_FREEDOM = 0.5  # with less the residuals tell nothing of the scatter, and the noise stands
+_MOST_FOR_SCATTER = 4000  # neighbourhoods, whose median misfit is known to a hundredth
 _PIXELS = (2 * _REACH + 1) ** 2
 _LANES = 32  # 25 pixels, or points side by side: whole vectors
 POINTS = 1024  # that are worth calling the kernel for
@@ -49,6 +50,28 @@ def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
     return quadratic, terms, linear[0], freedom
 
 
+def scatter(position: NDArray[np.float32], sigma: NDArray[np.float32], whole: NDArray[np.uint8]) -> float:
+    """Variance of positions about the quadratic surfaces fitted to them, over what sigma tells; NaN of none.
+
+    position, sigma : (H, W) float32; whole : as for `fit_kernel`. The median of an even sample.
+    """
+    rows, columns = np.nonzero(whole[_REACH:-_REACH, _REACH:-_REACH])
+    step = max(1, -(-len(rows) // _MOST_FOR_SCATTER))
+    if not len(rows):
+        return np.nan
+    windows = (2 * _REACH + 1,) * 2
+    at = rows[::step], columns[::step]
+    values, deviations = (
+        np.lib.stride_tricks.sliding_window_view(each, windows)[at].reshape(-1, _PIXELS) for each in (position, sigma)
+    )
+    sums, basis, _, freedom = stencils()
+    values = values - values[:, _PIXELS // 2, np.newaxis]
+    residuals = values - values @ sums[:, :_PIXELS].T @ basis[:, :_PIXELS]
+    misfit = np.sum((residuals / deviations) ** 2, axis=1) / freedom
+    # The median of a chi-square lies below its mean (Wilson-Hilferty).
+    return float(np.median(misfit)) / (1 - 2 / (9 * freedom)) ** 3
+
+
 @kernel
 def fit_kernel(
     first: int, last: int, position: Any, sigma: Any, usable: Any, whole: Any, stencils: Any, basis: Any, plane: Any,
@@ -63,7 +86,7 @@ def fit_kernel(
     whole : (H, W) uint8, pixels whose 5 x 5 neighbours are all usable; stencils, basis, plane, whole_freedom : as
     `stencils` returns them. Sums over pixels are of differences from the middle one, small enough for single precision.
     """
-    points, normals, deviation, found = fitted
+    points, normals, deviation, found, by_noise = fitted
     rows, columns = position.shape
     flat_position, flat_sigma = position.reshape(-1), sigma.reshape(-1)
     # A small image of pixels, for one point whose neighbours are not all usable.
@@ -96,7 +119,7 @@ def fit_kernel(
             if waiting == _LANES:
                 _fit_side_by_side(
                     work, waiting, which, stencils, basis, whole_freedom,
-                    position, starts, targets, points, normals, deviation, found,
+                    position, starts, targets, points, normals, deviation, found, by_noise,
                 )  # fmt: skip
                 waiting = np.int64(0)
             continue
@@ -120,17 +143,17 @@ def fit_kernel(
             residual = value[j] - (f0 + f1 * basis[1, j] + f2 * basis[2, j])
             misfit += member[j] * residual * residual / variance_at[j]
         freedom = _plane_freedom(member, members, gains, basis)
-        _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found)
+        _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found, by_noise)
     _fit_side_by_side(
         work, waiting, which, stencils, basis, whole_freedom,
-        position, starts, targets, points, normals, deviation, found,
+        position, starts, targets, points, normals, deviation, found, by_noise,
     )  # fmt: skip
 
 
 @kernel_part
 def _fit_side_by_side(
     work: Any, count: int, which: Any, stencils: Any, basis: Any, freedom: float,
-    position: Any, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any,
+    position: Any, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any, by_noise: Any,
 ) -> None:  # fmt: skip
     """Fit a quadratic surface to each of the first `count` columns of `work`: the points `which`.
 
@@ -157,7 +180,7 @@ def _fit_side_by_side(
         normals[i, 0] = normals[i, 1] = 0.0
         _put(
             i, ix, iy, x, y, gx, gy, work[_NOISE * _LANES + lane], work[_MISFIT * _LANES + lane], freedom,
-            starts, points, normals, deviation, found,
+            starts, points, normals, deviation, found, by_noise,
         )  # fmt: skip
 
 
@@ -225,7 +248,7 @@ def _solved(f0: Any, f1: Any, f2: Any, f3: Any, f4: Any, f5: Any, x: float, y: f
 @kernel_part(inline="always")
 def _put(
     i: int, ix: int, iy: int, x: float, y: float, gx: float, gy: float, noise: float, misfit: float, freedom: float,
-    starts: Any, points: Any, normals: Any, deviation: Any, found: Any,
+    starts: Any, points: Any, normals: Any, deviation: Any, found: Any, by_noise: Any,
 ) -> None:  # fmt: skip
     """Take point i as found, at (x, y) from the pixel (ix, iy), unless it moved too far or the surface is too flat."""
     gradient = np.sqrt(gx * gx + gy * gy)
@@ -238,6 +261,7 @@ def _put(
         return
     points[i, 0], points[i, 1] = ix + x, iy + y
     normals[i, 0], normals[i, 1] = gx / gradient, gy / gradient
+    by_noise[i] = np.sqrt(noise) / gradient
     deviation[i] = np.sqrt(variance) / gradient
     found[i] = True
 

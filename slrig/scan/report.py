@@ -63,7 +63,11 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "refused_pixels": {cause.name.lower(): int(counts[cause]) for cause in Refusal if cause is not Refusal.NONE},
         "lit_by_unresolved_bits": share_by_bits(curves),
         "lit_without_lines": round(lit_share(curves, curves.lost_lines), 4),
-        "noise": {"read_variance": curves.noise.read_variance, "slope": curves.noise.slope},
+        "noise": {
+            "read_variance": curves.noise.read_variance,
+            "slope": curves.noise.slope,
+            "compression_dn": curves.compression_dn,
+        },
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,
         "stripe_points_coded": len(curves.ensemble.points_px),
@@ -213,12 +217,6 @@ def capture_notes(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> li
         notes.append(
             "Gray-only: no line-shift frames, so points lie on the edges of the Gray code, located to sub-pixel"
         )
-    notes += [
-        f"camera '{name}': its frames are JPEG, whose compression is taken to err by {form.compression_dn:.1f} grey "
-        "levels where light changes: record PNG, TIFF or BMP for finer surfaces"
-        for name, form in capture.cameras.items()
-        if form.compression_dn
-    ]
     notes += [f"an exposure was left out: {cause}" for cause in evidence.left_out]
     notes += [f"the frames contradict their patterns: {fault}" for fault in evidence.faults]
     return notes

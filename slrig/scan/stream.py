@@ -145,7 +145,6 @@ class _CameraFrames:
                 form.size.shape,
                 full_scale=float(form.full_scale),
                 ends_repeats=ends_repeats(used, axis),
-                compression_dn=form.compression_dn,
             )
             tables = _tables(patterns.gray, patterns.lines, header.projector)
             self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered)

@@ -181,6 +181,17 @@ def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[n
     return edges_px if curves.unresolved.any() else None
 
 
+def compression_notes(cameras: Sequence[CameraResult]) -> list[str]:
+    """One sentence for each camera whose frames were JPEG once."""
+    return [
+        f"camera '{seen.name}': its frames were compressed as JPEG, which errs by as much as "
+        f"{seen.curves.compression_dn:.1f} grey levels of noise in every pixel would: take frames without compression "
+        "(GREY, YUYV; PNG, TIFF or BMP files) for a finer surface"
+        for seen in cameras
+        if seen.curves.compression_dn > 0
+    ]
+
+
 def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: float) -> list[str]:
     """One sentence for each camera that does not resolve the finest patterns on a part of what is lit."""
     notes = []

@@ -1,7 +1,8 @@
-"""Frames in JPEG files, as OpenCV writes them and as they come damaged, and what their compression errs by."""
+"""Frames in JPEG files, as OpenCV writes them and as they come damaged."""
 
 from __future__ import annotations
 
+import json
 import struct
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from slrig.bundle import read_bundle, write_bundle
 from slrig.bundle.description import DESCRIPTION
-from slrig.bundle.images import compression_dn, read_pages
+from slrig.bundle.images import read_pages
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Capture, Pixels, Shot, Size, White
 
@@ -40,7 +41,7 @@ def written(folder: Path, data: bytes) -> Path:
 def test_a_frame_is_what_was_written_within_its_compression(tmp_path: Path, options: tuple[int, ...]) -> None:
     path = written(tmp_path, jpeg(picture(), *options))
     off = read_pages(path, [0], CAMERA)[0].astype(float) - picture()
-    assert 0 < np.sqrt(np.mean(off**2)) < 4 * compression_dn(path)
+    assert 0 < np.sqrt(np.mean(off**2)) < 3
 
 
 def test_colour_becomes_grey(tmp_path: Path) -> None:
@@ -48,36 +49,14 @@ def test_colour_becomes_grey(tmp_path: Path) -> None:
     assert np.abs(seen.astype(float) - picture()).max() < 12
 
 
-def test_what_compression_errs_by_is_that_of_its_quantisers(tmp_path: Path) -> None:
-    """Random bytes fill every coefficient: 0.3 of the greatest error is stated, and the greatest is found."""
-    noise = np.random.default_rng(2).integers(0, 256, (800, 800), dtype=np.uint8)
-    for quality in (95, 80, 50):
-        data = jpeg(noise, cv2.IMWRITE_JPEG_QUALITY, quality)
-        decoded = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=float)
-        inside = (noise > 60) & (noise < 195)
-        found = float(np.sqrt(np.mean((decoded - noise)[inside] ** 2)))
-        assert compression_dn(written(tmp_path, data)) / 0.3 == pytest.approx(found, rel=0.2)
-
-
-def test_lossless_frames_err_by_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "frame.png"
-    cv2.imwrite(str(path), picture())
-    assert compression_dn(path) == compression_dn(tmp_path / "none.png") == 0.0
-
-
-def test_a_bundle_tells_it_of_its_cameras(tmp_path: Path) -> None:
+def test_a_bundle_may_hold_what_earlier_versions_noted_of_its_compression(tmp_path: Path) -> None:
     capture = Capture(Size(16, 8), (White(),), {"eye": CAMERA}, (Shot(0, "eye", picture(), 0.01, 0.0),))
     write_bundle(tmp_path / "b", capture)
-    assert read_bundle(tmp_path / "b").capture.cameras["eye"].compression_dn == 0.0
-    (frame,) = (tmp_path / "b").rglob("*.png")
-    jpeg_file = written(frame.parent, jpeg(picture()))
     description = tmp_path / "b" / DESCRIPTION
-    description.write_text(description.read_text().replace(frame.name, jpeg_file.name))
-    seen = read_bundle(tmp_path / "b").capture
-    assert seen.cameras["eye"].compression_dn == compression_dn(jpeg_file) > 0
-    # A bundle made of these frames, by a scan of the replayed recording for one, remembers it.
-    write_bundle(tmp_path / "again", seen)
-    assert read_bundle(tmp_path / "again").capture.cameras == seen.cameras
+    told = json.loads(description.read_text())
+    told["cameras"]["eye"]["compression_dn"] = 1.4
+    description.write_text(json.dumps(told))
+    assert read_bundle(tmp_path / "b").capture.cameras == {"eye": CAMERA}
 
 
 def without_end(data: bytes) -> bytes:

@@ -17,7 +17,7 @@ from slrig.model import Axis, FloatArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import PositionMap, has_phase, position_map
+from slrig.reconstruction.phase import PositionMap, by_scatter, has_phase, position_map
 from tests.unit.reconstruction.builders import bars, cells_of, code_frames, grid, nearest_lines
 from tests.unit.reconstruction.refining import fitted_points
 
@@ -235,7 +235,7 @@ def test_the_crossing_of_an_exact_plane_is_exact_whatever_pixels_are_missing(slo
     targets = plane(slope, angle_rad, *starts.T) + slope * np.random.default_rng(5).uniform(-0.7, 0.7, 500)
     for missing in (0.0, 0.25):
         usable = np.random.default_rng(6).random(SHAPE) >= missing
-        points, normals, sigma_px, found = fitted_points(here, usable, starts, targets)
+        points, normals, sigma_px, found, _ = fitted_points(here, usable, starts, targets)
         columns, rows = np.rint(starts).astype(int).T
         assert found.sum() > 0.95 * usable[rows, columns].sum()
         assert not found[~usable[rows, columns]].any()
@@ -270,7 +270,8 @@ def test_the_crossing_of_a_curved_surface_is_exact(slope: float, angle_rad: floa
     kept = steepness > 0.5 * abs(slope)
     starts, steepness = starts[kept], steepness[kept]
     targets = surface(*starts.T) + steepness * np.random.default_rng(5).uniform(-0.6, 0.6, len(starts))
-    points, normals, _, found = fitted_points(exact_map(surface(x, y)), np.ones(SHAPE, dtype=np.bool_), starts, targets)
+    usable = np.ones(SHAPE, dtype=np.bool_)
+    points, normals, _, found, _ = fitted_points(exact_map(surface(x, y)), usable, starts, targets)
     assert found.mean() > 0.95
     misses = (surface(*points[found].T) - targets[found]) / steepness[found]
     np.testing.assert_allclose(misses, 0, atol=1e-3)
@@ -304,7 +305,7 @@ def test_the_stated_deviation_is_that_of_the_noise(kind: str, slope: float, angl
     rows, columns = (each.ravel() for each in np.mgrid[5:235:3, 5:315:3])
     starts = np.stack([columns, rows], axis=1) + np.random.default_rng(10).uniform(-0.49, 0.49, (len(rows), 2))
     targets = plane(slope, angle_rad, *starts.T)
-    points, _, sigma_px, found = fitted_points(here, windows(kind, shape), starts, targets)
+    points, _, sigma_px, found, _ = fitted_points(here, windows(kind, shape), starts, targets)
     assert found.sum() > 1000
     errors = (plane(slope, angle_rad, *points[found].T) - targets[found]) / abs(slope)
     assert abs(errors.mean()) < 5 * errors.std() / math.sqrt(found.sum() / 10)
@@ -318,9 +319,12 @@ def test_scatter_about_the_surface_is_stated_even_if_the_noise_does_not_explain_
     starts = np.stack([x[5:-5:3, 5:-5:3].ravel(), y[5:-5:3, 5:-5:3].ravel()], axis=1)
     targets = plane(0.8, 0.3, *starts.T)
     usable = np.ones(truth.shape, dtype=np.bool_)
-    points, _, sigma_px, found = fitted_points(exact_map(noisy, 0.01), usable, starts, targets)
+    points, _, sigma_px, found, noise_px = fitted_points(exact_map(noisy, 0.01), usable, starts, targets)
     errors = (plane(0.8, 0.3, *points[found].T) - targets[found]) / 0.8
     assert np.sqrt(np.mean(errors**2) / np.mean(sigma_px[found] ** 2)) == pytest.approx(1.0, abs=0.1)
+    # What the noise alone makes of it is told beside: of a fifth of the scatter a fifth of the error.
+    assert np.sqrt(np.mean(errors**2) / np.mean(noise_px[found] ** 2)) == pytest.approx(5.0, abs=0.5)
+    assert (noise_px[found] <= sigma_px[found]).all()
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -337,7 +341,7 @@ def test_pixels_behind_a_barrier_are_another_surface(turned: bool, distance_px: 
     beside = np.asarray(np.rint(side) == 30 - distance_px)
     other = starts[:, 0] if turned else starts[:, 1]
     starts, targets = starts[beside], (300 + 0.9 * side + 0.1 * other)[beside]
-    points, _, _, found = fitted_points(there, ~barrier, starts, targets)
+    points, _, _, found, _ = fitted_points(there, ~barrier, starts, targets)
     assert found.all()
     assert len(found) > 15
     np.testing.assert_allclose(points, starts, atol=1e-3)
@@ -348,7 +352,7 @@ def test_a_slanted_barrier_of_single_pixels_is_a_barrier_too() -> None:
     behind, barrier = np.asarray(x + y > 60), np.asarray(x + y == 60)
     there = exact_map(np.where(behind, 335.0, 300.0) + 0.9 * x + 0.1 * y)
     starts = np.array([[25.0, 34.0], [30.0, 29.0], [40.0, 18.0], [24.0, 33.0]])
-    points, _, _, found = fitted_points(there, ~barrier, starts, 300 + starts @ [0.9, 0.1])
+    points, _, _, found, _ = fitted_points(there, ~barrier, starts, 300 + starts @ [0.9, 0.1])
     assert found.all()
     np.testing.assert_allclose(points, starts, atol=1e-3)
 
@@ -376,11 +380,11 @@ def test_what_is_not_measured_gives_no_point() -> None:
         begin, aim = starts.copy(), targets.copy()
         begin[0, 0] = np.nan if bad_start else begin[0, 0]
         aim[0] = np.nan if bad_target else aim[0]
-        _, _, sigma_px, found = fitted_points(here, usable, begin, aim)
+        _, _, sigma_px, found, _ = fitted_points(here, usable, begin, aim)
         assert found.tolist() == [False, True], (bad_start, bad_target, bad_position, bad_sigma)
         assert np.isfinite(sigma_px[1])
     nothing = fitted_points(exact_map(truth), usable, np.zeros((0, 2)), np.zeros(0))
-    assert [len(each) for each in nothing] == [0, 0, 0, 0]
+    assert [len(each) for each in nothing] == [0, 0, 0, 0, 0]
 
 
 def test_flat_ground_far_lines_and_the_images_border_give_no_point() -> None:
@@ -394,3 +398,16 @@ def test_flat_ground_far_lines_and_the_images_border_give_no_point() -> None:
     corners = np.array([[0.0, 30.0], [30.0, 0.0], [SHAPE[1] - 1.0, 30.0], [30.0, SHAPE[0] - 1.0], [-7.0, 900.0]])
     found = fitted_points(steep, usable, corners, plane(1.0, 0.0, *corners.T))[3]
     assert not found.any()
+
+
+@pytest.mark.parametrize(("stated", "compressed", "told"), [(3.0, 0.0, 1.0), (0.5, 0.0, 0.5), (3.0, 0.5, 2.35)])
+def test_scatter_lowers_an_overstated_deviation_and_raises_none(stated: float, compressed: float, told: float) -> None:
+    """Told is √(scatter + what compression adds), in units of the scatter, and no more than what was stated."""
+    y, x = np.mgrid[:60, :80]
+    scattered = 0.02 * np.random.default_rng(4).standard_normal(x.shape)
+    position = (0.5 * x + 0.01 * y + 0.001 * x * y + scattered).astype(np.float32)
+    seen = PositionMap(position, np.full(x.shape, 0.02 * stated, dtype=np.float32))
+    found = by_scatter(seen, np.ones(x.shape, dtype=np.bool_), compressed)
+    assert found.sigma == pytest.approx(np.full(x.shape, 0.02 * told), rel=0.05)
+    unseen = by_scatter(seen, np.zeros(x.shape, dtype=np.bool_), compressed)
+    assert (unseen.sigma == seen.sigma).all()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import read_bundle, write_bundle
+from slrig.bundle.notes import write_notes
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -148,7 +149,9 @@ def test_lines_that_were_never_shown_are_made_up_for_by_code_edges_and_told(reco
         return replace(shot, image=dark[shot.camera]) if is_line else shot
 
     bundle = changed(recorded, tmp_path / "no-lines", no_lines)
+    write_notes(bundle, ["what its capture told"])
     report = run(bundle, tmp_path / "out")
+    assert report["notes"][0] == "what its capture told"  # type: ignore[index]
     assert any("does not resolve the shifted lines on 100%" in note for note in report["notes"])  # type: ignore[attr-defined]
     assert all(camera["lit_without_lines"] > 0.99 for camera in report["cameras"].values())  # type: ignore[attr-defined]
 
