@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from slrig.model import FloatArray
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.phase import PositionMap
+from tests.unit.reconstruction.builders import grid
 
 FINE = 20
 PIXELS = 60
@@ -17,7 +18,9 @@ BLUR_PX = 0.55
 PERIOD_PX = 8.0
 
 
-def seen_through_blur(albedo: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+def seen_through_blur(
+    albedo: FloatArray, position: FloatArray, blur_px: float = BLUR_PX
+) -> tuple[FloatArray, FloatArray]:
     """Phase position and brightness at each pixel of a row, from albedo and position on the fine grid.
 
     The light of eight shifts, each a raised cosine over the projector, is blurred as a whole: no formula of the code
@@ -25,8 +28,8 @@ def seen_through_blur(albedo: FloatArray, position: FloatArray) -> tuple[FloatAr
     """
     shifts = np.arange(8)
     light = 1 + np.cos(2 * np.pi / PERIOD_PX * (position[:, None] - shifts))
-    lines = gaussian_filter1d(albedo[:, None] * light, BLUR_PX * FINE, axis=0, mode="nearest")[FINE // 2 :: FINE]
-    white = gaussian_filter1d(albedo, BLUR_PX * FINE, mode="nearest")[FINE // 2 :: FINE]
+    lines = gaussian_filter1d(albedo[:, None] * light, blur_px * FINE, axis=0, mode="nearest")[FINE // 2 :: FINE]
+    white = gaussian_filter1d(albedo, blur_px * FINE, mode="nearest")[FINE // 2 :: FINE]
     phase = np.angle((lines * np.exp(2j * np.pi / PERIOD_PX * shifts)).sum(axis=1)) * PERIOD_PX / (2 * np.pi)
     true = position[FINE // 2 :: FINE]
     return phase + PERIOD_PX * np.rint((true - phase) / PERIOD_PX), white
@@ -113,7 +116,9 @@ def test_a_step_of_the_surface_does_not_enter_the_slope() -> None:
     centred = at_pixel_centres(PositionMap(position, np.zeros_like(position)), contrast, 0 * contrast, BLUR_PX).position
     moved = (position - centred)[2]
     clear = np.r_[3:20, 23:37]
-    np.testing.assert_allclose(moved[clear], BLUR_PX**2 * 1.2 * 0.1, rtol=1e-3)
+    # Pixels at the step do not move, which bends the slope of those beside them by what they should have moved.
+    np.testing.assert_allclose(moved[clear], BLUR_PX**2 * 1.2 * 0.1, rtol=0.02)
+    np.testing.assert_array_equal(moved[20:22], 0)
 
 
 def test_noise_of_white_and_black_hardly_enters() -> None:
@@ -133,3 +138,38 @@ def test_noise_of_white_and_black_hardly_enters() -> None:
     inner = slice(5, -5)
     moved = (position - found.position)[:, inner]
     assert np.sqrt(np.mean((moved - wanted[inner]) ** 2)) < 0.3 * np.sqrt(np.mean(wanted[inner] ** 2))
+
+
+@pytest.mark.parametrize("blur_px", [0.4, 0.65, 0.9])
+def test_edges_of_a_print_tell_how_wide_the_blur_is(blur_px: float) -> None:
+    x = np.arange(PIXELS * FINE) / FINE - 0.5
+    position = 40 + 1.1 * x
+    measured, white = seen_through_blur(np.where(np.floor(x / 7.3) % 2 == 0, 1.0, 5.0), position, blur_px)
+    seen = PositionMap(np.tile(measured, (25, 1)).astype(np.float32), np.full((25, PIXELS), 0.02, dtype=np.float32))
+    contrast, quiet = np.tile(20 * white, (25, 1)).astype(np.float32), np.full((25, PIXELS), 0.1, dtype=np.float32)
+    clear = np.ones(contrast.shape, dtype=np.bool_)
+    expected_px = 0.65
+    told, untold = (
+        at_pixel_centres(seen, contrast, quiet, expected_px, **known).position[12, 5:-5]
+        for known in ({"clear": clear}, {})
+    )
+    # As much blur as displaces positions so far.
+    far = np.abs(seen.position[12, 5:-5] - untold)
+    ratio = np.abs(seen.position[12, 5:-5] - told)[far > 0.05] / far[far > 0.05]
+    assert expected_px * np.sqrt(np.median(ratio)) == pytest.approx(blur_px, rel=0.15)
+    # Where nothing is clear of shadows, what is expected stands.
+    unclear = at_pixel_centres(seen, contrast, quiet, expected_px, clear=~clear).position[12, 5:-5]
+    np.testing.assert_array_equal(unclear, untold)
+
+
+def test_shading_that_follows_the_surface_tells_no_blur() -> None:
+    x, y = grid((40, 90))
+    flutes = 3 * np.sin(x / 4)
+    # Light from the side: brighter where the surface turns to it.
+    contrast = (100 * np.exp(0.3 * np.cos(x / 4))).astype(np.float32)
+    random = np.random.default_rng(2)
+    position = (40 + 1.1 * x + 0.1 * y + 0.1 * flutes + random.normal(0, 0.01, x.shape)).astype(np.float32)
+    seen, quiet = PositionMap(position, np.full_like(position, 0.01)), np.full_like(position, 0.1)
+    known = at_pixel_centres(seen, contrast, quiet, BLUR_PX).position
+    told = at_pixel_centres(seen, contrast, quiet, BLUR_PX, clear=np.ones(x.shape, dtype=np.bool_)).position
+    np.testing.assert_array_equal(told, known)
