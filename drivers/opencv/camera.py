@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from drivers.opencv.controls import Controls, code_of, negotiate, size_of
 from drivers.opencv.feeds import DeviceFeed, FilmFeed, LiveFeed, Taken, opened
+from drivers.opencv.kernel import plain_pictures
 from drivers.opencv.options import Kind, Source
 from drivers.opencv.pixels import Picture, decoded_picture, raw_picture
 from drivers.opencv.reader import Reader
@@ -65,6 +66,7 @@ class OpenCvCamera:
         self._lost_before = 0
         self._corrupt = 0
         self._exposure_s = source.options.source_exposure_s or 0.0
+        self._notes: tuple[str, ...] = ()
         opening = {Kind.DEVICE: self._open_device, Kind.LIVE: self._open_live, Kind.FILM: self._open_film}
         self._feed, self._picture, self._controls = opening[source.kind]()
         self._reader = Reader(self._feed, f"slrig-opencv-{name}")
@@ -81,6 +83,7 @@ class OpenCvCamera:
             triggers=frozenset({Trigger.FREE}),
             exposure_range_s=exposures_s,
             gain_range=gains,
+            notes=self._notes,
         )
         if source.kind is Kind.LIVE:
             self._reader.start()
@@ -97,7 +100,15 @@ class OpenCvCamera:
         if self._controls is not None:
             self._require_idle()
             self._applied = self._controls.apply(settings)
-        return self._applied
+        return replace(self._applied, least_period_s=self._least_period_s())
+
+    def _least_period_s(self) -> float | None:
+        """Of a camera as OpenCV says, of a live source as the person does. A film is made already."""
+        if isinstance(self._feed, DeviceFeed):
+            rate_hz = self._feed.capture.get(cv2.CAP_PROP_FPS)
+            return max(1 / rate_hz, self._applied.exposure_s) if rate_hz > 0 else None
+        rate_hz = self._source.options.frame_rate_hz or 0.0
+        return 1 / rate_hz if isinstance(self._feed, LiveFeed) and rate_hz > 0 else None
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`. More than `count` frames can be had. Returns when a camera's settings have taken effect.
@@ -257,7 +268,9 @@ class OpenCvCamera:
             arrivals = None if source.options.delay_s is None else self._arrivals()
             feed = DeviceFeed(capture, source.label, period_ns, arrivals)
             self._exposure_s = self._exposure_s or period_ns / 1e9
-            controls = Controls(capture, source.options, source.label, fixed_s=self._exposure_s)
+            skipped, self._notes = plain_pictures(source.label, source.options.skip_controls)
+            fixed_s = self._exposure_s
+            controls = Controls(capture, source.options, source.label, fixed_s=fixed_s, skipped=skipped)
             picture = raw_picture(code, size_of(capture), source.options.bit_depth)
         except BaseException:
             capture.release()

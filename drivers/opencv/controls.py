@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 
 from drivers.opencv.options import OpenCvOptions
+from drivers.v4l2 import controls as v4l2
 from slrig.devices import AppliedSettings, CameraSettings
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
@@ -22,6 +23,16 @@ _ABSENT = -1.0
 _MANUAL = 1
 _LEAST_UNITS, _MOST_UNITS = 1, 600_000
 _TOLERANCE = 0.01
+
+_KERNELS = {
+    cv2.CAP_PROP_AUTO_EXPOSURE: v4l2.EXPOSURE_AUTO,
+    cv2.CAP_PROP_EXPOSURE: v4l2.EXPOSURE_ABSOLUTE,
+    cv2.CAP_PROP_GAIN: v4l2.GAIN,
+    cv2.CAP_PROP_AUTOFOCUS: v4l2.FOCUS_AUTO,
+    cv2.CAP_PROP_FOCUS: v4l2.FOCUS_ABSOLUTE,
+    cv2.CAP_PROP_AUTO_WB: v4l2.AUTO_WHITE_BALANCE,
+}
+"""The kernel's control behind each of OpenCV's numbers."""
 
 
 def code_of(capture: cv2.VideoCapture) -> str:
@@ -91,7 +102,8 @@ class Controls:
     """The controls of an open camera. Made once it streams with its format; switches every automatic off.
 
     `exposure_s` of a device that cannot be set is `fixed_s`. Gain 1 is the least that the device can do, and each of
-    its numbers above that counts as 1 more: V4L2 does not say what they mean.
+    its numbers above that counts as 1 more: V4L2 does not say what they mean. `skipped` are the kernel's controls that
+    are left alone: to this they are not there.
 
     Raises
     ------
@@ -99,8 +111,17 @@ class Controls:
         An automatic cannot be switched off, or there is no focus control where one is asked for.
     """
 
-    def __init__(self, capture: cv2.VideoCapture, options: OpenCvOptions, label: str, *, fixed_s: float) -> None:
+    def __init__(
+        self,
+        capture: cv2.VideoCapture,
+        options: OpenCvOptions,
+        label: str,
+        *,
+        fixed_s: float,
+        skipped: frozenset[int] = frozenset(),
+    ) -> None:
         self._capture = capture
+        self._skipped = skipped
         self._label = label
         self._fixed_s = fixed_s
         self._off(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL, "automatic exposure")
@@ -144,9 +165,9 @@ class Controls:
 
     def _range(self, number: int, least: float, most: float) -> Range | None:
         """Find the ends of a control's range, which OpenCV does not tell: the kernel clamps. Leaves it as it was."""
-        before = self._capture.get(number)
-        if before == _ABSENT:
+        if not self._has(number):
             return None
+        before = self._capture.get(number)
         ends = []
         for far in (least, most):
             self._capture.set(number, far)
@@ -154,8 +175,11 @@ class Controls:
         self._capture.set(number, before)
         return Range(min(ends), max(ends))
 
+    def _has(self, number: int) -> bool:
+        return _KERNELS[number] not in self._skipped and self._capture.get(number) != _ABSENT
+
     def _off(self, number: int, manual: int, what: str) -> None:
-        if self._capture.get(number) == _ABSENT:
+        if not self._has(number):
             return
         self._capture.set(number, manual)
         got = self._capture.get(number)

@@ -1,12 +1,16 @@
-"""What the kernel says of a camera and OpenCV keeps to itself: whether it is there, and whether it is free."""
+"""What the kernel says of a camera and OpenCV keeps to itself: whether it is there and free, and all its controls."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from ctypes import Structure
 from pathlib import Path
 
 from drivers.v4l2 import kernel
+from drivers.v4l2.controls import controls_of, without
+from drivers.v4l2.finding import identity_of
+from drivers.v4l2.processing import switch_off_processing
 from slrig.errors import DeviceGoneError, SlrigError
 
 
@@ -28,6 +32,32 @@ def require_present(path: str, otherwise: DeviceGoneError) -> None:
         _asked(path, "asking what it is", kernel.QUERYCAP, kernel.Capability())
     except SlrigError as error:
         raise otherwise from error
+
+
+def plain_pictures(path: str, skipped: Sequence[str]) -> tuple[frozenset[int], tuple[str, ...]]:
+    """Switch a camera's own image processing off, which OpenCV has no names for.
+
+    Return the numbers of the controls that are left alone, by the names that `skipped` has, and notes for a person.
+
+    Raises
+    ------
+    DeviceGoneError, DeviceError
+        It is not there, or fails.
+    UnsupportedByDeviceError
+        It has no control of such a name.
+    """
+    node = Path(path)
+    try:
+        handle = kernel.open_node(node)
+        try:
+            everything = controls_of(handle)
+            mine = without(everything, skipped, node)
+            notes = switch_off_processing(handle, node, mine, named=(), is_uvc=identity_of(handle).is_uvc)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise kernel.fault(node, "setting its controls", error) from error
+    return frozenset(everything.keys() - mine.keys()), notes
 
 
 def _asked(path: str, doing: str, request: int, argument: Structure) -> None:

@@ -70,6 +70,9 @@ class OpenCvOptions(Strict, use_attribute_docstrings=True):
     focus: float | None = None
     """Value of a camera's focus control; autofocus is off in any case."""
 
+    skip_controls: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Of a camera, controls to be left as they are, by the names that `v4l2-ctl --list-ctrls` gives them."""
+
     @field_validator("backend")
     @classmethod
     def _known(cls, name: str) -> str:

@@ -14,6 +14,8 @@ from drivers.v4l2.finding import Identity, Node, identity_of, resolved
 from drivers.v4l2.formats import CorruptFrameError, Layout, grey_image, prepare
 from drivers.v4l2.negotiation import agree
 from drivers.v4l2.options import V4L2Options
+from drivers.v4l2.processing import switch_off_processing
+from drivers.v4l2.scales import GainScale, exposure_scale
 from drivers.v4l2.stream import Stream, Taken, Waker
 from drivers.v4l2.tally import Tally
 from drivers.v4l2.timing import Durations, Exposure, exposure_of
@@ -47,8 +49,8 @@ class V4L2Camera:
 
     The device is held by its buffers from opening to `close`; it streams from `arm` to `disarm`.
 
-    Exposure is a multiple of 100 µs, rounded to the device's step. A device without exposure control is taken to
-    expose for a whole frame period. Gain: see `controls.GainScale`.
+    Exposure is a multiple of the device's unit (`scales`), rounded to its step. A device without exposure control is
+    taken to expose for a whole frame period. Gain: see `scales.GainScale`.
 
     Raises
     ------
@@ -78,16 +80,23 @@ class V4L2Camera:
             prepare(self._agreed.layout)
             self._stream = Stream(self._handle, node.path, options.buffers, self._waker)
             self._held.callback(self._stream.release)
-            self._controls = self._known_controls()
-            self._exposure = self._controls.get(ctl.EXPOSURE_ABSOLUTE)
-            self._scale = ctl.GainScale(ctl.gain_control(self._controls), options.gain_unity)
             self._period_ns = self._agreed.period_ns
+            try:
+                self._controls = ctl.without(ctl.controls_of(self._handle), options.skip_controls, node.path)
+                width_px = self._agreed.size.width_px
+                self._exposure = exposure_scale(self._controls, self._handle, node.path, width_px=width_px)
+            except OSError as error:
+                raise kernel.fault(node.path, "listing its controls", error) from error
+            self._scale = GainScale(ctl.gain_control(self._controls), options.gain_unity)
+            processed = switch_off_processing(
+                self._handle, node.path, self._controls, named=options.controls, is_uvc=identity.is_uvc
+            )
             self._set(None, None)
             self._applied = self._read_back()
         except BaseException:
             self._held.close()
             raise
-        self._info = self._described(identity, node)
+        self._info = self._described(identity, node, (*self._agreed.notes, *processed))
 
     @property
     def info(self) -> CameraInfo:
@@ -110,7 +119,7 @@ class V4L2Camera:
             self._state.check_settings(settings, self._info)
             units = None
             if self._exposure is not None:
-                units = max(self._exposure.nearest(settings.exposure_s / ctl.EXPOSURE_UNIT_S), 1)
+                units = self._exposure.units(settings.exposure_s)
             self._set(units, self._scale.units(settings.gain))
             self._applied = self._read_back()
             return self._applied
@@ -263,7 +272,7 @@ class V4L2Camera:
     def _require_unchanged(self) -> None:
         """Refuse settings that the device did not keep, or cannot have meant."""
         now = self._read_back()
-        if now != self._applied:
+        if (now.exposure_s, now.gain) != (self._applied.exposure_s, self._applied.gain):
             message = (
                 f"camera '{self._name}': set to exposure {self._applied.exposure_s:.6g} s and gain "
                 f"{self._applied.gain:.6g}, and once the stream ran, it used {now.exposure_s:.6g} s and {now.gain:.6g}:"
@@ -288,11 +297,11 @@ class V4L2Camera:
     def _read_back(self) -> AppliedSettings:
         exposure_s = self._agreed.period_ns / 1e9
         if self._exposure is not None:
-            exposure_s = ctl.value_of(self._handle, self._node, self._exposure) * ctl.EXPOSURE_UNIT_S
+            exposure_s = ctl.value_of(self._handle, self._node, self._exposure.control) * self._exposure.unit_s
         gain = 1.0
         if self._scale.control is not None:
             gain = self._scale.gain(ctl.value_of(self._handle, self._node, self._scale.control))
-        return AppliedSettings(exposure_s, gain)
+        return AppliedSettings(exposure_s, gain, max(self._period_ns / 1e9, exposure_s))
 
     def _identity(self) -> Identity:
         try:
@@ -311,15 +320,9 @@ class V4L2Camera:
             raise UnsupportedByDeviceError(message)
         return identity
 
-    def _known_controls(self) -> dict[int, ctl.Control]:
-        try:
-            return ctl.controls_of(self._handle)
-        except OSError as error:
-            raise kernel.fault(self._node, "listing its controls", error) from error
-
-    def _described(self, identity: Identity, node: Node) -> CameraInfo:
+    def _described(self, identity: Identity, node: Node, notes: tuple[str, ...]) -> CameraInfo:
         period_s = self._agreed.period_ns / 1e9
-        exposures = (period_s, period_s) if self._exposure is None else ctl.exposure_range_s(self._exposure)
+        exposures = (period_s, period_s) if self._exposure is None else self._exposure.range_s
         return CameraInfo(
             name=self._name,
             model=identity.card,
@@ -328,6 +331,7 @@ class V4L2Camera:
             triggers=frozenset({Trigger.FREE}),
             exposure_range_s=exposures,
             gain_range=self._scale.range,
+            notes=notes,
         )
 
 

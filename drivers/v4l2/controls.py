@@ -1,14 +1,19 @@
 """Controls: what a device lets be set, in which order, and what it reads back.
 
-Order matters: a device refuses or forgets an exposure while its automatic is on. Exposure is in units of 100 µs
-(`V4L2_CID_EXPOSURE_ABSOLUTE`). Gain has no unit in V4L2: see `GainScale`.
+Order matters: a device refuses or forgets an exposure while its automatic is on.
+
+A device that answers one control with a fault is still there. uvcvideo (`uvc_query_ctrl`) hands on what went wrong on
+the bus (ETIMEDOUT, EPROTO) or, where the camera stalled the request, what the camera gives as its cause: EBUSY,
+EACCES, EREMOTEIO, ERANGE, EINVAL, EIO for a unit, control or request that its firmware does not serve, EPIPE without a
+cause. Only ENODEV and its like say that it was unplugged.
 """
 
 from __future__ import annotations
 
 import errno
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,39 +21,50 @@ from drivers.v4l2 import kernel
 from drivers.v4l2.options import V4L2Options
 from slrig.errors import UnsupportedByDeviceError
 
-_USER, _CAMERA, _SOURCE = 0x0098_0900, 0x009A_0900, 0x009E_0900
+_USER, _CAMERA, _SOURCE, _PROCESSING = 0x0098_0900, 0x009A_0900, 0x009E_0900, 0x009F_0900
 
+CONTRAST = _USER + 1
 AUTO_WHITE_BALANCE = _USER + 12
+GAMMA = _USER + 16
+EXPOSURE_LINES = _USER + 17
 AUTOGAIN = _USER + 18
 GAIN = _USER + 19
 POWER_LINE_FREQUENCY = _USER + 24
+SHARPNESS = _USER + 27
+BACKLIGHT_COMPENSATION = _USER + 28
 EXPOSURE_AUTO = _CAMERA + 1
 EXPOSURE_ABSOLUTE = _CAMERA + 2
 EXPOSURE_AUTO_PRIORITY = _CAMERA + 3
 FOCUS_ABSOLUTE = _CAMERA + 10
 FOCUS_AUTO = _CAMERA + 12
+WIDE_DYNAMIC_RANGE = _CAMERA + 21
+HDR_SENSOR_MODE = _CAMERA + 36
+HBLANK = _SOURCE + 2
 ANALOGUE_GAIN = _SOURCE + 3
+PIXEL_RATE = _PROCESSING + 2
 
-EXPOSURE_UNIT_S = 1e-4
+_CLASS_LENGTH = 64
+"""More than a class of standard controls has."""
 _MANUAL = 1
 _OFF = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """A control as the device declares it; `name` as `v4l2-ctl --list-ctrls` writes it."""
+    """A control as the device declares it; `name` as `v4l2-ctl --list-ctrls` writes it. default : as it was made."""
 
     number: int
     name: str
     minimum: int
     maximum: int
     step: int
-    flags: int
+    default: int
+    is_menu: bool = False
 
     def nearest(self, value: float) -> int:
         """The value on the device's grid that is nearest, within its range.
 
-        >>> Control(0, "exposure_time_absolute", 3, 2047, 4, 0).nearest(9.2)
+        >>> Control(0, "exposure_time_absolute", 3, 2047, 4, 3).nearest(9.2)
         11
         """
         step = max(self.step, 1)
@@ -65,30 +81,74 @@ Controls = Mapping[int, Control]
 
 
 def controls_of(handle: int) -> dict[int, Control]:
-    """Every control that the device has and lets be written."""
+    """Every control that the device has and lets be written. Raises OSError: the device is gone."""
     found: dict[int, Control] = {}
-    asked = kernel.ControlDescription(id=kernel.CONTROL_NEXT)
+    number = 0
     while True:
         try:
-            kernel.ask(handle, kernel.QUERYCTRL, asked)
+            asked = _described(handle, number | kernel.CONTROL_NEXT)
         except OSError as error:
             if error.errno in kernel.REFUSED:
                 return found
-            raise
+            if error.errno in kernel.GONE:
+                raise
+            break
         number = int(asked.id)
-        if not asked.flags & (kernel.CONTROL_DISABLED | kernel.CONTROL_READ_ONLY | kernel.CONTROL_WRITE_ONLY):
-            name = re.sub(r"[^a-z0-9]+", "_", asked.name.decode("utf-8", "replace").lower()).strip("_")
-            found[number] = Control(number, name, asked.minimum, asked.maximum, asked.step, asked.flags)
-        asked = kernel.ControlDescription(id=number | kernel.CONTROL_NEXT)
+        _note(asked, found)
+    # The next control cannot even be described, and keeps those behind it from being listed: ask for them one by one.
+    for first in (_USER, _CAMERA, _SOURCE, _PROCESSING):
+        for each in range(max(first, number + 1), first + _CLASS_LENGTH):
+            try:
+                _note(_described(handle, each), found)
+            except OSError as error:
+                if error.errno in kernel.GONE:
+                    raise
+    return found
+
+
+def _described(handle: int, number: int) -> kernel.ControlDescription:
+    asked = kernel.ControlDescription(id=number)
+    kernel.ask(handle, kernel.QUERYCTRL, asked)
+    return asked
+
+
+def _note(asked: kernel.ControlDescription, found: dict[int, Control]) -> None:
+    if asked.flags & (kernel.CONTROL_DISABLED | kernel.CONTROL_READ_ONLY | kernel.CONTROL_WRITE_ONLY):
+        return
+    name = re.sub(r"[^a-z0-9]+", "_", asked.name.decode("utf-8", "replace").lower()).strip("_")
+    is_menu = asked.type in kernel.CONTROL_MENUS
+    found[int(asked.id)] = Control(
+        int(asked.id), name, asked.minimum, asked.maximum, asked.step, asked.default_value, is_menu
+    )
+
+
+def without(controls: Controls, skipped: Sequence[str], node: Path) -> Controls:
+    """Return the controls but for those to be left alone. Raises UnsupportedByDeviceError for a name it has not."""
+    names = {control.name for control in controls.values()}
+    for name in skipped:
+        if name not in names:
+            raise _lacks(name, controls, node)
+    return {number: control for number, control in controls.items() if control.name not in skipped}
 
 
 def value_of(handle: int, node: Path, control: Control) -> int:
-    """What a control is set to. Raises DeviceError."""
+    """What a control is set to.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        The device does not tell.
+    DeviceGoneError
+        It is gone.
+    """
     answer = kernel.ControlValue(id=control.number)
     try:
         kernel.ask(handle, kernel.G_CTRL, answer)
     except OSError as error:
-        raise kernel.fault(node, f"reading control {control.name}", error) from error
+        if error.errno in kernel.GONE:
+            raise kernel.fault(node, f"reading control {control.name}", error) from error
+        message = f"{node}: asked for the value of {control.name}, the driver {_refuses(error, control)}"
+        raise UnsupportedByDeviceError(message) from error
     return int(answer.value)
 
 
@@ -99,21 +159,20 @@ def put(handle: int, node: Path, control: Control, value: int) -> None:
     ------
     UnsupportedByDeviceError
         The device refuses the value, or takes another one in silence.
-    DeviceError
-        The device failed.
+    DeviceGoneError
+        It is gone.
     """
     try:
         kernel.ask(handle, kernel.S_CTRL, kernel.ControlValue(id=control.number, value=value))
     except OSError as error:
-        refused = (*kernel.REFUSED, errno.EACCES, errno.EBUSY)
-        if error.errno in refused:
-            message = (
-                f"{node}: asked {control.name} = {value}, the driver refuses it ({error.strerror}); it declares "
-                f"{control.minimum} to {control.maximum} in steps of {control.step}: look at v4l2-ctl -d {node} "
-                "--list-ctrls-menus for what holds it"
-            )
-            raise UnsupportedByDeviceError(message) from error
-        raise kernel.fault(node, f"setting control {control.name} to {value}", error) from error
+        if error.errno in kernel.GONE:
+            raise kernel.fault(node, f"setting control {control.name} to {value}", error) from error
+        message = (
+            f"{node}: asked {control.name} = {value}, the driver {_refuses(error, control)}. It declares "
+            f"{control.minimum} to {control.maximum} in steps of {control.step}: look at v4l2-ctl -d {node} "
+            "--list-ctrls-menus for what holds it"
+        )
+        raise UnsupportedByDeviceError(message) from error
     got = value_of(handle, node, control)
     if got != value:
         message = (
@@ -123,40 +182,15 @@ def put(handle: int, node: Path, control: Control, value: int) -> None:
         raise UnsupportedByDeviceError(message)
 
 
-@dataclass(frozen=True, slots=True)
-class GainScale:
-    """Gain as a factor, from the device's own numbers.
-
-    V4L2 does not say what a gain control's numbers mean. Without `unity` (option `gain_unity`), gain 1 is the least
-    that the device can do, and each number above it counts as 1 more: an order, not a ratio. With it, gain is the
-    control's value over the value at which the sensor's gain is 1.
-    """
-
-    control: Control | None
-    unity: int | None
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """Least and most gain; (1, 1) for a device without gain control."""
-        if self.control is None:
-            return (1.0, 1.0)
-        least = self.gain(self.control.minimum)
-        if least <= 0:
-            least = self.gain(self.control.minimum + max(self.control.step, 1))
-        return (least, self.gain(self.control.maximum))
-
-    def gain(self, units: int) -> float:
-        """The factor that a number of the device means."""
-        if self.control is None:
-            return 1.0
-        return units / self.unity if self.unity is not None else 1.0 + (units - self.control.minimum)
-
-    def units(self, gain: float) -> int | None:
-        """The number nearest to a factor; None for a device without gain control."""
-        if self.control is None:
-            return None
-        wanted = gain * self.unity if self.unity is not None else self.control.minimum + gain - 1
-        return self.control.nearest(wanted)
+def _refuses(error: OSError, control: Control) -> str:
+    number = error.errno or 0
+    words = f"refuses it ({os.strerror(number)})"
+    if number in (*kernel.REFUSED, errno.EACCES, errno.EBUSY):
+        return words
+    return (
+        f"{words}: the camera answers this control with a fault and is still there; skip_controls = "
+        f'["{control.name}"] in its table leaves it alone'
+    )
 
 
 def gain_control(controls: Controls) -> Control | None:
@@ -164,10 +198,9 @@ def gain_control(controls: Controls) -> Control | None:
     return controls.get(GAIN) or controls.get(ANALOGUE_GAIN)
 
 
-def exposure_range_s(control: Control) -> tuple[float, float]:
-    """Least and most exposure that a device declares."""
-    least = control.minimum if control.minimum > 0 else control.minimum + max(control.step, 1)
-    return (max(least, 1) * EXPOSURE_UNIT_S, control.maximum * EXPOSURE_UNIT_S)
+def exposure_control(controls: Controls) -> Control | None:
+    """The control that sets the exposure, if the device has one."""
+    return controls.get(EXPOSURE_ABSOLUTE) or controls.get(EXPOSURE_LINES)
 
 
 def in_order(
@@ -183,25 +216,23 @@ def in_order(
     UnsupportedByDeviceError
         An option names a control that the device does not have or a value that it cannot take.
     """
+    if options.focus is not None and FOCUS_ABSOLUTE not in controls:
+        raise _lacks("focus", controls, node)
     steps: list[tuple[Control, int]] = []
-    for number, value in (
-        (EXPOSURE_AUTO, _MANUAL),
-        (EXPOSURE_AUTO_PRIORITY, _OFF),
-        (EXPOSURE_ABSOLUTE, exposure_units),
-        (AUTOGAIN, _OFF),
-        (None, gain_units),
-        (FOCUS_AUTO, _OFF),
-        (FOCUS_ABSOLUTE, options.focus),
-        (AUTO_WHITE_BALANCE, _OFF),
-        (POWER_LINE_FREQUENCY, _OFF),
+    for control, value in (
+        (controls.get(EXPOSURE_AUTO), _MANUAL),
+        (exposure_control(controls), exposure_units),
+        (controls.get(AUTOGAIN), _OFF),
+        (gain_control(controls), gain_units),
+        (controls.get(FOCUS_AUTO), _OFF),
+        (controls.get(FOCUS_ABSOLUTE), options.focus),
+        (controls.get(AUTO_WHITE_BALANCE), _OFF),
+        (controls.get(POWER_LINE_FREQUENCY), _OFF),
     ):
-        control = gain_control(controls) if number is None else controls.get(number)
-        if control is None and number == FOCUS_ABSOLUTE and value is not None:
-            raise _lacks("focus", controls, node)
         if control is None or value is None:
             continue
         # Some devices have mains filters that cannot be switched off; with manual exposure they do nothing.
-        if number == POWER_LINE_FREQUENCY and not control.takes(value):
+        if control.number == POWER_LINE_FREQUENCY and not control.takes(value):
             continue
         steps.append((control, value))
     named = {control.name: control for control in controls.values()}

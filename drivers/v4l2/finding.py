@@ -26,12 +26,15 @@ DEV = Path("/dev")
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a node says of itself. `captures`: it gives frames in one plane, and streams them."""
+    """What a node says of itself. `captures`: it gives frames in one plane, and streams them. `is_uvc`: the kernel's
+    driver is that of USB Video Class cameras.
+    """
 
     card: str
     bus: str
     captures: bool
     several_planes: bool = False
+    is_uvc: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,7 @@ def identity_of(handle: int) -> Identity:
         bus=answer.bus_info.decode("utf-8", "replace"),
         captures=bool(can & kernel.CAP_VIDEO_CAPTURE and can & kernel.CAP_STREAMING),
         several_planes=bool(can & kernel.CAP_VIDEO_CAPTURE_MPLANE),
+        is_uvc=answer.driver == b"uvcvideo",
     )
 
 

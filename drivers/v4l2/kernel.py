@@ -38,6 +38,8 @@ CONTROL_DISABLED = 0x1
 CONTROL_READ_ONLY = 0x4
 CONTROL_WRITE_ONLY = 0x40
 CONTROL_NEXT = 0x8000_0000
+CONTROL_MENUS = (3, 9)
+"""Kinds of controls whose numbers stand for words."""
 
 
 class Capability(ctypes.Structure):
@@ -129,6 +131,28 @@ class Fraction(ctypes.Structure):
     """`v4l2_fract`."""
 
     _fields_ = (("numerator", ctypes.c_uint32), ("denominator", ctypes.c_uint32))
+
+
+class _IntervalSteps(ctypes.Structure):
+    _fields_ = (("min", Fraction), ("max", Fraction), ("step", Fraction))
+
+
+class _IntervalUnion(ctypes.Union):
+    _fields_ = (("discrete", Fraction), ("stepwise", _IntervalSteps))
+
+
+class FrameInterval(ctypes.Structure):
+    """`v4l2_frmivalenum`: one time per frame, or a range of them, of a pixel format and size."""
+
+    _fields_ = (
+        ("index", ctypes.c_uint32),
+        ("pixel_format", ctypes.c_uint32),
+        ("width", ctypes.c_uint32),
+        ("height", ctypes.c_uint32),
+        ("type", ctypes.c_uint32),
+        ("interval", _IntervalUnion),
+        ("reserved", ctypes.c_uint32 * 2),
+    )
 
 
 class CaptureParameters(ctypes.Structure):
@@ -224,6 +248,30 @@ class ControlValue(ctypes.Structure):
     _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
 
 
+class LongControlValue(ctypes.Structure):
+    """`v4l2_ext_control` of a 64-bit control. The kernel packs it: its value, lower half first, is not aligned."""
+
+    _fields_ = (
+        ("id", ctypes.c_uint32),
+        ("size", ctypes.c_uint32),
+        ("reserved2", ctypes.c_uint32),
+        ("halves", ctypes.c_uint32 * 2),
+    )
+
+
+class LongControlValues(ctypes.Structure):
+    """`v4l2_ext_controls`: a list of values to be read."""
+
+    _fields_ = (
+        ("which", ctypes.c_uint32),
+        ("count", ctypes.c_uint32),
+        ("error_idx", ctypes.c_uint32),
+        ("request_fd", ctypes.c_int32),
+        ("reserved", ctypes.c_uint32),
+        ("controls", ctypes.POINTER(LongControlValue)),
+    )
+
+
 def _request(direction: int, number: int, kind: type[ctypes.Structure] | type[ctypes.c_int]) -> int:
     # asm-generic/ioctl.h: two bits of direction, fourteen of size, eight of type ('V'), eight of number.
     return direction << 30 | ctypes.sizeof(kind) << 16 | ord("V") << 8 | number
@@ -246,10 +294,12 @@ S_PARM = _request(_BOTH, 22, StreamParameters)
 G_CTRL = _request(_BOTH, 27, ControlValue)
 S_CTRL = _request(_BOTH, 28, ControlValue)
 QUERYCTRL = _request(_BOTH, 36, ControlDescription)
+G_EXT_CTRLS = _request(_BOTH, 71, LongControlValues)
 ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
+ENUM_FRAMEINTERVALS = _request(_BOTH, 75, FrameInterval)
 
-GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT, errno.EIO})
-"""What the kernel answers when the device is not there any more; EIO: its stream has died."""
+GONE = frozenset({errno.ENODEV, errno.ENXIO, errno.ENOENT})
+"""What the kernel answers when the device is not there any more."""
 REFUSED = frozenset({errno.EINVAL, errno.ERANGE, errno.ENOTTY, errno.EOPNOTSUPP})
 """What the kernel answers to a request that the device cannot do."""
 
@@ -296,8 +346,7 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
     cause = f"{node}: {doing}: {os.strerror(number)}"
     if number in GONE:
         return DeviceGoneError(
-            f"{cause}; the camera is gone or its stream has died: plug it in again, and reopen it (slrig devices lists "
-            "those that are there)"
+            f"{cause}; the camera is gone: plug it in again, and reopen it (slrig devices lists those that are there)"
         )
     if number == errno.EBUSY:
         holders = holders_of(node)
@@ -316,6 +365,15 @@ def fault(node: Path, doing: str, error: OSError) -> DeviceError:
     if number in REFUSED:
         return UnsupportedByDeviceError(f"{cause}; the device cannot do that (slrig devices lists the cameras)")
     return DeviceError(f"{cause}; look for the kernel's own words with: dmesg | tail")
+
+
+def stream_fault(node: Path, doing: str, error: OSError) -> DeviceError:
+    """The same of a request about the frames: EIO there says that the stream has died, of another that it failed."""
+    if error.errno == errno.EIO:
+        return DeviceGoneError(
+            f"{node}: {doing}: {os.strerror(errno.EIO)}; its stream has died: plug it in again, and reopen it"
+        )
+    return fault(node, doing, error)
 
 
 def holders_of(node: Path) -> tuple[str, ...]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from drivers.v4l2.formats import LAYOUTS
 from slrig.bundle.faults import Strict
@@ -21,13 +21,13 @@ class V4L2Options(Strict, use_attribute_docstrings=True):
 
     pixel_format: Annotated[str, Field(min_length=3, max_length=4)] | None = None
     """Four characters as `v4l2-ctl --list-formats` writes them; else the best that the device offers: linear before
-    encoded, grey before colour, deep before shallow."""
+    encoded, grey before colour, deep before shallow, among those that reach 15 frames per second."""
 
     size_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
-    """[width, height]; else the largest."""
+    """[width, height]; else the largest that reaches 15 frames per second (or frame_rate_hz), if any does."""
 
     frame_rate_hz: Annotated[float, Field(gt=0, le=100_000)] | None = None
-    """Frames per second; else as the device is set."""
+    """Frames per second; else as the device is set, or the next that is 15 or more."""
 
     bit_depth: Annotated[int, Field(ge=8, le=16)] | None = None
     """How many low bits of a 16-bit sample the sensor fills (Y16 and 16-bit Bayer only); else all of them."""
@@ -48,7 +48,10 @@ class V4L2Options(Strict, use_attribute_docstrings=True):
     """Value of the focus control; autofocus is off in any case."""
 
     controls: dict[str, int] = Field(default_factory=dict)
-    """Further controls by the name that `v4l2-ctl --list-ctrls` gives them."""
+    """Further controls by the name that `v4l2-ctl --list-ctrls` gives them, in place of what the driver would set."""
+
+    skip_controls: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Controls to be left as they are, by those names: some cameras answer one of theirs with faults."""
 
     readout_s: Annotated[float, Field(ge=0, le=60)] | None = None
     """From the first row's end of exposure to the last one's arrival; else a frame period, the most it can be."""
@@ -64,6 +67,14 @@ class V4L2Options(Strict, use_attribute_docstrings=True):
             message = f"expected a pixel format that can be read ({known}), found '{text}'; choose one of them"
             raise ValueError(message)
         return text
+
+    @model_validator(mode="after")
+    def _not_both(self) -> Self:
+        both = sorted(self.controls.keys() & set(self.skip_controls))
+        if both:
+            message = f"{', '.join(both)}: named in controls, to be set, and in skip_controls, to be left; choose one"
+            raise ValueError(message)
+        return self
 
     @property
     def size(self) -> Size | None:

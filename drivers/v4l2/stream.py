@@ -172,7 +172,7 @@ class Stream:
         except OSError as error:
             if error.errno == errno.EAGAIN:
                 return None
-            raise kernel.fault(self._node, "taking a frame", error) from error
+            raise kernel.stream_fault(self._node, "taking a frame", error) from error
         index = int(buffer.index)
         stamp_ns = buffer.timestamp.tv_sec * 1_000_000_000 + buffer.timestamp.tv_usec * 1000
         stamp = Stamp(_source(buffer.flags), stamp_ns, self._queued_ns[index], time.monotonic_ns())
@@ -183,7 +183,7 @@ class Stream:
         try:
             kernel.ask(self._handle, request, argument)
         except OSError as error:
-            raise kernel.fault(self._node, doing, error) from error
+            raise kernel.stream_fault(self._node, doing, error) from error
 
 
 def _source(flags: int) -> StampSource:

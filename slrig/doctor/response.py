@@ -115,9 +115,15 @@ def _camera(viewer: Viewer, seen: Seen, sequence: PatternSequence) -> list[Findi
     if abs(exponent - 1) <= _LINEAR:
         found = f"its values grow in proportion to the exposure (power {exponent:.2f})"
         return [ok("response.camera", subject, found)]
-    found = f"its values grow with the exposure to the power of {exponent:.2f}, not in proportion"
+    found = (
+        f"its values grow with the exposure to the power of {exponent:.2f}, not in proportion: that moves stripes "
+        "little, since white and black frames are bent alike, but the errors that scans state are those of a straight "
+        "camera"
+    )
     remedy = (
-        "switch off gamma, automatic gain, wide dynamic range and tone curves in the camera; if it is linear, "
-        "the projector's light flickers: see that finding"
+        "set gamma to 1 (the control gamma, 100 of a USB camera, which the drivers v4l2 and opencv set where there is "
+        "one), and switch off automatic gain, wide dynamic range and tone curves; many cameras bend their pictures "
+        "whatever is set, raw formats (GREY, Y10, Bayer) are straight. If it is linear, the projector's light "
+        "flickers: see that finding"
     )
     return [note("response.camera", subject, found, remedy)]

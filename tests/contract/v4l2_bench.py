@@ -65,16 +65,20 @@ def usb_camera(port: str, serial: str, *names: str) -> str:
     return f"{tree}\n"
 
 
-def control(number: int, name: str, minimum: int, maximum: int, default: int, **more: int) -> dict[str, Any]:
+def control(number: int, name: str, minimum: int, maximum: int, default: int, **more: object) -> dict[str, Any]:
     ranges = {"minimum": minimum, "maximum": maximum, "step": 1, "default": default}
     return {"id": number, "name": name, **ranges, **more}
 
 
 CONTROLS = (
     control(0x00980900, "Brightness", -64, 64, 0),
+    control(0x00980901, "Contrast", 0, 64, 32),
     control(0x0098090C, "White Balance, Automatic", 0, 1, 1),
+    control(0x00980910, "Gamma", 72, 500, 220),
     control(0x00980913, "Gain", GAIN_UNITS, 8 * GAIN_UNITS, 2 * GAIN_UNITS),
     control(0x00980918, "Power Line Frequency", 0, 2, 1),
+    control(0x0098091B, "Sharpness", 0, 6, 3),
+    control(0x0098091C, "Backlight Compensation", 0, 2, 1),
     # Aperture priority: the exposure is the device's own until it is told otherwise.
     control(0x009A0901, "Auto Exposure", 0, 3, 3),
     control(0x009A0902, "Exposure Time, Absolute", 1, 400, 156),
@@ -86,13 +90,21 @@ CONTROLS = (
 
 @dataclass(frozen=True)
 class Faked:
-    """A fake camera. Times in seconds; `stamp`, `lost` and their like as in `v4l2_kernel`."""
+    """A fake camera. Times in seconds; `stamp`, `lost` and their like as in `v4l2_kernel`.
+
+    rates_of : times per frame of one format and size ("YUYV 160 x 120"), in place of `rates`. line_s : what a unit of
+    its exposure in lines lasts. A control may have `kind`, `flags`, `insists_on`, `stalls` (the requests "describe",
+    "get", "set" that it answers with `errno`), and `long`, a 64-bit value.
+    """
 
     formats: Mapping[str, list[tuple[int, int]]] = field(
         default_factory=lambda: {"GREY": [(CAMERA.width_px, CAMERA.height_px)]}
     )
     rates: tuple[tuple[int, int], ...] = ((1, 50), (1, 200), (1, 400), (1, 25))
+    rates_of: Mapping[str, tuple[tuple[int, int], ...]] = field(default_factory=dict)
     controls: tuple[dict[str, Any], ...] = CONTROLS
+    driver: str = "uvcvideo"
+    line_s: float = 0.0
     stamp: str = "start"
     readout_s: float = 0.0
     bands: int = 1
@@ -112,6 +124,7 @@ class Faked:
 
     def config(self, light: Path, faults: Path) -> dict[str, Any]:
         keys = (
+            *("rates_of", "driver", "line_s"),
             *("formats", "rates", "controls", "stamp", "readout_s", "jitter_s", "lag_frames", "lost", "corrupt"),
             *("flags_corrupt", "tells_rate", "stretches", "padding_bytes", "seed", "tree", "links"),
         )
@@ -174,6 +187,11 @@ class FakeDevice:
             (self.faults / name).touch()
         else:
             (self.faults / name).unlink(missing_ok=True)
+
+    def controls_set(self) -> dict[str, int]:
+        """Every control that was set since the camera was plugged in, and to what last."""
+        lines = (self.faults / "controls.txt").read_text().splitlines()
+        return {name: int(value) for name, value in (line.split(" = ") for line in lines)}
 
     def close(self) -> None:
         """Unplug, and end both processes. Idempotent."""

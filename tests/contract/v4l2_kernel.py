@@ -25,15 +25,18 @@ QUERYCAP, ENUM_FMT, G_FMT, S_FMT = 0x80685600, 0xC0405602, 0xC0D05604, 0xC0D0560
 REQBUFS, QUERYBUF, QBUF, DQBUF = 0xC0145608, 0xC0585609, 0xC058560F, 0xC0585611
 STREAMON, STREAMOFF, G_PARM, S_PARM = 0x40045612, 0x40045613, 0xC0CC5615, 0xC0CC5616
 G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES = 0xC008561B, 0xC008561C, 0xC0445624, 0xC02C564A
+G_EXT_CTRLS, ENUM_FRAMEINTERVALS = 0xC0205647, 0xC034564B
 SIZES = {
     request: request >> 16 & 0x3FFF
     for request in (
         *(QUERYCAP, ENUM_FMT, G_FMT, S_FMT, REQBUFS, QUERYBUF, QBUF, DQBUF, STREAMON, STREAMOFF),
-        *(G_PARM, S_PARM, G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES),
+        *(G_PARM, S_PARM, G_CTRL, S_CTRL, QUERYCTRL, ENUM_FRAMESIZES, G_EXT_CTRLS, ENUM_FRAMEINTERVALS),
     )
 }
 
 EXPOSURE_AUTO, EXPOSURE_ABSOLUTE, GAIN = 0x009A0901, 0x009A0902, 0x00980913
+EXPOSURE_LINES = 0x00980911
+READ_ONLY = 4
 PAGE = 4096
 MOST_BUFFERS = 32
 LONGEST_WAIT_NS = 5_000_000
@@ -133,7 +136,13 @@ class Device:
         self.controls = {control["id"]: control for control in self.config["controls"]}
         self.values = {number: control["default"] for number, control in self.controls.items()}
         self.code, (self.size, *_) = next(iter(self.config["formats"].items()))
-        self.rate = self.config["rates"][0]
+        self.rate = self.rates()[0]
+
+    def rates(self, code: str = "", size: Any = None) -> list[Any]:
+        """The times per frame of a format and size, those in use if none are named: (seconds, parts)."""
+        width, height = size or self.size
+        found = self.config["rates_of"].get(f"{code or self.code} {width} x {height}", self.config["rates"])
+        return list(found)
 
     def told(self, fault: str) -> bool:
         """Whether the test asks for this fault now."""
@@ -161,6 +170,8 @@ class Device:
             QBUF: self.queue,
             QUERYCTRL: self.describe_control,
             G_CTRL: self.tell_control,
+            G_EXT_CTRLS: self.tell_long_control,
+            ENUM_FRAMEINTERVALS: self.list_rate,
             S_CTRL: self.set_control,
         }
         if request == S_FMT:
@@ -174,7 +185,14 @@ class Device:
         return None
 
     def query(self, data: bytearray) -> None:
-        struct.pack_into("16s32s32s", data, 0, b"bench", self.config["card"].encode(), self.config["bus"].encode())
+        struct.pack_into(
+            "16s32s32s",
+            data,
+            0,
+            self.config["driver"].encode(),
+            self.config["card"].encode(),
+            self.config["bus"].encode(),
+        )
         struct.pack_into("III", data, 80, 0x60100, 0x84A00001, self.config["capabilities"])
 
     def list_format(self, data: bytearray) -> None:
@@ -191,6 +209,13 @@ class Device:
             raise Refused(errno.EINVAL)
         struct.pack_into("III", data, 8, 1, *sizes[index])
 
+    def list_rate(self, data: bytearray) -> None:
+        index, code, width, height = struct.unpack_from("I4sII", data, 0)
+        rates = self.rates(code.decode(), (width, height))
+        if index >= len(rates) or not self.config["tells_rate"]:
+            raise Refused(errno.EINVAL)
+        struct.pack_into("III", data, 16, 1, *rates[index])
+
     def set_format(self, data: bytearray, file: object) -> None:
         self.require_free(file)
         if self.buffers:
@@ -202,6 +227,8 @@ class Device:
         self.code = name if name in self.config["formats"] else next(iter(self.config["formats"]))
         sizes = self.config["formats"][self.code]
         self.size = min(sizes, key=lambda have: abs(have[0] - width) + abs(have[1] - height))
+        if self.rate not in self.rates():
+            self.rate = self.rates()[0]
         self.tell_format(data)
 
     def tell_format(self, data: bytearray) -> None:
@@ -221,7 +248,7 @@ class Device:
         seconds, parts = struct.unpack_from("II", data, 12)
         if parts and self.config["tells_rate"]:
             asked = seconds / parts
-            self.rate = min(self.config["rates"], key=lambda have: abs(have[0] / have[1] - asked))
+            self.rate = min(self.rates(), key=lambda have: abs(have[0] / have[1] - asked))
         self.tell_rate(data)
 
     def tell_rate(self, data: bytearray) -> None:
@@ -261,6 +288,8 @@ class Device:
         if self.told("no bandwidth"):
             raise Refused(errno.ENOSPC)
         exposure_ns = self.values.get(EXPOSURE_ABSOLUTE, 0) * 100_000
+        if EXPOSURE_LINES in self.values:
+            exposure_ns = round(self.values[EXPOSURE_LINES] * self.config["line_s"] * 1e9)
         period_ns = round(self.rate[0] / self.rate[1] * 1e9)
         self.sensor.start(period_ns, exposure_ns or period_ns)
         self.streaming = True
@@ -329,23 +358,44 @@ class Device:
             number = min((known for known in self.controls if known > number), default=-1)
         if number not in self.controls:
             raise Refused(errno.EINVAL)
-        control = self.controls[number]
+        control = self.stalled(number, "describe")
         ranges = (control["minimum"], control["maximum"], control["step"], control["default"])
-        struct.pack_into("II32siiiiI", data, 0, number, 1, control["name"].encode(), *ranges, control.get("flags", 0))
+        kind = control.get("kind", 1)
+        struct.pack_into(
+            "II32siiiiI", data, 0, number, kind, control["name"].encode(), *ranges, control.get("flags", 0)
+        )
+
+    def stalled(self, number: int, request: str) -> dict[str, Any]:
+        """The control, unless its firmware answers such requests with a fault."""
+        control: dict[str, Any] = self.controls[number]
+        if request in control.get("stalls", ()):
+            raise Refused(control["errno"])
+        return control
+
+    def tell_long_control(self, data: bytearray) -> None:
+        (number,) = struct.unpack_from("I", data, 0)
+        if number not in self.controls:
+            raise Refused(errno.EINVAL)
+        struct.pack_into("q", data, 12, self.stalled(number, "get")["long"])
 
     def tell_control(self, data: bytearray) -> None:
         (number,) = struct.unpack_from("I", data, 0)
         if number not in self.controls:
             raise Refused(errno.EINVAL)
+        self.stalled(number, "get")
         struct.pack_into("i", data, 4, self.values[number])
 
     def set_control(self, data: bytearray) -> None:
         number, value = struct.unpack_from("Ii", data, 0)
         if number not in self.controls:
             raise Refused(errno.EINVAL)
-        control = self.controls[number]
+        control = self.stalled(number, "set")
+        if control.get("flags", 0) & READ_ONLY:
+            raise Refused(errno.EACCES)
         # Automatic exposure rules; and a stubborn control takes what it likes. Neither says so.
-        if number == EXPOSURE_ABSOLUTE and self.values.get(EXPOSURE_AUTO, 1) != 1:
+        if number in (EXPOSURE_ABSOLUTE, EXPOSURE_LINES) and self.values.get(EXPOSURE_AUTO, 1) != 1:
             return
         value = control.get("insists_on", value)
         self.values[number] = min(max(value, control["minimum"]), control["maximum"])
+        with (Path(self.config["faults"]) / "controls.txt").open("a") as told:
+            told.write(f"{control['name']} = {self.values[number]}\n")

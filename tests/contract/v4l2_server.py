@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.contract.v4l2_kernel import MOST_BUFFERS, SIZES, Device, Refused
+from tests.contract.v4l2_kernel import G_EXT_CTRLS, MOST_BUFFERS, SIZES, Device, Refused
 
 
 def serve(config: dict[str, Any]) -> None:
@@ -40,6 +40,9 @@ def serve(config: dict[str, Any]) -> None:
         def handle(_: Any, client: Any, device: Device = device) -> bool:
             request = client.get_request() & 0xFFFFFFFF
             argument = client.get_arg().resolve(0, SIZES.get(request, 4))
+            if request == G_EXT_CTRLS:
+                # One control, behind the pointer at the end of the list's head.
+                argument = argument.resolve(24, 20)
             data = bytearray(argument.retrieve())
 
             def attempt(last: bool) -> bool:

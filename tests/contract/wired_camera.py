@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Projector, Trigger
 from slrig.errors import FrameTimeoutError
-from slrig.model import Frame
+from slrig.model import Calibration, Frame, Truth
 from tests.contract.stage import Stage
 
 WIRE_NS = 20_000
@@ -26,7 +27,8 @@ class _Exposure:
 class WiredCamera:
     """Implements `Camera` on a stage: exposes by software trigger, or at each pulse on its wire. Thread-safe.
 
-    usual_s : its exposure until it is configured. exposures_s, gains : their ranges.
+    usual_s : its exposure until it is configured. exposures_s, gains : their ranges. readout_s : beside the next
+    exposure; what comes before the sensor is ready is lost. tells : whether the camera says how long that takes.
     """
 
     def __init__(
@@ -37,8 +39,10 @@ class WiredCamera:
         usual_s: float = 0.01,
         exposures_s: tuple[float, float] = (0.0005, 0.05),
         gains: tuple[float, float] = (1.0, 4.0),
+        readout_s: float = 0.0,
+        tells: bool = True,
     ) -> None:
-        self._stage = stage
+        self._stage, self._readout_s, self._tells = stage, readout_s, tells
         triggers = frozenset({Trigger.SOFTWARE, Trigger.HARDWARE})
         self.info = CameraInfo(name, "wired", "0", stage.format, triggers, exposures_s, gains)
         self._changed = threading.Condition()
@@ -52,7 +56,8 @@ class WiredCamera:
         with self._changed:
             self._state.check_settings(settings, self.info)
             self._settings = settings
-            return AppliedSettings(settings.exposure_s, settings.gain)
+            least_period_s = max(settings.exposure_s, self._readout_s) + WIRE_NS / 1e9
+            return AppliedSettings(settings.exposure_s, settings.gain, least_period_s if self._tells else None)
 
     def arm(self, count: int, trigger: Trigger) -> None:
         """See `Camera`."""
@@ -111,8 +116,9 @@ class WiredCamera:
             self._missed += 1
             return
         self._room -= 1
-        self._busy_until_ns = begun_ns + round(self._settings.exposure_s * 1e9)
-        self._exposures.append(_Exposure(self._number, begun_ns, self._busy_until_ns))
+        end_ns = begun_ns + round(self._settings.exposure_s * 1e9)
+        self._busy_until_ns = max(end_ns, begun_ns + round(self._readout_s * 1e9))
+        self._exposures.append(_Exposure(self._number, begun_ns, end_ns))
         self._number += 1
         self._changed.notify_all()
 
@@ -130,3 +136,30 @@ class WiredCamera:
             settings.exposure_s,
             settings.gain,
         )
+
+
+class WiredHead:
+    """Implements `slrig.devices.Head`: a projector, and a camera on its wire."""
+
+    def __init__(self, projector: Projector, camera: Camera) -> None:
+        self._projector = projector
+        self._camera = camera
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """See `Head`."""
+        return {self._camera.info.name: self._camera}
+
+    @property
+    def projector(self) -> Projector:
+        """See `Head`."""
+        return self._projector
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """See `Head`. None: nothing is measured here."""
+        return None
+
+    def truth(self) -> Truth | None:
+        """See `Head`."""
+        return None

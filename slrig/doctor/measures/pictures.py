@@ -101,19 +101,13 @@ def expected_orientation(camera: Pinhole, projector: Pinhole) -> Orientation | N
     The surface stands where the optical axes come nearest to each other, across the direction between them. Lens
     distortion is left out: it turns nothing.
     """
-    view, beam = camera.rotation[2], projector.rotation[2]
-    between = view + beam
+    between = camera.rotation[2] + projector.rotation[2]
     if np.linalg.norm(between) < 1e-6:
         return None
     normal = np.asarray(between / np.linalg.norm(between), np.float64)
-    # The point with the least sum of squared distances from both axes; parallel axes meet at a usual distance.
-    projections = [np.eye(3) - np.outer(axis, axis) for axis in (view, beam)]
-    matrix = projections[0] + projections[1]
-    target = projections[0] @ camera.centre_mm + projections[1] @ projector.centre_mm
-    if np.linalg.cond(matrix) < 1e6:
-        meeting = np.asarray(np.linalg.solve(matrix, target), np.float64)
-    else:
-        meeting = np.asarray(camera.centre_mm + 1000.0 * view, np.float64)
+    meeting = _meeting(camera, projector)
+    if meeting is None:
+        meeting = np.asarray(camera.centre_mm + 1000.0 * camera.rotation[2], np.float64)
     pixel = _image_of(camera, meeting)
     if pixel is None:
         return None
@@ -124,6 +118,33 @@ def expected_orientation(camera: Pinhole, projector: Pinhole) -> Orientation | N
         return None
     origin, right, down = (np.asarray(hit, np.float64) for hit in hits)
     return Orientation(np.column_stack([right - origin, down - origin]))
+
+
+def depth_mm_per_px(camera: Pinhole, projector: Pinhole) -> float:
+    """Return how far a point moves that is triangulated one camera pixel beside its column, where the axes meet.
+
+    NaN where they do not meet: nothing says at which distance the rig works. Lens distortion is left out.
+    """
+    meeting = _meeting(camera, projector)
+    pixel = None if meeting is None else _image_of(camera, meeting)
+    if meeting is None or pixel is None:
+        return float("nan")
+    # The sheet of light of the column through the point: it holds the projector's own vertical, and its centre.
+    ray = meeting - projector.centre_mm
+    sheet = np.cross(ray, projector.rotation[1])
+    sheet = np.asarray(sheet / np.linalg.norm(sheet), np.float64)
+    return float(np.linalg.norm(_met(camera, pixel + np.array([1.0, 0.0]), meeting, sheet) - meeting))
+
+
+def _meeting(camera: Pinhole, projector: Pinhole) -> FloatArray | None:
+    """The point with the least sum of squared distances from both axes; None where they are parallel."""
+    axes = [(device.rotation[2], device.centre_mm) for device in (camera, projector)]
+    projections = [np.eye(3) - np.outer(axis, axis) for axis, _ in axes]
+    matrix = projections[0] + projections[1]
+    if np.linalg.cond(matrix) >= 1e6:
+        return None
+    target = sum((each @ centre for each, (_, centre) in zip(projections, axes, strict=True)), np.zeros(3))
+    return np.asarray(np.linalg.solve(matrix, target), np.float64)
 
 
 def apart_deg(one: Orientation, other: Orientation) -> float:

@@ -15,7 +15,7 @@ from drivers.opencv.camera import OpenCvCamera
 from drivers.opencv.feeds import FilmFeed
 from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture
-from slrig.devices import CameraSettings, Rig, Shown, Trigger
+from slrig.devices import AppliedSettings, CameraSettings, Rig, Shown, Trigger
 from slrig.errors import DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
 from tests.contract.stage import Stage, StagedProjector
@@ -112,7 +112,7 @@ def test_a_series_of_deep_images_keeps_its_depth(tmp_path: Path) -> None:
 def test_a_film_takes_the_exposure_it_was_made_with(tmp_path: Path) -> None:
     write_film(tmp_path / "film.avi", ramp(2))
     camera = opened(tmp_path)
-    assert camera.configure(CameraSettings(EXPOSURE_S)).exposure_s == EXPOSURE_S
+    assert camera.configure(CameraSettings(EXPOSURE_S)) == AppliedSettings(EXPOSURE_S, 1.0, least_period_s=None)
     with pytest.raises(UnsupportedByDeviceError, match="no control"):
         camera.configure(CameraSettings(1 / 60))
     camera.close()

@@ -16,7 +16,7 @@ import pytest
 from drivers.opencv import open_camera
 from drivers.opencv.camera import OpenCvCamera
 from drivers.opencv.feeds import LiveFeed
-from slrig.devices import Camera, CameraSettings, Trigger
+from slrig.devices import AppliedSettings, Camera, CameraSettings, Trigger
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, FrameTimeoutError, UnsupportedByDeviceError
 from tests.contract.opencv_bench import NetworkCamera, Served
 from tests.contract.stage import Stage, StagedProjector
@@ -50,7 +50,7 @@ def test_a_source_declares_what_its_table_says() -> None:
         assert (info.exposure_range_s, info.gain_range) == ((0.01, 0.01), (1.0, 1.0))
         assert info.triggers == {Trigger.FREE}
         assert str(info.format.size) == "80 x 60"
-        assert camera.configure(CameraSettings(0.01005)).exposure_s == 0.01
+        assert camera.configure(CameraSettings(0.01005)) == AppliedSettings(0.01, 1.0, least_period_s=0.02)
         with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0.02, it takes 0.01 only"):
             camera.configure(CameraSettings(0.02))
         with pytest.raises(UnsupportedByDeviceError, match="asked for gain 2, it takes 1 only; OpenCV has no control"):

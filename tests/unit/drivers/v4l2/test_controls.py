@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from drivers.v4l2 import controls as ctl
-from drivers.v4l2.controls import Control, GainScale
+from drivers.v4l2.controls import Control
 from drivers.v4l2.options import V4L2Options
+from drivers.v4l2.scales import ExposureScale, GainScale
 from slrig.bundle.faults import checked
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 
@@ -44,7 +45,6 @@ def test_automatics_are_off_before_what_they_govern_is_set() -> None:
     asked = options(focus=30, controls={"gamma": 100})
     assert names(ctl.in_order(webcam(), asked, exposure_units=167, gain_units=16, node=NODE)) == [
         ("auto_exposure", 1),
-        ("exposure_dynamic_framerate", 0),
         ("exposure_time_absolute", 167),
         ("gain_automatic", 0),
         ("gain", 16),
@@ -84,8 +84,10 @@ def test_a_value_goes_to_the_devices_grid(asked: float, units: int) -> None:
 
 
 def test_exposure_is_in_units_of_100_microseconds() -> None:
-    assert ctl.exposure_range_s(webcam()[ctl.EXPOSURE_ABSOLUTE]) == pytest.approx((0.0003, 0.2047))
-    assert ctl.exposure_range_s(Control(0, "exposure", 0, 100, 5, 0)) == pytest.approx((0.0005, 0.01))
+    absolute = ExposureScale(webcam()[ctl.EXPOSURE_ABSOLUTE], 1e-4)
+    assert absolute.range_s == pytest.approx((0.0003, 0.2047))
+    assert [absolute.units(each) for each in (0.01, 1e-9)] == [100, 3]
+    assert ExposureScale(Control(0, "exposure", 0, 100, 5, 0), 1e-4).range_s == pytest.approx((0.0005, 0.01))
 
 
 def test_gain_without_unity_counts_from_the_least() -> None:

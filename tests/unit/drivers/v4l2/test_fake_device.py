@@ -55,7 +55,7 @@ def armed(device: FakeDevice, settings: CameraSettings | None = None, **options:
         ({"pixel_format": "Y10", "size_px": [1280, 720]}, "asked Y10 1280 x 720, driver gives Y10 80 x 60"),
         ({"frame_rate_hz": 60.0}, "asked 60 frames per second, driver gives 50"),
         ({"bit_depth": 9}, "Y10 has 10 bits"),
-        ({"controls": {"brightness": 3, "gamma": 1}}, "control 'gamma', the device has: auto_exposure, brightness"),
+        ({"controls": {"brightness": 3, "gama": 1}}, "control 'gama', the device has: auto_exposure, backlight"),
         ({"device": "/dev/null"}, "no video device"),
     ],
 )

@@ -38,6 +38,8 @@ pytestmark = pytest.mark.skipif(ctypes.sizeof(ctypes.c_void_p) != 8, reason="the
         ("S_CTRL", 0xC008561C),
         ("QUERYCTRL", 0xC0445624),
         ("ENUM_FRAMESIZES", 0xC02C564A),
+        ("ENUM_FRAMEINTERVALS", 0xC034564B),
+        ("G_EXT_CTRLS", 0xC0205647),
     ],
 )
 def test_requests_have_the_kernels_numbers(name: str, number: int) -> None:
@@ -72,7 +74,7 @@ def test_fields_lie_where_the_kernel_has_them(structure: type[ctypes.Structure],
     ("number", "kind", "words"),
     [
         (errno.ENODEV, DeviceGoneError, "plug it in again"),
-        (errno.EIO, DeviceGoneError, "reopen"),
+        (errno.EIO, DeviceError, "dmesg"),
         (errno.EBUSY, DeviceBusyError, "fuser -v /dev/video7"),
         (errno.EACCES, DeviceError, "usermod -aG video"),
         (errno.ENOSPC, UnsupportedByDeviceError, "different USB controllers"),
@@ -85,6 +87,12 @@ def test_a_refusal_tells_what_to_do(number: int, kind: type[DeviceError], words:
     assert type(found) is kind
     assert words in str(found)
     assert str(found).startswith("/dev/video7: starting the stream: ")
+
+
+def test_only_a_streams_fault_says_that_the_stream_has_died() -> None:
+    broken = OSError(errno.EIO, os.strerror(errno.EIO))
+    assert type(kernel.stream_fault(NODE, "taking a frame", broken)) is DeviceGoneError
+    assert type(kernel.stream_fault(NODE, "taking a frame", OSError(errno.ENOMEM, "memory"))) is DeviceError
 
 
 def test_a_program_that_holds_a_device_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,311 @@
+"""A Raspberry Pi's camera: settings that are read back from its frames, and frames that began after an instant.
+
+The sensor runs by itself, so `read` waits for a frame whose exposure began late enough. Settings are written while it
+is stopped: then the first frame has them. Each frame tells the exposure and gain it was taken with, and the time from
+the frame before; a longer time between two stamps is frames that were lost, or that nobody fetched.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import TimeoutError as JobTimeoutError
+from pathlib import Path
+from typing import Any
+
+from drivers.picamera2.library import cameras, library, told
+from drivers.picamera2.options import PiCameraOptions
+from drivers.picamera2.stream import Stream, configured
+from slrig.bundle.faults import checked
+from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
+from slrig.errors import DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
+from slrig.model import CameraFormat, Frame
+
+FIXED: Mapping[str, object] = {
+    "AeEnable": False,
+    "AwbEnable": False,
+    "ColourGains": (1.0, 1.0),
+    "NoiseReductionMode": 0,
+    "HdrMode": 0,
+    "Sharpness": 0.0,
+    "Contrast": 1.0,
+    "Brightness": 0.0,
+}
+"""Nothing automatic, nothing that mixes neighbours or bends grey levels; set where the camera has it. 0 is "off"."""
+
+LONGEST_S = 1.0
+"""The longest exposure that is declared: some sensors take minutes, which no check waits for."""
+
+_BLANK_US = 5_000
+"""What a frame may take beyond its exposure; libcamera takes no more of it than the sensor needs."""
+
+_ERROR_NS = 1_000_000
+"""How late the kernel may notice the start of a frame on the wire."""
+
+_AS_ASKED = 0.01
+_SETTLING_FRAMES = 12
+_SLICE_S = 0.05
+_LATE_S = 3.0
+_SUSPENDED_NS = 1_000_000
+
+
+class PiCamera:
+    """Implements `slrig.devices.Camera`.
+
+    Parameters
+    ----------
+    name
+        As the rig file calls it.
+    options
+        Checked already.
+
+    Raises
+    ------
+    LibraryMissingError
+        picamera2 is not installed.
+    DeviceGoneError
+        There is no such camera.
+    DeviceBusyError
+        Another program holds it.
+    UnsupportedByDeviceError
+        It cannot do what an option asks.
+    """
+
+    def __init__(self, name: str, options: PiCameraOptions) -> None:
+        self._name, self._options = name, options
+        self._state = CameraState(name)
+        known = cameras()
+        numbers = [number for number, each in enumerate(known) if each["Id"] == options.device]
+        if not numbers:
+            found = ", ".join(each["Id"] for each in known) or "none"
+            message = f"camera '{name}': no camera '{options.device}' is connected; found: {found}; check its cable"
+            raise DeviceGoneError(message)
+        self._job: Any = None
+        with told(name, "opening it"):
+            self._camera = library()(numbers[0])
+        try:
+            with told(name, "configuring it"):
+                raw = options.pixels == "raw"
+                self._stream: Stream = configured(self._camera, name, raw=raw, size_px=options.size_px)
+                self._controls = self._camera.camera_controls
+                self._camera.set_controls(self._fixed())
+            self._info = self._declared(known[numbers[0]])
+        except BaseException:
+            self._camera.close()
+            raise
+
+    @property
+    def info(self) -> CameraInfo:
+        """See `Camera`. The gain is the sensor's own, as a factor."""
+        return self._info
+
+    def configure(self, settings: CameraSettings) -> AppliedSettings:
+        """See `Camera`. Runs the camera until a frame comes that was taken so.
+
+        Raises
+        ------
+        FrameTimeoutError
+            The camera delivers no frame.
+        """
+        self._state.check_settings(settings, self._info)
+        told_last = self._taken(settings.exposure_s, settings.gain, _SETTLING_FRAMES)
+        got = _applied(told_last)
+        if not _as_asked(told_last, settings.exposure_s, settings.gain):
+            message = (
+                f"camera '{self._name}': asked for exposure_s {settings.exposure_s:g} and gain {settings.gain:g}, it "
+                f"gives {got.exposure_s:g} and {got.gain:g}; ask for that"
+            )
+            raise UnsupportedByDeviceError(message)
+        return got
+
+    def arm(self, count: int, trigger: Trigger) -> None:
+        """See `Camera`. Starts the camera afresh: no frame of an earlier arming can come."""
+        self._state.check_arming(count, trigger, self._info)
+        self._last_ns = self._number = self._dropped = 0
+        with told(self._name, "starting it"):
+            self._camera.start()
+        self._state.armed = trigger
+
+    def trigger(self) -> None:
+        """See `Camera`. libcamera triggers no sensor by software."""
+        self._state.require_armed(Trigger.SOFTWARE)
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        """See `Camera`. A frame may have begun earlier than it says by the error of its stamp: that is allowed for."""
+        self._state.require_armed()
+        until_s = time.monotonic() + timeout_s
+        passed = 0
+        while True:
+            left_s = until_s - time.monotonic()
+            with told(self._name, "waiting for a frame"):
+                request = self._next(max(min(left_s, _SLICE_S), 0.0))
+            if request is not None:
+                try:
+                    self._state.require_armed()  # another thread may have closed it meanwhile
+                    frame = self._frame(request, after_ns)
+                finally:
+                    request.release()
+                if frame is not None:
+                    return frame
+                passed += 1
+            self._state.require_armed()
+            if left_s <= 0:
+                message = (
+                    f"camera '{self._name}': no frame that began after {after_ns} ns came in {timeout_s:g} s ({passed} "
+                    f"that began earlier were passed over); check its cable, and that the Pi keeps up"
+                )
+                raise FrameTimeoutError(message)
+
+    def disarm(self) -> None:
+        """See `Camera`."""
+        if self._state.armed is not None:
+            self._state.armed = None
+            self._stop()
+
+    def close(self) -> None:
+        """See `Camera`."""
+        self.disarm()
+        if self._state.close():
+            self._camera.close()
+
+    def _taken(self, exposure_s: float, gain: float, most: int) -> Mapping[str, Any]:
+        """Run the camera with these settings; what its first frame tells that was taken so, or after so many the last.
+        Raises FrameTimeoutError: it delivers no frame.
+        """
+        exposure_us = round(exposure_s * 1e6)
+        fastest_us = self._controls["FrameDurationLimits"][0]
+        limits = (fastest_us, max(fastest_us, exposure_us + _BLANK_US))
+        with told(self._name, "setting exposure and gain"):
+            self._camera.set_controls(
+                {"ExposureTime": exposure_us, "AnalogueGain": gain, "FrameDurationLimits": limits}
+            )
+            self._camera.start()
+            try:
+                while True:
+                    request = self._next(exposure_s + _LATE_S)
+                    if request is None:
+                        message = f"camera '{self._name}' delivers no frame at {exposure_s:g} s; check its cable"
+                        raise FrameTimeoutError(message)
+                    metadata: Mapping[str, Any] = request.get_metadata()
+                    request.release()
+                    most -= 1
+                    if _as_asked(metadata, exposure_s, gain) or most <= 0:
+                        return metadata
+            finally:
+                self._stop()
+
+    def _next(self, most_s: float) -> Any:
+        """The next request that is complete, waited for no longer; None if none came. It must be released."""
+        if self._job is None:
+            self._job = self._camera.capture_request(wait=False)
+        try:
+            request = self._camera.wait(self._job, timeout=most_s)
+        except (JobTimeoutError, TimeoutError):
+            return None
+        self._job = None
+        return request
+
+    def _stop(self) -> None:
+        if self._job is not None:
+            # Stopping waits for the jobs before it, and so forever where no frame comes any more.
+            self._camera.cancel_all_and_flush()
+            self._job = None
+        with told(self._name, "stopping it"):
+            self._camera.stop()
+
+    def _frame(self, request: Any, after_ns: int) -> Frame | None:
+        """The frame of a request; None if it began before."""
+        metadata = request.get_metadata()
+        now_ns = time.monotonic_ns()
+        exposure_ns = round(metadata["ExposureTime"] * 1e3)
+        stamp_ns = _monotonic(metadata["SensorTimestamp"], now_ns)
+        if self._last_ns:
+            steps = max(round((stamp_ns - self._last_ns) / (metadata["FrameDuration"] * 1e3)), 1)
+            self._number += steps
+            self._dropped += steps - 1
+        self._last_ns = stamp_ns
+        start_ns = stamp_ns - (exposure_ns if self._options.time_stamp == "readout" else 0)
+        if start_ns - _ERROR_NS < after_ns:
+            return None
+        # All rows are read out within a frame of the fastest mode, and were by the time the frame was here.
+        skew_ns = 0 if self._options.global_shutter else round(self._controls["FrameDurationLimits"][0] * 1e3)
+        skew_ns = max(min(skew_ns, now_ns - start_ns - exposure_ns), 0)
+        return Frame(
+            camera=self._name,
+            image=self._stream.image(request.make_buffer(self._stream.name)),
+            t_start_ns=start_ns,
+            t_end_ns=start_ns + exposure_ns + skew_ns,
+            t_err_ns=_ERROR_NS,
+            sequence_number=self._number,
+            dropped_count=self._dropped,
+            exposure_s=exposure_ns / 1e9,
+            gain=float(metadata["AnalogueGain"]),
+            shutter_skew_s=skew_ns / 1e9,
+        )
+
+    def _declared(self, known: Mapping[str, Any]) -> CameraInfo:
+        least, most = self._controls["AnalogueGain"][:2]
+        most_us = self._controls["ExposureTime"][1]
+        # libcamera may say 0, which stands for "automatic": a frame tells what the sensor's least is.
+        shortest = self._taken(max(self._controls["ExposureTime"][0], 1) / 1e6, max(float(least), 1.0), 1)
+        return CameraInfo(
+            name=self._name,
+            model=str(known["Model"]),
+            serial=self._options.device,
+            format=CameraFormat(self._stream.size, self._stream.layout.bit_depth),
+            triggers=frozenset({Trigger.FREE}),
+            exposure_range_s=(shortest["ExposureTime"] / 1e6, min(most_us / 1e6, LONGEST_S)),
+            gain_range=(max(float(least), 1.0), float(most)),
+        )
+
+    def _fixed(self) -> dict[str, object]:
+        """What is set once. Raises UnsupportedByDeviceError: a lens that can be moved has no place."""
+        fixed = {control: value for control, value in FIXED.items() if control in self._controls}
+        focus = self._options.focus_dioptres
+        if ("LensPosition" in self._controls) != (focus is not None):
+            message = (
+                f"camera '{self._name}' has a lens that moves by itself; write focus_dioptres, 1 / the distance in m"
+                if focus is None
+                else f"camera '{self._name}': asked for focus_dioptres {focus:g}, its lens is fixed; leave that out"
+            )
+            raise UnsupportedByDeviceError(message)
+        return fixed if focus is None else {**fixed, "AfMode": 0, "LensPosition": focus}
+
+
+def _applied(metadata: Mapping[str, Any]) -> AppliedSettings:
+    exposure_s, period_s = metadata["ExposureTime"] / 1e6, metadata["FrameDuration"] / 1e6
+    return AppliedSettings(exposure_s, float(metadata["AnalogueGain"]), period_s)
+
+
+def _as_asked(metadata: Mapping[str, Any], exposure_s: float, gain: float) -> bool:
+    return _near(metadata["ExposureTime"], exposure_s * 1e6) and _near(metadata["AnalogueGain"], gain)
+
+
+def _near(got: float, asked: float) -> bool:
+    return abs(got - asked) <= max(_AS_ASKED * asked, 1e-3)
+
+
+def _monotonic(stamp_ns: int, now_ns: int) -> int:
+    """A time stamp on CLOCK_MONOTONIC.
+
+    libcamera's document says CLOCK_BOOTTIME, which also counts the time that the machine was suspended; the receivers
+    of a Raspberry Pi stamp by CLOCK_MONOTONIC. Where the two differ, a frame that came just now tells which it is.
+    """
+    suspended_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+    if suspended_ns > _SUSPENDED_NS and abs(stamp_ns - suspended_ns - now_ns) < abs(stamp_ns - now_ns):
+        return stamp_ns - suspended_ns
+    return stamp_ns
+
+
+def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
+    """Open a Raspberry Pi's camera from its `[[camera]]` table (without `name`, `driver` and settings).
+
+    Raises
+    ------
+    ConfigError
+        The options have faults, all of them in one message.
+    LibraryMissingError, DeviceGoneError, DeviceBusyError, UnsupportedByDeviceError, DeviceError
+        See `PiCamera`.
+    """
+    del folder
+    return PiCamera(name, checked(PiCameraOptions, options, f"the [[camera]] table '{name}'"))

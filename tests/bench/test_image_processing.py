@@ -1,0 +1,63 @@
+"""Error over what is stated for it, of frames that a camera bent, sharpened or compressed. Prints a table.
+
+    pytest tests/bench/test_image_processing.py -s
+
+The sample bundles of an independent renderer, and a relief of our own: as it is, printed with squares, and with grain.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.bench.light_sweep import Light, lit_scene
+from tests.golden.test_bundles import SCENES
+from tests.golden.test_jpeg import scored
+
+PROCESSING: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    **{f"JPEG {quality}": {"quality": quality} for quality in (95, 90, 75, 50, 25)},
+    "gamma 2.2": {"gamma": 2.2},
+    **{f"gamma 2.2, JPEG {quality}": {"gamma": 2.2, "quality": quality} for quality in (90, 75, 50)},
+    "unsharp 1.5": {"unsharp": 1.5},
+    "gamma 2.2, unsharp 1, JPEG 80": {"gamma": 2.2, "unsharp": 1.0, "quality": 80},
+}
+RELIEFS = {"plain": Light(), "squares": Light(texture_ratio=7.0), "grain": Light(texture_ratio=7.0, texture="noise")}
+MOST = 1.4
+MOST_OF_BENT_PRINT = 2.0
+"""How far light reaches over a print's edge is not known without the response of the camera."""
+
+
+def judged(name: str, processing: str, folder: Path, work: Path, *, most: float = MOST) -> None:
+    truth = scored(folder, work, **PROCESSING[processing])["truth"]
+    sys.stdout.write(
+        f"{name:8} {processing:30} rms {1000 * truth['rms_mm']:5.1f} µm, error/σ {truth['error_over_sigma_p68']:4.2f}, "
+        f"covered to 0.3 mm {truth['complete_0.3mm']:.1%}\n"
+    )
+    assert 0.7 < truth["error_over_sigma_p68"] < most
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("processing", PROCESSING)
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_sample_bundle(shared: Path, tmp_path: Path, scene: str, processing: str) -> None:
+    judged(scene, processing, shared / "bundles" / scene, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def reliefs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("reliefs")
+    for name, light in RELIEFS.items():
+        (folder / name).mkdir()
+        lit_scene(light).scanned(folder / name, seed=1)
+    return {name: folder / name / "bundle-1" for name in RELIEFS}
+
+
+@pytest.mark.parametrize("processing", PROCESSING)
+@pytest.mark.parametrize("relief", RELIEFS)
+def test_a_relief(reliefs: dict[str, Path], tmp_path: Path, relief: str, processing: str) -> None:
+    bent = relief != "plain" and processing.startswith("gamma") and "unsharp" not in processing
+    judged(relief, processing, reliefs[relief], tmp_path, most=MOST_OF_BENT_PRINT if bent else MOST)

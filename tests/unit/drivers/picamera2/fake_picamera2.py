@@ -1,0 +1,262 @@
+"""picamera2 without a Raspberry Pi: the calls that the driver makes, as version 0.3.38 answers them, before a stage.
+
+A sensor exposes back to back. Of the requests that are complete one is kept for who asks; a job that asks waits for the
+next one. Requests that are not released are missing to the camera, and `stop` waits for the jobs that came before it.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import types
+from collections import deque
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.contract.stage import Stage
+
+BUFFERS = 6
+LINE_US = 20
+LEAST_LINES = 4
+BLANK_US = 600
+CONTROLS: Mapping[str, tuple[object, object, object]] = {
+    "AeEnable": (False, True, True),
+    "AwbEnable": (False, True, True),
+    "AnalogueGain": (1.0, 16.0, 1.0),
+    "Contrast": (0.0, 32.0, 1.0),
+    "ExposureTime": (0, 66_666, 20_000),
+    "FrameDurationLimits": (8_333, 120_000, 33_333),
+    "NoiseReductionMode": (0, 4, 0),
+    "Sharpness": (0.0, 16.0, 1.0),
+}
+
+
+@dataclass
+class Pi:
+    """A Raspberry Pi with one camera: what it sees, what is wrong with it, and what was asked of it."""
+
+    stage: Stage
+    identity: str = "/base/axi/pcie@120000/rp1/i2c@88000/ov9281@60"
+    model: str = "ov9281"
+    raw_format: str = "R10"
+    controls: dict[str, tuple[Any, Any, Any]] = field(default_factory=lambda: dict(CONTROLS))
+    held_elsewhere: bool = False
+    lost: float = 0.0
+    damaged: float = 0.0
+    stamp_offset_ns: int = 0
+    stamps_start: bool = False
+    frozen: bool = False
+    gives: dict[str, Any] = field(default_factory=dict)
+    asked: dict[str, Any] = field(default_factory=dict)
+    exposures: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=10_000))
+    held: int = 0
+
+    @contextmanager
+    def connected(self) -> Iterator[None]:
+        """Where `picamera2` is this."""
+        library = types.SimpleNamespace(Picamera2=self._library())
+        with mock.patch.dict(sys.modules, {"picamera2": library}):
+            yield
+
+    def _library(self) -> type:
+        pi = self
+
+        class Library(FakePicamera2):
+            def __init__(self, camera_num: int = 0) -> None:
+                super().__init__(pi, camera_num)
+
+            @staticmethod
+            def global_camera_info() -> list[dict[str, Any]]:
+                return [{"Id": pi.identity, "Model": pi.model, "Num": 0, "Location": 2, "Rotation": 0}]
+
+        return Library
+
+
+class Job:
+    """What `capture_request` gives that does not wait."""
+
+    def __init__(self) -> None:
+        self.future: Future[FakeRequest] = Future()
+
+
+class FakeRequest:
+    """A `CompletedRequest`."""
+
+    def __init__(self, camera: FakePicamera2, data: NDArray[np.uint8], metadata: dict[str, Any]) -> None:
+        self._camera, self._data, self._metadata = camera, data, metadata
+        self._released = False
+
+    def get_metadata(self) -> dict[str, Any]:
+        return dict(self._metadata)
+
+    def make_buffer(self, name: str) -> NDArray[np.uint8]:
+        assert not self._released
+        assert name == self._camera.read_stream
+        return self._data.copy()
+
+    def release(self) -> None:
+        assert not self._released
+        self._released = True
+        # The memory is the camera's again.
+        self._data[:] = 0xAA
+        self._camera.pi.held -= 1
+
+
+class FakePicamera2:
+    """A `Picamera2`."""
+
+    def __init__(self, pi: Pi, camera_num: int) -> None:
+        assert camera_num == 0
+        if pi.held_elsewhere:
+            message = "Camera __init__ sequence did not complete."
+            raise RuntimeError(message) from RuntimeError("Failed to acquire camera: Device or resource busy")
+        self.pi = pi
+        self._lock = threading.Condition()
+        self._config: dict[str, Any] = {}
+        self._pending: dict[str, Any] = {}
+        self._jobs: deque[Job] = deque()
+        self._completed: deque[FakeRequest] = deque()
+        self._running = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._rng = np.random.default_rng(5)
+        self.read_stream = ""
+        self.is_open = True
+
+    @property
+    def camera_controls(self) -> dict[str, tuple[Any, Any, Any]]:
+        return self.pi.controls
+
+    @property
+    def sensor_modes(self) -> list[dict[str, Any]]:
+        size = self.pi.stage.format.size
+        modes = [(size.width_px, size.height_px), (size.width_px // 2, size.height_px // 2)]
+        return [{"size": mode, "unpacked": self.pi.raw_format, "bit_depth": 10, "fps": 120.0} for mode in modes]
+
+    def create_video_configuration(self, **table: Any) -> dict[str, Any]:
+        config: dict[str, Any] = {
+            "main": {"format": "XBGR8888", "size": (1280, 720)},
+            "raw": {"format": self.pi.raw_format},
+        }
+        for stream in ("main", "raw"):
+            config[stream] |= table.get(stream, {})
+        return {
+            **config,
+            "controls": {"NoiseReductionMode": 1, "FrameDurationLimits": (33_333, 33_333)} | table["controls"],
+        }
+
+    def configure(self, config: dict[str, Any]) -> None:
+        assert self._thread is None
+        self._config = config
+        self.read_stream = "main" if config["main"]["format"] == "YUV420" else "raw"
+        stream = config[self.read_stream]
+        stream |= self.pi.gives
+        deep = 1 if stream["format"].endswith(("8", "YUV420")) else 2
+        # Rows end where a transfer of 32 bytes does.
+        stream["stride"] = -(-stream["size"][0] * deep // 32) * 32
+        self._pending |= config["controls"]
+
+    def camera_configuration(self) -> dict[str, Any]:
+        return self._config
+
+    def set_controls(self, controls: dict[str, Any]) -> None:
+        unknown = set(controls) - set(self.pi.controls)
+        if unknown:
+            message = f"Control {unknown} is not advertised by libcamera"
+            raise RuntimeError(message)
+        self._pending |= controls
+
+    def start(self) -> None:
+        assert self._thread is None
+        self.pi.asked |= self._pending
+        self._running.set()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        if self._thread is None:
+            return
+        assert not self._jobs, "stop waits for the jobs before it"
+        self._running.clear()
+        self._thread.join()
+        self._thread = None
+        with self._lock:
+            while self._completed:
+                self._completed.popleft().release()
+
+    def close(self) -> None:
+        self.stop()
+        self.is_open = False
+
+    def capture_request(self, wait: bool | None = None) -> Job:
+        assert wait is False
+        job = Job()
+        with self._lock:
+            self._jobs.append(job)
+            self._serve()
+        return job
+
+    def wait(self, job: Job, timeout: float | None = None) -> FakeRequest:
+        return job.future.result(timeout)
+
+    def cancel_all_and_flush(self) -> None:
+        with self._lock:
+            self._jobs.clear()
+
+    def _serve(self) -> None:
+        while self._jobs and self._completed:
+            self._jobs.popleft().future.set_result(self._completed.popleft())
+
+    def _run(self) -> None:
+        never = threading.Event()
+        asked = self.pi.asked
+        exposure_us = max(round(asked["ExposureTime"] / LINE_US), LEAST_LINES) * LINE_US
+        gain = round(asked["AnalogueGain"] * 16) / 16
+        least_us, most_us = asked["FrameDurationLimits"]
+        duration_us = min(max(least_us, exposure_us + BLANK_US), most_us)
+        due_ns = time.monotonic_ns()
+        while self._running.is_set():
+            if self.pi.frozen:
+                never.wait(0.01)
+                continue
+            start_ns = max(due_ns, time.monotonic_ns())
+            due_ns = start_ns + duration_us * 1000
+            end_ns = start_ns + exposure_us * 1000
+            while (left_ns := end_ns - time.monotonic_ns()) > 0:
+                never.wait(left_ns / 1e9)
+            self.pi.exposures.append((start_ns, end_ns))
+            luck = self._rng.random()
+            if luck >= self.pi.lost + self.pi.damaged and self.pi.held < BUFFERS:
+                stamp_ns = start_ns if self.pi.stamps_start else end_ns
+                metadata = {
+                    "SensorTimestamp": stamp_ns + self.pi.stamp_offset_ns,
+                    "ExposureTime": exposure_us,
+                    "AnalogueGain": gain,
+                    "FrameDuration": duration_us,
+                }
+                request = FakeRequest(self, self._seen(start_ns, end_ns, gain), metadata)
+                with self._lock:
+                    self.pi.held += 1
+                    self._completed.append(request)
+                    self._serve()
+                    while len(self._completed) > 1:
+                        self._completed.popleft().release()
+            while self._running.is_set() and (left_ns := due_ns - time.monotonic_ns()) > 0:
+                never.wait(min(left_ns / 1e9, 0.02))
+
+    def _seen(self, start_ns: int, end_ns: int, gain: float) -> NDArray[np.uint8]:
+        stream = self._config[self.read_stream]
+        width, height = stream["size"]
+        image = self.pi.stage.exposed(start_ns, end_ns, gain=gain)[:height, :width]
+        rows = np.ascontiguousarray(image).view(np.uint8).reshape(height, -1)
+        padded = np.full((height, stream["stride"]), 0x55, np.uint8)
+        padded[:, : rows.shape[1]] = rows
+        colours = height * stream["stride"] // 2 if stream["format"] == "YUV420" else 0
+        return np.concatenate([padded.ravel(), np.full(colours, 128, np.uint8)])

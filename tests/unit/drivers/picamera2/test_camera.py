@@ -1,0 +1,218 @@
+"""The picamera2 driver on a stand-in for the library: settings, pixels, times, and what goes wrong."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.picamera2 import PiCamera, find_devices, open_camera
+from slrig.devices import CameraSettings, Trigger
+from slrig.errors import (
+    DeviceBusyError,
+    DeviceGoneError,
+    DeviceStateError,
+    FrameTimeoutError,
+    LibraryMissingError,
+    UnsupportedByDeviceError,
+)
+from slrig.model import Frame
+from tests.contract.stage import Stage
+from tests.unit.capture.fake_rig import Scene
+from tests.unit.drivers.picamera2.fake_picamera2 import BLANK_US, Pi
+
+WHITE = np.full((1, 1), 255, np.uint8)
+EXPOSURE_S = 0.005
+
+
+def pi(*, bit_depth: int = 10, **fields: object) -> Pi:
+    return Pi(Stage(Scene(bit_depth=bit_depth)), **fields)  # type: ignore[arg-type]
+
+
+@contextmanager
+def opened(where: Pi, **options: object) -> Iterator[PiCamera]:
+    with where.connected():
+        camera = open_camera("left", {"device": where.identity, **options}, Path())
+    assert isinstance(camera, PiCamera)
+    try:
+        yield camera
+    finally:
+        camera.close()
+
+
+def frames(camera: PiCamera, count: int) -> list[Frame]:
+    camera.configure(CameraSettings(EXPOSURE_S))
+    camera.arm(count, Trigger.FREE)
+    return [camera.read(0, 5.0) for _ in range(count)]
+
+
+# ---- what is there
+
+
+def test_it_is_found_by_libcameras_id() -> None:
+    with pi().connected():
+        (found,) = find_devices()
+        assert found.driver == "picamera2"
+        assert found.device.endswith("ov9281@60")
+        with pytest.raises(DeviceGoneError, match=r"no camera 'Acme' is connected; found: .*ov9281@60"):
+            open_camera("left", {"device": "Acme"}, Path())
+
+
+def test_a_missing_library_and_a_camera_in_use_are_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "picamera2", None)
+    for call in (find_devices, lambda: open_camera("left", {"device": "x"}, Path())):
+        with pytest.raises(LibraryMissingError, match="--system-site-packages") as error:
+            call()
+        assert error.value.install.startswith("sudo apt install python3-libcamera")
+    with pytest.raises(DeviceBusyError, match="another program holds"), opened(pi(held_elsewhere=True)):
+        pass
+
+
+# ---- settings
+
+
+def test_settings_are_read_back_from_a_frame_with_the_period_that_they_allow() -> None:
+    where = pi()
+    with opened(where) as camera:
+        fast = camera.configure(CameraSettings(0.005, 2.0))
+        slow = camera.configure(CameraSettings(0.02))
+        assert camera.info.exposure_range_s == pytest.approx((80e-6, 0.066666))
+        assert camera.info.gain_range == (1.0, 16.0)
+    assert (fast.exposure_s, fast.gain, fast.least_period_s) == pytest.approx((0.005, 2.0, 0.008333))
+    assert slow.least_period_s == pytest.approx(0.02 + BLANK_US / 1e6)
+    # Nothing automatic, and no sharpening: what its controls are, and not those that it lacks.
+    off = {"AeEnable": False, "AwbEnable": False, "NoiseReductionMode": 0, "Sharpness": 0.0, "Contrast": 1.0}
+    assert where.asked == {**off, "ExposureTime": 20_000, "AnalogueGain": 1.0, "FrameDurationLimits": (8_333, 25_000)}
+    assert where.held == 0
+
+
+def test_what_the_sensor_takes_otherwise_is_refused() -> None:
+    with opened(pi()) as camera:
+        with pytest.raises(UnsupportedByDeviceError, match=r"exposure_s 0\.00015 and gain 1, it gives 0\.00016 and 1"):
+            camera.configure(CameraSettings(0.00015))
+        with pytest.raises(UnsupportedByDeviceError, match=r"asked for exposure_s 1, it takes"):
+            camera.configure(CameraSettings(1.0))
+        with pytest.raises(UnsupportedByDeviceError, match="by: free"):
+            camera.arm(1, Trigger.SOFTWARE)
+
+
+def test_a_lens_that_moves_is_held() -> None:
+    where = pi()
+    with pytest.raises(UnsupportedByDeviceError, match="its lens is fixed"), opened(where, focus_dioptres=2):
+        pass
+    where.controls |= {"LensPosition": (0.0, 32.0, 1.0), "AfMode": (0, 2, 0)}
+    with pytest.raises(UnsupportedByDeviceError, match="write focus_dioptres"), opened(where):
+        pass
+    with opened(where, focus_dioptres=2.0) as camera:
+        camera.configure(CameraSettings(EXPOSURE_S))
+    assert (where.asked["AfMode"], where.asked["LensPosition"]) == (0, 2.0)
+
+
+# ---- pixels
+
+
+@pytest.mark.parametrize(
+    ("pixels", "raw_format", "bit_depth"),
+    [("raw", "R10", 10), ("raw", "R8", 8), ("luma", "R10", 8), ("raw", "R16", 16)],
+)
+def test_pixels_are_those_of_the_sensor(pixels: str, raw_format: str, bit_depth: int) -> None:
+    where = pi(bit_depth=bit_depth, raw_format=raw_format)
+    where.stage.show(WHITE)
+    with opened(where, pixels=pixels) as camera:
+        assert camera.info.format.bit_depth == bit_depth
+        (frame,) = frames(camera, 1)
+    np.testing.assert_array_equal(frame.image, where.stage.expected(WHITE, exposure_s=EXPOSURE_S))
+
+
+def test_a_mosaic_of_colours_becomes_grey() -> None:
+    where = pi(raw_format="SRGGB10")
+    where.stage.show(WHITE)
+    with opened(where) as camera:
+        (frame,) = frames(camera, 1)
+    expected = where.stage.expected(WHITE, exposure_s=EXPOSURE_S)
+    assert frame.image.dtype == np.uint16
+    assert np.median(np.abs(frame.image.astype(float) - expected)) < 0.02 * expected.mean()
+
+
+def test_modes_and_formats_that_are_not_there_are_refused() -> None:
+    size = Scene().camera
+    half = (size.width_px // 2, size.height_px // 2)
+    with opened(pi(), size_px=half) as camera:
+        assert camera.info.format.size.shape == half[::-1]
+    with (
+        pytest.raises(UnsupportedByDeviceError, match=f"has the modes {half[0]} x {half[1]}"),
+        opened(pi(), size_px=(17, 17)),
+    ):
+        pass
+    compressed = pi(gives={"format": "MONO_PISP_COMP1"})
+    with pytest.raises(UnsupportedByDeviceError, match="libcamera gives MONO_PISP_COMP1"), opened(compressed):
+        pass
+
+
+# ---- when
+
+
+@pytest.mark.parametrize("suspended_s", [0.0, 3600.0])
+@pytest.mark.parametrize("stamps_start", [False, True])
+def test_the_exposure_is_where_the_frame_says(
+    stamps_start: bool, suspended_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offset_ns = round(suspended_s * 1e9)
+    monkeypatch.setattr(time, "clock_gettime_ns", lambda _: time.monotonic_ns() + offset_ns)
+    where = pi(stamps_start=stamps_start, stamp_offset_ns=offset_ns)
+    with opened(where, time_stamp="exposure" if stamps_start else "readout") as camera:
+        taken = frames(camera, 5)
+    for frame in taken:
+        assert any(abs(start_ns - frame.t_start_ns) <= frame.t_err_ns for start_ns, _ in where.exposures)
+        assert frame.t_end_ns - frame.t_start_ns == pytest.approx((EXPOSURE_S + frame.shutter_skew_s) * 1e9, abs=2)
+        assert 0 <= frame.shutter_skew_s <= 0.008333
+
+
+def test_a_global_shutter_has_no_skew() -> None:
+    with opened(pi(), global_shutter=True) as camera:
+        (frame,) = frames(camera, 1)
+    assert frame.shutter_skew_s == 0
+
+
+def test_frames_that_began_before_are_passed_over_and_give_their_memory_back() -> None:
+    where = pi(lost=0.1, damaged=0.05)
+    with opened(where) as camera:
+        camera.configure(CameraSettings(EXPOSURE_S))
+        camera.arm(1, Trigger.FREE)
+        for turn in range(60):
+            shown_ns = where.stage.show(WHITE if turn % 2 else None)
+            frame = camera.read(shown_ns, 5.0)
+            truth = where.stage.expected(WHITE if turn % 2 else None, exposure_s=EXPOSURE_S)
+            np.testing.assert_array_equal(frame.image, truth)
+    assert where.held == 0
+
+
+def test_lost_and_damaged_frames_are_counted_by_the_time_that_passed() -> None:
+    where = pi(lost=0.2, damaged=0.1)
+    with opened(where) as camera:
+        taken = frames(camera, 40)
+    numbers = [frame.sequence_number for frame in taken]
+    assert numbers == sorted(set(numbers))
+    assert taken[-1].dropped_count == numbers[-1] - len(taken) + 1
+    assert taken[-1].dropped_count >= 5
+
+
+# ---- what goes wrong
+
+
+def test_a_camera_that_falls_silent_times_out_and_can_be_closed() -> None:
+    where = pi()
+    with opened(where) as camera:
+        frames(camera, 1)
+        where.frozen = True
+        with pytest.raises(FrameTimeoutError, match="check its cable"):
+            camera.read(time.monotonic_ns(), 0.2)
+        camera.disarm()
+        camera.close()
+        with pytest.raises(DeviceStateError, match="closed"):
+            camera.arm(1, Trigger.FREE)
