@@ -99,12 +99,12 @@ class OakCamera:
         self._feed.begin()
         self._board.send(self._stream.socket, control)
         if self._stream.external_trigger:
-            return AppliedSettings(self._asked[0] / 1e6, self._asked[1] / ISO_OF_GAIN_1)
+            return AppliedSettings(self._asked[0] / 1e6, self._asked[1] / ISO_OF_GAIN_1, 1 / self._stream.fps)
         until_ns = time.monotonic_ns() + round((_SETTLE_S + 8 / self._stream.fps) * 1e9)
         last: Delivery | None = None
         while (delivery := self._feed.take(until_ns)) is not None:
             if self._as_asked(delivery):
-                return AppliedSettings(delivery.exposure_us / 1e6, delivery.iso / ISO_OF_GAIN_1)
+                return AppliedSettings(delivery.exposure_us / 1e6, delivery.iso / ISO_OF_GAIN_1, 1 / self._stream.fps)
             last = delivery
             if delivery.received_ns > until_ns:
                 break

@@ -1,10 +1,22 @@
-"""Cameras that speak GenICam, GigE Vision or USB3 Vision, through Aravis. Extra: `genicam`.
+"""Cameras that speak GenICam, through one of two libraries.
 
-Tried on a GigE Vision camera over loopback. USB3 Vision goes the same way through Aravis, and was not tried.
+`genicam`: GigE Vision and USB3 Vision through Aravis; extra `genicam`. Tried on a GigE Vision camera over loopback;
+USB3 Vision goes the same way through Aravis, and was not tried.
+
+`gentl`: what a vendor's GenTL producer serves (GigE Vision, USB3 Vision, CoaXPress, Camera Link and others) through
+harvesters; extra `gentl`. Tried on a producer of our own.
 """
 
-from drivers.genicam.camera import GenicamCamera, open_camera
-from drivers.genicam.finder import find_devices
-from drivers.genicam.options import GenicamOptions
+from drivers.genicam.camera import GenicamCamera, open_camera, open_gentl_camera
+from drivers.genicam.finder import find_devices, find_gentl_devices
+from drivers.genicam.options import GenicamOptions, GentlOptions
 
-__all__ = ["GenicamCamera", "GenicamOptions", "find_devices", "open_camera"]
+__all__ = [
+    "GenicamCamera",
+    "GenicamOptions",
+    "GentlOptions",
+    "find_devices",
+    "find_gentl_devices",
+    "open_camera",
+    "open_gentl_camera",
+]

@@ -17,9 +17,11 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from drivers.genicam.aravis import AravisConnection
 from drivers.genicam.connection import Connection
 from drivers.genicam.features import differ
-from drivers.genicam.options import GenicamOptions
+from drivers.genicam.gentl import GentlConnection
+from drivers.genicam.options import CameraOptions, GenicamOptions, GentlOptions
 from drivers.genicam.pixels import FORMATS
 from drivers.genicam.session import Session
 from drivers.genicam.setup import line_of, prepare, set_trigger
@@ -33,29 +35,30 @@ _LATE_S = 0.2
 _MOST_BUFFER_BYTES = 1 << 30
 _FEWEST_BUFFERS = 8
 
+_RATES = ("AcquisitionResultingFrameRate", "ResultingFrameRate", "ResultingFrameRateAbs")
+"""What tells the fastest rate that exposure, read-out and link allow: SFNC has no name for it, makers have theirs."""
+
 
 class GenicamCamera:
-    """Implements `slrig.devices.Camera` on Aravis.
+    """Implements `slrig.devices.Camera`.
 
     Parameters
     ----------
-    name
-        As the rig file calls it.
+    connection
+        The open device; this camera closes it.
     options
         Checked already.
 
     Raises
     ------
-    LibraryMissingError, DeviceGoneError, DeviceBusyError
-        See `Connection`.
     UnsupportedByDeviceError
         The device does not take an option, or takes it otherwise.
     """
 
-    def __init__(self, name: str, options: GenicamOptions) -> None:
-        self._name = name
+    def __init__(self, connection: Connection, options: CameraOptions) -> None:
+        self._name = connection.name
         self._options = options
-        self._connection = Connection(name, options)
+        self._connection = connection
         self._state = self._connection.state
         self._session: Session
         self._owes = False
@@ -63,6 +66,7 @@ class GenicamCamera:
             self._size = prepare(self._connection, options)
             self._line = line_of(self._connection, options)
             self._info = self._declared()
+            self._rate = next((each for each in _RATES if self._connection.features.has(each)), None)
             self._applied = self._in_use()
         except BaseException:
             self._connection.close()
@@ -165,7 +169,9 @@ class GenicamCamera:
     def _in_use(self) -> AppliedSettings:
         with self._connection.asking("reading exposure and gain") as camera:
             gain = float(camera.get_gain()) if camera.is_gain_available() else 1.0
-            return AppliedSettings(camera.get_exposure_time() / 1e6, gain)
+            exposure_s = camera.get_exposure_time() / 1e6
+        rate_hz = self._connection.features.number(self._rate) if self._rate is not None else 0.0
+        return AppliedSettings(exposure_s, gain, 1 / rate_hz if rate_hz > 0 else None)
 
     def _buffers(self, count: int) -> int:
         """As many as frames are asked for, so that none is lost while nobody reads; fewer if memory forbids."""
@@ -205,5 +211,34 @@ def open_camera(name: str, options: Mapping[str, object], folder: Path) -> Camer
         The camera does not take an option, or takes it otherwise.
     """
     del folder
-    table = f"the [[camera]] table of '{name}' (driver genicam)"
-    return GenicamCamera(name, checked(GenicamOptions, options, table))
+    table = checked(GenicamOptions, options, f"the [[camera]] table of '{name}' (driver genicam)")
+    return GenicamCamera(AravisConnection(name, table), table)
+
+
+def open_gentl_camera(name: str, options: Mapping[str, object], folder: Path) -> Camera:
+    """Open a camera behind a GenTL producer from a rig file's `[[camera]]` table.
+
+    Parameters
+    ----------
+    name
+        As the rig file calls it.
+    options
+        `GentlOptions`.
+    folder
+        Where the path of a producer counts from.
+
+    Raises
+    ------
+    ConfigError
+        The options have faults, all of them in one message.
+    LibraryMissingError
+        harvesters is not installed, or there is no producer.
+    DeviceGoneError
+        No such camera answers.
+    DeviceBusyError
+        Another program controls it.
+    UnsupportedByDeviceError
+        The camera does not take an option, or takes it otherwise.
+    """
+    table = checked(GentlOptions, options, f"the [[camera]] table of '{name}' (driver gentl)")
+    return GenicamCamera(GentlConnection(name, table, folder), table)

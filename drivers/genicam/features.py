@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
-from drivers.genicam.library import library
 from slrig.errors import UnsupportedByDeviceError
 
 TOLERANCE = 0.01
@@ -23,11 +22,16 @@ class Features:
     asking
         Gives the `Aravis.Camera` for one question; its registers must not be cached, so that what is read back comes
         from the camera.
+    kind
+        Of a feature: see `Connection`.
     """
 
-    def __init__(self, name: str, asking: Callable[[str], AbstractContextManager[Any]]) -> None:
+    def __init__(
+        self, name: str, asking: Callable[[str], AbstractContextManager[Any]], kind: Callable[[str], str]
+    ) -> None:
         self._name = name
         self._ask = asking
+        self._kind = kind
 
     def has(self, feature: str) -> bool:
         """Whether the device has the feature, and offers it as it is set now."""
@@ -49,6 +53,11 @@ class Features:
         with self._asking(feature) as camera:
             return int(camera.get_integer(feature))
 
+    def number(self, feature: str) -> float:
+        """The value of a number with decimals."""
+        with self._asking(feature) as camera:
+            return float(camera.get_float(feature))
+
     def execute(self, feature: str) -> None:
         """Execute a command."""
         with self._asking(feature) as camera:
@@ -67,6 +76,9 @@ class Features:
             raise self._refused(
                 feature, entry, f"it offers {', '.join(offered) or 'nothing now'}", "choose one of these"
             )
+        if self.text(feature) == entry:
+            # Some cameras offer one entry only, and do not let it be written.
+            return
         with self._asking(feature) as camera:
             camera.set_string(feature, entry)
         self._compare(feature, entry, self.text(feature))
@@ -91,27 +103,23 @@ class Features:
                 "from features, or set what enables it before"
             )
             raise UnsupportedByDeviceError(message)
-        aravis = library().aravis
-        with self._asking(feature) as camera:
-            node = camera.get_device().get_feature(feature)
-        match value:
-            case bool() if isinstance(node, aravis.GcBoolean):
+        match value, self._kind(feature):
+            case bool(), "Boolean":
                 with self._asking(feature) as camera:
                     camera.set_boolean(feature, value)
                     got = bool(camera.get_boolean(feature))
                 self._compare(feature, value, got)
-            case str() if isinstance(node, aravis.GcEnumeration):
+            case str(), "Enumeration":
                 self.choose(feature, value)
-            case str() if isinstance(node, aravis.GcString):
+            case str(), "String":
                 with self._asking(feature) as camera:
                     camera.set_string(feature, value)
                 self._compare(feature, value, self.text(feature))
-            case int() if isinstance(node, aravis.GcInteger) and not isinstance(value, bool):
+            case int(), "Integer" if not isinstance(value, bool):
                 self.set_whole(feature, value)
-            case int() | float() if isinstance(node, aravis.GcFloat) and not isinstance(value, bool):
+            case int() | float(), "Float" if not isinstance(value, bool):
                 self._set_number(feature, float(value))
-            case _:
-                kind = type(node).__name__.removeprefix("Gc").removesuffix("Node")
+            case _, kind:
                 raise self._refused(feature, value, f"it is a feature of the kind {kind}", "write a value of that kind")
 
     def _set_number(self, feature: str, value: float) -> None:

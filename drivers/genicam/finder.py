@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from drivers.genicam.connection import listed
+from drivers.genicam import aravis, producers
 from slrig.devices import FoundDevice
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
-    """Every GigE Vision and USB3 Vision camera that answers; opens none.
+    """Every GigE Vision and USB3 Vision camera that answers Aravis; opens none.
 
     Raises
     ------
     LibraryMissingError
         Aravis or PyGObject is not installed.
     """
-    return tuple(FoundDevice("genicam", identity, label) for identity, label in listed())
+    return tuple(FoundDevice("genicam", identity, label) for identity, label in aravis.listed())
+
+
+def find_gentl_devices() -> tuple[FoundDevice, ...]:
+    """Every camera that an installed GenTL producer sees; opens none.
+
+    Raises
+    ------
+    LibraryMissingError
+        harvesters is not installed.
+    """
+    return tuple(FoundDevice("gentl", identity, label) for identity, label in producers.listed())

@@ -31,11 +31,11 @@ class Region(Strict, use_attribute_docstrings=True):
     """How many rows."""
 
 
-class GenicamOptions(Strict, use_attribute_docstrings=True):
-    """The keys of a `[[camera]]` table with `driver = "genicam"` (beside name, exposure_s and gain)."""
+class CameraOptions(Strict, use_attribute_docstrings=True):
+    """What a rig file says about a GenICam camera, whichever library opens it."""
 
     device: str = Field(min_length=1)
-    """Aravis' id (vendor-model-serial, as `slrig devices` lists it), or the IP address of a GigE camera."""
+    """As `slrig devices` lists it."""
 
     pixel_format: str = Field(default="Mono8", min_length=1)
     """PFNC name: Mono8, Mono10, Mono12, Mono16, their packed kinds, Bayer…, RGB8, BGR8."""
@@ -64,6 +64,25 @@ class GenicamOptions(Strict, use_attribute_docstrings=True):
     """How long a frame may take from its software trigger to that arrival, beyond the exposure; so long the next
     trigger waits for it."""
 
+    @model_validator(mode="after")
+    def _set_once(self) -> Self:
+        """Refuse features that the driver sets itself: two masters for one register."""
+        own = sorted(set(self.features) & OWN_FEATURES)
+        if own:
+            message = (
+                f"features names {', '.join(own)}, which the driver sets itself; use exposure_s, gain, pixel_format, "
+                "region and trigger_line instead"
+            )
+            raise ValueError(message)
+        return self
+
+
+class GenicamOptions(CameraOptions, use_attribute_docstrings=True):
+    """The keys of a `[[camera]]` table with `driver = "genicam"` (beside name, exposure_s and gain)."""
+
+    device: str = Field(min_length=1)
+    """Aravis' id (vendor-model-serial, as `slrig devices` lists it), or the IP address of a GigE camera."""
+
     packet_size_bytes: int | None = Field(default=None, ge=_LEAST_PACKET_BYTES, le=_MOST_PACKET_BYTES)
     """GigE: the size of packets; else the largest that arrives whole is found out."""
 
@@ -77,17 +96,16 @@ class GenicamOptions(Strict, use_attribute_docstrings=True):
     """GigE: read the network card directly (less load; needs CAP_NET_RAW, and receives nothing on a loopback
     interface)."""
 
-    @model_validator(mode="after")
-    def _set_once(self) -> Self:
-        """Refuse features that the driver sets itself: two masters for one register."""
-        own = sorted(set(self.features) & OWN_FEATURES)
-        if own:
-            message = (
-                f"features names {', '.join(own)}, which the driver sets itself; use exposure_s, gain, pixel_format, "
-                "region and trigger_line instead"
-            )
-            raise ValueError(message)
-        return self
+
+class GentlOptions(CameraOptions, use_attribute_docstrings=True):
+    """The keys of a `[[camera]]` table with `driver = "gentl"` (beside name, exposure_s and gain)."""
+
+    device: str = Field(min_length=1)
+    """The producer's id of the camera (as `slrig devices` lists it), or its serial number."""
+
+    producer: str | None = Field(default=None, min_length=1)
+    """The vendor's GenTL producer, a .cti file, from the rig file's folder; else all in the folders that the variable
+    GENICAM_GENTL64_PATH names."""
 
 
 OWN_FEATURES = frozenset(

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
-from drivers.genicam.connection import Connection
-from drivers.genicam.library import library
-from drivers.genicam.options import GenicamOptions
+from drivers.genicam.connection import Connection, Delivery, Stream
+from drivers.genicam.options import CameraOptions
 from drivers.genicam.pixels import PixelFormat, grey
 from drivers.genicam.timing import (
     Arrival,
@@ -21,15 +18,12 @@ from drivers.genicam.timing import (
     UntriggeredStarts,
 )
 from slrig.devices import AppliedSettings, Trigger
-from slrig.errors import DeviceError, FrameTimeoutError
+from slrig.errors import FrameTimeoutError
 from slrig.model import Frame, Pixels, Size
 
 _SLICE_S = 0.05
 _LATCHES = 5
 _TIE_AGAIN_NS = 5_000_000_000
-_OLDEST_NS = 60_000_000_000
-_CLOCK_TRIES = 5
-_CLOCK_TIGHT_NS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +46,12 @@ class Session:
         What was set.
     """
 
-    def __init__(self, connection: Connection, options: GenicamOptions, form: PixelFormat, size: Size) -> None:
+    def __init__(self, connection: Connection, options: CameraOptions, form: PixelFormat, size: Size) -> None:
         self._connection = connection
         self._options = options
         self._form = form
         self._size = size
-        self._stream: Any = None
+        self._stream: Stream | None = None
         self._numbers = FrameNumbers()
         self._good = 0
         self._last_end_ns = 0
@@ -77,23 +71,13 @@ class Session:
         self._stamped = self._options.time_stamp != "none" and self._connection.has_stamps
         self._tied_ns = 0
         self._tie(_LATCHES)
-        aravis = library().aravis
-        with self._connection.asking("starting") as camera:
-            payload = camera.get_payload()
-            self._stream = self._connection.stream(self._options)
-            for _ in range(buffers):
-                self._stream.push_buffer(aravis.Buffer.new_allocate(payload))
-            camera.start_acquisition()
+        self._stream = self._connection.start(buffers)
 
     def end(self) -> None:
         """Stop, whatever state the camera is in."""
-        if not self._connection.is_lost:
-            # A camera that is lost only now is told of by the next call that needs it.
-            with suppress(DeviceError), self._connection.asking("stopping") as camera:
-                camera.stop_acquisition()
         if self._stream is not None:
-            stream, self._stream = [self._stream], None
-            self._connection.let_go(stream)
+            stream, self._stream = self._stream, None
+            stream.end()
 
     def triggered(self, begun_ns: int, ended_ns: int, *, times: int) -> None:
         """Note a software trigger, and how often it may have been sent."""
@@ -147,23 +131,15 @@ class Session:
         self._waiting.clear()
 
     def _take(self, most_s: float) -> bool:
-        """Take one buffer from the stream and judge it, waiting for it no longer than a slice; False: none came."""
-        if most_s > 0:
-            buffer = self._stream.timeout_pop_buffer(round(min(most_s, _SLICE_S) * 1e6) + 1)
-        else:
-            buffer = self._stream.try_pop_buffer()
-        if buffer is None:
-            return False
-        try:
-            self._judge(buffer)
-        finally:
-            self._stream.push_buffer(buffer)
-        return True
+        """Take one frame from the stream and judge it, waiting for it no longer than a slice; False: none came."""
+        delivery = None if self._stream is None else self._stream.take(min(most_s, _SLICE_S))
+        if delivery is not None:
+            self._judge(delivery)
+        return delivery is not None
 
-    def _judge(self, buffer: Any) -> None:
-        arrived_ns = _arrived_ns(buffer)
-        number = self._numbers.next(int(buffer.get_frame_id()))
-        image = self._image(buffer)
+    def _judge(self, delivery: Delivery) -> None:
+        number = self._numbers.next(delivery.block_id)
+        image = self._image(delivery)
         if image is None:
             self._passed["corrupt"] += 1
             return
@@ -171,8 +147,8 @@ class Session:
             self._passed["repeated"] += 1
             return
         self._good += 1
-        stamp_ns = int(buffer.get_timestamp()) if self._stamped else 0
-        arrival = Arrival(number, stamp_ns or None, arrived_ns)
+        stamp_ns = delivery.stamp_ns if self._stamped else 0
+        arrival = Arrival(number, stamp_ns or None, delivery.arrived_ns)
         start = self._asked.start(arrival) if self.trigger is Trigger.SOFTWARE else self._unasked.start(arrival)
         if start is None:
             self._passed["unasked"] += 1
@@ -197,15 +173,13 @@ class Session:
             gain=self._applied.gain,
         )
 
-    def _image(self, buffer: Any) -> Pixels | None:
+    def _image(self, delivery: Delivery) -> Pixels | None:
         """The image, or None if packets are missing or it is not what was set."""
-        aravis = library().aravis
-        if buffer.get_status() != aravis.BufferStatus.SUCCESS:
-            return None
-        if (buffer.get_image_width(), buffer.get_image_height()) != (self._size.width_px, self._size.height_px):
+        image = delivery.image
+        if image is None or image.size != self._size:
             return None
         try:
-            return grey(buffer.get_data(), self._form, self._size, padding_bytes=buffer.get_image_padding()[0])
+            return grey(image.data, self._form, self._size, padding_bytes=image.padding_bytes)
         except ValueError:
             return None
 
@@ -238,24 +212,3 @@ class Session:
         latches = [latch for latch in (self._connection.latch() for _ in range(looks)) if latch is not None]
         if len(latches) == looks:
             self._clock.latch(latches)
-
-
-def _arrived_ns(buffer: Any) -> int:
-    """When the frame's first packet arrived, CLOCK_MONOTONIC: Aravis notes it on the wall clock."""
-    now_ns, wall_ns = _both_clocks()
-    ago_ns = wall_ns - int(buffer.get_system_timestamp())
-    # A wall clock that was set meanwhile tells nothing; the frame has arrived by now in any case.
-    return now_ns - ago_ns if 0 <= ago_ns < _OLDEST_NS else now_ns
-
-
-def _both_clocks() -> tuple[int, int]:
-    """CLOCK_MONOTONIC and the wall clock at one instant, as near as a few tries bring them."""
-    best_ns, found = _OLDEST_NS, (0, 0)
-    for _ in range(_CLOCK_TRIES):
-        before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        if after_ns - before_ns < best_ns:
-            # The later of the two: a frame must not seem to have arrived before it did.
-            best_ns, found = after_ns - before_ns, (after_ns, wall_ns)
-        if best_ns < _CLOCK_TIGHT_NS:
-            break
-    return found

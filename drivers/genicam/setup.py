@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from drivers.genicam.connection import Connection
-from drivers.genicam.options import GenicamOptions, Region
+from drivers.genicam.options import CameraOptions, Region
 from drivers.genicam.pixels import FORMATS
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size
 
-_SELECTOR, _FRAME_START = "TriggerSelector", "FrameStart"
+_SELECTOR = "TriggerSelector"
+_STARTS = ("FrameStart", "ExposureStart")
+"""What starts one frame; IDS' cameras (uEye+) have the latter only. For one exposure per frame they are the same."""
+
 _AUTOMATIC = ("ExposureAuto", "GainAuto", "BlackLevelAuto", "BalanceWhiteAuto", "GammaAuto")
 
 
-def prepare(connection: Connection, options: GenicamOptions) -> Size:
+def prepare(connection: Connection, options: CameraOptions) -> Size:
     """Stop what runs, switch off what is automatic, set format, region and features. Return the image's extent.
 
     Raises
@@ -44,7 +47,7 @@ def prepare(connection: Connection, options: GenicamOptions) -> Size:
     return _set_region(connection, options)
 
 
-def _set_region(connection: Connection, options: GenicamOptions) -> Size:
+def _set_region(connection: Connection, options: CameraOptions) -> Size:
     features = connection.features
     # Extents are bounded by the offsets in use, so those go first, and come back last.
     for offset in ("OffsetX", "OffsetY"):
@@ -69,7 +72,7 @@ def _set_region(connection: Connection, options: GenicamOptions) -> Size:
     return Size(region.width_px, region.height_px)
 
 
-def line_of(connection: Connection, options: GenicamOptions) -> str | None:
+def line_of(connection: Connection, options: CameraOptions) -> str | None:
     """Return the input that a hardware trigger comes by; None if the camera has none.
 
     Raises
@@ -79,7 +82,7 @@ def line_of(connection: Connection, options: GenicamOptions) -> str | None:
     """
     features = connection.features
     if features.has(_SELECTOR):
-        features.choose(_SELECTOR, _FRAME_START)
+        features.choose(_SELECTOR, _start_of(features.choices(_SELECTOR)))
     lines = (
         tuple(source for source in features.choices("TriggerSource") if source.startswith("Line"))
         if (features.has("TriggerSource"))
@@ -96,7 +99,7 @@ def line_of(connection: Connection, options: GenicamOptions) -> str | None:
     return options.trigger_line
 
 
-def set_trigger(connection: Connection, source: str | None, options: GenicamOptions) -> None:
+def set_trigger(connection: Connection, source: str | None, options: CameraOptions) -> None:
     """Let `source` start every exposure; None lets the camera run by itself.
 
     Raises
@@ -106,13 +109,14 @@ def set_trigger(connection: Connection, source: str | None, options: GenicamOpti
     """
     features = connection.features
     selectors = features.choices(_SELECTOR) if features.has(_SELECTOR) else ()
+    start = _start_of(selectors)
     for selector in selectors:
-        if selector != _FRAME_START:
+        if selector != start:
             features.choose(_SELECTOR, selector)
             if features.has("TriggerMode"):
                 features.choose("TriggerMode", "Off")
     if selectors:
-        features.choose(_SELECTOR, _FRAME_START)
+        features.choose(_SELECTOR, start)
     if source is None:
         if features.has("TriggerMode"):
             features.choose("TriggerMode", "Off")
@@ -121,3 +125,8 @@ def set_trigger(connection: Connection, source: str | None, options: GenicamOpti
     features.choose("TriggerSource", source)
     if source != "Software" and features.has("TriggerActivation"):
         features.choose("TriggerActivation", options.trigger_activation)
+
+
+def _start_of(selectors: tuple[str, ...]) -> str:
+    """The selector of what starts a frame; the usual one, which is then refused, where there is none of them."""
+    return next((each for each in _STARTS if each in selectors), _STARTS[0])

@@ -71,7 +71,8 @@ class FakeGigE:
     stage
         What it sees.
     kind
-        "stock": as Aravis makes it; "sfnc": in the names of SFNC 2, with a trigger line and more pixel formats.
+        "stock": as Aravis makes it; "sfnc": in the names of SFNC 2, with a trigger line and more pixel formats;
+        "exposure start": the same, its trigger selector named as IDS' cameras name it.
     fate
         Asked once per frame.
     packed

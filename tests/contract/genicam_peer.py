@@ -67,8 +67,17 @@ def read_exactly(stream: socket.socket, count: int) -> bytes:
     return got
 
 
-def sfnc(xml: str) -> str:
-    """The fake camera's description in today's names (SFNC 2), with more pixel formats and a trigger line."""
+# As fast as exposure and 2 ms of read-out, one after the other, allow.
+_RATE = """
+<SwissKnife Name="ResultingFrameRate"><pVariable Name="EXPOSURE">ExposureTimeRegister</pVariable>
+<Formula>1000000.0 / (EXPOSURE + 2000.0)</Formula></SwissKnife>
+"""
+
+
+def sfnc(xml: str, *, start: str = "FrameStart") -> str:
+    """The fake camera's description in today's names (SFNC 2), with more pixel formats, a trigger line, and the rate
+    that its settings result in. start : the trigger selector of what starts a frame.
+    """
     formats = "".join(
         f'<EnumEntry Name="{name}" NameSpace="Standard"><Value>{code}</Value></EnumEntry>'
         for name, code in PIXEL_FORMATS.items()
@@ -80,6 +89,8 @@ def sfnc(xml: str) -> str:
         (r'(?s)(<Enumeration Name="PixelFormat".*?</DisplayName>).*?(<pValue>)', rf"\1{formats}\2"),
         ('EnumEntry Name="Line0"', 'EnumEntry Name="Line1"'),
         ("<Address>0x304</Address>", f"<Address>{HARD_WIRE:#x}</Address>"),
+        ('(?=<Float Name="AcquisitionFrameRate">)', _RATE),
+        ('EnumEntry Name="FrameStart"', f'EnumEntry Name="{start}"'),
     )
     for old, new in edits:
         xml, found = re.subn(old, new, xml)
@@ -128,11 +139,12 @@ def main(descriptor: int, kind: str) -> None:
     gi.require_version("Aravis", "0.8")
     aravis = importlib.import_module("gi.repository.Aravis")
     starter = socket.socket(fileno=descriptor)
-    if kind == "sfnc":
+    if kind != "stock":
         text = aravis.FakeCamera.new(SERIAL).get_genicam_xml()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "camera.xml"
-            path.write_text(sfnc(text if isinstance(text, str) else text[0]), encoding="utf-8")
+            start = "ExposureStart" if kind == "exposure start" else "FrameStart"
+            path.write_text(sfnc(text if isinstance(text, str) else text[0], start=start), encoding="utf-8")
             fake = aravis.GvFakeCamera.new_full(INTERFACE, SERIAL, str(path))
     else:
         fake = aravis.GvFakeCamera.new(INTERFACE, SERIAL)
@@ -140,7 +152,7 @@ def main(descriptor: int, kind: str) -> None:
         sys.exit("the GigE Vision port of the loopback interface is taken")
     camera = fake.get_fake_camera()
     camera.set_trigger_frequency(TRIGGERS_HZ)
-    if kind == "sfnc":
+    if kind != "stock":
         camera.write_register(aravis.FAKE_CAMERA_REGISTER_TRIGGER_SOURCE, 1)
     library = ctypes.CDLL("libaravis-0.8.so.0")
     # Introspection keeps a callback for the length of the call only, so this one is given by hand.

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -40,17 +40,34 @@ def pip_install(sources: Sequence[Path], work: Path) -> Path:
     return target
 
 
+def pip_fetch(requirement: str, work: Path) -> Path:
+    """Install a package of an index into a folder, without what it requires; return that folder. Skips without one."""
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    target = work / "fetched"
+    done = subprocess.run(  # noqa: S603 - our own command
+        [*command, "--only-binary=:all:", "--target", str(target), requirement],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        pytest.skip(f"needs {requirement}, which pip could not get: {done.stderr.strip().splitlines()[-1]}")
+    return target
+
+
 def path_with(*sites: Path) -> str:
     """PYTHONPATH with these folders first."""
     known = os.environ.get("PYTHONPATH")
     return os.pathsep.join([*map(str, sites), *([known] if known else [])])
 
 
-def slrig(*arguments: str, path: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run slrig as a process of its own, in a folder, with a PYTHONPATH."""
+def slrig(
+    *arguments: str, path: str, folder: Path, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run slrig as a process of its own, in a folder, with a PYTHONPATH and more of an environment."""
     return subprocess.run(  # noqa: S603 - our own command
         [sys.executable, "-m", "slrig.cli", *arguments],
-        env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200"},
+        env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200", **(environment or {})},
         cwd=folder,
         capture_output=True,
         text=True,
@@ -64,6 +81,14 @@ def example_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the example camera and the projector that lights its chart are installed."""
     sources = [HERE / "example_package", HERE / "projector_package"]
     return pip_install(sources, tmp_path_factory.mktemp("examples"))
+
+
+@pytest.fixture(scope="session")
+def pylon_site(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """PYTHONPATH with the driver for Basler's SDK, that SDK, and a projector that lights its emulated camera."""
+    work = tmp_path_factory.mktemp("pylon")
+    sources = [HERE / name for name in ("pylon_package", "pylon_scene_package")]
+    return path_with(pip_install(sources, work), pip_fetch("pypylon>=26.9", work))
 
 
 @pytest.fixture(scope="session")

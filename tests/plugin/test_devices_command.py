@@ -22,10 +22,15 @@ from slrig.errors import DriverBrokenError
 from tests.plugin.conftest import path_with
 
 LIMIT_S = 2.0
-LIBRARIES = ("depthai", "gi")
+LIBRARIES = ("depthai", "gi", "harvesters", "picamera2")
 """What the extras bring: the child is told that there is none of it."""
 
-FINDERS = {"depthai": "drivers.depthai:find_devices", "genicam": "drivers.genicam:find_devices"}
+FINDERS = {
+    "depthai": "drivers.depthai:find_devices",
+    "genicam": "drivers.genicam:find_devices",
+    "gentl": "drivers.genicam:find_gentl_devices",
+    "picamera2": "drivers.picamera2:find_devices",
+}
 NOTHING = Findings((), (), ())
 INSTALL = "pip install 'slrig[depthai]'"
 

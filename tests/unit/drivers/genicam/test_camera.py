@@ -116,7 +116,7 @@ def expose_armed(camera: GenicamCamera) -> Frame:
         ({"features": {"BinningHorizontal": "two"}}, r"of the kind Integer"),
         ({"features": {"AcquisitionFrameRate": "fast"}}, r"of the kind Float"),
         ({"features": {"TestBoolean": 1}}, r"of the kind Boolean"),
-        ({"features": {"TestStringReg": 3}}, r"of the kind StringReg"),
+        ({"features": {"TestStringReg": 3}}, r"of the kind String"),
         ({"features": {"BinningHorizontal": 99}}, r"BinningHorizontal 99, it takes 1 to 16"),
         ({"features": {"TriggerActivation": "FallingEdge"}}, r"it offers RisingEdge"),
     ],

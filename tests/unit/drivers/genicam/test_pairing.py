@@ -44,13 +44,13 @@ class Disturbed:
 class Pairing:
     """Shows random patterns, reads a frame of each, and asks of which pattern its image is."""
 
-    def __init__(self, peer: FakeGigE, camera: GenicamCamera, seed: int) -> None:
+    def __init__(self, stage: Stage, camera: GenicamCamera, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
         self._camera = camera
         self._sequence = sequence()
-        self._projector = StagedProjector(peer.stage)
+        self._projector = StagedProjector(stage)
         self._projector.load(self._sequence)
-        truths = [peer.stage.expected(profile, exposure_s=REFERENCE_EXPOSURE_S) for profile in self._sequence.profiles]
+        truths = [stage.expected(profile, exposure_s=REFERENCE_EXPOSURE_S) for profile in self._sequence.profiles]
         self._truths = np.stack(truths).astype(np.float32)
         self._idle = threading.Event()
         self.accepted = 0
@@ -94,7 +94,7 @@ def test_triggered_frames_show_what_they_are_paired_with(peer: FakeGigE, disturb
     camera = opened(answer_s=0.02, packet_resend=False)
     camera.configure(CameraSettings(EXPOSURE_S, GAIN))
     camera.arm(100, Trigger.SOFTWARE)
-    pairing = Pairing(peer, camera, 1)
+    pairing = Pairing(peer.stage, camera, 1)
     pairing.run(FRAMES, trigger=Trigger.SOFTWARE, timeout_s=0.026)
     assert pairing.wrong == []
     assert numbers_rise(pairing.frames)
@@ -116,7 +116,7 @@ def test_free_running_frames_show_what_they_are_paired_with(
         camera = opened(device=address, features=features, packet_resend=False, transfer_s=0.05)
         camera.configure(CameraSettings(EXPOSURE_S, GAIN))
         camera.arm(100, Trigger.FREE)
-        pairing = Pairing(peer, camera, 2)
+        pairing = Pairing(peer.stage, camera, 2)
         pairing.run(count, trigger=Trigger.FREE, timeout_s=1.0)
         camera.close()
     assert pairing.wrong == []

@@ -1,0 +1,257 @@
+"""A GigE Vision or USB3 Vision camera through Aravis: how it is got, how its frames come, and how it is let go."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import AbstractContextManager, suppress
+from typing import Any
+
+from drivers.genicam.connection import Connection, Delivery, Memory, Stream
+from drivers.genicam.library import library, told
+from drivers.genicam.options import GenicamOptions
+from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
+from slrig.model import Size
+
+PROTOCOLS = ("GigEVision", "USB3Vision")
+"""What this driver opens of the things that Aravis lists."""
+
+_LATCH = 0x0944
+_LATCH_BIT = 2
+_LATCHED_HIGH, _LATCHED_LOW = 0x0948, 0x094C
+
+_OLDEST_NS = 60_000_000_000
+_CLOCK_TRIES = 5
+_CLOCK_TIGHT_NS = 20_000
+
+
+class AravisConnection(Connection):
+    """An open device. Aravis' own thread tells when control is lost.
+
+    Parameters
+    ----------
+    name
+        The camera's, for messages.
+    options
+        `GenicamOptions`.
+
+    Raises
+    ------
+    LibraryMissingError
+        Aravis is not installed.
+    DeviceGoneError
+        No such camera answers.
+    DeviceBusyError
+        Another program controls it.
+    """
+
+    def __init__(self, name: str, options: GenicamOptions) -> None:
+        super().__init__(name)
+        aravis = library().aravis
+        self._options = options
+        self._camera = _opened(aravis, name, options.device)
+        self._device = self._camera.get_device()
+        self._is_gige = bool(self._camera.is_gv_device())
+        self._device.set_register_cache_policy(aravis.RegisterCachePolicy.DISABLE)
+        # Not a method of ours: the device would keep us, and we it.
+        lost = self._lost
+        self._handler = self._device.connect("control-lost", lambda *_: lost.set())
+        try:
+            self._require_control(options.device)
+            if self._is_gige:
+                self._prepare_network(aravis, options)
+        except BaseException:
+            self.close()
+            raise
+
+    def told(self, doing: str) -> AbstractContextManager[None]:
+        """See `Connection`."""
+        return told(self.name, doing)
+
+    def kind(self, feature: str) -> str:
+        """See `Connection`."""
+        aravis = library().aravis
+        with self.asking(f"feature {feature}"):
+            node = self._device.get_feature(feature)
+        for kind in ("Boolean", "Enumeration", "String", "Integer", "Float"):
+            if isinstance(node, getattr(aravis, f"Gc{kind}")):
+                return kind
+        return type(node).__name__.removeprefix("Gc").removesuffix("Node")
+
+    def start(self, buffers: int) -> Stream:
+        """See `Connection`. A new `Aravis.Stream`: no buffer of an earlier one can come out of it."""
+        aravis = library().aravis
+        with self.asking("opening a stream") as camera:
+            stream = camera.create_stream(None, None)
+        if stream is None:
+            message = f"camera '{self.name}' gave no stream; close other programs that read from it, and try again"
+            raise DeviceError(message)
+        if isinstance(stream, aravis.GvStream):
+            resend = aravis.GvStreamPacketResend
+            stream.set_property("packet-resend", resend.ALWAYS if self._options.packet_resend else resend.NEVER)
+            stream.set_property("socket-buffer", aravis.GvStreamSocketBuffer.AUTO)
+        with self.asking("starting") as camera:
+            payload = camera.get_payload()
+            for _ in range(buffers):
+                stream.push_buffer(aravis.Buffer.new_allocate(payload))
+            camera.start_acquisition()
+        return AravisStream(self, stream)
+
+    def latch(self) -> tuple[int, int, int] | None:
+        """See `Connection`. GigE Vision has it in registers that every device shares, USB3 Vision in features."""
+        if not self._is_gige:
+            return super().latch()
+        try:
+            return self._latched_gige()
+        except UnsupportedByDeviceError:
+            return None
+
+    @property
+    def has_stamps(self) -> bool:
+        """See `Connection`."""
+        return not self._is_gige or self._device.get_timestamp_tick_frequency() > 0
+
+    def close(self) -> None:
+        """Let the device go. Idempotent; works after it is lost."""
+        if not self.state.close():
+            return
+        with suppress(Exception):
+            self._device.disconnect(self._handler)
+        held, self._device, self._camera = [self._camera, self._device], None, None
+        self.let_go(held)
+
+    def let_go(self, held: list[Any]) -> None:
+        """Drop Aravis' objects, the only references to which are in the list."""
+        if self._lost.is_set():
+            # Each of them says goodbye to the device first, and waits 5 s for an answer that will not come.
+            threading.Thread(target=held.clear, name=f"goodbye to {self.name}", daemon=True).start()
+        else:
+            held.clear()
+
+    def _latched_gige(self) -> tuple[int, int, int] | None:
+        frequency_hz = self._device.get_timestamp_tick_frequency()
+        if not frequency_hz:
+            return None
+        with self.asking("looking at its clock"):
+            before_ns = time.monotonic_ns()
+            self._device.write_register(_LATCH, _LATCH_BIT)
+            after_ns = time.monotonic_ns()
+            high, low = (self._device.read_register(address) for address in (_LATCHED_HIGH, _LATCHED_LOW))
+        seconds, ticks = divmod((high & 0xFFFFFFFF) << 32 | low & 0xFFFFFFFF, frequency_hz)
+        return before_ns, seconds * 10**9 + ticks * 10**9 // frequency_hz, after_ns
+
+    def _require_control(self, device: str) -> None:
+        if self._is_gige and not self._device.is_controller():
+            message = (
+                f"camera '{self.name}': another program controls {device}; close it, or wait some seconds if it has "
+                "just ended"
+            )
+            raise DeviceBusyError(message)
+
+    def _prepare_network(self, aravis: Any, options: GenicamOptions) -> None:
+        kind = aravis.GvStreamOption
+        with self.asking("setting up the network") as camera:
+            camera.gv_set_stream_options(kind.NONE if options.packet_socket else kind.PACKET_SOCKET_DISABLED)
+            if options.packet_delay_ns is not None:
+                camera.gv_set_packet_delay(options.packet_delay_ns)
+            if options.packet_size_bytes is None:
+                camera.gv_auto_packet_size()
+                return
+            camera.gv_set_packet_size_adjustment(aravis.GvPacketSizeAdjustment.NEVER)
+            camera.gv_set_packet_size(options.packet_size_bytes)
+            got = camera.gv_get_packet_size()
+        if got != options.packet_size_bytes:
+            message = (
+                f"camera '{self.name}': asked for packet_size_bytes {options.packet_size_bytes}, it gives {got}; write "
+                "that, or leave it out"
+            )
+            raise DeviceError(message)
+
+
+class AravisStream:
+    """Implements `Stream` on an `Aravis.Stream` that runs."""
+
+    def __init__(self, connection: AravisConnection, stream: Any) -> None:
+        self._connection = connection
+        self._stream = stream
+
+    def take(self, most_s: float) -> Delivery | None:
+        """See `Stream`."""
+        if most_s > 0:
+            buffer = self._stream.timeout_pop_buffer(round(most_s * 1e6) + 1)
+        else:
+            buffer = self._stream.try_pop_buffer()
+        if buffer is None:
+            return None
+        try:
+            arrived_ns = _arrived_ns(buffer)
+            image = None
+            if buffer.get_status() == library().aravis.BufferStatus.SUCCESS:
+                size = Size(buffer.get_image_width(), buffer.get_image_height())
+                image = Memory(buffer.get_data(), size, buffer.get_image_padding()[0])
+            return Delivery(int(buffer.get_frame_id()), arrived_ns, int(buffer.get_timestamp()), image)
+        finally:
+            self._stream.push_buffer(buffer)
+
+    def end(self) -> None:
+        """See `Stream`."""
+        connection = self._connection
+        if not connection.is_lost:
+            # A camera that is lost only now is told of by the next call that needs it.
+            with suppress(DeviceError), connection.asking("stopping") as camera:
+                camera.stop_acquisition()
+        held, self._stream = [self._stream], None
+        connection.let_go(held)
+
+
+def _opened(aravis: Any, name: str, device: str) -> Any:
+    try:
+        with told(name, f"opening {device}"):
+            return aravis.Camera.new(device)
+    except DeviceGoneError as error:
+        known = ", ".join(label for _, label in listed()) or "none"
+        message = (
+            f"camera '{name}': no GenICam camera '{device}' answers; found: {known}. Check cable, power, and that its "
+            "IP address lies in the network of this machine's card"
+        )
+        raise DeviceGoneError(message) from error
+
+
+def listed() -> tuple[tuple[str, str], ...]:
+    """Id and label of every camera that answers. Opens nothing; takes Aravis about one second."""
+    aravis = library().aravis
+    aravis.update_device_list()
+    found = []
+    for index in range(aravis.get_n_devices()):
+        protocol = aravis.get_device_protocol(index)
+        if protocol in PROTOCOLS:
+            identity = aravis.get_device_id(index)
+            parts = (
+                aravis.get_device_vendor(index),
+                aravis.get_device_model(index),
+                aravis.get_device_serial_nbr(index),
+            )
+            where = aravis.get_device_address(index)
+            found.append((identity, f"{' '.join(filter(None, parts))} ({protocol}, {where}): {identity}"))
+    return tuple(sorted(found))
+
+
+def _arrived_ns(buffer: Any) -> int:
+    """When the frame's first packet arrived, CLOCK_MONOTONIC: Aravis notes it on the wall clock."""
+    now_ns, wall_ns = _both_clocks()
+    ago_ns = wall_ns - int(buffer.get_system_timestamp())
+    # A wall clock that was set meanwhile tells nothing; the frame has arrived by now in any case.
+    return now_ns - ago_ns if 0 <= ago_ns < _OLDEST_NS else now_ns
+
+
+def _both_clocks() -> tuple[int, int]:
+    """CLOCK_MONOTONIC and the wall clock at one instant, as near as a few tries bring them."""
+    best_ns, found = _OLDEST_NS, (0, 0)
+    for _ in range(_CLOCK_TRIES):
+        before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        if after_ns - before_ns < best_ns:
+            # The later of the two: a frame must not seem to have arrived before it did.
+            best_ns, found = after_ns - before_ns, (after_ns, wall_ns)
+        if best_ns < _CLOCK_TIGHT_NS:
+            break
+    return found

@@ -1,0 +1,79 @@
+"""The gentl driver on a GenTL producer of our own, before a staged projector."""
+
+from __future__ import annotations
+
+import atexit
+import importlib.util
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+
+from drivers.genicam import open_gentl_camera
+from slrig.devices import Camera, Projector
+from slrig.model import Calibration, Truth
+from tests.contract.genicam_bench import CAMERA, scene, sequence
+from tests.contract.gentl_camera import MemoryCamera
+from tests.contract.gentl_producer import FakeProducer, build
+from tests.contract.stage import Stage, StagedProjector
+from tests.contract.suite import Bench
+
+
+def require_harvesters() -> None:
+    """Skip where harvesters or a C compiler is not installed; fail instead where CI=true, which has to install them."""
+    missing = [name for name in ("harvesters", "genicam") if importlib.util.find_spec(name) is None]
+    if shutil.which("gcc") is None:
+        missing.append("gcc")
+    if missing:
+        reason = f"needs {', '.join(missing)}: pip install 'slrig[gentl]', apt install gcc"
+        if os.environ.get("CI") == "true":
+            pytest.fail(reason)
+        pytest.skip(reason)
+
+
+@lru_cache(maxsize=1)
+def _producer() -> FakeProducer:
+    # A process loads a producer once.
+    folder = Path(tempfile.mkdtemp(prefix="slrig-gentl-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return FakeProducer(build(folder), MemoryCamera(Stage(scene())))
+
+
+def serving(camera: MemoryCamera) -> FakeProducer:
+    """The producer, with this camera plugged in."""
+    require_harvesters()
+    producer = _producer()
+    producer.serve(camera)
+    return producer
+
+
+def table(served: FakeProducer, **options: object) -> dict[str, object]:
+    """The `[[camera]]` table of the camera."""
+    region = {"width_px": CAMERA.width_px, "height_px": CAMERA.height_px}
+    device = f"slrig-memory-{served.camera.serial}"
+    return {"device": device, "producer": str(served.file), "region": region, **options}
+
+
+class GentlHead:
+    """Implements `slrig.devices.Head`: the driver's camera, and a staged projector."""
+
+    calibration: Calibration | None = None
+
+    def __init__(self, producer: FakeProducer) -> None:
+        self.projector: Projector = StagedProjector(producer.camera.stage)
+        self.cameras: Mapping[str, Camera] = {"left": open_gentl_camera("left", table(producer), Path())}
+
+    def truth(self) -> Truth | None:
+        """See `Head`."""
+        return None
+
+
+def bench(folder: Path) -> Bench:
+    """The driver before a stage, with a software trigger, a wire and a clock that can be latched."""
+    del folder
+    producer = serving(MemoryCamera(Stage(scene(noise_dn=0.5), latency_s=0.002, jitter_s=0.002)))
+    return Bench(lambda: GentlHead(producer), sequence())
