@@ -57,11 +57,13 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         There is no graphical session, or it does not let this user in.
     """
+    from drivers.display.projector import DisplayProjector
     from drivers.screen.options import ScreenOptions
-    from drivers.screen.projector import ScreenProjector
+    from drivers.screen.stage import opened
 
     del folder
-    return ScreenProjector(checked(ScreenOptions, options, "the [projector] table of driver 'screen'"))
+    told = checked(ScreenOptions, options, "the [projector] table of driver 'screen'")
+    return DisplayProjector(told, lambda: opened(told))
 
 
 def find_devices() -> tuple[FoundDevice, ...]:

@@ -6,53 +6,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from slrig.bundle.faults import Strict
-from slrig.model import Size
-
-Extent = Annotated[int, Field(ge=1, le=65_535)]
-Seconds = Annotated[float, Field(ge=0, le=5)]
-
-UNMEASURED_S = 0.05
-"""How late the light of a display is that nobody has measured, ± as much: none of the usual projectors is later."""
+from drivers.display.options import DisplayOptions
 
 
-class ScreenOptions(Strict, use_attribute_docstrings=True):
-    """The keys of a `[projector]` table with `driver = "screen"`."""
-
-    output: Annotated[str, Field(min_length=1, max_length=100, json_schema_extra={"takes": "device"})]
-    """The connector, as `slrig devices` and `xrandr` name it (HDMI-1, DP-2)."""
+class ScreenOptions(DisplayOptions, use_attribute_docstrings=True):
+    """The keys of a `[projector]` table with `driver = "screen"`. `output` is named as `xrandr` does (HDMI-1, DP-2)."""
 
     backend: Literal["auto", "sdl", "x11"] = "auto"
     """x11 presents through X itself and is told when each picture was flipped; sdl presents through SDL (extra
     `screen`), everywhere; auto is x11 where there is an X server with the Present extension."""
 
-    native_px: Annotated[tuple[Extent, Extent], Field(strict=False)] | None = None
-    """[width, height] of the projector's own raster (its data sheet's "native resolution"), where its EDID prefers
-    another size, or none."""
-
-    monitor: Annotated[str, Field(min_length=1)] | None = None
-    """The display that must be at that connector, as `slrig devices` calls it; else any is taken."""
-
-    latency_s: Seconds | None = None
-    """From the signal of a picture's last row to its light: the display's own delay, as measured. Until then it is
-    taken to be 0.05 s, ± as much."""
-
-    latency_error_s: Seconds | None = None
-    """± what it varies; else half a refresh."""
-
     trust_compositor: bool = False
     """True to show through a compositor, which may scale, tint or delay what it is given."""
 
-    check_pixels: bool = True
-    """Whether one picture of each sequence is read back from the frame buffer and compared."""
-
-    dark_after_s: Annotated[float, Field(ge=0, le=86_400)] = 600.0
-    """For how long the output is kept black after the process that had opened it ended, however it did."""
-
     display: Annotated[str, Field(min_length=1)] | None = None
     """The X server, as in DISPLAY; else that of the environment."""
-
-    @property
-    def native(self) -> Size | None:
-        """The projector's own raster, if it is told."""
-        return None if self.native_px is None else Size(*self.native_px)

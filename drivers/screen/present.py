@@ -8,9 +8,9 @@ from itertools import count
 
 import numpy as np
 
+from drivers.display.timing import Presented, copied, flipped
 from drivers.screen.requests import fill_tiled, free_pixmap, graphics_context, pixmap, put_grey
 from drivers.screen.station import Station
-from drivers.screen.timing import Presented, copied, flipped
 from slrig.errors import DeviceError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Pixels, Size
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.display.edid import Edid, parse
 from drivers.screen.connection import Connection
-from drivers.screen.edid import Edid, parse
 from drivers.screen.requests import atom_name
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Size

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.display.pixels import coloured
 from drivers.screen.connection import Connection
 from slrig.model import Pixels, Size
 
@@ -136,15 +137,6 @@ def read_pixels(connection: Connection, x: int, y: int, size: Size) -> NDArray[n
     reply = connection.ask(73, body, data=_WHOLE_PIXELS)
     words = np.frombuffer(reply, "<u4", count=size.width_px * size.height_px, offset=32)
     return words.reshape(size.shape) & np.uint32(0xFFFFFF)
-
-
-def coloured(levels: Pixels) -> NDArray[np.uint32]:
-    """Grey levels as the screen's pixels: (H, W) uint8 to (H, W) uint32, 0x00RRGGBB.
-
-    >>> [hex(word) for word in coloured(np.array([[0, 255, 7]], np.uint8))[0]]
-    ['0x0', '0xffffff', '0x70707']
-    """
-    return np.asarray(levels.astype("<u4") * np.uint32(0x010101))
 
 
 def owner_of(connection: Connection, selection: int) -> int:

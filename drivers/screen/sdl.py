@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.display.pixels import coloured
+from drivers.display.timing import Presented, queued
 from drivers.screen.options import ScreenOptions
-from drivers.screen.requests import coloured
 from drivers.screen.station import Station
-from drivers.screen.timing import Presented, queued
 from slrig.errors import DeviceError, LibraryMissingError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Pixels, Size
 

@@ -1,65 +1,21 @@
-"""What the projector needs of whatever puts patterns on an output."""
+"""The stage of this machine: an output of its X server, or a full-screen window of SDL."""
 
 from __future__ import annotations
 
 import os
 import sys
-from typing import Protocol
 
+from drivers.display.stage import Stage
+from drivers.display.timing import Presented
 from drivers.screen.connection import Connection
 from drivers.screen.options import ScreenOptions
 from drivers.screen.present import EXTENSION, PresentSurface
 from drivers.screen.sdl import SdlSurface, SdlWindow, fullscreen
 from drivers.screen.station import Station
-from drivers.screen.timing import Presented
 from slrig.errors import UnsupportedByDeviceError
-from slrig.model import PatternSequence, Pixels, Size
+from slrig.model import PatternSequence, Pixels
 
 _XWAYLAND = "XWAYLAND"
-
-
-class Stage(Protocol):
-    """An output with patterns on it. One thread uses it, but for `cover`; it is dark after opening."""
-
-    @property
-    def size(self) -> Size:
-        """The pixels that are shown."""
-        ...
-
-    @property
-    def refresh_s(self) -> float:
-        """One refresh period."""
-        ...
-
-    @property
-    def model(self) -> str:
-        """What is connected, in words."""
-        ...
-
-    @property
-    def serial(self) -> str:
-        """Its serial number, else the output's name."""
-        ...
-
-    def load(self, sequence: PatternSequence) -> None:
-        """Take patterns, after a look at whether they can be shown as they are."""
-        ...
-
-    def show(self, index: int | None) -> Presented:
-        """Show a pattern, None the dark."""
-        ...
-
-    def compare(self, levels: Pixels) -> None:
-        """See that this picture, (H, W) uint8, is in the frame buffer, where that can be read."""
-        ...
-
-    def cover(self) -> bool:
-        """Go dark by other means than `show`, from any thread; return whether that was done."""
-        ...
-
-    def close(self) -> None:
-        """Leave the output dark, as far as that can be done."""
-        ...
 
 
 class XStage:

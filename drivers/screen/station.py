@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
-
+from drivers.display.pixels import coloured, require_same
 from drivers.screen import guarding, randr
 from drivers.screen.connection import Connection, RequestRefusedError
 from drivers.screen.guard import Duty
@@ -21,7 +20,6 @@ from drivers.screen.requests import (
     VISIBILITY_NOTIFY,
     atom,
     black_window,
-    coloured,
     free_pixmap,
     hidden_window,
     owner_of,
@@ -39,6 +37,10 @@ _COMPOSITE = "Composite"
 _UNREDIRECTS_IN_S = 1.0
 _LOOKS_EVERY_S = 0.05
 _BAD_MATCH = 8
+_MENDS_PIXELS = (
+    "another window lies above, or the graphics driver scales or converts: try the other backend (backend = "
+    '"x11" or "sdl"), and close other programs on that output'
+)
 
 
 class Station:
@@ -155,18 +157,8 @@ class Station:
         UnsupportedByDeviceError
             It does not. Tells how many pixels differ, and where.
         """
-        wanted = coloured(levels)
         found = read_pixels(self.connection, self.picture.x, self.picture.y, self.picture.size)
-        wrong = np.argwhere(found != wanted)
-        if len(wrong):
-            row, column = (int(place) for place in wrong[0])
-            message = (
-                f"output {self.output.name}: {len(wrong)} of {wanted.size} pixels are not the pattern's: at (row "
-                f"{row}, column {column}) #{int(wanted[row, column]):06x} was shown, the frame buffer has "
-                f"#{int(found[row, column]):06x}; another window lies above, or the graphics driver scales or "
-                'converts: try the other backend (backend = "x11" or "sdl"), and close other programs on that output'
-            )
-            raise UnsupportedByDeviceError(message)
+        require_same(self.output.name, coloured(levels), found, _MENDS_PIXELS)
 
     def await_event(self, kind: int, timeout_s: float) -> Iterator[bytes]:
         """Yield events of one kind as they come, until the time is over; the others are taken note of."""

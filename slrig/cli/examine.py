@@ -194,6 +194,8 @@ def _rig_table(synchronisation: Synchronisation) -> str:
         f"latency_s = {_number(synchronisation.latency_s)}",
         f"latency_error_s = {_number(synchronisation.latency_error_s)}",
     ]
+    if synchronisation.earliest_s is not None:
+        lines.append(f"earliest_s = {_number(synchronisation.earliest_s)}")
     if synchronisation.line_time_s:
         lines += ["", "[synchronisation.line_time_s]"]
         lines += [f"{name} = {_number(line_s, digits=9)}" for name, line_s in synchronisation.line_time_s.items()]
@@ -218,7 +220,8 @@ def _latency_words(found: CameraLatency) -> str:
         f"light comes {ms['latency_s']} ± {ms['standard_error_s']} after the instant the projector states",
         f"it varies by {ms['jitter_s']} (standard deviation), 95 % come within {ms['latency_p95_s']}; "
         f"to white {ms['rise_s']}, to black {ms['fall_s']}",
-        f"it is stable {ms['latest_s']} after that instant at the latest, {ms['settle_s']} of it to settle",
+        f"it begins to change {ms['earliest_s']} after that instant at the earliest, and is stable {ms['latest_s']} "
+        f"after it at the latest, {ms['settle_s']} of it to settle",
         shutter,
         f"from {found.flashes_used} of {found.flashes} flashes, {found.rows_used} rows that fit to {ms['residual_s']}",
     ]

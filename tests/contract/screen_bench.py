@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -38,6 +39,16 @@ def photographed(pixels: Pixels, scene: Scene, *, exposure_s: float, gain: float
     return np.asarray(scene.format.full_scale * level * gain * exposure_s / REFERENCE_EXPOSURE_S)
 
 
+class ShownPixels(Protocol):
+    """What an output shows now."""
+
+    def grey(self) -> Pixels:
+        """(H, W) uint8."""
+        ...
+
+    def close(self) -> None: ...
+
+
 class ScreenCamera:
     """Implements `slrig.devices.Camera` by photographing an output: software trigger, global shutter.
 
@@ -46,7 +57,7 @@ class ScreenCamera:
 
     LOOKS = 6
 
-    def __init__(self, name: str, pixels: OutputPixels, scene: Scene) -> None:
+    def __init__(self, name: str, pixels: ShownPixels, scene: Scene) -> None:
         self._pixels, self._scene = pixels, scene
         self._rng = np.random.default_rng(0)
         triggers = frozenset({Trigger.SOFTWARE})

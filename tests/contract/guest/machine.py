@@ -59,6 +59,7 @@ def run_in_guest(
     timeout_s: float = 300.0,
     memory_mib: int = 1536,
     cores: int = 2,
+    monitor: bool = False,
 ) -> Finished:
     """Boot, run one command in the checkout, power off.
 
@@ -77,6 +78,8 @@ def run_in_guest(
         Added to PATH and to the few variables that the guest is given.
     timeout_s
         The whole run's. The machine is killed then, and with this process in any case.
+    monitor
+        Whether the guest's second serial port is QEMU's own monitor (QMP), by which it sees what its displays show.
 
     Raises
     ------
@@ -101,6 +104,7 @@ def run_in_guest(
         *("-virtfs", f"local,path={_escaped(share)},mount_tag={SHARE_TAG},security_model=none"),
         *("-device", "virtio-rng-pci"),
         *(word for device in devices for word in ("-device", device)),
+        *(_monitor(folder / "monitor") if monitor else ()),
     ]
     begun = time.monotonic()
     said, timed_out = _run(arguments, timeout_s)
@@ -135,6 +139,15 @@ def require_guest(needs: Callable[[], None] = machine_needs) -> None:
         if error.fixable and os.environ.get("CI") == "true":
             pytest.fail(f"no guest, and CI must have one: {error}")
         pytest.skip(f"no guest: {error}")
+
+
+def _monitor(socket: Path) -> Sequence[str]:
+    """The machine listens as a monitor, and its serial port calls there."""
+    path = _escaped(socket)
+    return (
+        *("-chardev", f"socket,id=monitor,path={path},server=on,wait=off", "-mon", "chardev=monitor,mode=control"),
+        *("-chardev", f"socket,id=port,path={path}", "-serial", "chardev:port"),
+    )
 
 
 def _qemu() -> str:

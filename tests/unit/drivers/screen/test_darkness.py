@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from drivers.display.projector import DisplayProjector
+from drivers.display.timing import Presented
 from drivers.screen import guarding, open_projector
-from drivers.screen.projector import ScreenProjector
-from slrig.errors import DeviceError, DeviceStateError
+from slrig.errors import DeviceStateError
 from slrig.model import Size
 from tests.contract.screen_bench import rig_options, sequence
 from tests.contract.screen_server import DummyServer, OutputPixels
@@ -42,14 +43,14 @@ sys.stdin.readline()
 """
 
 
-def opened(**options: object) -> ScreenProjector:
+def opened(**options: object) -> DisplayProjector:
     projector = open_projector(rig_options(RIGHT, SIZE, **options), Path())
-    assert isinstance(projector, ScreenProjector)
+    assert isinstance(projector, DisplayProjector)
     OPEN.append(projector)
     return projector
 
 
-def lit(projector: ScreenProjector) -> ScreenProjector:
+def lit(projector: DisplayProjector) -> DisplayProjector:
     projector.load(sequence(SIZE))
     projector.show(WHITE)
     return projector
@@ -151,27 +152,25 @@ def test_another_process_takes_the_output_over_from_the_guard_of_one_that_was_ki
     assert until(lambda: is_white(right)) < FAR_S
 
 
-def test_blank_from_another_thread_interrupts_a_show(right: OutputPixels) -> None:
-    projector = opened(latency_s=1.0)
+def test_blank_from_another_thread_interrupts_a_show(right: OutputPixels, monkeypatch: pytest.MonkeyPatch) -> None:
+    projector = opened()
     projector.load(sequence(SIZE))
-    failure: list[Exception] = []
-
-    def show() -> None:
-        try:
-            projector.show(WHITE)
-        except DeviceError as error:
-            failure.append(error)
-
-    showing = threading.Thread(target=show)
-    showing.start()
-    until(lambda: is_white(right))
     darkening = threading.Thread(target=projector.blank)
-    darkening.start()
-    until(lambda: is_black(right), within_s=2.0)
-    projector.close()
-    showing.join(FAR_S)
+    present = projector._stage.show
+
+    def darkened_meanwhile(index: int | None) -> Presented:
+        presented = present(index)
+        if index == WHITE:
+            # The picture is there, and `show` has yet to return.
+            assert is_white(right)
+            darkening.start()
+            assert projector._darkened.wait(FAR_S)
+        return presented
+
+    monkeypatch.setattr(projector._stage, "show", darkened_meanwhile)
+    with pytest.raises(DeviceStateError, match="darkened from outside"):
+        projector.show(WHITE)
     darkening.join(FAR_S)
-    assert isinstance(failure[0], DeviceStateError)
     assert is_black(right)
 
 
@@ -196,14 +195,14 @@ def test_the_guard_covers_a_window_whose_thread_hangs(right: OutputPixels) -> No
 
 def test_a_guard_that_is_killed_is_replaced_when_the_rig_is_opened_again(right: OutputPixels) -> None:
     opened().close()
-    guard = guarding._kept[(None, RIGHT)]
+    _, guard = guarding._kept[(None, RIGHT)]
     os.kill(guard._process.pid, signal.SIGKILL)
     until(lambda: is_white(right))
     assert not guard.cover()
     projector = lit(opened())
     projector.close()
     assert is_black(right)
-    assert guarding._kept[(None, RIGHT)] is not guard
+    assert guarding._kept[(None, RIGHT)][1] is not guard
 
 
 def test_the_guard_goes_where_its_output_goes_and_ends_with_it(server: DummyServer, right: OutputPixels) -> None:
@@ -217,7 +216,7 @@ def test_the_guard_goes_where_its_output_goes_and_ends_with_it(server: DummyServ
     until(lambda: is_white(left))
     moved.close()
     left.close()
-    guard = guarding._kept[(None, RIGHT)]
+    _, guard = guarding._kept[(None, RIGHT)]
     assert guard.is_alive
     server.run("xrandr", "--output", RIGHT, "--off")
     until(lambda: not guard.is_alive)

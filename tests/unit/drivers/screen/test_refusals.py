@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.display.edid import Edid
 from drivers.screen.connection import XScreen
-from drivers.screen.edid import Edid
 from drivers.screen.randr import IDENTITY, UPRIGHT, Mode, Output, Picture
 from drivers.screen.refusals import chosen, require_exact, require_true_colour
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError

@@ -1,4 +1,4 @@
-"""The projector on a screen output, as the rest of slrig sees it."""
+"""The projector on a display output, as the rest of slrig sees it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from drivers.screen.options import UNMEASURED_S, ScreenOptions
-from drivers.screen.stage import Stage, opened
-from drivers.screen.timing import Presented, whole_light
-from drivers.screen.working import OwnThread
+from drivers.display.options import UNMEASURED_S, DisplayOptions
+from drivers.display.stage import Stage
+from drivers.display.timing import Presented, whole_light
+from drivers.display.working import OwnThread
 from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceError, DeviceStateError
 from slrig.model import PatternSequence
@@ -25,23 +25,25 @@ _USUAL_WAIT = 2.0
 """Refreshes from show to the end of a picture's scan-out: half a one to wait, one or one and a half to be shown."""
 
 
-class ScreenProjector:
+class DisplayProjector:
     """Implements `slrig.devices.Projector` on one output of this computer.
 
-    A thread of its own does whatever is done with the window; `blank` and `close` work from any other, and where that
+    opened : gives the stage, dark; called on the thread that is to use it.
+
+    A thread of its own does whatever is done with the stage; `blank` and `close` work from any other, and where that
     thread hangs in a graphics driver, another process makes the output black.
 
     Raises
     ------
-    UnsupportedByDeviceError, DeviceGoneError, DeviceBusyError, DeviceError, LibraryMissingError
-        As `drivers.screen.stage.opened`.
+    DeviceError
+        As `opened`, or it did not answer in time.
     """
 
-    def __init__(self, options: ScreenOptions) -> None:
+    def __init__(self, options: DisplayOptions, opened: Callable[[], Stage]) -> None:
         self._options = options
         self._thread = OwnThread(f"output {options.output}")
         try:
-            self._stage: Stage = self._thread.do(lambda: opened(options), timeout_s=_OPENS_IN_S)
+            self._stage: Stage = self._thread.do(opened, timeout_s=_OPENS_IN_S)
         except BaseException:
             self._thread.end(timeout_s=0)
             raise
@@ -85,7 +87,7 @@ class ScreenProjector:
         return self._or_dark(lambda: self._shown(sequence, index))
 
     def play(self, exposure_s: float, period_s: float) -> None:
-        """See `Projector`. A screen has no trigger wire."""
+        """See `Projector`. A display has no trigger wire."""
         self._state.refuse_to_play(exposure_s, period_s)
 
     def stop(self) -> None:
@@ -98,7 +100,7 @@ class ScreenProjector:
         Raises
         ------
         DeviceError
-            The window does not go black, and nobody is there to cover it.
+            The output does not go black, and nobody is there to cover it.
         """
         if self._state.closed.is_set():
             return
@@ -135,7 +137,6 @@ class ScreenProjector:
         if self._unchecked and not self._darkened.is_set():
             self._thread.do(lambda: self._stage.compare(sequence.image(index)), timeout_s=_SHOWS_IN_S)
             self._unchecked = False
-        SystemClock().wait_until(t_visible_ns + t_err_ns, self._state.closed)
         if self._darkened.is_set():
             message = f"pattern {index} was darkened from outside before its light was there; show it again"
             raise DeviceStateError(message)

@@ -36,7 +36,10 @@ class OwnThread:
             return done.result(timeout_s)
         except TimeoutError:
             if done.cancel() or not done.done():
-                message = f"{self._name} did not answer in {timeout_s:g} s: the graphics driver hangs; start X again"
+                message = (
+                    f"{self._name} did not answer in {timeout_s:g} s: the graphics driver hangs; see the kernel's log "
+                    "(dmesg)"
+                )
                 raise DeviceError(message) from None
             return done.result()
 

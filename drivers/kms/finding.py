@@ -1,0 +1,109 @@
+"""Connectors as the kernel lists them in /sys/class/drm: no card is opened, so no desktop is disturbed."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.display.edid import Edid, parse
+from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
+
+SYSTEM = Path("/sys/class/drm")
+DEVICES = Path("/dev/dri")
+
+_CONNECTOR = re.compile(r"(card\d+)-(.+)")
+_NEVER = ("Writeback",)
+
+
+@dataclass(frozen=True, slots=True)
+class Connector:
+    """A connector of a graphics card.
+
+    card : the card's node. status : connected, disconnected or unknown, as of the kernel's last look. mode : the first
+    that its display offers, as WxH; empty where it offers none.
+    """
+
+    name: str
+    card: Path
+    status: str
+    mode: str
+    edid: Edid | None
+
+    def __str__(self) -> str:
+        told = ", ".join(part for part in (str(self.edid or ""), self.mode or self.status) if part)
+        return f"{self.name} ({told})"
+
+
+def connectors() -> tuple[Connector, ...]:
+    """Every connector of every card, by name."""
+    found = []
+    for folder in SYSTEM.glob("card*-*"):
+        matched = _CONNECTOR.fullmatch(folder.name)
+        if matched is not None and not matched[2].startswith(_NEVER):
+            lines = _read(folder / "modes").decode("ascii", "replace").split()
+            found.append(
+                Connector(
+                    matched[2],
+                    DEVICES / matched[1],
+                    _read(folder / "status").decode("ascii", "replace").strip() or "unknown",
+                    lines[0] if lines else "",
+                    parse(_read(folder / "edid")),
+                )
+            )
+    return tuple(sorted(found, key=lambda connector: connector.name))
+
+
+def chosen(name: str) -> Connector:
+    """Return the connector of that name.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        There is none, or no card at all. Names those that there are.
+    """
+    there = connectors()
+    if not there:
+        message = (
+            f"output {name}: the kernel has no display output (nothing in {SYSTEM}); its graphics driver is not loaded "
+            "(nomodeset in the kernel's command line, or nvidia_drm without modeset=1), or this is a container that "
+            "was not given /dev/dri"
+        )
+        raise UnsupportedByDeviceError(message)
+    for connector in there:
+        if connector.name == name:
+            return connector
+    listed = "; ".join(map(str, there))
+    message = (
+        f"output {name}: the kernel has no connector of that name; it has: {listed}; write one of these names into the "
+        "rig file (X names them otherwise: its HDMI-1 is HDMI-A-1 here)"
+    )
+    raise UnsupportedByDeviceError(message)
+
+
+def gone(name: str) -> DeviceGoneError:
+    """Nothing is connected: what to say of it."""
+    others = "; ".join(str(each) for each in connectors() if each.status == "connected") or "none"
+    message = (
+        f"output {name}: nothing is connected to it; connected are: {others}; check the cable and that the projector "
+        "is on and not in stand-by, or write one of these names into the rig file"
+    )
+    return DeviceGoneError(message)
+
+
+def is_unplugged(name: str, card: Path) -> bool:
+    """Whether the kernel has noticed that nothing is connected (any more)."""
+    return _read(SYSTEM / f"{card.name}-{name}" / "status").strip() == b"disconnected"
+
+
+def display(name: str, card: Path) -> Edid | None:
+    """What is connected, as of the kernel's last look."""
+    return parse(_read(SYSTEM / f"{card.name}-{name}" / "edid"))
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError:
+        # A card that was unplugged while we looked.
+        return b""

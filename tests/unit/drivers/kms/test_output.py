@@ -1,0 +1,342 @@
+"""The driver on a card in memory: what it asks of the kernel, what it refuses, and what times it states."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.kms import find_devices, finding, guard, holders, holding, kernel, open_projector
+from slrig.devices import Projector
+from slrig.errors import ConfigError, DeviceBusyError, DeviceError, DeviceGoneError, UnsupportedByDeviceError
+from slrig.model import Size
+from slrig.patterns.sequence import encode, scan_patterns
+from tests.unit.drivers.kms.fake_kernel import CONTROLLERS, CURSOR, PRIMARY, FakeKernel, mode
+
+SIZE = Size(1280, 800)
+SEQUENCE = encode(
+    scan_patterns(SIZE, line_shift=False, period_px=8, line_width_px=1, gray_cell_px=4, gray_offset_px=0, rows=False),
+    SIZE,
+)
+Install = Callable[..., FakeKernel]
+
+
+class FakeGuard:
+    """Stands for the process; `tests/contract/test_kms_guest.py` has the real one."""
+
+    is_alive = True
+
+    def __init__(self, module: str, duty: str, output: str, handles: tuple[int, ...]) -> None:
+        assert (module, len(handles)) == (guard.__name__, 1)
+        assert output in duty
+
+    def cover(self) -> bool:
+        return True
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    fakes: list[FakeKernel] = []
+
+    def installed(**state: object) -> FakeKernel:
+        fake = FakeKernel(tmp_path / "drm", **state)  # type: ignore[arg-type]
+        monkeypatch.setattr(finding, "SYSTEM", fake.system)
+        for name in ("opened", "ask", "mapped"):
+            monkeypatch.setattr(kernel, name, getattr(fake, name))
+        monkeypatch.setattr(holding, "Guard", FakeGuard)
+        fakes.append(fake)
+        return fake
+
+    yield installed
+    holding.release(finding.DEVICES / "card0")
+    for fake in fakes:
+        fake.ours.close()
+        fake.theirs.close()
+
+
+def opened(**more: object) -> Projector:
+    return open_projector({"output": "HDMI-A-1", "latency_s": 0.0, "latency_error_s": 0.0, **more}, Path())
+
+
+def scanned_out(fake: FakeKernel) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]:
+    memory = fake.memory[fake.buffers[fake.values[(PRIMARY, "FB_ID")]] << 12]
+    rows = np.frombuffer(memory, "<u4")
+    return rows[: len(rows) // SIZE.height_px * SIZE.height_px].reshape(SIZE.height_px, -1)[:, : SIZE.width_px]
+
+
+@pytest.mark.parametrize("atomic", [True, False])
+def test_patterns_are_shown_as_they_are(install: Install, atomic: bool) -> None:
+    fake = install(atomic=atomic)
+    projector = opened()
+    assert projector.info.size == SIZE
+    assert projector.info.refresh_s == pytest.approx(1 / 60, rel=1e-4)
+    projector.load(SEQUENCE)
+    for index in range(len(SEQUENCE)):
+        projector.show(index)
+        assert np.array_equal(scanned_out(fake), SEQUENCE.image(index).astype(np.uint32) * 0x010101), index
+    projector.blank()
+    assert not scanned_out(fake).any()
+    projector.close()
+    assert not scanned_out(fake).any()
+
+
+def test_everything_that_would_change_a_picture_is_off(install: Install) -> None:
+    fake = install()
+    opened().close()
+    of_controller = {name: fake.values[(CONTROLLERS[0], name)] for name in ("GAMMA_LUT", "CTM", "VRR_ENABLED")}
+    assert of_controller == {"GAMMA_LUT": 0, "CTM": 0, "VRR_ENABLED": 0}
+    assert fake.values[(11, "Broadcast RGB")] == 1
+    assert fake.values[(PRIMARY, "rotation")] == 1
+    assert fake.values[(CURSOR, "FB_ID")] == fake.values[(CURSOR, "CRTC_ID")] == 0
+    source = [fake.values[(PRIMARY, name)] for name in ("SRC_X", "SRC_Y", "SRC_W", "SRC_H")]
+    shown = [fake.values[(PRIMARY, name)] for name in ("CRTC_X", "CRTC_Y", "CRTC_W", "CRTC_H")]
+    assert [value / 65536 for value in source] == shown == [0, 0, 1280, 800]
+
+
+def test_an_older_driver_gets_an_identity_ramp_and_full_range(install: Install) -> None:
+    fake = install(atomic=False)
+    opened().close()
+    assert fake.gammas == [value * 257 for value in range(256)]
+    assert fake.values[(11, "Broadcast RGB")] == 1
+    assert kernel.SET_CURSOR in [request for request, _ in fake.asked]
+
+
+def test_a_flips_stamp_is_when_its_scan_out_began(install: Install) -> None:
+    fake = install()
+    projector = opened()
+    projector.load(SEQUENCE)
+    stamps: list[int] = []
+
+    def stamped() -> int:
+        stamps.append(time.monotonic_ns() // 1000 * 1000)
+        return stamps[-1]
+
+    fake.stamp = stamped
+    shown = projector.show(0)
+    assert projector.info.refresh_s is not None
+    assert shown.t_visible_ns == stamps[-1] + round(projector.info.refresh_s * 1e9)
+    assert shown.t_err_ns == 500_000
+    projector.close()
+
+
+@pytest.mark.parametrize("state", [{"counts": False}, {"stamp": lambda: 0}], ids=["not counted", "zero"])
+def test_a_stamp_that_tells_nothing_is_not_believed(install: Install, state: dict[str, object]) -> None:
+    install(**state)
+    projector = opened()
+    projector.load(SEQUENCE)
+    asked_ns = time.monotonic_ns()
+    shown = projector.show(0)
+    period_ns = round((projector.info.refresh_s or 0) * 1e9)
+    assert shown.t_err_ns >= period_ns // 2
+    assert shown.t_visible_ns + shown.t_err_ns >= asked_ns + 2 * period_ns
+    assert ("does not tell" in projector.info.model) == ("counts" in state)
+    projector.close()
+
+
+def test_an_event_of_a_flip_before_is_passed_over(install: Install) -> None:
+    fake = install()
+    projector = opened()
+    projector.load(SEQUENCE)
+    fake.flipped(5)
+    fake.refusals[kernel.ATOMIC] = [errno.EBUSY]
+    assert projector.show(1).index == 1
+    projector.close()
+
+
+def test_a_display_that_makes_no_refresh_is_told_of(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = install()
+    projector = opened()
+    projector.load(SEQUENCE)
+    monkeypatch.setattr("drivers.kms.output._FLIPS_IN_S", 0.05)
+    monkeypatch.setattr(fake, "flipped", lambda _: None)
+    with pytest.raises(DeviceError, match="made no refresh"):
+        projector.show(1)
+    projector.close()
+
+
+def test_a_display_that_is_pulled_is_gone(install: Install) -> None:
+    fake = install()
+    projector = opened()
+    projector.load(SEQUENCE)
+    fake.plug(11, False)
+    with pytest.raises(DeviceGoneError, match="nothing is connected to it"):
+        projector.show(0)
+    with pytest.raises(DeviceGoneError):
+        projector.load(SEQUENCE)
+    projector.close()
+
+
+def test_another_display_in_its_place_is_told_of(install: Install) -> None:
+    fake = install()
+    projector = opened()
+    fake.modes[11] = [mode(1920, 1080, preferred=True)]
+    with pytest.raises(UnsupportedByDeviceError, match="open the rig again"):
+        projector.load(SEQUENCE)
+    projector.close()
+
+
+def test_what_the_frame_buffer_does_not_hold_is_told_of(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = install()
+    projector = opened()
+    projector.load(SEQUENCE)
+    send = fake.flipped
+
+    def spoiled(number: int) -> None:
+        scanned_out(fake)[3, 5] ^= 1
+        send(number)
+
+    monkeypatch.setattr(fake, "flipped", spoiled)
+    with pytest.raises(UnsupportedByDeviceError, match=r"1 of 1024000 pixels .* \(row 3, column 5\)"):
+        projector.show(0)
+    monkeypatch.undo()
+    projector.close()
+
+
+@pytest.mark.parametrize(
+    ("table", "modes", "message"),
+    [
+        ({"native_px": [1024, 768]}, None, r"asked for 1024 x 768, row by row; its modes are: 1280 x 800 at 60\.00 Hz"),
+        ({"refresh_hz": 120}, None, "asked for 1280 x 800 at 120 Hz"),
+        ({}, [mode(1280, 800)], "no EDID tells the projector's own raster"),
+        ({}, [mode(1920, 1080, flags=kernel.MODE_INTERLACED, preferred=True)], "interlaced or doubled"),
+        ({}, [], "its modes are: none"),
+        ({"monitor": "EPS PJ 720"}, None, "found 'a display without EDID'"),
+    ],
+)
+def test_what_is_not_exact_is_refused(
+    install: Install, table: dict[str, object], modes: list[kernel.ModeInfo] | None, message: str
+) -> None:
+    fake = install()
+    if modes is not None:
+        fake.modes[11] = modes
+    with pytest.raises(UnsupportedByDeviceError, match=message):
+        opened(**table)
+    # The card was let go: another program may have it.
+    assert not holding._held
+
+
+def test_of_equal_sizes_the_rate_may_be_chosen(install: Install) -> None:
+    fake = install()
+    fake.modes[11] = [mode(1280, 800, preferred=True), mode(1280, 800, rate=120)]
+    projector = opened(refresh_hz=120)
+    assert projector.info.refresh_s == pytest.approx(1 / 120, rel=1e-4)
+    projector.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("HDMI-A-2", DeviceGoneError, r"connected are: HDMI-A-1 \(1280x800\)"),
+        ("HDMI-1", UnsupportedByDeviceError, "it has: HDMI-A-1 .*; HDMI-A-2 .*X names them otherwise"),
+    ],
+)
+def test_an_output_that_is_not_there_is_named_beside_those_that_are(
+    install: Install, name: str, error: type[Exception], message: str
+) -> None:
+    install()
+    with pytest.raises(error, match=message):
+        opened(output=name)
+
+
+def test_a_machine_without_a_graphics_driver_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finding, "SYSTEM", tmp_path)
+    assert find_devices() == ()
+    with pytest.raises(UnsupportedByDeviceError, match="nomodeset"):
+        opened()
+
+
+def test_a_card_of_a_desktop_is_busy_and_its_holder_is_named(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(master=False)
+    (tmp_path / "proc" / "812").mkdir(parents=True)
+    (tmp_path / "proc" / "812" / "comm").write_text("gnome-shell\n")
+    monkeypatch.setattr(holders, "PROCESSES", tmp_path / "proc")
+    # The number of a socket's device: no guard listens for it.
+    with pytest.raises(DeviceBusyError, match=r"held by gnome-shell \(process 812\).*Ctrl\+Alt\+F3"):
+        opened()
+
+
+@pytest.mark.parametrize(
+    ("number", "error", "message"),
+    [
+        (errno.EACCES, DeviceError, "usermod -aG video"),
+        (errno.EPERM, DeviceError, "DeviceAllow=char-drm"),
+        (errno.ENOENT, DeviceGoneError, "was not given"),
+    ],
+)
+def test_a_card_that_does_not_open_says_what_to_do(
+    install: Install, monkeypatch: pytest.MonkeyPatch, number: int, error: type[Exception], message: str
+) -> None:
+    install()
+
+    def refused(_: str) -> int:
+        raise OSError(number, "refused")
+
+    monkeypatch.setattr(kernel, "opened", refused)
+    with pytest.raises(error, match=message):
+        opened()
+
+
+@pytest.mark.parametrize(
+    ("number", "error", "message"),
+    [
+        (errno.EACCES, DeviceBusyError, "another program has taken"),
+        (errno.ENODEV, DeviceGoneError, "was unplugged"),
+        (errno.ENOSPC, DeviceError, "may not have this mode"),
+    ],
+)
+def test_a_commit_that_the_kernel_refuses_says_what_it_means(
+    install: Install, number: int, error: type[Exception], message: str
+) -> None:
+    fake = install()
+    fake.refusals[kernel.ATOMIC] = [number]
+    with pytest.raises(error, match=message):
+        opened()
+
+
+def test_a_controller_that_drives_another_display_is_left_to_it(install: Install) -> None:
+    fake = install()
+    fake.plug(12, True)
+    fake.driven = {11: CONTROLLERS[1], 12: CONTROLLERS[1]}
+    opened().close()
+    assert fake.values[(11, "CRTC_ID")] == CONTROLLERS[0]
+    holding.release(finding.DEVICES / "card0")
+    fake.possible = 0b10
+    with pytest.raises(UnsupportedByDeviceError, match="HDMI-A-2; unplug a display"):
+        opened()
+
+
+def test_a_card_stays_ours_and_its_memory_does_not_grow(install: Install) -> None:
+    fake = install()
+    for _ in range(3):
+        projector = opened()
+        with pytest.raises(DeviceBusyError, match="close that rig"):
+            opened()
+        projector.close()
+        projector.close()
+    assert len(fake.buffers) == len(fake.memory) == 3
+
+
+def test_connectors_with_a_display_are_found_and_nothing_is_opened(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake = install()
+    (fake.system / "card0-Writeback-1").mkdir()
+    monkeypatch.setattr(kernel, "opened", None)
+    assert [(each.device, each.label) for each in find_devices()] == [("HDMI-A-1", "HDMI-A-1 (1280x800)")]
+    assert not fake.asked
+
+
+def test_all_faults_of_a_table_come_in_one_message() -> None:
+    with pytest.raises(ConfigError) as caught:
+        open_projector({"outputs": "HDMI-A-1", "refresh_hz": 0, "display": ":0"}, Path())
+    for word in ("output: missing", "refresh_hz", "display"):
+        assert word in str(caught.value), word
