@@ -41,8 +41,13 @@ acknowledges a fault, before it is answered, even with an error.
     HELLO version watchdog_ms on_ms duty bright    dark; begins a session, nothing is loaded. OK and <key>=<value> words
                                                    in any order; a host passes over keys that it does not know.
     PING                                           OK <µs> <state> <fault>; µs since the box started
-    LOAD count crc32                               dark; OK <count> <first>; the box holds that run of patterns, from
-                                                   <first> of its flash; ERR 9 <held> <crc32 of all> if it does not
+    PICK at crc32 crc32 …                          dark, nothing is loaded; these are the patterns <at>, <at> + 1 … of
+                                                   the next LOAD, wherever they lie in the flash. Begins anew at 0, and
+                                                   goes on without a gap. OK <picked so far> <those of this line that
+                                                   the box does not hold> …
+    LOAD count crc32                               dark; OK <count> <first> <gap_us>; the patterns that were picked, or
+                                                   else a run of that length, if they have that checksum. The first one
+                                                   is <first> of the flash. ERR 9 <held> <crc32 of all> if neither has
     SHOW index                                     OK <index> <µs>, once its light is on the scene, since µs; it stays.
                                                    What was lit before is put out first.
     SEQ first count exposure_us period_us mode     OK <µs> of the first light. mode 0: the box lights one pattern each
@@ -51,7 +56,8 @@ acknowledges a fault, before it is answered, even with an error.
     TRIG                                           OK <index> <µs>; the next pattern of a sequence of mode 1
     STOP                                           dark; OK <patterns of the last sequence that were lit>
     BLANK                                          dark; OK
-    STATUS                                         OK state= loaded= first= index= frames= shows= fault= t_us=
+    STATUS                                         OK state= loaded= first= index= frames= shows= fault= t_us=, without
+                                                   index= before the first light
     BYE                                            dark; ends the session; nothing is loaded; OK
 
 HELLO's version is 1. The other numbers are limits that the box keeps to from then on; it grants less if it must, and
@@ -66,6 +72,9 @@ permille of full power; a box that cannot go so low answers ERR 4 bright 1000. I
     light_us= error_us=          longest time from a command to its light; error of its time stamps
     gap_us= hold_us= least_us=   least time from one exposure's end to the next; how long a pattern of a sequence stays
                                  lit beyond its exposure; shortest exposure
+    pick=                        how many patterns PICK takes; a box without this word has no PICK, and holds runs only
+
+gap_us in HELLO is for patterns in the order of the flash; LOAD answers that of the sequence, longer where it goes back.
 
 States and events
 -----------------
@@ -99,7 +108,7 @@ command and its answer. Its clock may be 1000 ppm off, steadily; drift falls out
 
 A pattern's checksum is the CRC-32 (zlib's) of its image, a byte per pixel, row by row from the top left, 0 dark, 255
 lit. The checksum in LOAD is the CRC-32 of those of its patterns, in order, four bytes each, most significant first.
-With the option `export_folder`, the driver writes the images, and the checksums as patterns.json, for flashing.
+`slrig patterns` writes the images of all that a rig shows, and the checksums as patterns.json, once, for flashing.
 
 A session
 ---------
@@ -108,11 +117,11 @@ own clock, µs; `>` to the box, `<` from it, a line that begins with `|` goes on
 
        1000 > 1A2B 1 HELLO 1 2000 60000 1000 1000*0F42
             < 1A2B 1 OK sltp=1 model=example fw=1.0 w=4 h=2 max=3 boot=00C0FFEE watchdog_ms=2000 on_ms=60000
-            | duty=1000 bright=1000 light_us=2000 error_us=50 gap_us=3000 hold_us=500 least_us=200*FD7B
+            | duty=1000 bright=1000 light_us=2000 error_us=50 gap_us=3000 hold_us=500 least_us=200 pick=512*DC8B
        2000 > 1A2B 2 PING*8724
             < 1A2B 2 OK 2000 idle 0*2536
        3000 > 1A2B 3 LOAD 3 027B77B3*9533
-            < 1A2B 3 OK 3 0*F5CB
+            < 1A2B 3 OK 3 0 3000*F858
        4000 > 1A2B 4 SHOW 1*17D0
             < 1A2B 4 OK 1 4020*3A01
      154000 > 1A2B 4 SHOW 1*17D0
@@ -136,11 +145,18 @@ own clock, µs; `>` to the box, `<` from it, a line that begins with `|` goes on
             < 1A2B 8 OK*AD6B
     2401000 > 1A2B 9 STATUS*8E87
             < 1A2B 9 OK state=ready loaded=3 first=0 index=2 frames=3 shows=5 fault=0 t_us=2401000*22BE
-    2402000 > 1A2B 10 BYE*45BC
-            < 1A2B 10 OK*3EAD
+    2401500 > 1A2B 10 PICK 0 B1C2A1A3 2144DF1C*ED29
+            < 1A2B 10 OK 2*522A
+    2401600 > 1A2B 11 LOAD 2 BC87C827*58DC
+            < 1A2B 11 OK 2 2 3000*FFC5
+    2401700 > 1A2B 12 SHOW 1*40D5
+            < 1A2B 12 OK 1 2401720*2AF5
+    2402000 > 1A2B 13 BYE*AB6E
+            < 1A2B 13 OK*A571
 
 The first answer to SHOW 1 was lost, and came again; the line to SHOW 2 was damaged. A second host was turned away. The
-first one fell silent: its watchdog put the light out, and it had to acknowledge that.
+first one fell silent: its watchdog put the light out, and it had to acknowledge that. Last it picked the left half and
+white, which do not lie so in the flash.
 """
 
 from __future__ import annotations
@@ -177,12 +193,16 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         Nothing on the port speaks SLTP/1, or it may not be opened.
     """
-    from drivers.serial_projector.options import SerialProjectorOptions, export_path
+    from drivers.serial_projector.options import SerialProjectorOptions
     from drivers.serial_projector.port import SerialPort
     from drivers.serial_projector.projector import SerialProjector
 
     table = checked(SerialProjectorOptions, options, "the [projector] table of a serial projector")
-    return SerialProjector(SerialPort(table.port, baud=table.baud), table, export_folder=export_path(table, folder))
+
+    def open_port() -> SerialPort:
+        return SerialPort(table.port, baud=table.baud)
+
+    return SerialProjector(open_port, table, export_folder=folder / table.export_folder)
 
 
 def find_devices() -> tuple[FoundDevice, ...]:

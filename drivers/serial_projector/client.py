@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import Any, TypeVar
 
 from drivers.serial_projector.clock import DeviceClock
 from drivers.serial_projector.frames import Event, Mode, Refused
 from drivers.serial_projector.link import Link, RefusedError, Reply, SilentError
+from drivers.serial_projector.pattern_set import crc32_of_all
+from drivers.serial_projector.port import Port
 from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
 
 PROTOCOL = 1
+PICKED_AT_ONCE = 16
+"""Checksums in one line: a line has 240 bytes."""
 _PINGS = 8
 _FAREWELL_S = 0.6
 _AGAIN_S = 0.1
@@ -34,7 +39,9 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """What a box says of itself in HELLO: the fields of the protocol, under their names there."""
+    """What a box says of itself in HELLO: the fields of the protocol, under their names there. pick : 0 for a box that
+    holds runs of its flash only.
+    """
 
     sltp: int
     model: str
@@ -52,6 +59,7 @@ class Box:
     gap_us: int
     hold_us: int
     least_us: int
+    pick: int = 0
 
     @property
     def light_s(self) -> float:
@@ -61,16 +69,16 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a box does now."""
+    """What a box does now. index : the pattern that was lit last, None before the first."""
 
     state: str
     loaded: int
     first: int
-    index: int
     frames: int
     shows: int
     fault: int
     t_us: int
+    index: int | None = None
 
 
 class Client:
@@ -97,11 +105,17 @@ class Client:
         self._clock = DeviceClock()
         self._abandoned = threading.Event()
         self._box = self._greeted()
+        self._gap_us = self._box.gap_us
 
     @property
     def box(self) -> Box:
         """What the box said of itself when it was last greeted."""
         return self._box
+
+    @property
+    def gap_us(self) -> int:
+        """Least time between exposures of the sequence that is loaded: an engine that steps takes longer to go back."""
+        return self._gap_us
 
     @property
     def link(self) -> Link:
@@ -114,6 +128,13 @@ class Client:
             self._clock = DeviceClock()
             self._box = self._greeted()
             return self._box
+
+    def reconnect(self, open_port: Callable[[], Port]) -> None:
+        """Open the port again, after the box was unplugged and plugged in. Greets nobody. Raises as opening does."""
+        with self._lock:
+            # The system gives the old name to a new device only once nobody holds the old one.
+            self._link.port.close()
+            self._link.replace_port(open_port())
 
     def ping(self) -> tuple[str, int]:
         """What the box does, and the fault that it went dark for (0: none)."""
@@ -130,10 +151,35 @@ class Client:
         finally:
             self._lock.release()
 
-    def load(self, count: int, crc32: int) -> None:
-        """Have the box take a run of its patterns."""
-        self._ask("LOAD", count, f"{crc32:08X}")
-        self._abandoned.clear()
+    def load(self, each: Sequence[int]) -> tuple[int, ...]:
+        """Have the box take patterns, told by their CRC-32; return the indices of those that it lacks, none if it took
+        them. As a run of its flash if they lie so, which an engine steps through fastest; else picked one by one. A
+        box that cannot pick refuses those.
+        """
+        with self._lock:
+            try:
+                self._load(each)
+            except RefusedError as refusal:
+                if refusal.number not in {Refused.PATTERNS, Refused.RANGE} or len(each) > self._box.pick:
+                    raise
+                lacking = self._picked(each)
+                if lacking:
+                    return lacking
+                self._load(each)
+            self._abandoned.clear()
+            return ()
+
+    def _load(self, each: Sequence[int]) -> None:
+        reply = self._ask("LOAD", len(each), f"{crc32_of_all(each):08X}")
+        self._gap_us = _whole(reply, 2) if len(reply.words) > 2 else self._box.gap_us
+
+    def _picked(self, each: Sequence[int]) -> tuple[int, ...]:
+        """Pick patterns; return the indices of those that the box lacks."""
+        lacking: list[int] = []
+        for at in range(0, len(each), PICKED_AT_ONCE):
+            reply = self._ask("PICK", at, *(f"{crc32:08X}" for crc32 in each[at : at + PICKED_AT_ONCE]))
+            lacking += (_whole(reply, index) for index in range(1, len(reply.words)))
+        return tuple(lacking)
 
     def show(self, index: int) -> tuple[int, int]:
         """Light a pattern; return (t_visible_ns, t_err_ns), CLOCK_MONOTONIC."""
@@ -292,12 +338,17 @@ def _keyed(model: type[_Values], words: tuple[str, ...]) -> _Values:
     faults = []
     for field in fields(model):
         text = given.get(field.name)
+        if text is None and field.default is not MISSING:
+            continue
         if text is None:
             faults.append(f"no {field.name}")
         elif field.type == "str":
             values[field.name] = text
         elif text.isdigit():
             values[field.name] = int(text)
+        elif text == "-1" and field.default is None:
+            # So boxes of firmware 1.0 say that there is none.
+            continue
         else:
             faults.append(f"{field.name}={text}, no whole number")
     if faults:

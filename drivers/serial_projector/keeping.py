@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 
 from drivers.serial_projector.client import Client
-from slrig.errors import DeviceError, DeviceGoneError
+from slrig.errors import DeviceError
 
 BEATS_PER_WATCHDOG = 5
 """So many that a few lost ones, or a busy host, do not put the light out."""
 
 
 class KeepAlive:
-    """A thread that beats until it is stopped or the port is gone, except while the box is abandoned.
+    """A thread that beats until it is stopped, except while the box is abandoned.
 
     It says that the process lives, not that its owner thread does: a pattern that a stuck owner leaves lit is put out
     by the box after `max_on_s`.
@@ -35,9 +35,6 @@ class KeepAlive:
         while not self._stop.wait(self._period_s):
             try:
                 self._client.beat()
-            except DeviceGoneError:
-                # The owner's next command finds out, and says so.
-                return
             except DeviceError:
-                # What the box answers is the owner's business; that it heard this is enough.
+                # What the box answers, and that it is gone, is the owner's business: its next command finds out.
                 continue

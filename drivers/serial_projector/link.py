@@ -72,6 +72,11 @@ class Link:
     _splitter: Splitter = field(default_factory=Splitter)
     _waiting: deque[bytes] = field(default_factory=deque)
 
+    def replace_port(self, port: Port) -> None:
+        """Go on over another port. What was under way on the old one is lost."""
+        self.port, self._splitter = port, Splitter()
+        self._waiting.clear()
+
     def ask(
         self,
         verb: str,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
@@ -40,11 +39,6 @@ class SerialProjectorOptions(Strict, use_attribute_docstrings=True):
     deadline_s: Annotated[float, Field(ge=0.1, le=60)] = 2.5
     """How long a command may be sent again before it has failed."""
 
-    export_folder: Annotated[str, Field(min_length=1)] | None = None
-    """Where to write the patterns of a sequence that the box does not hold, for flashing; from the rig file's
-    folder."""
-
-
-def export_path(options: SerialProjectorOptions, folder: Path) -> Path | None:
-    """Where patterns are written, if anywhere."""
-    return None if options.export_folder is None else folder / options.export_folder
+    export_folder: Annotated[str, Field(min_length=1)] = "patterns"
+    """Where `slrig patterns` writes what is to be flashed, each set into a folder of its own, named by its checksum;
+    from the rig file's folder."""

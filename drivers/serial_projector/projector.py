@@ -37,15 +37,16 @@ class SerialProjector:
 
     Parameters
     ----------
-    port
-        Open; the projector closes it.
+    open_port
+        Opens the port, now and again when the box was unplugged in the dark; the projector closes it.
     options
         Checked.
     export_folder
-        Where the images of a sequence go that the box does not hold; None: nowhere.
+        Where `write_patterns` writes.
     """
 
-    def __init__(self, port: Port, options: SerialProjectorOptions, *, export_folder: Path | None) -> None:
+    def __init__(self, open_port: Callable[[], Port], options: SerialProjectorOptions, *, export_folder: Path) -> None:
+        self._open_port = open_port
         self._options = options
         self._export_folder = export_folder
         limits = Limits(
@@ -54,6 +55,7 @@ class SerialProjector:
             duty=round(options.max_duty * 1000),
             bright=round(options.brightness * 1000),
         )
+        port = open_port()
         link = Link(port, options.reply_s, options.deadline_s)
         try:
             self._client = Client(link, limits, label=options.port, open_s=options.open_s)
@@ -62,10 +64,19 @@ class SerialProjector:
             raise
         box = self._client.box
         self._size = Size(box.w, box.h)
-        self._info = ProjectorInfo("projector", f"{box.model} {box.fw}", options.port, self._size, True, box.light_s)
+        self._info = ProjectorInfo(
+            name="projector",
+            model=f"{box.model} {box.fw}",
+            serial=options.port,
+            size=self._size,
+            plays=True,
+            latency_s=box.light_s,
+            gap_s=box.gap_us / 1e6,
+            duty=box.duty / 1000,
+        )
         self._boot = box.boot
         self._state = ProjectorState(f"the trigger box on {options.port}")
-        self._wanted = (0, 0)
+        self._wanted: tuple[int, ...] = ()
         self._lit: str | None = None
         self._keeping = KeepAlive(self._client, watchdog_s=box.watchdog_ms / 1000)
 
@@ -85,31 +96,43 @@ class SerialProjector:
         return tuple(Shown(*frame) for frame in self._client.frames())
 
     def load(self, sequence: PatternSequence) -> None:
-        """See `Projector`. The box must hold these patterns, one after another: their checksums are compared.
+        """See `Projector`. The box must hold these patterns: their checksums are compared.
 
         Raises
         ------
         UnsupportedByDeviceError
-            It holds others, or the sequence is for another size, or too long.
+            It lacks some of them, or the sequence is for another size, or too long.
         """
         self._state.require_open()
         self._state.loaded = None
         self.blank()
         self._state.require_size(sequence, self._size)
-        count, most = len(sequence), self._client.box.max
-        each = crc32_of_each(sequence)
-        if count > most:
-            found = f"the trigger box holds {most} patterns, the sequence has {count}"
-            raise UnsupportedByDeviceError(self._to_be_flashed(sequence, found))
-        self._wanted = (count, crc32_of_all(each))
+        self._wanted = crc32_of_each(sequence)
         try:
-            self._sent(lambda: self._client.load(*self._wanted))
+            lacking = self._sent(lambda: self._client.load(self._wanted))
         except UnsupportedByDeviceError as error:
-            found = (
-                f"asked for {count} patterns with CRC-32 {self._wanted[1]:08X}, the trigger box holds others ({error})"
+            lacking, why = tuple(range(len(sequence))), f"it takes runs of its flash only, and this is none ({error})"
+        else:
+            why = f"it lacks {len(lacking)} of them, pattern {lacking[0]} the first" if lacking else ""
+        if lacking:
+            message = (
+                f"asked for {len(sequence)} patterns, the trigger box on {self._options.port} holds "
+                f"{self._client.box.max}: {why}. Flash it once with all that this rig shows: slrig patterns RIG writes "
+                f"them into {self._export_folder}"
             )
-            raise UnsupportedByDeviceError(self._to_be_flashed(sequence, found)) from error
+            raise UnsupportedByDeviceError(message)
         self._state.loaded = sequence
+
+    def write_patterns(self, sequence: PatternSequence) -> str:
+        """See `FlashedProjector`. Into a folder of its own: no other set is written over."""
+        self._state.require_size(sequence, self._size)
+        crc32 = crc32_of_all(crc32_of_each(sequence))
+        folder = self._export_folder / f"{crc32:08X}"
+        export(sequence, folder)
+        return (
+            f"{len(sequence)} images and patterns.json are in {folder}: put the images into the light engine's memory, "
+            "in the order of their numbers, and patterns.json onto the box"
+        )
 
     def show(self, index: int) -> Shown:
         """See `Projector`. The instant is the box's own stamp; its error comes from the exchanges with its clock."""
@@ -184,6 +207,11 @@ class SerialProjector:
         except _RestartedError:
             # Told below, if it does not go better.
             pass
+        except DeviceGoneError:
+            # Unplugged and plugged in again while nothing was lit: nobody has lost anything.
+            if self._lit is not None or self._state.closed.is_set():
+                raise
+            self._client.reconnect(self._open_port)
         try:
             self._meet_again()
             return self._obeyed(command)
@@ -232,8 +260,9 @@ class SerialProjector:
             )
             raise DeviceGoneError(message)
         self._boot = box.boot
-        if self._state.loaded is not None:
-            self._obeyed(lambda: self._client.load(*self._wanted))
+        if self._state.loaded is not None and self._obeyed(lambda: self._client.load(self._wanted)):
+            message = f"the trigger box on {self._options.port} {how} and holds other patterns; load them again"
+            raise DeviceGoneError(message)
 
     def _check_timing(self, exposure_us: int, period_us: int) -> None:
         box = self._client.box
@@ -242,8 +271,8 @@ class SerialProjector:
         for fits, found, remedy in (
             (exposure_us >= box.least_us, f"at least {box.least_us / 1e6:.6g} s", "expose for longer"),
             (
-                period_us >= exposure_us + box.gap_us,
-                f"at least {box.gap_us / 1e6:.6g} s between exposures",
+                period_us >= exposure_us + self._client.gap_us,
+                f"at least {self._client.gap_us / 1e6:.6g} s between exposures",
                 "lengthen the exposure: the period grows with it",
             ),
             (lit_us <= box.on_ms * 1000, f"at most {box.on_ms / 1000:.6g} s of light (max_on_s)", "raise max_on_s"),
@@ -256,15 +285,6 @@ class SerialProjector:
             if not fits:
                 message = f"{asked}, the trigger box on {self._options.port} gives {found}; {remedy}"
                 raise UnsupportedByDeviceError(message)
-
-    def _to_be_flashed(self, sequence: PatternSequence, found: str) -> str:
-        """What to do about a sequence that the box does not hold; writes its images where the rig file says so."""
-        if self._export_folder is None:
-            where = 'write export_folder = "patterns" into the rig file and scan again: its images are written there'
-        else:
-            export(sequence, self._export_folder)
-            where = f"its images and patterns.json are in {self._export_folder} now"
-        return f"{found}. Flash the sequence: {where}; put the images into the light engine, patterns.json onto the box"
 
 
 class _RestartedError(DeviceError):

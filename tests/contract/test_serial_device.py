@@ -41,7 +41,7 @@ SLACK_S = 0.2
 
 @pytest.mark.slow
 def test_the_contract_holds_on_a_bad_line(tmp_path: Path) -> None:
-    examined = bench(tmp_path, noise=Noise(LOSS / 2, CORRUPTION / 2, seed=5), reply_s=0.02)
+    examined = bench(tmp_path, noise=Noise(LOSS / 2, CORRUPTION / 2, seed=5), reply_s=0.06)
     report = run(examined.open_rig, examined.sequence)
     failed = [str(result.failure) for result in report.results if result.outcome is Outcome.FAILED]
     assert not failed

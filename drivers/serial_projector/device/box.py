@@ -5,6 +5,8 @@ Runs unchanged in MicroPython and in CPython.
 
 # MicroPython has neither `__future__` nor `abc` or `dataclasses`: plain classes do.
 
+import binascii
+
 DUTY_WINDOW_US = 10000000
 DUTY_SLOTS = 20
 DUTY_SLACK = 20
@@ -48,7 +50,8 @@ class Description:
 
     light_us : longest time from a command to its light. error_us : error of its time stamps. gap_us : least time from
     the end of an exposure to the next one. hold_us : how long a pattern of a sequence stays lit beyond its exposure.
-    least_us : shortest exposure. on_ms, duty, watchdog_ms : the most that it grants.
+    least_us : shortest exposure. step_us : how much longer it takes for each pattern that it must pass by, or go back
+    over, to get from one pattern to the next. on_ms, duty, watchdog_ms : the most that it grants.
     """
 
     def __init__(
@@ -64,6 +67,7 @@ class Description:
         gap_us: int,
         hold_us: int,
         least_us: int,
+        step_us: int = 0,
         watchdog_ms: int = 10000,
         on_ms: int = 3600000,
         duty: int = 1000,
@@ -73,8 +77,28 @@ class Description:
         self.crc32 = b"".join([value.to_bytes(4, "big") for value in crc32])
         self.count = len(crc32)
         self.light_us, self.error_us = light_us, error_us
-        self.gap_us, self.hold_us, self.least_us = gap_us, hold_us, least_us
+        self.gap_us, self.hold_us, self.least_us, self.step_us = gap_us, hold_us, least_us, step_us
         self.watchdog_ms, self.on_ms, self.duty = watchdog_ms, on_ms, duty
+
+    def found(self, crc32: int) -> int:
+        """Where a pattern lies in the flash, the first place if there are several; -1 if it does not."""
+        wanted, at = crc32.to_bytes(4, "big"), -1
+        while True:
+            at = self.crc32.find(wanted, at + 1)
+            if at < 0 or at % 4 == 0:
+                return at // 4
+
+    def crc32_of(self, order: list[int]) -> int:
+        """The checksum of a sequence of the flash's patterns."""
+        return binascii.crc32(b"".join([self.crc32[4 * at : 4 * at + 4] for at in order]))
+
+    def gap_of(self, order: list[int]) -> int:
+        """Least time between exposures of a sequence of the flash's patterns, µs."""
+        most = 0
+        for before, after in zip(order, order[1:]):  # noqa: B905, RUF007 - MicroPython has neither
+            # Back means from the first one on, again.
+            most = max(most, after - before - 1 if after >= before else after)
+        return self.gap_us + most * self.step_us
 
 
 class LightTime:

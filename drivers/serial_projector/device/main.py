@@ -26,10 +26,16 @@ except ImportError:
     from box import Description, Hardware, HardwareError  # type: ignore[no-redef]
     from protocol import Device  # type: ignore[no-redef]
 
-MODEL, FIRMWARE = "slrig-pico", "1.0.0"
+MODEL, FIRMWARE = "slrig-pico", "1.1.0"
 WIDTH_PX, HEIGHT_PX = 912, 1140
 
 STEP_PIN, HOME_PIN, LAMP_PIN, CAMERA_PIN, READY_PIN, SERVICE_PIN = 2, 3, 4, 5, 6, 15
+
+HOME_LEVEL = 1
+"""Level of a pulse on HOME. 0 for an engine that runs while this input is high and begins anew after it was low."""
+
+STEPS_TO_FIRST = 0
+"""Pulses on STEP from HOME to the first pattern: 1 where that one waits for a trigger, too."""
 
 STEP_US = 50
 """Length of a pulse on STEP or HOME, and of the pause after it."""
@@ -67,11 +73,12 @@ def described(patterns: dict) -> Description:
         WIDTH_PX,
         HEIGHT_PX,
         crc32,
-        light_us=2 * STEP_US * (len(crc32) + 1) + max(SETTLE_US, READY_US) + LAMP_US,
+        light_us=2 * STEP_US * (len(crc32) + 1 + STEPS_TO_FIRST) + max(SETTLE_US, READY_US) + LAMP_US,
         error_us=ERROR_US,
         gap_us=HOLD_US + 2 * STEP_US + SETTLE_US + 1000,
         hold_us=HOLD_US,
         least_us=LEAST_US,
+        step_us=2 * STEP_US,
         duty=MOST_DUTY,
         on_ms=MOST_ON_MS,
     )
@@ -84,7 +91,7 @@ class Board(Hardware):
         self._time = time
         self._lamp = machine.PWM(machine.Pin(LAMP_PIN), freq=DIM_HZ, duty_u16=0)
         self._step = machine.Pin(STEP_PIN, machine.Pin.OUT, value=0)
-        self._home = machine.Pin(HOME_PIN, machine.Pin.OUT, value=0)
+        self._home = machine.Pin(HOME_PIN, machine.Pin.OUT, value=1 - HOME_LEVEL)
         self._ready = None if READY_PIN is None else machine.Pin(READY_PIN, machine.Pin.IN, machine.Pin.PULL_DOWN)
         self._camera = _pulses(machine, rp2)
         self._level = 65535
@@ -102,7 +109,9 @@ class Board(Hardware):
     def select(self, pattern: int) -> None:
         """See `Hardware`."""
         if self._position < 0 or pattern < self._position:
-            self._send(self._home)
+            self._send(self._home, HOME_LEVEL)
+            for _ in range(STEPS_TO_FIRST):
+                self._send(self._step)
             self._position = 0
         while self._position < pattern:
             self._send(self._step)
@@ -136,10 +145,10 @@ class Board(Hardware):
         self._level = 65535 * permille // 1000
         return permille
 
-    def _send(self, pin) -> None:
-        pin.value(1)
+    def _send(self, pin, level=1) -> None:
+        pin.value(level)
         self._time.sleep_us(STEP_US)
-        pin.value(0)
+        pin.value(1 - level)
         self._time.sleep_us(STEP_US)
 
 

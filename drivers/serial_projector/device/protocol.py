@@ -17,6 +17,8 @@ except ImportError:
     from box import Description, Hardware, HardwareError, LightTime  # type: ignore[import-not-found, no-redef]
 
 LEAST_WATCHDOG_MS = 50
+MOST_PICKED = 512
+"""Patterns of one sequence; PICK takes no more."""
 _UNDER_LIGHT = ("lit", "playing", "waiting")
 
 
@@ -43,7 +45,9 @@ class Device:
         self._reply = b""
         self._heard_us = 0
         self._watchdog_us, self._on_us, self._duty = LEAST_WATCHDOG_MS * 1000, 0, 0
-        self._first = self._count = 0
+        self._order: list[int] = []
+        self._picked: list[int] = []
+        self._gap_us = description.gap_us
         self._state = "idle"
         self._fault = 0
         self._light_time = LightTime()
@@ -128,7 +132,7 @@ class Device:
                 self._state = "ready"
                 self._event(f"DONE {count}")
                 return
-            self._hardware.select(self._first + first + self._frames)
+            self._hardware.select(self._order[first + self._frames])
             self._next_us = max(self._next_us + period_us, self._hardware.time_us())
         elif not self._lit and self._state == "playing" and now_us >= self._next_us:
             self._light_frame()
@@ -168,7 +172,7 @@ class Device:
 
     def _trip(self, code: int) -> None:
         self._dark()
-        self._state = "ready" if self._count else "idle"
+        self._state = "ready" if self._order else "idle"
         self._fault = code
         self._event(f"FAULT {code}")
 
@@ -209,11 +213,12 @@ class Device:
         return self._reply
 
     def _act(self, verb: str, words: list[str]) -> str:
-        wanted = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5}.get(verb, 0)
-        if verb not in ("HELLO", "PING", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"):
+        if verb not in ("HELLO", "PING", "PICK", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"):
             raise Refusal(wire.VERB, verb)
+        wanted = {"HELLO": 5, "LOAD": 2, "SHOW": 1, "SEQ": 5, "PICK": max(len(words), 2)}.get(verb, 0)
+        checksums = verb in ("PICK", "LOAD")
         try:
-            numbers = [int(word, 16) if (verb, at) == ("LOAD", 1) else int(word) for at, word in enumerate(words)]
+            numbers = [int(word, 16 if checksums and at else 10) for at, word in enumerate(words)]
         except ValueError:
             numbers = []
         if len(numbers) != len(words) or len(words) != wanted or (numbers and min(numbers) < 0):
@@ -223,6 +228,7 @@ class Device:
 
     def _hello(self, version: int, watchdog_ms: int, on_ms: int, duty: int, bright: int) -> str:
         about = self._about
+        self._picked = []
         self._darken("idle")
         self._open = False
         if version != wire.VERSION:
@@ -239,21 +245,40 @@ class Device:
             f"sltp={wire.VERSION} model={about.model} fw={about.firmware} w={about.width_px} h={about.height_px} "
             f"max={about.count} boot={self._boot:08X} watchdog_ms={watchdog_ms} on_ms={on_ms} duty={duty} "
             f"bright={granted} light_us={about.light_us} error_us={about.error_us} gap_us={about.gap_us} "
-            f"hold_us={about.hold_us} least_us={about.least_us}"
+            f"hold_us={about.hold_us} least_us={about.least_us} pick={MOST_PICKED}"
         )
 
     def _ping(self) -> str:
         return f"{self._hardware.time_us()} {self._state} {self._fault}"
 
+    def _pick(self, at: int, *crc32: int) -> str:
+        self._darken("idle")
+        if at == 0:
+            self._picked = []
+        if at != len(self._picked) or at + len(crc32) > MOST_PICKED or max(crc32) > 0xFFFFFFFF:
+            raise Refusal(wire.RANGE, f"{at} after {len(self._picked)}, most {MOST_PICKED}")
+        self._picked += [self._about.found(each) for each in crc32]
+        return " ".join(
+            [f"{len(self._picked)}"] + [f"{i}" for i, each in enumerate(self._picked) if each < 0 and i >= at]
+        )
+
     def _load(self, count: int, crc32: int) -> str:
         self._darken("idle")
+        about, order = self._about, self._picked
+        self._picked = []
+        if not order or len(order) != count or -1 in order or about.crc32_of(order) != crc32:
+            order = self._run_of(count, crc32)
+        self._order, self._gap_us, self._state = order, about.gap_of(order), "ready"
+        return f"{count} {order[0]} {self._gap_us}"
+
+    def _run_of(self, count: int, crc32: int) -> list[int]:
+        """So many patterns of the flash, one after another, that have this checksum."""
         about = self._about
         if not 1 <= count <= about.count:
             raise Refusal(wire.RANGE, f"{count} of {about.count}")
         for first in range(about.count - count + 1):
             if binascii.crc32(about.crc32[4 * first : 4 * (first + count)]) == crc32:
-                self._first, self._count, self._state = first, count, "ready"
-                return f"{count} {first}"
+                return list(range(first, first + count))
         raise Refusal(wire.PATTERNS, f"{about.count} {binascii.crc32(about.crc32):08X}")
 
     def _show(self, index: int) -> str:
@@ -261,7 +286,7 @@ class Device:
         self._index = index
         self._dark()
         self._state = "ready"
-        self._hardware.select(self._first + index)
+        self._hardware.select(self._order[index])
         t_us = self._light()
         self._state = "lit"
         return f"{index} {t_us}"
@@ -269,14 +294,14 @@ class Device:
     def _seq(self, first: int, count: int, exposure_us: int, period_us: int, mode: int) -> str:
         about = self._about
         self._require_light(first)
-        if not 1 <= count <= self._count - first or mode not in (wire.FREE, wire.STEP):
+        if not 1 <= count <= len(self._order) - first or mode not in (wire.FREE, wire.STEP):
             raise Refusal(wire.RANGE, f"{count} patterns from {first}, mode {mode}")
-        if not about.least_us <= exposure_us <= self._on_us - about.hold_us or period_us < exposure_us + about.gap_us:
+        if not about.least_us <= exposure_us <= self._on_us - about.hold_us or period_us < exposure_us + self._gap_us:
             raise Refusal(wire.RANGE, f"exposure {exposure_us} period {period_us}")
         if mode == wire.FREE and (exposure_us + about.hold_us) * 1000 > self._duty * period_us:
             raise Refusal(wire.LIMIT, f"duty {self._duty}")
         self._darken("ready")
-        self._hardware.select(self._first + first)
+        self._hardware.select(self._order[first])
         self._sequence, self._frames = (first, count, exposure_us, period_us), 0
         self._next_us = self._hardware.time_us() + about.gap_us
         self._state = "playing" if mode == wire.FREE else "waiting"
@@ -291,30 +316,33 @@ class Device:
         return f"{self._index} {t_us}"
 
     def _stop(self) -> str:
-        self._darken("ready" if self._count else "idle")
+        self._darken("ready" if self._order else "idle")
         return f"{self._frames}"
 
     def _blank(self) -> str:
-        self._darken("ready" if self._count else "idle")
+        self._darken("ready" if self._order else "idle")
         return ""
 
     def _bye(self) -> str:
+        self._picked = []
         self._darken("idle")
         self._open = False
         return ""
 
     def _status(self) -> str:
+        # Before the first light there is no pattern to tell.
+        index = f"index={self._index} " if self._index >= 0 else ""
         return (
-            f"state={self._state} loaded={self._count} first={self._first} index={self._index} frames={self._frames} "
-            f"shows={self._shows} fault={self._fault} t_us={self._hardware.time_us()}"
+            f"state={self._state} loaded={len(self._order)} first={self._order[0] if self._order else 0} {index}"
+            f"frames={self._frames} shows={self._shows} fault={self._fault} t_us={self._hardware.time_us()}"
         )
 
     def _require_light(self, index: int) -> None:
         self._require_no_fault()
-        if not self._count or self._state in ("playing", "waiting"):
+        if not self._order or self._state in ("playing", "waiting"):
             raise Refusal(wire.STATE, self._state)
-        if not 0 <= index < self._count:
-            raise Refusal(wire.RANGE, f"{index} of {self._count}")
+        if not 0 <= index < len(self._order):
+            raise Refusal(wire.RANGE, f"{index} of {len(self._order)}")
         self._require_duty()
 
     def _require_no_fault(self) -> None:
@@ -332,7 +360,7 @@ class Device:
         """End whatever goes on, by the host's wish: that also acknowledges a fault."""
         self._state = state
         if state == "idle":
-            self._first = self._count = 0
+            self._order = []
         self._fault = 0
         self._dark()
         if self._owes_dark:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from simulated_rig.light import light_table
 from simulated_rig.options import HeadOptions
 from simulated_rig.rendering import Stage, View
-from simulated_rig.scene import read_scene, surface_of
+from simulated_rig.scene import read_scene
+from simulated_rig.staging import Script
 from slrig.bundle.faults import checked
 from slrig.config import read_rig
 from slrig.model import Calibration, CameraFormat, Pixels, Size
@@ -54,14 +55,15 @@ class World:
         (camera,) = options.camera
         scene = rig.parent / options.scene
         lens = options.projector.pinhole()
-        stage = Stage(
-            surface_of(read_scene(scene), scene.parent),
+        self._script = Script(options, read_scene(scene), scene.parent)
+        self._stage = Stage(
+            self._script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
         )
         self._view = View(
             camera.pinhole(),
-            stage,
+            self._stage,
             blur_px=camera.blur_px,
             ambient=options.ambient,
             samples_per_axis=options.samples_per_axis,
@@ -85,6 +87,18 @@ class World:
     def format(self) -> CameraFormat:
         """The sensor's."""
         return self._format
+
+    @property
+    def poses(self) -> int:
+        """How many poses its script has."""
+        return len(self._script.poses)
+
+    def move(self, index: int) -> None:
+        """Put what the script moves into a pose, as a person does: while nobody photographs it."""
+        with self._lock:
+            self._stage.change(surface=self._script.surface(index))
+            self._images.clear()
+        self._seen(DARK)
 
     @property
     def profiles(self) -> list[Pixels]:

@@ -27,10 +27,10 @@ from tests.unit.drivers.serial_projector.line import SerialLine
 SIZE = Size(400, 300)
 
 
-def whole_sequence(size: Size = SIZE) -> PatternSequence:
+def whole_sequence(size: Size = SIZE, *, line_width_px: int = 1) -> PatternSequence:
     """The 26 patterns of a usual scan at 400 x 300."""
     patterns = scan_patterns(
-        size, line_shift=True, period_px=8, line_width_px=1, gray_cell_px=None, gray_offset_px=0, rows=False
+        size, line_shift=True, period_px=8, line_width_px=line_width_px, gray_cell_px=None, gray_offset_px=0, rows=False
     )
     return encode(patterns, size)
 

@@ -100,6 +100,14 @@ class SerialLine:
             os.close(self._master)
             os.close(self._slave)
 
+    def plug_in(self) -> None:
+        """Plug the cable in again: `path` is another one. Only from `on_command` or `do`."""
+        if self._cut:
+            self._master, self._slave = pty.openpty()
+            tty.setraw(self._slave)
+            self.path = os.ttyname(self._slave)
+            self._rest, self._cut = b"", False
+
     def do(self, what: Callable[[], None]) -> None:
         """Have something done in the box's own thread, and wait for it."""
         done = threading.Event()

@@ -51,6 +51,17 @@ def test_a_pattern_is_reached_by_steps_from_home(pico: Pico, board: main.Board) 
     assert pico.levels[main.LAMP_PIN] == 0
 
 
+def test_an_engine_whose_home_is_a_low_level_runs_in_between(pico: Pico, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(main, "HOME_LEVEL", 0)
+    monkeypatch.setattr(main, "STEPS_TO_FIRST", 1)
+    board = main.Board(pico.machine, pico.rp2, pico.time)
+    assert pico.levels[main.HOME_PIN] == 1
+    board.select(2)
+    assert pico.levels[main.HOME_PIN] == 1
+    assert sum(what == f"{main.HOME_PIN}=0" for _, what in pico.did) == 1
+    assert pulses(pico, main.STEP_PIN) == 3
+
+
 def test_an_engine_that_is_not_ready_is_a_failure_and_homed_next_time(pico: Pico, board: main.Board) -> None:
     board.select(2)
     pico.levels[main.READY_PIN] = 0

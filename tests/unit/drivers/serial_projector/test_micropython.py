@@ -114,10 +114,12 @@ def random_lines(seed: int, count: int) -> list[tuple[int, str]]:
             [
                 *(f"HELLO 1 {rng.choice([40, 500, 1000])} {rng.choice([50, 5000])} {duty} 500" for duty in (200, 1000)),
                 f"LOAD {size} 00C0FFEE",
+                f"PICK 0 {CRC32[first]:08X} {CRC32[first - 7]:08X}",
+                f"PICK {size} 00C0FFEE {CRC32[first]:08X}",
+                f"LOAD 2 {crc32_of_all([CRC32[first], CRC32[first - 7]]):08X}",
                 f"LOAD {size} {crc32_of_all(CRC32[first : first + size]):08X}",
-                f"LOAD 26 {crc32_of_all(CRC32):08X}",
-                f"LOAD 26 {crc32_of_all(CRC32):08X}",
-                *(f"SHOW {rng.randrange(26)}" for _ in range(6)),
+                *(f"LOAD 26 {crc32_of_all(CRC32):08X}" for _ in range(4)),
+                *(f"SHOW {rng.randrange(26)}" for _ in range(8)),
                 f"SEQ {rng.randrange(3)} {size} {rng.choice([50, 4000, 9000])} {rng.choice([6400, 50000])} 0",
                 f"SEQ 0 {size} 4000 10000 1",
                 *("TRIG", "TRIG", "PING", "PING", "STOP", "BLANK", "STATUS", "DANCE", "SHOW", "SHOW -1", "LOAD x y"),
@@ -139,7 +141,7 @@ def random_lines(seed: int, count: int) -> list[tuple[int, str]]:
 def test_both_interpreters_play_the_same_sessions(monkeypatch: pytest.MonkeyPatch) -> None:
     told = ""
     for seed in range(4):
-        script = f"CRC32 = {CRC32}\nLINES = {random_lines(seed, 500)}\n{PLAY}"
+        script = f"CRC32 = {CRC32}\nLINES = {random_lines(seed, 600)}\n{PLAY}"
         in_ours = in_cpython(script, monkeypatch)
         assert in_micropython(script, FIRMWARE) == in_ours
         told += in_ours
@@ -161,11 +163,14 @@ def test_the_pins_do_the_same_in_both(monkeypatch: pytest.MonkeyPatch, tmp_path:
         "SHOW 1",
         "SEQ 2 3 4000 8000 0",
         "STATUS",
+        "PICK 0 " + " ".join(f"{CRC32[index]:08X}" for index in (9, 4, 25)),
+        f"LOAD 3 {crc32_of_all([CRC32[index] for index in (9, 4, 25)]):08X}",
+        "SEQ 0 3 4000 9000 0",
         "BYE",
     ]
     lines = [framed(f"1A2B {number} {text}") for number, text in enumerate(texts)]
     script = f"CRC32 = {CRC32}\nLINES = {lines}\n{PINS}"
     told = in_cpython(script, monkeypatch)
     assert in_micropython(script, tmp_path) == told
-    assert told.count("FRAME") == 3
-    assert told.count("5=1") == 3
+    assert told.count("FRAME") == 6
+    assert told.count("5=1") == 6

@@ -95,7 +95,7 @@ def test_every_line_of_the_example_carries_its_checksum() -> None:
 
 
 def test_the_page_names_everything_that_goes_over_the_wire() -> None:
-    verbs = {"HELLO", "PING", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"}
+    verbs = {"HELLO", "PING", "PICK", "LOAD", "SHOW", "SEQ", "TRIG", "STOP", "BLANK", "STATUS", "BYE"}
     assert {verb for verb in verbs if re.search(rf"^    {verb}\b", PAGE, re.MULTILINE)} == verbs
     assert all(f"{name}=" in PAGE for name in (*Box.__dataclass_fields__, *Status.__dataclass_fields__))
     errors = PAGE.partition("Errors: ")[2].partition("\n\n")[0]

@@ -15,11 +15,13 @@ import pytest
 
 from drivers.serial_projector import open_projector
 from drivers.serial_projector.client import Client, Limits
+from drivers.serial_projector.device import protocol
 from drivers.serial_projector.frames import Mode
 from drivers.serial_projector.link import Link
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each
 from drivers.serial_projector.port import SerialPort
 from drivers.serial_projector.projector import SerialProjector
+from slrig.devices import FlashedProjector
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -64,6 +66,8 @@ class Watch:
 def test_it_is_dark_after_opening_and_tells_what_it_is(bench: Bench) -> None:
     projector = bench.open()
     assert bench.scene.lit is None
+    status = projector.client.status()
+    assert (status.state, status.index, status.shows) == ("idle", None, 0)
     info = projector.info
     assert (info.size, info.plays, info.model) == (SIZE, True, "test-box 1.0.0")
     assert info.serial == bench.line.path
@@ -101,7 +105,8 @@ def test_a_play_lights_every_pattern_once_and_pulses_the_cameras(bench: Bench) -
     ):
         assert on.t_ns <= pulse_ns
         assert off.t_ns - pulse_ns >= 4_000_000, "lit for the whole exposure"
-    assert projector.client.status().state == "ready"
+    status = projector.client.status()
+    assert (status.state, status.index) == ("ready", 25)
     projector.stop()
     played = projector.played
     assert [each.index for each in played] == list(range(26))
@@ -126,7 +131,7 @@ def test_a_play_that_is_stopped_is_dark_and_another_one_begins_at_the_beginning(
 
 def test_patterns_can_be_stepped_by_trigger(either_bench: Bench) -> None:
     client = either_bench.open().client
-    client.load(3, crc32_of_run(8, 3))
+    assert client.load(crc32_of_each(SEQUENCE)[8:11]) == ()
     client.sequence(0, 3, 4_000, 8_000, Mode.STEP)
     watch = Watch(either_bench.scene)
     for index in range(3):
@@ -134,10 +139,6 @@ def test_patterns_can_be_stepped_by_trigger(either_bench: Bench) -> None:
         watch.until(lambda scene, lit=2 * index + 2: len(scene.changes) >= lit)  # type: ignore[misc]
         assert abs(t_ns - either_bench.scene.changes[2 * index].t_ns) <= error_ns + 20_000_000
     assert [pattern for pattern, _ in either_bench.scene.shown] == [8, 9, 10]
-
-
-def crc32_of_run(first: int, count: int) -> int:
-    return crc32_of_all(crc32_of_each(SEQUENCE)[first : first + count])
 
 
 @pytest.mark.parametrize(("first", "count"), [(0, 26), (0, 2), (2, 14), (24, 2)])
@@ -151,29 +152,60 @@ def test_any_run_of_what_is_flashed_can_be_shown(bench: Bench, first: int, count
         assert bench.scene.lit == flashed + index
 
 
-def test_patterns_that_are_not_flashed_are_refused_dark_and_written_out(bench: Bench, tmp_path: Path) -> None:
-    projector = bench.open(tmp_path, export_folder="patterns")
+def backwards() -> PatternSequence:
+    return PatternSequence(SIZE, SEQUENCE.patterns[::-1], SEQUENCE.profiles[::-1])
+
+
+def test_patterns_are_shown_in_any_order_and_as_often_as_asked_for(either_bench: Bench) -> None:
+    projector = either_bench.open()
+    projector.load(PatternSequence(SIZE, SEQUENCE.patterns[::-1] * 2, SEQUENCE.profiles[::-1] * 2))
+    for index in (0, 3, 51, 26):
+        projector.show(index)
+    # White and black come twice in the flash, too: the first place is taken.
+    assert [pattern for pattern, _ in either_bench.scene.shown] == [1, 22, 0, 1]
+
+
+def test_a_box_of_old_firmware_takes_runs_and_nothing_else(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(protocol, "MOST_PICKED", 0)
+    projector = bench.open()
+    assert projector.client.box.pick == 0
+    projector.load(part(2, 14))
+    projector.show(0)
+    assert bench.scene.lit == 2
+    with pytest.raises(UnsupportedByDeviceError, match=r"runs of its flash only.*slrig patterns"):
+        projector.load(backwards())
+
+
+def test_patterns_that_are_not_flashed_are_refused_dark_and_nothing_is_written(bench: Bench, tmp_path: Path) -> None:
+    projector = bench.open(tmp_path)
     projector.load(SEQUENCE)
     projector.show(0)
-    other = PatternSequence(SIZE, SEQUENCE.patterns[::-1], SEQUENCE.profiles[::-1])
-    with pytest.raises(UnsupportedByDeviceError, match=r"holds others .*patterns.json are in .*patterns"):
-        projector.load(other)
+    wider = whole_sequence(SIZE, line_width_px=2)
+    with pytest.raises(UnsupportedByDeviceError, match=r"it lacks 8 of them, pattern 16 the first\..*slrig patterns"):
+        projector.load(wider)
     assert bench.scene.lit is None
     with pytest.raises(DeviceStateError, match="no sequence is loaded"):
         projector.show(0)
-    description = json.loads((tmp_path / "patterns" / "patterns.json").read_text())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_set_of_patterns_is_written_into_a_folder_of_its_own(bench: Bench, tmp_path: Path) -> None:
+    projector = bench.open(tmp_path)
+    assert isinstance(projector, FlashedProjector)
+    told = [projector.write_patterns(each) for each in (SEQUENCE, backwards(), SEQUENCE)]
+    first, second = (crc32_of_all(crc32_of_each(each)) for each in (SEQUENCE, backwards()))
+    assert {folder.name for folder in (tmp_path / "patterns").iterdir()} == {f"{first:08X}", f"{second:08X}"}
+    folder = tmp_path / "patterns" / f"{second:08X}"
+    assert str(folder) in told[1]
+    description = json.loads((folder / "patterns.json").read_text())
     assert description["size_px"] == [400, 300]
-    assert [int(each, 16) for each in description["crc32"]] == list(crc32_of_each(other))
+    assert [int(each, 16) for each in description["crc32"]] == list(crc32_of_each(backwards()))
     for index in (0, 7, 25):
-        image = cv2.imread(str(tmp_path / "patterns" / f"{index:03d}.png"), cv2.IMREAD_UNCHANGED)
+        image = cv2.imread(str(folder / f"{index:03d}.png"), cv2.IMREAD_UNCHANGED)
         assert image is not None
-        assert np.array_equal(image, other.image(index))
-
-
-def test_without_a_folder_the_refusal_says_how_to_get_the_images(bench: Bench) -> None:
-    longer = PatternSequence(SIZE, SEQUENCE.patterns * 2, SEQUENCE.profiles * 2)
-    with pytest.raises(UnsupportedByDeviceError, match=r"holds 26 patterns, the sequence has 52.*export_folder"):
-        bench.open().load(longer)
+        assert np.array_equal(image, backwards().image(index))
+    with pytest.raises(UnsupportedByDeviceError, match="shows 400 x 300"):
+        projector.write_patterns(whole_sequence(Size(408, 300)))
 
 
 def test_a_sequence_of_another_size_is_refused(bench: Bench) -> None:
@@ -363,7 +395,10 @@ def test_a_cable_that_is_pulled_ends_in_darkness(bench: Bench, doing: str) -> No
     with pytest.raises(DeviceGoneError):
         projector.blank()
     shown = len(bench.scene.shown)
-    watch.until(lambda scene: scene.lit is None and scene.changes[-1].t_ns > pulled_ns + 150_000_000)
+    # Between two patterns of a play it is dark for 0.02 s.
+    while not watch.stays(lambda scene: scene.lit is None, 0.1):
+        assert len(bench.scene.shown) <= shown + 10
+        watch.until(lambda scene: scene.lit is None)
     assert bench.scene.changes[-1].t_ns - pulled_ns < 0.2e9 + 0.3e9
     assert len(bench.scene.shown) <= shown + 10
     projector.close()
@@ -371,6 +406,25 @@ def test_a_cable_that_is_pulled_ends_in_darkness(bench: Bench, doing: str) -> No
     with pytest.raises(DeviceStateError):
         projector.show(4)
     projector.blank()
+
+
+def test_a_box_that_was_plugged_in_again_in_the_dark_goes_on(bench: Bench, tmp_path: Path) -> None:
+    port = tmp_path / "port"
+    port.symlink_to(bench.line.path)
+    projector = bench.open(port=str(port), watchdog_s=0.2)
+    projector.load(SEQUENCE)
+    projector.show(3)
+    projector.blank()
+    bench.line.do(bench.line.unplug)
+    with pytest.raises(DeviceGoneError, match="there is none such"):
+        projector.load(SEQUENCE)
+    bench.line.do(bench.line.plug_in)
+    port.unlink()
+    port.symlink_to(bench.line.path)
+    projector.load(SEQUENCE)
+    projector.show(4)
+    watch = Watch(bench.scene)
+    assert watch.stays(lambda scene: scene.lit == 4, 0.5), "its sign of life goes over the new port"
 
 
 def test_a_line_that_falls_silent_is_left_to_the_watchdog(make_bench: Callable[..., Bench]) -> None:

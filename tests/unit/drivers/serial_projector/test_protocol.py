@@ -409,7 +409,7 @@ def test_a_sequence_out_of_range_is_refused(words: str) -> None:
 
 def test_any_run_of_the_flash_can_be_loaded_and_nothing_else() -> None:
     host = Host().ready()
-    assert host.ok(f"LOAD 3 {crc32_of_all(CRC32[7:10]):08X}") == ("3", "7")
+    assert host.ok(f"LOAD 3 {crc32_of_all(CRC32[7:10]):08X}") == ("3", "7", "3000")
     host.ok("SHOW 2")
     assert host.light.shown == [9]
     assert host.refused("SHOW 3") == Refused.RANGE
@@ -420,7 +420,71 @@ def test_any_run_of_the_flash_can_be_loaded_and_nothing_else() -> None:
         assert host.refused(f"LOAD {count} 00000000") == Refused.RANGE
 
 
-@pytest.mark.parametrize("dark", ["BLANK", "STOP", "BYE", "LOAD 27 00000000", HELLO, "HELLO 2 1000 5000 1000 1000"])
+def picked(order: list[int]) -> list[str]:
+    """What a host sends to load patterns of the flash in any order."""
+    crc32 = [CRC32[index] for index in order]
+    lines = (" ".join(f"{each:08X}" for each in crc32[at : at + 16]) for at in range(0, len(crc32), 16))
+    return [
+        *(f"PICK {16 * at} {line}" for at, line in enumerate(lines)),
+        f"LOAD {len(order)} {crc32_of_all(crc32):08X}",
+    ]
+
+
+def test_patterns_are_picked_from_anywhere_in_the_flash() -> None:
+    host = Host(step_us=100).ready()
+    order = [0, 1, 25, 24, 3, 3, *range(8, 22), 0, 1]
+    first, second, load = picked(order)
+    assert host.ok(first) == ("16",)
+    assert host.state() == "idle"
+    assert host.ok(second) == ("22",)
+    # Home, and 24 steps: 24 more than to the next one. The sequence may be longer than the flash, too.
+    assert host.ok(load) == ("22", "0", str(3000 + 24 * 100))
+    for index in range(len(order)):
+        host.ok(f"SHOW {index}")
+    assert host.light.shown == order
+    assert host.refused("SHOW 22") == Refused.RANGE
+    assert host.refused("SEQ 0 22 4000 9399 0") == Refused.RANGE
+    host.ok("SEQ 2 3 4000 9400 0")
+    host.pass_us(100_000)
+    assert host.light.shown[22:] == [25, 24, 3]
+    run = host.ok(f"LOAD 2 {crc32_of_all(CRC32[:2]):08X}")
+    assert run == ("2", "0", "3000"), "what was picked is used up"
+
+
+def test_patterns_that_the_flash_lacks_are_told_and_not_loaded() -> None:
+    host = Host().ready()
+    assert host.ok(f"PICK 0 {CRC32[4]:08X} 12345678 {CRC32[2]:08X} 0") == ("4", "1", "3")
+    assert host.ok(f"PICK 4 {CRC32[0]:08X} 1") == ("6", "5")
+    assert host.refused("LOAD 6 00000000") == Refused.PATTERNS
+    host.ok(picked([3, 2])[0])
+    assert host.refused(f"LOAD 2 {crc32_of_all([CRC32[2], CRC32[4]]):08X}") == Refused.PATTERNS
+
+
+@pytest.mark.parametrize("words", ["1 00000000", "0", "", "0 100000000", "0 -1", "x 0"])
+def test_a_pick_out_of_order_or_range_is_refused(words: str) -> None:
+    host = Host().ready()
+    assert host.refused(f"PICK {words}".rstrip()) == Refused.RANGE
+
+
+def test_picking_ends_with_its_session() -> None:
+    host = Host().ready()
+    pick, load = picked([5, 4])
+    host.ok(pick)
+    host.ok(HELLO)
+    assert host.refused(load) == Refused.PATTERNS
+
+
+def test_a_pick_that_is_sent_again_picks_once() -> None:
+    host = Host().ready()
+    pick, load = picked([5, 4])
+    host.ok(pick)
+    assert host.ask(pick, number=host.number).words == ("2",)
+    assert host.ok(load)[:2] == ("2", "5")
+
+
+@pytest.mark.parametrize(
+    "dark", ["BLANK", "STOP", "BYE", "PICK 0 0", "LOAD 27 00000000", HELLO, "HELLO 2 1000 5000 1000 1000"]
+)
 def test_every_verb_that_is_dark_is(dark: str) -> None:
     for begin in ("SHOW 1", "SEQ 0 26 4000 10000 0"):
         host = Host().ready()
@@ -481,6 +545,8 @@ def test_a_light_that_does_not_go_out_is_told_to_again_and_again() -> None:
 
 def test_status_tells_everything() -> None:
     host = Host().ready()
+    words = dict(word.split("=") for word in host.ok("STATUS"))
+    assert "index" not in words, "nothing was lit yet"
     host.ok("SHOW 5")
     words = dict(word.split("=") for word in host.ok("STATUS"))
     assert words == {
