@@ -15,16 +15,24 @@ diagonal (10.8 µm). So a column's edge zigzags by half a column from row to row
 for every column. A calibration for 912 x 1140 pixels takes all this in: its fy is twice its fx, and its cx moves by ¼.
 
 The engine is told things in the order stop, set, validate, start. `play` shows the loaded sequence once, with a pulse
-on TRIG_OUT_1 per pattern. `show` plays a sequence of one pattern, which the engine ends by itself after `hold_s`:
-whatever becomes of this program, the light goes off then. Dark means: sequence stopped and every LED switched off.
+on TRIG_OUT_1 per pattern. `show` plays a sequence of one pattern, which the engine ends by itself within 2 s; while
+this program lives, it begins that anew, for `hold_s` at the most. Dark means: sequence stopped and every LED off.
+
+How fast it shows. A dozen commands of some 3 ms, and the time that a picture takes from the flash: 200 ms at the worst,
+less for simple pictures; TI's program tells it. The engine's buffer holds two pictures, and a sequence that runs
+repeats from there without loading (DLPU011, "Pattern Sequence Background"). Whether a start after a stop does so, too,
+no document says; so it is taken to load, unless the rig file says otherwise (`image_kept_s`).
+
+Which way the current goes. TI's own sources for the LightCrafter 4500 (lcr4500.cpp in the DLP SDK) send 255 less the
+current; the manual has it the other way. 5 % taken for the wrong sense is 95 %. So until the rig file tells, the
+registers stand at half, which is the same in both, and the light is on for a twelfth of the time: 4.2 % on average.
 
 Untested on metal. All of it was tested against a peer that speaks the protocol below a kernel's hidraw node; what the
 peer knows is what TI's documents and TI's own sources say, as each module's docstring cites. To be watched on the first
-day: the sense of the LED current (`led_current_inverted`), light between a stop and a start, the polarity of the
-trigger output, and how long a picture takes from the flash to the mirrors (`image_load_s`; `slrig latency` measures).
+day: light between a stop and a start (a held pattern may blink once a second), the polarity of the trigger output, and
+how long a picture takes from the flash to the mirrors (`image_load_s`; `slrig latency` measures).
 
-The DLPC900 (LightCrafter 6500, 9000) frames its commands alike, but has other pattern tables: `drivers.dlpc350.link`
-would serve it, the rest would not. The DLPC347x speak I²C.
+The DLPC900 (LightCrafter 6500, 9000) frames its commands alike, but has other pattern tables: `drivers.dlpc900`.
 """
 
 from __future__ import annotations
@@ -63,16 +71,16 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
         It may not be opened, or failed.
     """
     _require_system()
-    from drivers.dlpc350.finding import engines, resolved
     from drivers.dlpc350.flash import read_flash
-    from drivers.dlpc350.link import open_link
     from drivers.dlpc350.options import EngineOptions
-    from drivers.dlpc350.projector import LightEngine
+    from drivers.dlpc350.projector import DLPC350, LightEngine
+    from drivers.pattern_engine.finding import engines, resolved
+    from drivers.pattern_engine.link import open_link
 
     table = checked(EngineOptions, options, "the [projector] table of a light engine")
     flash = read_flash(folder / table.patterns)
-    node = resolved(table.device, engines())
-    return LightEngine(open_link(node.path), table, flash, serial=node.name)
+    node = resolved(table.device, engines(DLPC350))
+    return LightEngine(open_link(node.path, DLPC350), table, flash, serial=node.name)
 
 
 def find_devices() -> tuple[FoundDevice, ...]:
@@ -84,9 +92,10 @@ def find_devices() -> tuple[FoundDevice, ...]:
         This is not Linux.
     """
     _require_system()
-    from drivers.dlpc350.finding import engines, found_devices
+    from drivers.dlpc350.projector import DLPC350
+    from drivers.pattern_engine.finding import engines, found_devices
 
-    return found_devices(engines())
+    return found_devices(DLPC350, engines(DLPC350))
 
 
 def _require_system() -> None:

@@ -25,8 +25,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from drivers.dlpc350.planes import PLANES, Plane, keys_of_plane, picture_of, plane_of, planes_in, words
+from drivers.dlpc350.planes import PLANES, picture_of, planes_in
 from drivers.dlpc350.timing import MOST_IMAGES
+from drivers.pattern_engine.planes import Plane, keys_of_plane, plane_of, words
 from slrig.bundle.faults import Strict, checked, read_json, read_text
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import PatternSequence
@@ -90,9 +91,7 @@ class Flash:
         Raises
         ------
         UnsupportedByDeviceError
-            The flash lacks patterns. The pictures that hold them have been written, and the message says what to do.
-        StorageError
-            They could not be written.
+            The flash lacks patterns; the message says what to do.
         """
         found = [self._candidates(plane_of(sequence, index)) for index in range(len(sequence))]
         missing = [index for index, candidates in enumerate(found) if not candidates]
@@ -113,14 +112,23 @@ class Flash:
         return {place.image: place for place in places if place is not None}
 
     def _lacking(self, sequence: PatternSequence, missing: Sequence[int]) -> UnsupportedByDeviceError:
-        written = write_pictures(self.folder / TO_FLASH, sequence, self.pictures)
         named = ", ".join(words(sequence.patterns[index]) for index in missing[:3])
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         return UnsupportedByDeviceError(
             f"the engine's flash, as {self.folder / LIST} lists it, lacks {len(missing)} of {len(sequence)} patterns "
-            f"({named}{more}); the pictures to put there are in {written.folder} now: add them to the firmware with "
-            "TI's LightCrafter 4500 program, in the order of their numbers, with the firmware tag "
-            f'"{written.tag}", upload it, and let patterns in the [projector] table of the rig file name that folder'
+            f"({named}{more}); flash it once with all that this rig shows: slrig patterns RIG writes the pictures into "
+            f"{self.folder / TO_FLASH}"
+        )
+
+    def written(self, sequence: PatternSequence) -> str:
+        """Write pictures that hold a sequence, beside those that are flashed, and say what to do with them.
+        Raises as `write_pictures`.
+        """
+        written = write_pictures(self.folder / TO_FLASH, sequence, self.pictures)
+        return (
+            f"the pictures to flash are in {written.folder}: add them to the firmware with TI's LightCrafter 4500 "
+            f'program, in the order of their numbers, with the firmware tag "{written.tag}", upload it, and let '
+            "patterns in the [projector] table of the rig file name that folder"
         )
 
 

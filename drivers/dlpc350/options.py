@@ -1,66 +1,34 @@
-"""What a rig file says of a light engine."""
+"""What a rig file says of a light engine with a DLPC350."""
 
 from __future__ import annotations
 
-from enum import IntEnum
-from typing import Annotated, Literal, Self
+from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from slrig.bundle.faults import Strict
-
-Share = Annotated[float, Field(gt=0, le=1)]
+from drivers.pattern_engine.options import LightOptions
 
 
-class Colour(IntEnum):
-    """LEDs of a pattern, as the pattern table has them: bit 0 red, 1 green, 2 blue."""
-
-    RED = 1
-    GREEN = 2
-    YELLOW = 3
-    BLUE = 4
-    MAGENTA = 5
-    CYAN = 6
-    WHITE = 7
-
-
-class EngineOptions(Strict, use_attribute_docstrings=True):
+class EngineOptions(LightOptions, use_attribute_docstrings=True):
     """The keys of a `[projector]` table with `driver = "dlpc350"`."""
 
     patterns: Annotated[str, Field(min_length=1)]
     """A folder with the list of the pictures in the engine's flash (`images.json`) and these pictures, from the rig
     file's own. There need not be one yet: a scan then writes the pictures that it lacks into `to_flash` there."""
 
-    device: Annotated[str, Field(min_length=1)] | None = None
-    """What `slrig devices` lists, or a path (`/dev/hidraw0`); else the only engine that is plugged in."""
+    led_current_inverted: bool | None = None
+    """True where 255 switches an LED off and 0 gives it the most current, with the polarity register at "normal": so
+    TI's own program for the LightCrafter 4500 has it; false on boards that are built as the manual says. `slrig doctor`
+    finds it out. Until it is written here, light is 5 % of the board's most at the most, on average and whichever it
+    is, and sequences are not played."""
 
-    led: Literal["white", "red", "green", "blue", "yellow", "cyan", "magenta"] = "white"
-    """The LEDs that patterns are lit with."""
+    image_load_s: Annotated[float, Field(ge=0, le=1)] = 0.2
+    """From the command to start until light, at the most, where the engine loads a picture from its flash: TI's worst
+    case; TI's program tells that of each picture ("Image Load Time")."""
 
-    led_current: Share = 0.3
-    """Current of these LEDs, as a share of the board's most."""
-
-    led_current_limit: Share = 0.5
-    """No more current than this, whatever led_current says."""
-
-    led_current_inverted: bool = True
-    """True where 255 switches an LED off and 0 gives it the most current, with the polarity register at "normal": so it
-    was found on the LightCrafter 4500 (TI forum, thread 451589), unlike in the manual."""
-
-    duty_limit: Share = 1.0
-    """Light is on for no more than this share of the time while a sequence is played."""
-
-    hold_s: Annotated[float, Field(ge=2, le=200)] = 30.0
-    """A shown pattern goes dark after this long by itself."""
-
-    image_load_s: Annotated[float, Field(ge=0, le=5)] = 0.2
-    """From the command to start until light, at the most: the engine loads a picture from its flash."""
-
-    light_margin_s: Annotated[float, Field(ge=0, le=1)] = 0.0005
-    """In a played sequence, light lasts this much longer than the exposure."""
-
-    trigger_polarity: Literal["high", "low"] = "high"
-    """Which way TRIG_OUT_1 goes as the pattern's light begins: high, it rises; low, it falls."""
+    image_kept_s: Annotated[float, Field(ge=0, le=1)] | None = None
+    """The same where the pattern before was in the same picture. Absent: as long as image_load_s, since no document
+    says that the engine does not load it again; `slrig latency`, which flashes two patterns of one picture, tells."""
 
     trigger_delay_us: Annotated[float, Field(ge=-20.05, le=2.78)] = 0.0
     """How much later than the light TRIG_OUT_1 changes."""
@@ -68,22 +36,6 @@ class EngineOptions(Strict, use_attribute_docstrings=True):
     standby: bool = False
     """Put the engine into standby when it is closed; it is woken when opened, in any case."""
 
-    @model_validator(mode="after")
-    def _within_limits(self) -> Self:
-        if self.led_current > self.led_current_limit:
-            message = (
-                f"led_current is {self.led_current:g}, led_current_limit allows {self.led_current_limit:g}; lower the "
-                "current, or raise the limit if eyes and LEDs are safe with it"
-            )
-            raise ValueError(message)
-        return self
-
-    @property
-    def colour(self) -> Colour:
-        """The LEDs that patterns are lit with."""
-        return Colour[self.led.upper()]
-
-    @property
-    def current_byte(self) -> int:
-        """The current in 255ths of the most."""
-        return round(self.led_current * 255)
+    def load_s(self, *, kept: bool) -> float:
+        """From the command to start until light, at the most. kept : the picture is that of the pattern before."""
+        return self.image_kept_s if kept and self.image_kept_s is not None else self.image_load_s

@@ -1,4 +1,4 @@
-"""Bit planes: what one pattern is to the mirrors, and 24 of them as a picture for the engine's flash.
+"""Bit planes: 24 of them as a picture for the engine's flash.
 
 Plane n of a picture is bit n of green for n = 0 to 7, bit n - 8 of red up to 15, bit n - 16 of blue up to 23, the least
 significant first: DLPU010, "Pattern Number Mapping", as copied at github.com/agmarrugo/bit-plane-image-coding; and the
@@ -8,7 +8,6 @@ pictures of 912 x 1140 pixels with 24 bits per pixel.
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from collections.abc import Sequence
 from typing import Any
@@ -16,39 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.errors import ConfigError, UnsupportedByDeviceError
-from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Size, White
+from drivers.pattern_engine.planes import Plane
+from slrig.errors import ConfigError
+from slrig.model import Size
 
 MIRRORS = Size(912, 1140)
 """Columns and rows of the DLP4500, addressed as the controller addresses them."""
 PLANES = 24
 
-Plane = NDArray[np.bool_]
-"""(1140, 912) bool: which mirrors send light."""
-
 _FILE_HEADER = struct.Struct("<2sIHHI")
 _PICTURE_HEADER = struct.Struct("<IiiHHIIiiII")
 _CHANNELS = (1, 2, 0)
 """Where green, red and blue lie in a BMP's pixel."""
-
-
-def plane_of(sequence: PatternSequence, index: int) -> Plane:
-    """Return the mirrors of pattern `index`. Raises UnsupportedByDeviceError unless it is black and white only."""
-    profile = sequence.profiles[index]
-    lit: NDArray[np.bool_] = profile == np.iinfo(profile.dtype).max
-    if not (lit | (profile == 0)).all():
-        message = (
-            f"asked for pattern {index} with shades of grey; a mirror is on or off: use Gray code and shifted lines, "
-            "which are black and white"
-        )
-        raise UnsupportedByDeviceError(message)
-    return np.broadcast_to(lit, MIRRORS.shape)
-
-
-def keys_of_plane(plane: Plane) -> tuple[bytes, bytes]:
-    """Return what tells a plane and its inverse from all others: SHA-256 of their bits."""
-    bits = np.packbits(plane)
-    return hashlib.sha256(bits.tobytes()).digest(), hashlib.sha256((~bits).tobytes()).digest()
 
 
 def picture_of(planes: Sequence[Plane]) -> bytes:
@@ -85,16 +63,3 @@ def planes_in(picture: bytes, name: str) -> tuple[Plane, ...]:
         (upright[..., _CHANNELS[number // 8]] >> np.uint8(number % 8) & np.uint8(1)).astype(np.bool_)
         for number in range(PLANES)
     )
-
-
-def words(pattern: Pattern) -> str:
-    """Words for a pattern."""
-    match pattern:
-        case White() | Black():
-            return pattern.kind
-        case Gray():
-            inverse = ", inverted" if pattern.inverted else ""
-            return f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}, cell {pattern.cell_px} px{inverse}"
-        case LineShift():
-            width = f", {pattern.line_width_px} px wide" if pattern.line_width_px > 1 else ""
-            return f"{pattern.axis} lines {pattern.shift} of {pattern.period_px}{width}"

@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-import threading
 import time
-from contextlib import suppress
-from functools import partial
 
 from drivers.dlpc350.engine import Command, Engine
 from drivers.dlpc350.flash import Flash, Place
-from drivers.dlpc350.link import Link
 from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.tables import tables_of
-from drivers.dlpc350.timing import DARK_US, MOST_PATTERNS, Timing, check_loading, check_timing, lit
-from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
-from slrig.errors import DeviceGoneError, SlrigError, UnsupportedByDeviceError
+from drivers.dlpc350.tables import Tables, tables_of
+from drivers.dlpc350.timing import DARK_US, MOST_PATTERNS, check_loading, check_timing, lit
+from drivers.pattern_engine.engine import Command as Shared
+from drivers.pattern_engine.link import Kind, Link
+from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
+from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import UnsupportedByDeviceError
 from slrig.model import PatternSequence
 
-AWAKE_S = 10.0
-"""How long an engine may take to wake up."""
+DLPC350 = Kind("dlpc350", 0x6401, "3.0")
 VALIDATED_S = 5.0
-RUNNING_S = 2.0
-_COMMANDS_S = 0.06
-"""What the commands of one `show` take, typically: some twenty, of about 3 ms each."""
+_LONG_US = 1_000_000
+"""A sequence of this length still runs when the engine is asked whether it does."""
 
 
-class LightEngine:
+class LightEngine(PatternEngine[Engine]):
     """Implements `slrig.devices.Projector` on a DLPC350.
 
     Parameters
@@ -45,30 +43,20 @@ class LightEngine:
     """
 
     def __init__(self, link: Link, options: EngineOptions, flash: Flash, *, serial: str = "") -> None:
-        self._engine = Engine(link)
+        super().__init__(Engine(link), options)
         self._options = options
         self._flash = flash
-        self._info = ProjectorInfo(
-            name="projector",
-            model="DLPC350 light engine",
-            serial=serial,
-            size=MIRRORS,
-            plays=True,
-            latency_s=options.image_load_s + _COMMANDS_S,
-        )
-        self._state = ProjectorState("the light engine")
+        self._serial = serial
         self._places: tuple[Place, ...] = ()
-        self._lock = threading.RLock()
-        try:
-            self._prepare()
-        except BaseException:
-            self._leave()
-            raise
+        # What the engine was told last, and which picture it shows; None where that is not known.
+        self._told: tuple[Timing, Tables] | None = None
+        self._picture: int | None = None
+        self._take_over()
 
-    @property
-    def info(self) -> ProjectorInfo:
-        """See `Projector`. It steps, and it plays, with a pulse on TRIG_OUT_1 per pattern."""
-        return self._info
+    def write_patterns(self, sequence: PatternSequence) -> str:
+        """See `FlashedProjector`. What is flashed already keeps its place."""
+        self._state.require_size(sequence, MIRRORS)
+        return self._flash.written(sequence)
 
     def load(self, sequence: PatternSequence) -> None:
         """See `Projector`. Refuses patterns that the flash lacks, and writes the pictures that hold them."""
@@ -86,50 +74,35 @@ class LightEngine:
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
-        """See `Projector`. Dark again after `hold_s`, whatever becomes of this program.
+        """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
 
         When light begins is not told by the engine: it is after the command to start was sent, and before its sequencer
         says that it runs and a picture has had its time from the flash to the mirrors. The error is half of that span.
         """
         self._state.require_pattern(index)
-        hold_us = round(self._options.hold_s * 1e6)
-        timing = Timing(hold_us - DARK_US, hold_us)
+        place = self._places[index]
+        load_s = self._options.load_s(kept=self._picture == place.image)
+        # The sequence ends by itself: until it began, a picture may have to be loaded.
+        alone_us = round((LEFT_ALONE_S - self._options.image_load_s) * 1e6)
+        if self.unproven:
+            timing, count = DIM, min(alone_us // DIM.period_us, MOST_PATTERNS)
+        else:
+            timing, count = Timing(alone_us - DARK_US, alone_us), 1
         check_timing(timing)
-        earliest_ns, running_ns = self._run((self._places[index],), timing)
-        latest_ns = running_ns + round(self._options.image_load_s * 1e9)
-        SystemClock().wait_until(latest_ns, self._state.closed)
-        self._state.require_open()
-        return Shown(index, (earliest_ns + latest_ns) // 2, (latest_ns - earliest_ns + 1) // 2)
+        with self._lock:
+            earliest_ns, running_ns = self._run((place,) * count, timing)
+            self._begin_holding(alone_us / 1e6, again_s=(LEFT_ALONE_S - self._options.image_load_s) / 2)
+        return self._shown(index, earliest_ns, running_ns + round(load_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
         """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
         self._state.require_loaded("play")
+        self._require_proven()
         options = self._options
         timing = lit(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
         counts = tables_of(self._places, options.colour, dark_between=timing.dark_between).counts
         check_loading(counts, timing.period_us, options.image_load_s)
         self._run(self._places, timing)
-
-    def stop(self) -> None:
-        """See `Projector`."""
-        self.blank()
-
-    def blank(self) -> None:
-        """See `Projector`. LEDs off, then the sequence stopped: each is tried, whatever becomes of the other."""
-        with self._lock:
-            faults = [] if self._state.closed.is_set() else self._darken()
-        # With the LEDs off it is dark, but an engine that does not do as it is told is to be known.
-        if faults:
-            raise faults[0]
-
-    def close(self) -> None:
-        """See `Projector`."""
-        # Whoever waits for light need not wait any more.
-        already = self._state.closed.is_set()
-        self._state.closed.set()
-        with self._lock:
-            if not already:
-                self._leave()
 
     def _run(self, places: tuple[Place, ...], timing: Timing) -> tuple[int, int]:
         """Stop, set, validate, start. Return when the command to start was sent, and when the engine said it runs."""
@@ -139,51 +112,44 @@ class LightEngine:
             self._state.require_open()
             try:
                 self.blank()
-                engine.set_timing(timing)
-                engine.set_tables(tables)
+                told, self._told = self._told, None
+                if told is None or told[0] != timing:
+                    engine.set_timing(timing)
+                engine.set_tables(tables, None if told is None else told[1])
                 engine.validate(VALIDATED_S)
                 started_ns = time.monotonic_ns()
                 engine.leds(by_sequence=True)
                 engine.start()
                 # A short sequence may be over before the engine could be asked.
-                if tables.length * timing.period_us >= RUNNING_S * 1e6:
+                if tables.length * timing.period_us >= _LONG_US:
                     engine.wait_until_running(RUNNING_S)
+                self._told, self._picture = (timing, tables), places[-1].image
                 return started_ns, time.monotonic_ns()
             except BaseException:
+                self._picture = None
                 self._darken()
                 raise
 
-    def _darken(self) -> list[SlrigError]:
-        """LEDs off, then stop, each tried whatever becomes of the other. Return what the engine said against it."""
-        faults: list[SlrigError] = []
-        for darken in (partial(self._engine.leds, by_sequence=False), self._engine.stop):
-            try:
-                darken()
-            except SlrigError as error:
-                faults.append(error)
-        return faults
-
-    def _prepare(self) -> None:
-        """Darken the engine first, then look whether it is what the rig file says, then set what never changes."""
+    def _prepare(self) -> ProjectorInfo:
         engine, options = self._engine, self._options
-        # An engine in standby may refuse this, and is dark.
-        for fault in self._darken():
-            if isinstance(fault, DeviceGoneError):
-                raise fault
-        if engine.byte(Command.POWER) & 1:
-            engine.set_byte(Command.POWER, 0)
-        engine.wait_until_initialised(AWAKE_S)
-        self.blank()
         self._check_flash()
-        engine.settle_byte(Command.DISPLAY_MODE, 1)
+        engine.settle_byte(Shared.DISPLAY_MODE, 1)
         engine.settle_byte(Command.PATTERN_SOURCE, 3)
         engine.settle_byte(Command.TRIGGER_MODE, 1)
-        for unchanged in (Command.FLIP_LONG, Command.FLIP_SHORT, Command.INVERT_DATA):
-            engine.settle_byte(unchanged, 0)
-        engine.set_led_current(options.colour, options.current_byte, inverted=options.led_current_inverted)
+        self._set_up_light()
         engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
         # Changing the mode may start what the engine shows by itself.
         self.blank()
+        return ProjectorInfo(
+            name="projector",
+            model="DLPC350 light engine",
+            serial=self._serial,
+            size=MIRRORS,
+            plays=not self.unproven,
+            latency_s=options.load_s(kept=True) + COMMANDS_S,
+            gap_s=options.light_margin_s,
+            duty=options.duty_limit,
+        )
 
     def _check_flash(self) -> None:
         flash = self._flash
@@ -206,12 +172,6 @@ class LightEngine:
             )
             raise UnsupportedByDeviceError(message)
 
-    def _leave(self) -> None:
-        """Darken as far as the engine lets, and let it go."""
-        self._darken()
+    def _rest(self) -> None:
         if self._options.standby:
-            with suppress(SlrigError):
-                self._engine.set_byte(Command.POWER, 1)
-        self._state.loaded = None
-        self._state.closed.set()
-        self._engine.close()
+            self._engine.set_byte(Shared.POWER, 1)

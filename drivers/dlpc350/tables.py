@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from drivers.dlpc350.flash import Place
-from drivers.dlpc350.options import Colour
+from drivers.pattern_engine.options import Colour
 
 INTERNAL = 0
 _BIT_DEPTH = 1

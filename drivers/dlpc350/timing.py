@@ -8,8 +8,8 @@ takes from the flash, the LightCrafter 4500 user's guide (DLPU011, "Pattern Sequ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from drivers.pattern_engine.timing import Timing, check_duty, light_us
 from slrig.errors import UnsupportedByDeviceError
 
 MINIMUM_US = {1: 235, 2: 700, 3: 1570, 4: 1700, 5: 2000, 6: 2500, 7: 4500, 8: 8333}
@@ -25,52 +25,16 @@ MOST_IMAGES = 64
 """Entries of the image table."""
 
 
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """How long each pattern is lit, and from one pattern to the next, whole microseconds."""
-
-    exposure_us: int
-    period_us: int
-
-    @property
-    def dark_between(self) -> bool:
-        """Whether the mirrors are cleared after each pattern."""
-        return self.exposure_us < self.period_us
-
-
 def lit(exposure_s: float, period_s: float, *, margin_s: float, duty_limit: float) -> Timing:
-    """How long to light patterns of which cameras take `exposure_s`, one per period.
-
-    Parameters
-    ----------
-    margin_s
-        Light beyond the exposure: it covers what a camera takes from the pulse to its first row.
-    duty_limit
-        How much of the time light may be on.
-
-    Raises
-    ------
-    UnsupportedByDeviceError
-        The engine does not have this timing, or the duty limit forbids it.
+    """How long to light patterns of which cameras take `exposure_s`, one per period; see `light_us` and `check_duty`.
+    Raises UnsupportedByDeviceError: the engine does not have this timing, or the duty limit forbids it.
     """
     period_us = round(period_s * 1e6)
-    wanted_us = max(round((exposure_s + margin_s) * 1e6), MINIMUM_US[1])
-    if exposure_s <= 0 or wanted_us > period_us:
-        message = (
-            f"asked for {exposure_s:.6f} s of light every {period_s:.6f} s: with {margin_s:.6f} s for the cameras to "
-            f"start, light takes {wanted_us} µs, the period is {period_us} µs; lengthen the period"
-        )
-        raise UnsupportedByDeviceError(message)
+    wanted_us = light_us(exposure_s, period_s, margin_s=margin_s, least_us=MINIMUM_US[1])
     # What the dark between does not fit into is lit to its end.
     timing = Timing(wanted_us if wanted_us <= period_us - DARK_US else period_us, period_us)
     check_timing(timing)
-    duty = timing.exposure_us / timing.period_us
-    if duty > duty_limit:
-        message = (
-            f"asked for {timing.exposure_us} µs of light every {timing.period_us} µs: light is on for {duty:.0%} of "
-            f"the time, duty_limit of the rig file allows {duty_limit:.0%}; lengthen the period, or shorten exposure_s"
-        )
-        raise UnsupportedByDeviceError(message)
+    check_duty(timing, duty_limit)
     return timing
 
 

@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 
 from slrig.capture.latency import USUAL_SEARCH_S, LatencyMeasurement
-from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation
+from slrig.capture.sequencer import choose_triggers
+from slrig.capture.streaming import earliest_change_s
+from slrig.devices import CameraInfo, FoundDevice, ProjectorInfo, Rig, Synchronisation, UnprovenLight
 from slrig.doctor import timing
 from slrig.doctor.advice import ExposureAdvice, exposure_advice, is_whole, unsnapped
+from slrig.doctor.current import sense_of_current
 from slrig.doctor.findings import Finding, Severity, camera_named, fault, ms, note, ok
 from slrig.doctor.flicker import Flicker, flicker
 from slrig.doctor.focus import focus
@@ -21,6 +24,7 @@ from slrig.doctor.geometry import picture
 from slrig.doctor.light import Seen, at_exposure, look
 from slrig.doctor.measures.levels import ResponseCurve
 from slrig.doctor.response import response
+from slrig.doctor.sharpening import sharpening
 from slrig.doctor.viewing import Viewer
 from slrig.errors import DeviceError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size
@@ -116,6 +120,7 @@ class _Examination:
         self.refresh_hz: float | None = None
         self.curve: ResponseCurve | None = None
         self.flickers: tuple[Flicker, ...] = ()
+        self.unproven = False
         self._advice: dict[str, ExposureAdvice] = {}
 
     def run(self) -> None:
@@ -123,6 +128,7 @@ class _Examination:
         steps: list[tuple[str, Callable[[], None]]] = [
             ("patterns", self._choose_sequence),
             ("light", self._look),
+            ("current", self._prove),
             ("timing", self._time),
             ("picture and focus", self._picture),
             ("response", self._response),
@@ -137,6 +143,9 @@ class _Examination:
                 self.findings.append(_failed(stage, error))
                 if isinstance(error, DeviceGoneError):
                     return
+            if self.unproven:
+                # All else would be measured in a light that is not the one of scans.
+                return
 
     def diagnosis(self) -> Diagnosis:
         order = list(Severity)[::-1]
@@ -151,7 +160,8 @@ class _Examination:
         if self.measured is None:
             return None
         found = self.measured.synchronisation
-        needless = timing.late_s(self.measured) < timing.LATE_S and not found.line_time_s
+        streams = earliest_change_s(replace(self.rig, synchronisation=found), choose_triggers(self.rig)) is not None
+        needless = timing.late_s(self.measured) < timing.LATE_S and not found.line_time_s and not streams
         return None if needless and self.rig.synchronisation is None else found
 
     def _choose_sequence(self) -> None:
@@ -187,6 +197,13 @@ class _Examination:
             if seen is not None:
                 self.seen[name] = seen
 
+    def _prove(self) -> None:
+        """Find out which way the current goes, where the projector does not know."""
+        projector, best_lit = self.rig.projector, self._best_lit()
+        self.unproven = isinstance(projector, UnprovenLight) and projector.unproven
+        if self.unproven and best_lit is not None:
+            self.findings.append(sense_of_current(self._viewer(best_lit.name), self.sequence, best_lit))
+
     def _time(self) -> None:
         if not self.seen:
             return
@@ -215,6 +232,7 @@ class _Examination:
             shown, findings = picture(self._viewer(name), self.sequence, seen, self.rig.calibration)
             self.findings += findings
             self.findings += focus(name, self.sequence, seen, shown, period_px=self.period_px)
+            self.findings += sharpening(name, seen, shown, self.rig.calibration)
 
     def _best_lit(self) -> Seen | None:
         """What the camera sees that is asked about the projector: the one whose image it lights most."""
@@ -247,6 +265,12 @@ def _declared(rig: Rig, displays: Sequence[FoundDevice]) -> list[Finding]:
     found = [ok("device.projector", "projector", _of_projector(rig.projector.info))]
     for name, camera in rig.cameras.items():
         found.append(ok("device.camera", camera_named(name), _of_camera(camera.info)))
+        remedy = (
+            "do what it says, in the camera's table of the rig file; slrig devices --options lists what can be written"
+        )
+        found += [
+            note("device.told", camera_named(name), f"its driver tells: {each}", remedy) for each in camera.info.notes
+        ]
     if displays:
         listed = "; ".join(f"{each.device} ({each.driver}): {each.label}" for each in displays)
         found.append(ok("device.displays", "projector", f"projectors and outputs that were found: {listed}"))

@@ -10,7 +10,7 @@ import numpy as np
 from slrig.doctor.findings import Finding, Severity, camera_named, fault, judged, ms, note, ok
 from slrig.doctor.measures.levels import USUAL_SNR, LightLevels, light_levels
 from slrig.doctor.viewing import Viewer
-from slrig.model import Black, FloatArray, Gray, PatternSequence, White
+from slrig.model import Black, FloatArray, Frame, Gray, PatternSequence, White
 
 _FRAMES = 4
 _LEAST_LIT = 0.01
@@ -34,8 +34,8 @@ class Seen:
     """What one camera sees of the projector.
 
     own : at the rig's own exposure, own_exposure_s; levels : at exposure_s, which suits the light. shortest_s,
-    longest_s : exposures at which noise, or saturation, leaves enough of the light. skew_s : of the shutter, as the
-    driver states it.
+    longest_s : exposures at which noise, or saturation, leaves enough of the light. skew_s : of the shutter, and
+    stamp_error_s, of the time stamps, as the driver states them.
     """
 
     name: str
@@ -46,6 +46,7 @@ class Seen:
     shortest_s: float
     longest_s: float
     skew_s: float
+    stamp_error_s: float = 0.0
 
 
 def look(viewer: Viewer, sequence: PatternSequence, *, others: str) -> tuple[Seen | None, list[Finding]]:
@@ -55,7 +56,7 @@ def look(viewer: Viewer, sequence: PatternSequence, *, others: str) -> tuple[See
     """
     subject = camera_named(viewer.name)
     own_s = viewer.within(viewer.rig.settings[viewer.name].exposure_s)
-    own, skew_s = _measured(viewer, sequence, own_s)
+    own, frame = _measured(viewer, sequence, own_s)
     own_s = viewer.exposure_s
     exposure_s, levels = own_s, own
     for _ in range(_MOST_LOOKS):
@@ -63,7 +64,7 @@ def look(viewer: Viewer, sequence: PatternSequence, *, others: str) -> tuple[See
         if abs(wanted_s / exposure_s - 1) < 0.02 or (not _visible(levels) and wanted_s > max(_LONGEST_S, own_s)):
             break
         exposure_s = wanted_s
-        levels, _ = _measured(viewer, sequence, exposure_s)
+        levels, frame = _measured(viewer, sequence, exposure_s)
         exposure_s = viewer.exposure_s
     if not _visible(levels):
         return None, [_nothing(subject, own, levels, own_s, others)]
@@ -75,7 +76,8 @@ def look(viewer: Viewer, sequence: PatternSequence, *, others: str) -> tuple[See
         remedy = "the patterns go to the wrong output: name the projector's connector in the rig file, or exchange the"
         return None, [fault("display.other", "projector", found, f"{remedy} cables. {others}")]
     usable_s = (levels.shortest_exposure_s(exposure_s), levels.longest_exposure_s(exposure_s))
-    seen = Seen(viewer.name, own_s, own, exposure_s, levels, *usable_s, skew_s)
+    timing = (frame.shutter_skew_s, frame.t_err_ns / 1e9)
+    seen = Seen(viewer.name, own_s, own, exposure_s, levels, *usable_s, *timing)
     return seen, [_part(subject, seen), _exposure(subject, seen, viewer), _room(subject, seen)]
 
 
@@ -85,14 +87,15 @@ def at_exposure(viewer: Viewer, sequence: PatternSequence, seen: Seen, exposure_
     return replace(seen, exposure_s=viewer.exposure_s, levels=levels)
 
 
-def _measured(viewer: Viewer, sequence: PatternSequence, exposure_s: float) -> tuple[LightLevels, float]:
+def _measured(viewer: Viewer, sequence: PatternSequence, exposure_s: float) -> tuple[LightLevels, Frame]:
+    """The levels of white and black, and one of the white frames."""
     patterns = sequence.patterns
     with viewer.armed(sequence, exposure_s, 2 * _FRAMES):
         white = viewer.frames(patterns.index(White()), _FRAMES)
         black = viewer.frames(patterns.index(Black()), _FRAMES)
     full_scale = viewer.camera.info.format.full_scale
     levels = light_levels([f.image for f in white], [f.image for f in black], full_scale=full_scale)
-    return levels, white[0].shutter_skew_s
+    return levels, white[0]
 
 
 def _visible(levels: LightLevels) -> bool:

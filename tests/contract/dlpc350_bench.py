@@ -14,30 +14,31 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from drivers import dlpc350
-from drivers.dlpc350.finding import engines
+from drivers import dlpc350, dlpc900
 from drivers.dlpc350.flash import Flash, read_flash, write_pictures
-from drivers.dlpc350.link import Link
 from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.projector import LightEngine
+from drivers.dlpc350.projector import DLPC350, LightEngine
+from drivers.pattern_engine.finding import engines
+from drivers.pattern_engine.link import Link
 from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture
 from slrig.conformance import run
-from slrig.devices import Camera, Projector
+from slrig.devices import Projector
 from slrig.errors import DeviceBusyError, DeviceGoneError
-from slrig.model import Calibration, PatternSequence, Size, Truth
+from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract import dlpc900_bench
 from tests.contract.dlpc350_device import Cable, FakeEngine, UhidEngine
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench, rig_of
-from tests.contract.wired_camera import WiredCamera
+from tests.contract.wired_camera import WiredCamera, WiredHead
 from tests.unit.capture.fake_rig import Scene
 
 PICTURES = "pictures"
@@ -45,6 +46,7 @@ LOAD_S = 0.03
 """What the fake engine takes for a picture."""
 _MOST_LOAD_S = 0.15
 """What its rig file says at the most. The fake is a thread, which a busy machine keeps waiting for a while."""
+PROVEN = {"led_current_inverted": True}
 _EXPOSURES_S = (1e-4, 0.5)
 _GAINS = (1.0, 8.0)
 
@@ -70,33 +72,6 @@ def scene() -> Scene:
     )
 
 
-class EngineHead:
-    """Implements `slrig.devices.Head`: a light engine, and a camera on its wire."""
-
-    def __init__(self, projector: Projector, camera: Camera) -> None:
-        self._projector = projector
-        self._camera = camera
-
-    @property
-    def cameras(self) -> Mapping[str, Camera]:
-        """See `Head`."""
-        return {self._camera.info.name: self._camera}
-
-    @property
-    def projector(self) -> Projector:
-        """See `Head`."""
-        return self._projector
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """See `Head`. None: nothing is measured here."""
-        return None
-
-    def truth(self) -> Truth | None:
-        """See `Head`."""
-        return None
-
-
 class Table:
     """A stage, and a fake engine that lights it, with the pictures of a sequence in its flash; used by one head."""
 
@@ -111,22 +86,22 @@ class Table:
 
     def options(self, **more: object) -> dict[str, object]:
         """The engine's table in a rig file."""
-        return {"patterns": PICTURES, "image_load_s": _MOST_LOAD_S, "light_margin_s": 0.002, **more}
+        return {"patterns": PICTURES, "image_load_s": _MOST_LOAD_S, "light_margin_s": 0.002, **PROVEN, **more}
 
-    def head(self, projector: Projector) -> EngineHead:
+    def head(self, projector: Projector) -> WiredHead:
         """The projector and a new camera."""
         self._camera = WiredCamera("left", self.stage, usual_s=1 / 60, exposures_s=_EXPOSURES_S, gains=_GAINS)
-        return EngineHead(projector, self._camera)
+        return WiredHead(projector, self._camera)
 
-    def connected(self, **more: object) -> EngineHead:
+    def connected(self, **more: object) -> WiredHead:
         """The driver at the other end of a new cable."""
         flash = read_flash(self.folder / PICTURES)
-        link = Link(Cable(self.engine).host, "light engine")
+        link = Link(Cable(self.engine).host, "light engine", DLPC350)
         return self.head(
             LightEngine(link, EngineOptions.model_validate(self.options(**more)), flash, serial="LC4500-1")
         )
 
-    def opened(self, **more: object) -> EngineHead:
+    def opened(self, **more: object) -> WiredHead:
         """The driver as a rig opens it, on whatever engine the kernel has."""
         return self.head(dlpc350.open_projector(self.options(**more), self.folder))
 
@@ -143,6 +118,29 @@ def bench(folder: Path) -> Bench:
 
 
 Notes = dict[str, float | int | str]
+
+
+def a_dlpc900_beside_it_is_told_from_it_and_scans(_: Table, notes: Notes) -> None:
+    """Plug one in, find each driver's own engine, send patterns through the kernel, and capture them by wire."""
+    beside = dlpc900_bench.Table()
+    device = UhidEngine(beside.engine, product=0xC900, serial="LCR6500-1", port="usb-0000:00:14.0-3/input0")
+    other = UhidEngine(FakeEngine({}), product=0xC900, serial="LCR6500-1", port="usb-0000:00:14.0-3/input1")
+    until_s = time.monotonic() + 30.0
+    while not dlpc900.find_devices() and time.monotonic() < until_s:
+        threading.Event().wait(0.05)
+    assert [each.device for each in dlpc900.find_devices()] == ["LCR6500-1"]
+    assert [each.device for each in dlpc350.find_devices()] == ["LC4500-1"]
+    shown = dlpc900_bench.sequence()
+    rig = rig_of(beside.opened(device="LCR6500-1"))
+    evidence = Evidence(shown.patterns, {name: camera.info.format for name, camera in rig.cameras.items()})
+    begun = time.monotonic()
+    with rig:
+        shots = list(capture(rig, shown, evidence=evidence))
+    notes |= {"patterns": len(shown), "s": round(time.monotonic() - begun, 2)}
+    assert (len(shots), evidence.summary().shot_again) == (len(shown), 0), evidence.summary()
+    assert beside.engine.lit is None
+    device.unplug()
+    other.unplug()
 
 
 def both_axes_are_scanned_by_wire(table: Table, notes: Notes) -> None:
@@ -169,7 +167,7 @@ def it_is_found_by_its_serial_number(table: Table, notes: Notes) -> None:
 
 def an_engine_that_another_program_holds_is_busy(table: Table, notes: Notes) -> None:
     """Hold it as another program does, and as this driver does."""
-    path = engines()[0].path
+    path = engines(DLPC350)[0].path
     other = os.open(path, os.O_RDWR)
     try:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -218,6 +216,7 @@ def an_engine_that_is_unplugged_is_gone(table: Table, notes: Notes) -> None:
 
 _PLUGGED: dict[int, UhidEngine] = {}
 CHECKS: tuple[Callable[[Table, Notes], None], ...] = (
+    a_dlpc900_beside_it_is_told_from_it_and_scans,
     both_axes_are_scanned_by_wire,
     it_is_found_by_its_serial_number,
     an_engine_that_another_program_holds_is_busy,

@@ -16,9 +16,11 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from slrig.model import Pixels
 
@@ -67,6 +69,13 @@ class FakeEngine:
         Told of every change of light (None: dark), and of every edge of the trigger output (ns).
     load_s
         How long a picture takes from the flash.
+    keeps
+        Whether a start takes it from the buffer where it is still there. TI's documents say that a sequence repeats
+        from there without a load (DLPU011, "Pattern Sequence Background"), and do not say it of another start.
+    command_s
+        How long each command takes.
+    led_inverted
+        Whether light falls as the registers of the currents rise; None: it is full unless all of them are 255.
     """
 
     def __init__(
@@ -78,6 +87,9 @@ class FakeEngine:
         tag: str = "",
         load_s: float = 0.0,
         standby: bool = False,
+        keeps: bool = False,
+        command_s: float = 0.0,
+        led_inverted: bool | None = None,
     ) -> None:
         self.faults = Faults()
         self.commands: list[tuple[int, bytes]] = []
@@ -92,6 +104,9 @@ class FakeEngine:
         }
         self._planes = {index: _planes(picture) for index, picture in pictures.items()}
         self._light, self._pulse, self._load_s = light, pulse, load_s
+        self._keeps, self._command_s, self._led_inverted = keeps, command_s, led_inverted
+        self._buffered: list[int] = []
+        self._never = threading.Event()
         self._mailboxes = {1: bytearray(64), 2: bytearray(128 * 3)}
         self._mirrors: Pixels | None = WHITE
         self._lit: Pixels | None = None
@@ -132,6 +147,8 @@ class FakeEngine:
         flags, sequence = message[0], message[1]
         command = int.from_bytes(message[4:6], "little")
         data = bytes(message[6:length])
+        if self._command_s:
+            self._never.wait(self._command_s)
         with self._lock:
             self.commands.append((command, data)) if not flags & 0x80 else None
             if command in self.faults.silent:
@@ -231,7 +248,9 @@ class FakeEngine:
         swaps = -1
         # Two pictures are loaded beforehand, of more than two only the first one.
         loaded_ns = time.monotonic_ns() + round(self._load_s * 1e9 * min(len(images), 2))
-        if halt.wait(self._load_s):
+        kept = self._keeps and self._buffered == images
+        self._buffered = images
+        if halt.wait(0.0 if kept else self._load_s):
             return
         for entry in entries:
             if entry >> 18 & 1:
@@ -277,6 +296,9 @@ class FakeEngine:
         awake = self.registers[0x0200] == b"\0"
         on = self.registers[0x1A07][0] & 0xF and any(value != 255 for value in self.registers[0x0B01])
         lit = self._mirrors if awake and on else None
+        if lit is not None and self._led_inverted is not None:
+            share = max(self.registers[0x0B01]) / 255
+            lit = np.rint(lit * (1 - share if self._led_inverted else share)).astype(np.uint8)
         if lit is not self._lit:
             self._lit = lit
             self.shown.append(lit)
@@ -290,12 +312,18 @@ def _planes(picture: bytes) -> tuple[Pixels, ...]:
         message = "a picture of the flash is none of 912 x 1140 pixels"
         raise ValueError(message)
     blue, green, red = (np.asarray(channel) for channel in cv2.split(pixels))
-    return tuple(_profile(channel >> np.uint8(bit) & np.uint8(1)) for channel in (green, red, blue) for bit in range(8))
+    return tuple(
+        profile_of(channel >> np.uint8(bit) & np.uint8(1)) for channel in (green, red, blue) for bit in range(8)
+    )
 
 
-def _profile(plane: Pixels) -> Pixels:
+def profile_of(plane: NDArray[Any]) -> Pixels:
     """A plane as the one row or column that it repeats; whole where it does not."""
-    values = (plane > 0).astype(np.uint8) * np.uint8(255)
+    return repeated((plane > 0).astype(np.uint8) * np.uint8(255))
+
+
+def repeated(values: NDArray[Any]) -> NDArray[Any]:
+    """A picture as the one pixel, row or column that it repeats; whole where it does not."""
     if (values == values[0, 0]).all():
         return values[:1, :1]
     if (values == values[:1]).all():
@@ -353,7 +381,12 @@ class UhidEngine:
     _DESCRIPTOR = bytes.fromhex("0600ff 0901 a101 0901 1500 26ff00 7508 9540 8102 0902 9540 9102 c0".replace(" ", ""))
 
     def __init__(
-        self, engine: FakeEngine, *, serial: str = "LC4500-1", port: str = "usb-0000:00:14.0-2/input0"
+        self,
+        engine: FakeEngine,
+        *,
+        product: int = 0x6401,
+        serial: str = "LC4500-1",
+        port: str = "usb-0000:00:14.0-2/input0",
     ) -> None:
         self.engine = engine
         self._handle = os.open("/dev/uhid", os.O_RDWR | os.O_CLOEXEC)
@@ -366,7 +399,7 @@ class UhidEngine:
             len(self._DESCRIPTOR),
             3,
             0x0451,
-            0x6401,
+            product,
             0x100,
             0,
             self._DESCRIPTOR,

@@ -211,7 +211,7 @@ def test_the_rig_file_that_it_writes_scans_where_the_old_one_did_not(tmp_path: P
     told = " ".join(shown.stdout.split())
     assert "2 faults, no notes" in told
     assert "white is saturated on" in told
-    assert "do write latency_s = 0.040" in told
+    assert "do use the table [synchronisation] of the rig file" in told
     with open_rig(read_rig(path)) as rig, pytest.raises(ScanEvidenceError):
         list(capture(rig, own_sequence(rig)))
     with open_rig(read_rig(better)) as rig:

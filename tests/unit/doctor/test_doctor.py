@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from simulated_rig.device import SimulatedHead, open_head
@@ -29,15 +30,23 @@ EYE = {"size_px": [96, 72], "focal_px": [520.0, 520.0], "blur_px": 0.4}
 class OtherCamera:
     """A rendered camera with other triggers, that loses frames now and then."""
 
-    def __init__(self, camera: Camera, triggers: frozenset[Trigger], *, lose: frozenset[int] = frozenset()) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        triggers: frozenset[Trigger],
+        *,
+        lose: frozenset[int] = frozenset(),
+        notes: tuple[str, ...] = (),
+    ) -> None:
         self._camera = camera
+        self._notes = notes
         self._triggers = triggers
         self._lose = lose
         self._reads = 0
 
     @property
     def info(self) -> CameraInfo:
-        return replace(self._camera.info, triggers=self._triggers)
+        return replace(self._camera.info, triggers=self._triggers, notes=self._notes)
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         return self._camera.configure(settings)
@@ -62,6 +71,21 @@ class OtherCamera:
 
     def close(self) -> None:
         self._camera.close()
+
+
+class VagueCamera(OtherCamera):
+    """A rendered camera whose time stamps are off by 10 ms either way, at random, and that says so or does not."""
+
+    def __init__(self, camera: Camera, *, says_so: bool) -> None:
+        super().__init__(camera, frozenset({Trigger.FREE}))
+        self._rng = np.random.default_rng(5)
+        self._error_ns = 10_000_000 if says_so else 0
+
+    def read(self, after_ns: int, timeout_s: float) -> Frame:
+        frame = super().read(after_ns, timeout_s)
+        off_ns = int(self._rng.integers(-10_000_000, 10_000_000))
+        start_ns, end_ns = frame.t_start_ns + off_ns, frame.t_end_ns + off_ns
+        return replace(frame, t_start_ns=start_ns, t_end_ns=end_ns, t_err_ns=self._error_ns)
 
 
 class HoldingProjector:
@@ -143,7 +167,9 @@ def test_a_sound_rig_is_sound_by_any_trigger_though_frames_are_lost(rig: Rig, tr
     diagnosis = examined(replace(rig, cameras={"eye": camera}))
     assert diagnosis.of(Severity.FAULT) == ()
     assert diagnosis.of(Severity.NOTE) == ()
-    assert {"patterns.verified", "picture.upright", "focus.sharp", "flicker.none"} <= names(diagnosis, Severity.OK)
+    assert {"patterns.verified", "picture.upright", "focus.sharp", "sharpening.none", "flicker.none"} <= names(
+        diagnosis, Severity.OK
+    )
     # A camera that waits for its trigger while the projector works sees no flash as it happens.
     told = "timing.late" if trigger is Trigger.FREE else "timing.punctual"
     assert told in names(diagnosis, Severity.OK)
@@ -157,6 +183,25 @@ def test_a_triggered_camera_that_sees_no_flash_happen_still_tells_late_light(tmp
         told = timing.punctual(rig, seen, ScanEvidenceError("no flash was seen as it happened"))
     assert (told.name, told.severity) == ("timing.late", Severity.FAULT)
     assert "no flash was seen as it happened" in told.found
+
+
+@pytest.mark.parametrize(("says_so", "name"), [(True, "timing.stamps"), (False, "timing.jitter")])
+def test_vague_time_stamps_are_not_put_down_to_the_projector(rig: Rig, says_so: bool, name: str) -> None:
+    vague = replace(rig, cameras={"eye": VagueCamera(rig.cameras["eye"], says_so=says_so)})
+    seen, _ = look(Viewer(vague, "eye", wait_s=0.1), doctor_sequence(rig.projector.info.size), others="")
+    assert seen is not None
+    _, findings = timing.latency(vague, {"eye": seen}, search_s=0.1, told=lambda *_: None)
+    [told] = [each for each in findings if each.name in {"timing.stamps", "timing.jitter"}]
+    assert told.name == name
+    assert told.subject == ("camera 'eye'" if says_so else "projector")
+    assert ("they are the limit of what can be measured" in told.found) is says_so
+
+
+def test_what_a_driver_tells_of_its_camera_is_passed_on(rig: Rig) -> None:
+    slow = OtherCamera(rig.cameras["eye"], frozenset({Trigger.FREE}), notes=("gives 5 frames per second",))
+    [told] = examined(replace(rig, cameras={"eye": slow})).of(Severity.NOTE)
+    assert (told.name, told.subject) == ("device.told", "camera 'eye'")
+    assert "gives 5 frames per second" in told.found
 
 
 def test_a_camera_on_a_wire_is_left_alone_and_named(rig: Rig) -> None:

@@ -11,7 +11,11 @@ import pytest
 
 from slrig.option_models import described_drivers, kinds_of, option_model
 
-SHIPPED = {"depthai", "dlpc350", "genicam", "opencv", "replay", "screen", "serial_projector", "simulated", "v4l2"}
+SHIPPED = {
+    *("depthai", "genicam", "gentl", "opencv", "picamera2", "v4l2"),
+    *("dlpc350", "dlpc900", "kms", "screen", "serial_projector"),
+    *("replay", "simulated"),
+}
 
 
 def properties(schema: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -42,6 +46,7 @@ def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:
         if (model := option_model(driver)) is not None
     }
     assert {driver: names for driver, names in marked.items() if names} == {
+        "kms": ["output"],
         "screen": ["output"],
         "serial_projector": ["port"],
     }

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from drivers.dlpc350.flash import LIST, TO_FLASH, Place, read_flash, write_pictures
-from drivers.dlpc350.planes import MIRRORS, picture_of, plane_of, planes_in
+from drivers.dlpc350.planes import MIRRORS, picture_of, planes_in
+from drivers.pattern_engine.planes import plane_of
 from slrig.errors import ConfigError, StorageError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, Pattern, PatternSequence, White
 from slrig.patterns.sequence import encode, scan_patterns
@@ -104,12 +105,14 @@ def test_every_place_holds_its_pattern(tmp_path: Path, rows: bool) -> None:
         assert np.array_equal(shown, sequence.image(index) == 255), sequence.patterns[index]
 
 
-def test_what_is_missing_is_written_to_be_flashed(tmp_path: Path) -> None:
+def test_what_is_missing_is_told_and_written_when_asked_for(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedByDeviceError) as refused:
         read_flash(tmp_path).places(scan())
     text = str(refused.value)
-    flash = read_flash(tmp_path / TO_FLASH)
     assert "lacks 28 of 28 patterns (white, black, column Gray bit 0 of 8, cell 4 px and 25 more)" in text
+    assert list(tmp_path.iterdir()) == []
+    text = read_flash(tmp_path).written(scan())
+    flash = read_flash(tmp_path / TO_FLASH)
     assert str(tmp_path / TO_FLASH) in text
     assert f'"{flash.tag}"' in text
     assert len(flash.places(scan())) == 28
@@ -120,6 +123,7 @@ def test_what_is_flashed_already_keeps_its_place(tmp_path: Path) -> None:
     before = read_flash(tmp_path)
     with pytest.raises(UnsupportedByDeviceError, match="lacks 16 of 34 patterns"):
         before.places(scan(period_px=16))
+    before.written(scan(period_px=16))
     after = read_flash(tmp_path / TO_FLASH)
     assert [picture.flash_index for picture in after.pictures] == [0, 1]
     assert after.places(scan()) == before.places(scan())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import threading
 import time
 from collections.abc import Callable
@@ -12,10 +13,11 @@ from typing import Any
 import pytest
 
 from drivers.dlpc350.flash import Flash, write_pictures
-from drivers.dlpc350.link import Link
 from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.planes import MIRRORS
-from drivers.dlpc350.projector import LightEngine
+from drivers.dlpc350.projector import DLPC350, LightEngine
+from drivers.pattern_engine.link import Link
+from slrig.devices import FlashedProjector, UnprovenLight
 from slrig.errors import DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, LineShift, PatternSequence, Pixels, Size, White
 from slrig.patterns.sequence import encode
@@ -43,8 +45,9 @@ class Bench:
 
     def open(self, **options: object) -> LightEngine:
         self.cable = Cable(self.engine)
-        table = EngineOptions.model_validate({"patterns": "p", "image_load_s": 0.0, **options})
-        return LightEngine(Link(self.cable.host, "light engine", answer_s=2.0), table, self.flash, serial="1")
+        usual = {"patterns": "p", "image_load_s": 0.0, "led_current_inverted": True}
+        table = EngineOptions.model_validate({**usual, **options})
+        return LightEngine(Link(self.cable.host, "light engine", DLPC350, answer_s=2.0), table, self.flash, serial="1")
 
     def _pulse(self, t_ns: int) -> None:
         self.pulses.append(t_ns)
@@ -90,6 +93,9 @@ def test_the_order_is_stop_set_validate_start(bench: Bench) -> None:
         0x1A31,
         *(VALIDATE, LEDS, START),
     ]
+    # The next one has the same timing, and another pattern of the same picture.
+    projector.show(0)
+    assert bench.commands() == [LEDS, STOP, 0x1A33, 0x1A32, 0x1A34, 0x1A33, VALIDATE, LEDS, START]
     projector.close()
 
 
@@ -281,8 +287,11 @@ def test_tables_that_the_engine_refuses_are_told_in_words_and_it_is_dark(flash: 
 def test_a_flash_without_a_list_asks_for_pictures(bench: Bench, tmp_path: Path) -> None:
     bench.flash = Flash(tmp_path)
     projector = bench.open()
-    with pytest.raises(UnsupportedByDeviceError, match="lacks 3 of 3 patterns"):
+    with pytest.raises(UnsupportedByDeviceError, match=r"lacks 3 of 3 patterns.*slrig patterns"):
         projector.load(SEQUENCE)
+    assert list(tmp_path.iterdir()) == [], "what is only tried is not written"
+    assert isinstance(projector, FlashedProjector)
+    assert str(tmp_path / "to_flash") in projector.write_patterns(SEQUENCE)
     assert (tmp_path / "to_flash" / "images.json").is_file()
     with pytest.raises(DeviceStateError):
         projector.show(0)
@@ -307,7 +316,7 @@ def test_whatever_is_refused_on_the_way_to_light_leaves_it_dark(bench: Bench, co
     projector.show(0)
     bench.engine.faults.refused.add(command)
     with pytest.raises(DeviceError, match=f"refused the command {command:#06x}"):
-        projector.show(2)
+        projector.play(0.01, 0.03)
     assert bench.engine.lit is None
     assert not bench.engine.running
     bench.engine.faults.refused.clear()
@@ -338,16 +347,142 @@ def test_one_way_to_go_dark_is_enough_and_the_other_is_told(bench: Bench) -> Non
     projector.close()
 
 
-def test_a_held_pattern_goes_dark_by_itself(bench: Bench) -> None:
-    dark = threading.Event()
-    bench.engine._light = lambda profile: dark.set() if profile is None else dark.clear()
-    projector = bench.open(hold_s=2.0)
+class Darkness:
+    """Notes when the engine went dark, and waits for it."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._changed = threading.Condition()
+        self._since_s: float | None = None
+        bench.engine._light = self._told
+
+    def wait(self, timeout_s: float) -> float | None:
+        """CLOCK_MONOTONIC, since when it is dark; None if it is not."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._since_s is not None, timeout_s)
+            return self._since_s
+
+    def _told(self, profile: Pixels | None) -> None:
+        with self._changed:
+            self._since_s = time.monotonic() if profile is None else None
+            self._changed.notify_all()
+
+
+@pytest.mark.slow
+def test_a_held_pattern_stays_for_as_long_as_asked_and_goes_dark_by_itself(bench: Bench) -> None:
+    dark = Darkness(bench)
+    projector = bench.open(hold_s=3.0, image_load_s=0.1)
+    projector.load(SEQUENCE)
+    shown_s = time.monotonic()
+    projector.show(0)
+    since_s = dark.wait(7)
+    assert since_s is not None
+    # The engine ends what was begun before hold_s was over: that is 1.9 s of light at the most.
+    assert 3.0 <= since_s - shown_s <= 3.0 + 1.9 + 0.3
+    # Nobody switched the LEDs off.
+    assert bench.engine.registers[LEDS] == b"\x08"
+    projector.close()
+
+
+@pytest.mark.slow
+def test_two_seconds_after_its_host_has_died_it_is_dark(flash: Flash) -> None:
+    bench = Bench(flash, load_s=0.2)
+    dark = Darkness(bench)
+    projector = bench.open(image_load_s=0.2, hold_s=60.0)
     projector.load(SEQUENCE)
     projector.show(0)
-    assert not dark.is_set()
-    assert dark.wait(5)
-    # It was the engine that ended it: nobody switched the LEDs off.
-    assert bench.engine.registers[LEDS] == b"\x08"
+    # As if the process were killed: nothing goes over the cable any more, and it is not pulled out.
+    with projector._lock:
+        died_s = time.monotonic()
+        since_s = dark.wait(5)
+    assert since_s is not None
+    assert since_s - died_s <= 2.0
+    projector.close()
+
+
+@pytest.mark.parametrize("gone", ["blank", "stop", "load"])
+def test_what_is_dark_is_not_started_again(bench: Bench, gone: str) -> None:
+    projector = bench.open(image_load_s=1.0, image_kept_s=0.0)
+    projector.load(SEQUENCE)
+    projector._picture = 0
+    projector.show(0)
+    calls: dict[str, Callable[[], object]] = {
+        "blank": projector.blank,
+        "stop": projector.stop,
+        "load": lambda: projector.load(SEQUENCE),
+    }
+    calls[gone]()
+    bench.commands()
+    assert not projector._state.closed.wait(0.7), "longer than half of what was begun"
+    assert bench.commands() == []
+    projector.close()
+
+
+def test_a_pattern_of_the_same_picture_is_not_waited_for(flash: Flash) -> None:
+    bench = Bench(flash, load_s=0.2, keeps=True, command_s=0.003)
+    projector = bench.open(image_load_s=0.2, image_kept_s=0.01)
+    projector.load(SEQUENCE)
+    first = projector.show(0)
+    assert first.t_err_ns >= 0.1e9
+    took_s = []
+    for index in (2, 0, 2, 1, 0):
+        begun_s = time.monotonic()
+        shown = projector.show(index)
+        took_s.append(time.monotonic() - begun_s)
+        assert shown.t_err_ns <= 0.05e9
+        assert _shows(bench, SEQUENCE.profiles[index])
+    print(f"\n{min(took_s) * 1e3:.0f} ms a pattern, commands of 3 ms")  # noqa: T201 - the figure of the test
+    assert min(took_s) <= 0.1
+    projector.blank()
+    projector.play(0.01, 0.02)
+    projector.close()
+
+
+# Which way the LEDs' current goes.
+
+
+@pytest.mark.parametrize("inverted", [True, False])
+def test_until_the_sense_of_the_current_is_known_light_is_a_twentieth(flash: Flash, inverted: bool) -> None:
+    bench = Bench(flash, led_inverted=inverted)
+    projector = bench.open(led_current_inverted=None, led_current=0.5)
+    assert isinstance(projector, UnprovenLight)
+    assert (projector.unproven, projector.info.plays) == (True, False)
+    projector.load(SEQUENCE)
+    with pytest.raises(UnsupportedByDeviceError, match="slrig doctor finds it out"):
+        projector.play(0.01, 0.02)
+    most = {}
+    for share in (None, 0.4, 0.6):
+        if share is not None:
+            projector.try_current(share)
+        bench.engine.shown.clear()
+        projector.show(0)
+        exposure_us, period_us = struct.unpack("<II", bench.engine.registers[0x1A29])
+        assert len(bench.engine._entries()) * period_us <= 2_000_000
+        while not (lit := [each for each in bench.engine.shown if each is not None]):
+            os.sched_yield()
+        most[share] = int(lit[0].max()) / 255
+        assert most[share] * exposure_us / period_us <= 0.0501
+    assert (most[0.6] > most[0.4]) is not inverted
+    for share in (0.39, 0.61):
+        with pytest.raises(UnsupportedByDeviceError, match=r"only 0\.4 to 0\.6"):
+            projector.try_current(share)
+    told = projector.option_for(rises=most[0.6] > most[0.4])
+    assert told == f"led_current_inverted = {str(inverted).lower()}"
+    projector.close()
+
+
+@pytest.mark.parametrize(("turned", "rises", "option"), [(1, True, "true"), (1, False, "false"), (0, False, "true")])
+def test_the_polarity_register_turns_what_is_to_be_written(bench: Bench, turned: int, rises: bool, option: str) -> None:
+    bench.engine.registers[0x1A05] = bytes([turned])
+    projector = bench.open(led_current_inverted=None)
+    assert projector.option_for(rises=rises) == f"led_current_inverted = {option}"
+    projector.close()
+
+
+def test_a_current_whose_sense_is_known_is_not_tried(bench: Bench) -> None:
+    projector = bench.open()
+    assert not projector.unproven
+    with pytest.raises(UnsupportedByDeviceError, match="asked to try"):
+        projector.try_current(0.5)
     projector.close()
 
 
@@ -374,11 +509,11 @@ def test_an_engine_that_is_gone_while_it_is_opened_is_gone(bench: Bench) -> None
     bench.cable = Cable(bench.engine)
     bench.cable.unplug()
     with pytest.raises(DeviceGoneError):
-        LightEngine(Link(bench.cable.host, "light engine"), EngineOptions(patterns="p"), bench.flash)
+        LightEngine(Link(bench.cable.host, "light engine", DLPC350), EngineOptions(patterns="p"), bench.flash)
 
 
 def test_closing_from_another_thread_ends_a_wait_for_light(bench: Bench) -> None:
-    projector = bench.open(image_load_s=5.0)
+    projector = bench.open(image_load_s=1.0)
     projector.load(SEQUENCE)
     errors: list[Exception] = []
     lit = threading.Event()

@@ -7,9 +7,11 @@ from typing import Any
 import pytest
 
 from drivers.dlpc350.flash import Place
-from drivers.dlpc350.options import Colour, EngineOptions
+from drivers.dlpc350.options import EngineOptions
 from drivers.dlpc350.tables import tables_of
-from drivers.dlpc350.timing import MINIMUM_US, Timing, check_loading, check_timing, lit
+from drivers.dlpc350.timing import MINIMUM_US, check_loading, check_timing, lit
+from drivers.pattern_engine.options import Colour
+from drivers.pattern_engine.timing import Timing
 from slrig.bundle.faults import checked
 from slrig.errors import ConfigError, UnsupportedByDeviceError
 

@@ -1,8 +1,9 @@
 """Which light engines are plugged in, told from /sys alone: nothing is opened.
 
 A hidraw node's `device/uevent` names bus, vendor and product (HID_ID), the serial number (HID_UNIQ) and the port
-(HID_PHYS): kernel, drivers/hid/hid-core.c. A serial number that two engines share, or none, stands for no engine: the
-port does then.
+(HID_PHYS): kernel, drivers/hid/hid-core.c. An engine may have several HID interfaces; commands go to the first (TI's
+usb.c, `USB_Open`), whose port ends in "/input0" (kernel, drivers/hid/usbhid/hid-core.c). A serial number that two
+engines share, or none, stands for no engine: the port does then.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivers.pattern_engine.link import TI, Kind
 from slrig.devices import FoundDevice
 from slrig.errors import ConfigError, DeviceGoneError
 
 SYSFS = Path("/sys/class/hidraw")
 DEV = Path("/dev")
-HID_ID = "00000451:00006401"
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +30,15 @@ class Node:
     label: str
 
 
-def engines(sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[Node, ...]:
+def engines(kind: Kind, sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[Node, ...]:
     """Return the engines that are plugged in, each under a name that no other has."""
     try:
         names = sorted((entry.name for entry in sysfs.iterdir()), key=_number)
     except OSError:
         return ()
-    found = [(dev / name, facts) for name in names if HID_ID in (facts := _facts(sysfs / name)).get("HID_ID", "")]
+    wanted = f"{TI:08X}:{kind.product:08X}"
+    listed = ((dev / name, _facts(sysfs / name)) for name in names)
+    found = [(path, facts) for path, facts in listed if wanted in facts.get("HID_ID", "") and _is_first(facts)]
     for_key = {key: Counter(facts.get(key, "") for _, facts in found) for key in ("HID_UNIQ", "HID_PHYS")}
     nodes = []
     for path, facts in found:
@@ -44,9 +47,9 @@ def engines(sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[Node, ...]:
     return tuple(nodes)
 
 
-def found_devices(found: tuple[Node, ...]) -> tuple[FoundDevice, ...]:
+def found_devices(kind: Kind, found: tuple[Node, ...]) -> tuple[FoundDevice, ...]:
     """The engines in the words of `slrig devices`."""
-    return tuple(FoundDevice("dlpc350", node.name, f"{node.label} ({node.path})") for node in found)
+    return tuple(FoundDevice(kind.driver, node.name, f"{node.label} ({node.path})") for node in found)
 
 
 def resolved(device: str | None, found: tuple[Node, ...]) -> Node:
@@ -69,6 +72,12 @@ def resolved(device: str | None, found: tuple[Node, ...]) -> Node:
         message = f'[projector] names no light engine, plugged in: {have}; write device = "…" with one of those names'
         raise ConfigError(message)
     return chosen[0]
+
+
+def _is_first(facts: dict[str, str]) -> bool:
+    """Whether this is the engine's first interface, as far as its port tells."""
+    number = re.search(r"/input(\d+)$", facts.get("HID_PHYS", ""))
+    return number is None or int(number[1]) == 0
 
 
 def _facts(entry: Path) -> dict[str, str]:

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from drivers import dlpc350
-from drivers.dlpc350.finding import engines, found_devices, resolved
+from drivers.dlpc350.projector import DLPC350
+from drivers.pattern_engine.finding import engines, found_devices, resolved
 from slrig.errors import ConfigError, DeviceGoneError, WrongSystemError
 
 ENGINE = "0003:00000451:00006401"
@@ -28,9 +29,9 @@ def test_engines_are_told_from_other_devices(tmp_path: Path) -> None:
     plug(tmp_path, 10, serial="B")
     plug(tmp_path, 2, serial="A")
     (tmp_path / "hidraw3").mkdir()
-    found = engines(tmp_path)
+    found = engines(DLPC350, tmp_path)
     assert [(node.name, str(node.path)) for node in found] == [("A", "/dev/hidraw2"), ("B", "/dev/hidraw10")]
-    (first, _) = found_devices(found)
+    (first, _) = found_devices(DLPC350, found)
     assert (first.driver, first.device) == ("dlpc350", "A")
     assert first.label == "Texas Instruments DLPC350 (/dev/hidraw2)"
 
@@ -38,23 +39,28 @@ def test_engines_are_told_from_other_devices(tmp_path: Path) -> None:
 def test_a_name_never_stands_for_two(tmp_path: Path) -> None:
     for number, port in ((0, "usb-1/input0"), (1, "usb-2/input0"), (2, ""), (3, "")):
         plug(tmp_path, number, serial="LCR2", port=port)
-    assert [node.name for node in engines(tmp_path)] == ["usb-1/input0", "usb-2/input0", "/dev/hidraw2", "/dev/hidraw3"]
+    assert [node.name for node in engines(DLPC350, tmp_path)] == [
+        "usb-1/input0",
+        "usb-2/input0",
+        "/dev/hidraw2",
+        "/dev/hidraw3",
+    ]
 
 
 def test_the_engine_that_is_meant(tmp_path: Path) -> None:
     plug(tmp_path, 0, serial="A")
-    (only,) = engines(tmp_path)
+    (only,) = engines(DLPC350, tmp_path)
     assert resolved(None, (only,)) is resolved("A", (only,)) is resolved("/dev/hidraw0", (only,)) is only
     with pytest.raises(DeviceGoneError, match=r'light engine "B", plugged in: A \(/dev/hidraw0\)'):
         resolved("B", (only,))
     plug(tmp_path, 1, serial="B")
     with pytest.raises(ConfigError, match=r"A .*; B .*; write device"):
-        resolved(None, engines(tmp_path))
-    assert resolved("B", engines(tmp_path)).path == Path("/dev/hidraw1")
+        resolved(None, engines(DLPC350, tmp_path))
+    assert resolved("B", engines(DLPC350, tmp_path)).path == Path("/dev/hidraw1")
 
 
 def test_none_is_no_error_for_the_finder(tmp_path: Path) -> None:
-    assert engines(tmp_path / "none") == ()
+    assert engines(DLPC350, tmp_path / "none") == ()
     with pytest.raises(DeviceGoneError, match="asked for a light engine, plugged in: none"):
         resolved(None, ())
 

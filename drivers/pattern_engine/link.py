@@ -20,6 +20,7 @@ import struct
 import threading
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError
@@ -30,11 +31,33 @@ READ, ANSWER, FAILED = 0x80, 0x40, 0x20
 MOST_DATA = 512 - HEADER
 """The engine's buffer holds 512 bytes of a message (DLPU018 §1.2)."""
 
-UDEV_RULE = 'KERNEL=="hidraw*", ATTRS{idVendor}=="0451", ATTRS{idProduct}=="6401", MODE="0660", TAG+="uaccess"'
 ANSWER_S = 1.0
-ENGINE = (0x0451, 0x6401)
 _RAW_INFO = 0x8008_4803
 """HIDIOCGRAWINFO: bus type, vendor, product (include/uapi/linux/hidraw.h)."""
+
+TI = 0x0451
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A controller on USB. driver : slrig's; product : its id under TI's; firmware : the oldest that serves."""
+
+    driver: str
+    product: int
+    firmware: str
+
+    @property
+    def udev_rule(self) -> str:
+        """The line that lets a user open it."""
+        return (
+            f'KERNEL=="hidraw*", ATTRS{{idVendor}}=="{TI:04x}", ATTRS{{idProduct}}=="{self.product:04x}", '
+            'MODE="0660", TAG+="uaccess"'
+        )
+
+
+class RefusedError(DeviceError):
+    """The controller said that it does not take a command."""
+
 
 _GONE = {errno.EIO, errno.ENODEV, errno.ENXIO, errno.EPIPE, errno.ESHUTDOWN, errno.ECONNRESET}
 
@@ -48,12 +71,15 @@ class Link:
         A file descriptor of a hidraw node, or of anything that keeps reports apart as it does. The link closes it.
     name
         Words for the engine, for messages.
+    kind
+        What it is.
     answer_s
         How long an answer may take.
     """
 
-    def __init__(self, handle: int, name: str, *, answer_s: float = ANSWER_S) -> None:
+    def __init__(self, handle: int, name: str, kind: Kind, *, answer_s: float = ANSWER_S) -> None:
         self.name = name
+        self.kind = kind
         self._handle: int | None = handle
         self._answer_s = answer_s
         self._sequence = 0
@@ -65,13 +91,19 @@ class Link:
         """Send a command, and wait until the engine has taken it. Raises as `read`."""
         self._exchange(command, data, ANSWER)
 
+    def send(self, command: int, data: bytes) -> None:
+        """Send a command that is given no answer. Raises as `read`."""
+        self._exchange(command, data, 0)
+
     def read(self, command: int, length: int) -> bytes:
         """Ask for `length` bytes, and return these and what else there is.
 
         Raises
         ------
+        RefusedError
+            The engine refused.
         DeviceError
-            The engine refused, or did not answer.
+            It did not answer.
         DeviceGoneError
             It was unplugged.
         DeviceStateError
@@ -81,7 +113,7 @@ class Link:
         if len(data) < length:
             message = (
                 f"{self.name}: asked for {length} bytes of {command:#06x}, it gave {len(data)}; its firmware is not "
-                "one that this driver knows: update it to 3.0 or later"
+                f"one that this driver knows: update it to {self.kind.firmware} or later"
             )
             raise DeviceError(message)
         return data
@@ -105,7 +137,7 @@ class Link:
             message_bytes += command.to_bytes(2, "little") + data
             for start in range(0, len(message_bytes), REPORT):
                 self._send(message_bytes[start : start + REPORT].ljust(REPORT, b"\0"))
-            return self._answer(command, time.monotonic() + self._answer_s)
+            return self._answer(command, time.monotonic() + self._answer_s) if flags & ANSWER else b""
 
     def _answer(self, command: int, until: float) -> bytes:
         while True:
@@ -120,9 +152,9 @@ class Link:
             if report[0] & FAILED:
                 message = (
                     f"{self.name} refused the command {command:#06x}; switch it off and on, and update its firmware "
-                    "to 3.0 or later if it goes on"
+                    f"to {self.kind.firmware} or later if it goes on"
                 )
-                raise DeviceError(message)
+                raise RefusedError(message)
             return data[:length]
 
     def _send(self, report: bytes) -> None:
@@ -173,7 +205,7 @@ class Link:
         return DeviceError(message)
 
 
-def open_link(path: Path, *, answer_s: float = ANSWER_S) -> Link:
+def open_link(path: Path, kind: Kind, *, answer_s: float = ANSWER_S) -> Link:
     """Open a hidraw node for this program alone.
 
     Raises
@@ -193,8 +225,8 @@ def open_link(path: Path, *, answer_s: float = ANSWER_S) -> Link:
     except OSError as error:
         if error.errno in (errno.EACCES, errno.EPERM):
             message = (
-                f"{path}: asked to open the light engine, this user may not; write the line {UDEV_RULE} into "
-                "/etc/udev/rules.d/60-dlpc350.rules, run: sudo udevadm control --reload, and plug it in again"
+                f"{path}: asked to open the light engine, this user may not; write the line {kind.udev_rule} into "
+                f"/etc/udev/rules.d/60-{kind.driver}.rules, run: sudo udevadm control --reload, and plug it in again"
             )
             raise DeviceError(message) from error
         if error.errno == errno.EBUSY:
@@ -203,17 +235,17 @@ def open_link(path: Path, *, answer_s: float = ANSWER_S) -> Link:
         raise DeviceGoneError(message) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        _require_engine(handle, path)
+        _require_engine(handle, path, kind)
     except BlockingIOError as error:
         os.close(handle)
         raise _busy(path) from error
     except BaseException:
         os.close(handle)
         raise
-    return Link(handle, f"light engine {path}", answer_s=answer_s)
+    return Link(handle, f"light engine {path}", kind, answer_s=answer_s)
 
 
-def _require_engine(handle: int, path: Path) -> None:
+def _require_engine(handle: int, path: Path, kind: Kind) -> None:
     """Compare vendor and product of an open node: numbers of nodes are given again after an unplug."""
     import fcntl
 
@@ -224,8 +256,9 @@ def _require_engine(handle: int, path: Path) -> None:
         message = f"{path}: asked for the light engine, found no hidraw node ({error.strerror}); see: slrig devices"
         raise DeviceGoneError(message) from error
     found = struct.unpack("=IHH", answer)[1:]
-    if found != ENGINE:
-        message = f"{path}: asked for the light engine 0451:6401, found {found[0]:04x}:{found[1]:04x}; plug it in again"
+    if found != (TI, kind.product):
+        asked, got = (f"{vendor:04x}:{product:04x}" for vendor, product in ((TI, kind.product), found))
+        message = f"{path}: asked for the light engine {asked}, found {got}; plug it in again"
         raise DeviceGoneError(message)
 
 

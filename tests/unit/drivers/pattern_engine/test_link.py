@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.dlpc350.link import Link, open_link
+from drivers.dlpc350.projector import DLPC350
+from drivers.pattern_engine.link import Link, open_link
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError
 from tests.contract.dlpc350_device import Cable, FakeEngine
 
@@ -22,7 +23,7 @@ SHORT_S = 0.05
 @contextmanager
 def wired(*, answer_s: float = 5.0) -> Iterator[tuple[Link, socket.socket]]:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link = Link(near.detach(), "light engine", answer_s=answer_s)
+    link = Link(near.detach(), "light engine", DLPC350, answer_s=answer_s)
     try:
         with far:
             yield link, far
@@ -36,7 +37,7 @@ def engine() -> FakeEngine:
 
 
 def linked(engine: FakeEngine, *, answer_s: float = 5.0) -> Link:
-    return Link(Cable(engine).host, "light engine", answer_s=answer_s)
+    return Link(Cable(engine).host, "light engine", DLPC350, answer_s=answer_s)
 
 
 def test_a_command_is_framed_as_the_manual_says() -> None:
@@ -85,7 +86,7 @@ def test_what_another_program_left_unread_is_forgotten() -> None:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with far:
         far.send(bytes([0xC0, 1, 1, 0, 7]).ljust(64, b"\0"))
-        link = Link(near.detach(), "light engine", answer_s=SHORT_S)
+        link = Link(near.detach(), "light engine", DLPC350, answer_s=SHORT_S)
         with pytest.raises(DeviceError, match="did not answer"):
             link.read(0x1A0C, 1)
         link.close()
@@ -140,14 +141,14 @@ def test_a_closed_link_is_closed() -> None:
 
 def test_a_node_that_is_not_there_is_gone(tmp_path: Path) -> None:
     with pytest.raises(DeviceGoneError, match="No such file"):
-        open_link(tmp_path / "hidraw7")
+        open_link(tmp_path / "hidraw7", DLPC350)
 
 
 def test_a_node_that_is_no_engine_is_gone(tmp_path: Path) -> None:
     path = tmp_path / "hidraw0"
     path.write_bytes(b"")
     with pytest.raises(DeviceGoneError, match="no hidraw node"):
-        open_link(path)
+        open_link(path, DLPC350)
 
 
 @pytest.mark.parametrize(("vendor", "product"), [(0x0451, 0x6401), (0x046D, 0xC077)])
@@ -163,10 +164,10 @@ def test_a_number_that_was_given_to_another_device_is_noticed(
     path.write_bytes(b"")
     monkeypatch.setattr(fcntl, "ioctl", answer)
     if product == 0x6401:
-        open_link(path).close()
+        open_link(path, DLPC350).close()
     else:
         with pytest.raises(DeviceGoneError, match="found 046d:c077"):
-            open_link(path)
+            open_link(path, DLPC350)
 
 
 def test_a_node_that_another_program_holds_is_busy(tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ def test_a_node_that_another_program_holds_is_busy(tmp_path: Path) -> None:
     with path.open("wb") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         with pytest.raises(DeviceBusyError, match="another program holds it"):
-            open_link(path)
+            open_link(path, DLPC350)
 
 
 @pytest.mark.parametrize(("number", "kind"), [(errno.EACCES, DeviceError), (errno.EBUSY, DeviceBusyError)])
@@ -186,7 +187,7 @@ def test_a_node_that_may_not_be_opened_says_what_to_do(
 
     monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(kind) as refused:
-        open_link(Path("/dev/hidraw0"))
+        open_link(Path("/dev/hidraw0"), DLPC350)
     assert type(refused.value) is kind
     if number == errno.EACCES:
         assert 'ATTRS{idProduct}=="6401"' in str(refused.value)

@@ -1,0 +1,194 @@
+"""What the DLPC900 understands beside `drivers.pattern_engine.engine`: its pattern table, and pictures over USB.
+
+Each command is in the guide (DLPU018 revisions F and J, the number of its table is beside it) and in TI's own program
+(API.c, `CmdList`, in github.com/RhojAnn/DLPC900_CLI under lib). Where they contradict each other, the driver does not
+depend on it: bit 0 of byte 9 of a definition means "no TRIG_OUT_2" in the guide and "TRIG_OUT_2" in API.c; TRIG_OUT_2
+is not used. Revision F calls the second number of the configuration repetitions; revision J calls it the number of
+patterns to show, and TI's program uses it so (`on_updateLUT_Button_clicked`: as many as there are entries is once).
+
+TI's program asks for no answer to pictures' data and to the order (API.c, `LCR_SendMsg`); so it is here, and the error
+code is read after each: it is the last command's only, so that a later message would hide what was wrong with this one.
+Programs of others do so after every command (pycrafter6500.py, `checkforerrors`).
+
+Bit 0 of byte 5 of a definition clears the mirrors after the exposure. Revision J says that it matters with a trigger
+from outside only; TI's program, that it is for every pattern of one bit (API.c, `LCR_AddToPatLut`). It is set, as in
+the guide's example of patterns on the fly and in pycrafter6500.py: else a pattern could stay through its dark time.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+
+from drivers.dlpc900.pictures import Place
+from drivers.pattern_engine import engine
+from drivers.pattern_engine.link import RefusedError
+from slrig.errors import DeviceError, UnsupportedByDeviceError
+from slrig.model import Size
+
+
+class Command(IntEnum):
+    """USB commands."""
+
+    ERROR_CODE = 0x0100  # 2-11: of the last command
+    VERSION = 0x0205  # 2-7: four bytes are the application's: patch (2), minor, major
+    HARDWARE = 0x0206  # 2-9: which mirrors
+    CONFIGURATION = 0x1A31  # 2-132: entries (2), patterns to show (4)
+    ORDER = 0x1A32  # 2-134: entries (2), patterns to show (4), indices (2 each)
+    DEFINITION = 0x1A34  # 2-136: see `definition`
+    PICTURE_1 = 0x1A2A  # 2-138: index (2), bytes with the header (4); of the first controller
+    DATA_1 = 0x1A2B  # 2-140: bytes (2), data
+    PICTURE_2 = 0x1A2C  # of the second controller
+    DATA_2 = 0x1A2D
+
+
+_CLEARED = 1
+ON_THE_FLY = 3
+"""Display mode: pictures come over USB (DLPU018 table 2-97)."""
+MODE_S = 0.6
+"""How long a change of mode may take. The guide says of another one that it takes 0.3 s, and that what is read before
+may be the mode that was (table 2-97); of this one it says nothing, so it has twice that.
+"""
+MOST_DATA = 504
+"""Bytes of a picture in one message (DLPU018 table 5-3)."""
+SECOND_READY, INCOMPATIBLE = 16, 2
+"""Bits of the hardware status (DLPU018 table 2-2)."""
+
+ERRORS = {
+    2: "a device failed",
+    3: "it does not know the command",
+    4: "controller and mirrors do not fit",
+    5: "not in this mode",
+    6: "a parameter is not one that it has",
+    7: "what a parameter refers to is not there",
+    8: "its memory is full",
+    9: "it does not know the packing of the picture",
+    10: "the bit position is not one that it has",
+    11: "the picture is not there",
+    12: "the dark time is not one that it has",
+    13: "the delay is not one that it has",
+    14: "the exposure is not one that it has",
+    15: "the pattern's number is not one that it has",
+    16: "the definition of the pattern is not one that it takes",
+    17: "the picture's place in its memory is not one that it has",
+    255: "it failed inside",
+}
+"""DLPU018 table 2-12."""
+
+
+class Mirrors(IntEnum):
+    """Hardware by its number (DLPU018 table 2-10)."""
+
+    DLP6500 = 1
+    DLP9000 = 2
+    DLP670S = 3
+    DLP500YX = 4
+
+    @property
+    def size(self) -> Size:
+        """Columns and rows (data sheet of the DLPC900, DLPS037, features)."""
+        return {1: Size(1920, 1080), 2: Size(2560, 1600), 3: Size(2716, 1600), 4: Size(2048, 1200)}[self]
+
+    @property
+    def controllers(self) -> int:
+        """How many share the columns (DLPS037, features)."""
+        return 1 if self is Mirrors.DLP6500 else 2
+
+    @property
+    def least_us(self) -> int:
+        """Shortest exposure of a 1-bit pattern (DLPU018 table 2-103)."""
+        return {1: 105, 2: 105, 3: 100, 4: 62}[self]
+
+
+def definition(index: int, place: Place, *, exposure_us: int, dark_us: int, leds: int) -> bytes:
+    """Return an entry of the pattern table: number (2), exposure (3, µs), LEDs in bits 4 to 6 and that the mirrors are
+    cleared in bit 0, dark time after it (3, µs), nothing, and picture (11 bits) and plane (5 bits). One bit deep, not
+    triggered from outside.
+    """
+    return (
+        struct.pack("<H", index)
+        + exposure_us.to_bytes(3, "little")
+        + bytes([leds << 4 | _CLEARED])
+        + dark_us.to_bytes(3, "little")
+        + b"\0"
+        + struct.pack("<H", place.picture | place.plane << 11)
+    )
+
+
+class Engine(engine.Engine):
+    """A DLPC900 behind a link."""
+
+    def version(self) -> tuple[int, int]:
+        """Major and minor number of its firmware."""
+        told = self._link.read(Command.VERSION, 4)
+        return told[3], told[2]
+
+    def mirrors(self) -> Mirrors:
+        """Which mirrors it drives. Raises UnsupportedByDeviceError: none that this driver knows."""
+        number = self._link.read(Command.HARDWARE, 1)[0]
+        try:
+            return Mirrors(number)
+        except ValueError as error:
+            known = ", ".join(mirrors.name for mirrors in Mirrors)
+            message = f"{self.name} has mirrors of type {number}, this driver knows {known}; use one of these"
+            raise UnsupportedByDeviceError(message) from error
+
+    def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
+        """Set TRIG_OUT_1 (DLPU018 table 2-112): polarity, and both edges later than the light's by the delay."""
+        self.settle(engine.Command.TRIGGER_OUT_1, struct.pack("<Bhh", active_low, delay_us, delay_us))
+
+    def define(self, entry: bytes) -> None:
+        """Set an entry of the pattern table. It holds from the next `configure` on."""
+        self._tell(Command.DEFINITION, entry)
+
+    def configure(self, entries: int, shown: int) -> None:
+        """Take the table's first entries in their order, and show as many patterns of them."""
+        self._tell(Command.CONFIGURATION, struct.pack("<HI", entries, shown))
+
+    def order(self, indices: Sequence[int], shown: int) -> None:
+        """Show as many patterns as asked of these entries, over and over."""
+        self._link.send(Command.ORDER, struct.pack(f"<HI{len(indices)}H", len(indices), shown, *indices))
+        self._require_done("take the order of the patterns")
+
+    def upload(self, number: int, parts: Sequence[bytes]) -> None:
+        """Send a picture, a part for each controller. Pictures are sent with the last one first (table 2-139)."""
+        for part, begin, data in zip(
+            parts, (Command.PICTURE_1, Command.PICTURE_2), (Command.DATA_1, Command.DATA_2), strict=False
+        ):
+            self._tell(begin, struct.pack("<HI", number, len(part)))
+            for start in range(0, len(part), MOST_DATA):
+                piece = part[start : start + MOST_DATA]
+                self._link.send(data, struct.pack("<H", len(piece)) + piece)
+                self._require_done(f"take picture {number}")
+
+    def faults(self) -> str:
+        """What the hardware status complains of, in words; empty if of nothing."""
+        told = [super().faults()]
+        if self.byte(engine.Command.HARDWARE_STATUS) & INCOMPATIBLE:
+            told.append(ERRORS[4])
+        return "; ".join(filter(None, told))
+
+    def require_well(self) -> None:
+        """Raise DeviceError, with its cause, if the hardware status complains."""
+        if faults := self.faults():
+            message = f"{self.name} says: {faults}; switch it off and on"
+            raise DeviceError(message)
+
+    def _tell(self, command: Command, data: bytes) -> None:
+        """Send a command. Raises UnsupportedByDeviceError if the engine refuses it, with what it says."""
+        try:
+            self._link.write(command, data)
+        except RefusedError as error:
+            raise self._refusal(f"take {command.name.lower().replace('_', ' ')} {data.hex(' ')}") from error
+
+    def _require_done(self, doing: str) -> None:
+        if self.byte(Command.ERROR_CODE):
+            raise self._refusal(doing)
+
+    def _refusal(self, doing: str) -> UnsupportedByDeviceError:
+        code = self.byte(Command.ERROR_CODE)
+        told = ERRORS.get(code, f"error code {code}")
+        return UnsupportedByDeviceError(
+            f"{self.name} was asked to {doing}, and says: {told}; report this message to the driver's maintainer"
+        )

@@ -1,0 +1,175 @@
+"""The light engine as a projector: pictures are sent when a sequence is loaded, then a table of them is shown."""
+
+from __future__ import annotations
+
+import time
+
+from drivers.dlpc900.engine import MODE_S, ON_THE_FLY, SECOND_READY, Engine, Mirrors, definition
+from drivers.dlpc900.options import EngineOptions
+from drivers.dlpc900.pictures import Place, memory_of, packed
+from drivers.dlpc900.timing import lit
+from drivers.pattern_engine.engine import Command
+from drivers.pattern_engine.link import Kind, Link
+from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
+from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import DeviceError, UnsupportedByDeviceError
+from slrig.model import PatternSequence
+
+DLPC900 = Kind("dlpc900", 0xC900, "6.0")
+OLDEST = (6, 0)
+"""Before 5.0 patterns cannot be put into another order (DLPU101, "Edit LUT"); up to 5.0.0 blocks of mirrors may lock
+after a change of mode (DLPT028)."""
+_DARK_END_US = 10_000
+_ALONE_US = round(LEFT_ALONE_S * 1e6) - _DARK_END_US
+
+
+class LightEngine(PatternEngine[Engine]):
+    """Implements `slrig.devices.Projector` on a DLPC900.
+
+    Parameters
+    ----------
+    link
+        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+    options
+        What the rig file says.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        Its firmware or its mirrors are not ones that are known, or it does not take a setting.
+    DeviceError, DeviceGoneError
+        The engine failed.
+    """
+
+    def __init__(self, link: Link, options: EngineOptions, *, serial: str = "") -> None:
+        super().__init__(Engine(link), options)
+        self._options = options
+        self._serial = serial
+        self._mirrors: Mirrors
+        self._places: tuple[Place, ...] = ()
+        # The pattern table, as far as the engine has it.
+        self._table: dict[int, bytes] = {}
+        self._take_over()
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. Sends the patterns, of some 10 kB for 24 of them, at 64 kB a second at the most."""
+        self._state.require_open()
+        self._state.loaded = None
+        self.blank()
+        self._state.require_size(sequence, self._mirrors.size)
+        memory = memory_of(sequence)
+        columns = self._mirrors.size.width_px // self._mirrors.controllers
+        with self._lock:
+            self._state.require_open()
+            self._table.clear()
+            self._places = memory.places
+            # The table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
+            for index in range(len(memory.places)):
+                self._define(index, DIM)
+            self._engine.configure(len(memory.places), len(sequence))
+            for number in reversed(range(len(memory.pictures))):
+                picture = memory.pictures[number]
+                halves = [picture[:, at : at + columns] for at in range(0, picture.shape[1], columns)]
+                self._engine.upload(number, [packed(half) for half in halves])
+        self._state.loaded = sequence
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`. Dark again after `hold_s`, and `LEFT_ALONE_S` after the end of this program.
+
+        A pattern without any LED ends what is shown: it is dark, whatever the mirrors do after a sequence.
+        """
+        self._state.require_pattern(index)
+        if self.unproven:
+            exposure_us, dark_us = DIM.exposure_us, DIM.period_us - DIM.exposure_us
+            times = _ALONE_US // DIM.period_us
+        else:
+            exposure_us, dark_us, times = _ALONE_US, _DARK_END_US, 1
+        with self._lock:
+            self._state.require_open()
+            last = len(self._places) - 1
+            try:
+                self.blank()
+                self._define(index, Timing(exposure_us, exposure_us))
+                self._define(last, Timing(dark_us, dark_us))
+                self._engine.configure(len(self._places), len(self._places))
+                self._engine.order((index, last), 2 * times)
+                started_ns = self._start()
+                self._engine.wait_until_running(RUNNING_S)
+                self._engine.require_well()
+            except BaseException:
+                self._darken()
+                raise
+            self._begin_holding(LEFT_ALONE_S, again_s=LEFT_ALONE_S / 2)
+        return self._shown(index, started_ns, time.monotonic_ns() + round(self._options.start_s * 1e9))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        self._state.require_loaded("play")
+        self._require_proven()
+        options = self._options
+        timing = lit(
+            exposure_s,
+            period_s,
+            margin_s=options.light_margin_s,
+            duty_limit=options.duty_limit,
+            least_us=self._mirrors.least_us,
+        )
+        with self._lock:
+            self._state.require_open()
+            try:
+                self.blank()
+                patterns = len(self._places) - 1
+                for index in range(patterns):
+                    self._define(index, timing)
+                self._engine.configure(len(self._places), patterns)
+                self._start()
+                self._engine.require_well()
+            except BaseException:
+                self._darken()
+                raise
+
+    def _define(self, index: int, timing: Timing) -> None:
+        """Set an entry of the pattern table, unless the engine has it."""
+        leds = 0 if index == len(self._places) - 1 else int(self._options.colour)
+        dark_us = timing.period_us - timing.exposure_us
+        entry = definition(index, self._places[index], exposure_us=timing.exposure_us, dark_us=dark_us, leds=leds)
+        if self._table.get(index) != entry:
+            self._table.pop(index, None)
+            self._engine.define(entry)
+            self._table[index] = entry
+
+    def _start(self) -> int:
+        """Start the sequence; return when that was begun."""
+        started_ns = time.monotonic_ns()
+        self._engine.leds(by_sequence=True)
+        self._engine.start()
+        return started_ns
+
+    def _prepare(self) -> ProjectorInfo:
+        engine, options = self._engine, self._options
+        version = engine.version()
+        if version < OLDEST:
+            found, wanted = (".".join(map(str, each)) for each in (version, OLDEST))
+            message = f"{engine.name} has firmware {found}, this driver needs {wanted}; update it with TI's program"
+            raise UnsupportedByDeviceError(message)
+        self._mirrors = mirrors = engine.mirrors()
+        if mirrors.controllers > 1 and not engine.byte(Command.HARDWARE_STATUS) & SECOND_READY:
+            message = f"{engine.name}: a {mirrors.name} has two controllers, the second one does not answer; "
+            message += "switch it off and on"
+            raise DeviceError(message)
+        engine.settle_byte(Command.DISPLAY_MODE, ON_THE_FLY, within_s=MODE_S)
+        # A new mode may start what the engine shows by itself.
+        self.blank()
+        self._set_up_light()
+        engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
+        return ProjectorInfo(
+            name="projector",
+            model=f"DLPC900 light engine, {mirrors.name}",
+            serial=self._serial,
+            size=mirrors.size,
+            plays=not self.unproven,
+            latency_s=options.start_s + COMMANDS_S,
+            gap_s=options.light_margin_s + mirrors.least_us / 1e6,
+            duty=options.duty_limit,
+        )

@@ -1,0 +1,282 @@
+"""A DLPC900 at the other end of the wire: what the controller does with reports, as DLPU018 says, and strictly.
+
+It is as unhelpful as the guide allows, like `tests.contract.dlpc350_device`: it wakes up with a pattern lit; settings
+are refused while a sequence runs, and so are tables and pictures but in the mode for them; pictures that do not come
+with the last one first, or came before the table had its length, are lost; the last pattern of a sequence stays lit.
+TRIG_OUT_1 is on while a pattern is, so it has an edge only after dark. A pattern that is not to be cleared stays
+through its dark time. Data and orders are answered by nothing; what is wrong with them is only in the error code, which
+the next command replaces.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model import Pixels, Size
+from tests.contract.dlpc350_device import FakeEngine, profile_of, repeated
+
+_SETTINGS = {0x0B01: 3, 0x1008: 1, 0x1009: 1, 0x1A05: 1, 0x1A1D: 5, 0x1A30: 1}
+_ANY_TIME = {0x0200: 1, 0x1A07: 1}
+_PATTERN_COMMANDS = {0x1A31, 0x1A32, 0x1A34, 0x1A2A, 0x1A2B, 0x1A2C, 0x1A2D}
+_UNANSWERED = {0x1A2B, 0x1A2D, 0x1A32}
+_SIZES = {1: Size(1920, 1080), 2: Size(2560, 1600)}
+
+
+@dataclass
+class _Entry:
+    """An entry of the pattern table, µs."""
+
+    exposure_us: int
+    dark_us: int
+    leds: int
+    picture: int
+    plane: int
+    cleared: bool
+
+
+class Fake900(FakeEngine):
+    """A controller that is sent its pictures.
+
+    mirrors : 1 DLP6500, 2 DLP9000. version : of its firmware. refusing : error codes by commands that are refused. The
+    others as `FakeEngine` has them.
+    """
+
+    def __init__(
+        self,
+        *,
+        light: Callable[[Pixels | None], object] = lambda _: None,
+        pulse: Callable[[int], None] = lambda _: None,
+        mirrors: int = 1,
+        version: tuple[int, int] = (6, 1),
+        standby: bool = False,
+        command_s: float = 0.0,
+        led_inverted: bool | None = None,
+    ) -> None:
+        super().__init__({}, light=light, pulse=pulse, standby=standby, command_s=command_s, led_inverted=led_inverted)
+        for command, length in (_SETTINGS | _ANY_TIME).items():
+            self.registers.setdefault(command, bytes(length))
+        self.registers |= {0x1A1D: bytes(5), 0x1A1B: b"\1"}
+        self.mirrors, self.version = mirrors, version
+        self.error = 0
+        self.refusing: dict[int, int] = {}
+        self.second_ready = mirrors != 1
+        self.entries: dict[int, _Entry] = {}
+        self._effective: dict[int, _Entry] = {}
+        self._configured = (0, 0)
+        self._order: list[int] = []
+        self._shown_of_order = 0
+        self._halves: dict[tuple[int, int], NDArray[np.uint32]] = {}
+        self._loading: dict[int, tuple[int, int, bytearray]] = {}
+        self._pictures: dict[int, NDArray[np.uint32]] = {}
+
+    @property
+    def size(self) -> Size:
+        """Columns and rows."""
+        return _SIZES[self.mirrors]
+
+    def _told(self, command: int) -> bytes | None:
+        match command:
+            case 0x0100:
+                return bytes([self.error])
+            case 0x0205:
+                return struct.pack("<HBB12x", 3, self.version[1], self.version[0])
+            case 0x0206:
+                return bytes([self.mirrors]) + b"out of the box".ljust(32, b"\0")
+            case 0x1A0A:
+                return bytes([self._hardware | (16 if self.second_ready else 0)])
+            case 0x1A1B:
+                return self.faults.bent.get(command, self.registers[command])
+        # These are the other controller's.
+        return None if command in {0x1A1A, 0x1A42, 0x1AFF, 0x1A22, 0x1A23, 0x1A29} else super()._told(command)
+
+    def _set(self, command: int, data: bytes) -> bytes | None:
+        if command in _PATTERN_COMMANDS:
+            self.error = self.refusing.get(command, 0) or self._pattern_command(command, data)
+            refused = self.error and command not in _UNANSWERED
+            return None if refused else b""
+        self.error = 0
+        if command == 0x1A24:
+            return self._started(data)
+        if command == 0x1A1B and len(data) == 1 and not self.running:
+            self.registers[command] = data
+            self._halves.clear()
+            return b""
+        if len(data) != (_SETTINGS | _ANY_TIME).get(command) or (self.running and command in _SETTINGS):
+            self.error = 5 if self.running else 6
+            return None
+        if command == 0x1A1D and not -20 <= struct.unpack("<Bhh", data)[1] <= struct.unpack("<Bhh", data)[2] <= 20_000:
+            self.error = 13
+            return None
+        self.registers[command] = data
+        self._relight()
+        return b""
+
+    def _pattern_command(self, command: int, data: bytes) -> int:
+        """Do it, and return the error code."""
+        if self.running or self.registers[0x1A1B] != b"\3":
+            return 5
+        match command:
+            case 0x1A34:
+                return self._define(data)
+            case 0x1A31:
+                entries, shown = struct.unpack("<HI", data)
+                if not 1 <= entries <= 400 or set(range(entries)) - self.entries.keys():
+                    return 15
+                if entries != self._configured[0]:
+                    self._halves.clear()
+                self._configured = (entries, shown)
+                self._effective = {index: self.entries[index] for index in range(entries)}
+                self._order, self._shown_of_order = list(range(entries)), shown
+            case 0x1A32:
+                count, shown = struct.unpack_from("<HI", data)
+                order = list(struct.unpack_from(f"<{count}H", data, 6))
+                if any(index >= self._configured[0] for index in order):
+                    return 15
+                self._order, self._shown_of_order = order, shown
+            case 0x1A2A | 0x1A2C:
+                number, size = struct.unpack("<HI", data)
+                half = 0 if command == 0x1A2A else 1
+                if number > 17:
+                    return 17
+                # The last one comes first: any other order begins anew, and what there was is lost.
+                if (half, number + 1) not in self._halves or (half, number) in self._halves:
+                    self._halves = {key: held for key, held in self._halves.items() if key[0] != half}
+                self._loading[half] = (number, size, bytearray())
+            case _:
+                return self._load(0 if command == 0x1A2B else 1, data)
+        return 0
+
+    def _define(self, data: bytes) -> int:
+        if len(data) != 12:
+            return 6
+        (index,) = struct.unpack_from("<H", data)
+        flags, (place,) = data[5], struct.unpack_from("<H", data, 10)
+        entry = _Entry(
+            int.from_bytes(data[2:5], "little"),
+            int.from_bytes(data[6:9], "little"),
+            flags >> 4 & 7,
+            place & 0x7FF,
+            place >> 11,
+            bool(flags & 1),
+        )
+        if flags & 0x8E or data[9] & 2 or entry.plane > 23:
+            return 16
+        if entry.exposure_us < 105:
+            return 14
+        self.entries[index] = entry
+        return 0
+
+    def _load(self, half: int, data: bytes) -> int:
+        if half not in self._loading:
+            return 7
+        number, size, came = self._loading[half]
+        if int.from_bytes(data[:2], "little") != len(data) - 2 or len(data) - 2 > 504:
+            return 6
+        came += data[2:]
+        if len(came) < size:
+            return 0
+        del self._loading[half]
+        columns = self.size.width_px // (1 if self.mirrors == 1 else 2)
+        picture = unpacked(bytes(came[:size]), Size(columns, self.size.height_px))
+        if picture is None:
+            return 9
+        self._halves[half, number] = picture
+        self._pictures.clear()
+        return 0
+
+    def _profile(self, entry: _Entry) -> Pixels:
+        # All planes at once are cut to a line: a start that takes longer than its answer may is no engine's.
+        if entry.picture not in self._pictures:
+            halves = [self._halves[half, entry.picture] for half in range(1 if self.mirrors == 1 else 2)]
+            self._pictures[entry.picture] = repeated(np.hstack(halves))
+        return profile_of(self._pictures[entry.picture] >> np.uint32(entry.plane) & np.uint32(1))
+
+    def _started(self, data: bytes) -> bytes | None:
+        if data == b"\0":
+            self._stop()
+            return b""
+        halves = 1 if self.mirrors == 1 else 2
+        needed = {(half, self._effective[index].picture) for index in self._order for half in range(halves)}
+        if data != b"\2" or self.running or not self._order or needed - self._halves.keys():
+            self.error = 5
+            return None
+        shown = self._shown_of_order or 2**32
+        steps = [self._effective[index] for index in self._order]
+        for step in steps:
+            self._profile(step)
+        self._halt = threading.Event()
+        threading.Thread(target=self._show, args=(self._halt, steps, shown), daemon=True).start()
+        return b""
+
+    def _show(self, halt: threading.Event, steps: list[_Entry], shown: int) -> None:
+        triggered = False
+        for number in range(shown):
+            entry = steps[number % len(steps)]
+            if not self._change(halt, self._profile(entry) if entry.leds else None):
+                return
+            if not triggered:
+                self._pulse(time.monotonic_ns())
+            triggered = True
+            # A thread that comes late must not hurry afterwards: an engine's periods are even.
+            if halt.wait(entry.exposure_us / 1e6):
+                return
+            if entry.cleared and entry.dark_us:
+                triggered = False
+                if not self._change(halt, None):
+                    return
+            if halt.wait(entry.dark_us / 1e6):
+                return
+        with self._lock:
+            if self._halt is halt:
+                self._halt = None
+
+
+def unpacked(content: bytes, size: Size) -> NDArray[np.uint32] | None:
+    """A picture out of its header and its enhanced run-length encoding (DLPU018 2-106, 2-109); None: faulty."""
+    signature, width, height, count = struct.unpack_from("<4sHHI", content)
+    if signature != b"Spld" or (width, height) != (size.width_px, size.height_px) or content[25:27] != b"\2\1":
+        return None
+    if content[12:20] != b"\xff" * 8 or count != len(content) - 48 or count % 4:
+        return None
+    data = content[48:]
+    pixels = np.zeros(width * height, np.uint32)
+    at = filled = 0
+
+    def number() -> int:
+        nonlocal at
+        first = data[at]
+        at += 1
+        if first < 128:
+            return first
+        at += 1
+        return first & 0x7F | data[at - 1] << 7
+
+    def pixel() -> int:
+        nonlocal at
+        at += 3
+        return int.from_bytes(data[at - 3 : at], "big")
+
+    while True:
+        repeat = number()
+        if repeat:
+            pixels[filled : filled + repeat] = pixel()
+            filled += repeat
+            continue
+        raw = number()
+        if raw != 1:
+            for _ in range(raw):
+                pixels[filled] = pixel()
+                filled += 1
+            continue
+        copied = number()
+        if copied == 0:
+            return pixels.reshape(height, width) if filled == pixels.size else None
+        pixels[filled : filled + copied] = pixels[filled - width : filled - width + copied]
+        filled += copied
