@@ -51,6 +51,9 @@ class SolvedEntry(Strict):
     ]
     volume_mm: Annotated[list[Vector3], Field(min_length=2, max_length=2)]
     expected_error_mm: Annotated[float, Field(ge=0)]
+    scale_sigma: Annotated[
+        float, Field(ge=0, le=1, description="deviation of the scale, a share, by the size of the board alone")
+    ] = 0.0
 
 
 class CalibrationEntry(Strict):
@@ -133,7 +136,9 @@ def _solved(entry: SolvedEntry | None) -> Solved | None:
     if entry is None:
         return None
     covariance, volume_mm = (np.array(each, dtype=np.float64) for each in (entry.covariance, entry.volume_mm))
-    return Solved(entry.id, entry.solved_at.isoformat(), covariance, volume_mm, entry.expected_error_mm)
+    return Solved(
+        entry.id, entry.solved_at.isoformat(), covariance, volume_mm, entry.expected_error_mm, entry.scale_sigma
+    )
 
 
 def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:

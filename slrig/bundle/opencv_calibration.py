@@ -54,7 +54,7 @@ DEVICE_KEYS = (
     "rotation",
     "translation_mm",
 )
-SOLVED_KEYS = ("id", "solved_at", "covariance", "volume_mm", "expected_error_mm")
+SOLVED_KEYS = ("id", "solved_at", "covariance", "volume_mm", "expected_error_mm", "scale_sigma")
 
 
 def read_opencv_calibration(path: Path) -> Calibration:
@@ -153,9 +153,13 @@ def _is_side(value: Value) -> TypeGuard[int]:
 
 def _read_solved(found: Value, path: Path) -> Solved:
     entries = _require_keys(found, SOLVED_KEYS, path, SOLVED, "leave the whole map out")
-    name, solved_at, error_mm = entries["id"], entries["solved_at"], entries["expected_error_mm"]
-    if not isinstance(name, str) or not isinstance(solved_at, str) or not isinstance(error_mm, int | float):
-        _refuse(path, f"text as id and solved_at of '{SOLVED}' and a number as expected_error_mm", "something else",
+    name, solved_at = entries["id"], entries["solved_at"]
+    error_mm, scale_sigma = entries["expected_error_mm"], entries["scale_sigma"]
+    if not isinstance(name, str) or not isinstance(solved_at, str):
+        _refuse(path, f"text as id and solved_at of '{SOLVED}'", "something else",
+                "export it again, or leave the whole map out")  # fmt: skip
+    if not isinstance(error_mm, int | float) or not isinstance(scale_sigma, int | float):
+        _refuse(path, f"numbers as expected_error_mm and scale_sigma of '{SOLVED}'", "something else",
                 "export it again, or leave the whole map out")  # fmt: skip
     if not 1 <= len(name) <= MOST_ID_LENGTH:
         _refuse(path, f"a text of 1 to {MOST_ID_LENGTH} characters as {SOLVED}.id", shorten(name), "export it again")
@@ -163,12 +167,14 @@ def _read_solved(found: Value, path: Path) -> Solved:
         _refuse(path, f"ISO 8601 with the offset from UTC as {SOLVED}.solved_at", shorten(solved_at), "correct it")
     if not 0 <= error_mm < np.inf:
         _refuse(path, f"{SOLVED}.expected_error_mm of 0 or more", f"{error_mm}", "export it again")
+    if not 0 <= scale_sigma <= 1:
+        _refuse(path, f"{SOLVED}.scale_sigma from 0 to 1", f"{scale_sigma}", "export it again")
     covariance = _matrix(entries, "covariance", path, SOLVED)
     volume_mm = _matrix(entries, "volume_mm", path, SOLVED)
     if not np.isfinite(volume_mm).all():
         _refuse(path, f"finite numbers in {SOLVED}.volume_mm", "others", "export it again")
     try:
-        return Solved(name, solved_at, covariance, volume_mm, float(error_mm))
+        return Solved(name, solved_at, covariance, volume_mm, float(error_mm), float(scale_sigma))
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: {SOLVED}.{cause}") from cause
 

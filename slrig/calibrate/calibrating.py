@@ -59,6 +59,7 @@ class Calibrations:
         rig_name: str,
         tools: CalibrationTools,
         spare_bytes: int = 0,
+        wanted_mm: float | None = None,
     ) -> None:
         self._data = folder
         self.store = CalibrationStore(folder)
@@ -68,8 +69,12 @@ class Calibrations:
         self._rig_name = rig_name
         self._tools = tools
         self.poses = PoseDesk(self.register, folder, runner, self._work, tools, spare_bytes)
-        self.solves = SolveDesk(self.register, self._work, tools)
+        self.solves = SolveDesk(self.register, self._work, tools, wanted_mm, self._of_the_rig)
         runner.use_calibration(self.store.active_calibration())
+
+    def _of_the_rig(self) -> Calibration | None:
+        facts = self._runner.status().facts
+        return None if facts is None else facts.calibration
 
     def take_up(self) -> None:
         """Settle what the last run of the service left open, or have it go on. Before the rig is used.

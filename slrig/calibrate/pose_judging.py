@@ -34,6 +34,9 @@ _ANSWER = (
 )
 """Fields of `slrig.calibration.poses.checks.PoseAnswer` that belong to the pose alone."""
 
+_CHECK = ("poses", "difference_mm", "stated_mm", "ratio", "chance", "fits", "words")
+"""Fields of `slrig.calibration.judging.odd_even.OddEven`, whose `motion` stands beside them."""
+
 
 def judgement(pose: ReadPose, earlier: Sequence[ReadPose], setting: Setting) -> Judgement:
     """Return what to tell of a pose, the accepted ones before it at hand."""
@@ -52,7 +55,7 @@ def standing(poses: Sequence[ReadPose], setting: Setting) -> Standing:
 
 def summary(result: CalibrationResult) -> Mapping[str, Any]:
     """Return the figures of a solve that an answer shows."""
-    solution, bow = result.solution, result.solution.bow
+    solution, bow, checked = result.solution, result.solution.bow, result.odd_even
     figures = {
         "devices": {
             each.name: {
@@ -65,13 +68,17 @@ def summary(result: CalibrationResult) -> Mapping[str, Any]:
             for each in device_figures(result)
         },
         "baselines": baselines(result),
-        "expected": _fields(result.expected, "point_mm", "noise_mm", "total_mm", "length_share", "across", "volume_mm"),
-        "verdict": _fields(result.verdict, "grade", "summary", "reasons"),
-        "scale": result.scale,
+        "expected": _fields(
+            result.expected, "point_mm", "noise_mm", "total_mm", "length_share", "across", "volume_mm", "board_mm"
+        ),
+        "odd_even": None if checked is None else {**_fields(checked, *_CHECK), **checked.motion._asdict()},
+        "verdict": _fields(result.verdict, "grade", "summary", "reasons", "remarks", "unattended", "wanted_mm"),
         "board": {
             "bowed": solution.board_shape_mm is not None,
             "bow_mm": None if bow is None else [bow.height_mm, bow.sigma_mm],
             "words": board_words(solution),
+            "scale_sigma": solution.size.scale_sigma,
+            "stretch": [solution.size.stretch, solution.size.stretch_sigma],
         },
         "poses": list(solution.poses),
         "outliers": solution.outliers,

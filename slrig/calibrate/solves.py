@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 from uuid import UUID
@@ -32,6 +32,10 @@ class SolveDesk:
     register: CalibrationRegister
     work: RigJobs
     tools: CalibrationTools
+    wanted_mm: float | None = None
+    """What the rig file says that a point of a scan may be wrong by."""
+    of_the_rig: Callable[[], Calibration | None] = lambda: None
+    """Gives the calibration that the rig has by itself."""
 
     def solve(self, session_id: UUID, *, board_shape: BoardShape = BoardShape.AUTO) -> SessionRecord:
         """Begin to solve a session from its accepted poses. Returns at once.
@@ -97,6 +101,7 @@ class SolveDesk:
             progress=progress,
             earlier=self._comparable(record),
             board_shape=BoardShape(plan["board_shape"]),
+            wanted_mm=self.wanted_mm,
         )
         number = plan["number"]
         if result.calibration.solved is not None:
@@ -116,15 +121,16 @@ class SolveDesk:
         return Outcome({"solve": number})
 
     def _comparable(self, record: SessionRecord) -> Calibration | None:
-        """The calibration in use, if it is one of the same devices."""
+        """The calibration in use, or else the rig's own, if it is one of the same devices."""
         active = self.register.store.active_calibration()
-        if active is None or record.projector is None:
+        used = self.of_the_rig() if active is None else active.calibration
+        if used is None or record.projector is None:
             return None
         try:
-            check_calibration(active.calibration, record.projector, record.cameras, "the calibration in use")
+            check_calibration(used, record.projector, record.cameras, "the calibration in use")
         except CalibrationError:
             return None
-        return active.calibration
+        return used
 
 
 def solve_name(session_id: UUID, number: int) -> str:

@@ -2,13 +2,15 @@
 
 After VDI/VDE 2634 part 2 and ISO 10360-13; no conformity is claimed. A sphere or plane is fitted by least squares of
 the distances to it; at most three points in a thousand, those that lie furthest off, are left out, and how many is
-said.
+said. All else that was measured on the artefact counts, at a rim and at a grazing view as elsewhere: whoever scans a
+part gets those points, too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +21,18 @@ from slrig.model import FloatArray
 REJECTED_SHARE = 0.003
 """At most this share of the points is left out (VDI/VDE 2634-2)."""
 
-STEEPEST_DEG = 60.0
-"""Points that a device sees more obliquely than this do not count."""
-
 FEWEST_POINTS = 100
 _DISPERSED = 0.95
 _MOST_VOTES = 20_000
 _VOTE_REACH = 0.08  # of the radius: how far the centres that single normals point at may lie from one another
-_SHELL = 0.05  # of the radius, at first
-_DEVIATIONS = 8.0
+_SHELL = 0.05  # of the radius: what lies nearer to the sphere is taken for a part of it
+_SLAB = 0.01  # of the plane's length: as for the sphere
 _ROUNDS = 4
 _TRIALS = 200
 _TILT_COSINE = np.cos(np.deg2rad(15.0))
+_TURNED_COSINE = np.cos(np.deg2rad(45.0))
+"""What faces so differently is another thing that touches the artefact: a rod or a foot of up to half a ball's radius
+leaves the ball at 60 degrees or more. Noise turns few points so far, and how many is said."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,13 @@ class FittedPlane:
     normal: FloatArray
     distances_mm: FloatArray
     rejected: int
+
+
+class OnArtefact(NamedTuple):
+    """Indices of the points on an artefact, (n,), and how many more lie as near to it, but face quite differently."""
+
+    points: NDArray[np.intp]
+    turned: int
 
 
 class Decision(StrEnum):
@@ -146,11 +155,12 @@ def _require_enough(points_mm: FloatArray, what: str) -> None:
         raise NothingToReconstructError(message)
 
 
-def ball_points(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, count: int) -> list[NDArray[np.intp]]:
-    """Indices of the points on each of `count` balls of one diameter, the ball with most points first.
+def ball_points(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, count: int) -> list[OnArtefact]:
+    """The points on each of `count` balls of one diameter, the ball with most points first.
 
     points_mm, normals : (n, 3) float64, the normals outwards. Each normal points back to its ball's centre, one radius
-    below the surface: where most of them meet is a centre.
+    below the surface: where most of them meet is a centre. What then lies within a twentieth of the radius of the
+    sphere is on it, however far off its noise put it.
 
     Raises
     ------
@@ -159,7 +169,7 @@ def ball_points(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, 
     """
     radius_mm = diameter_mm / 2
     left = np.ones(len(points_mm), dtype=bool)
-    found: list[NDArray[np.intp]] = []
+    found: list[OnArtefact] = []
     for number in range(count):
         inside = _ball(points_mm, normals, radius_mm, left)
         if inside is None:
@@ -169,12 +179,14 @@ def ball_points(points_mm: FloatArray, normals: FloatArray, diameter_mm: float, 
             )
             raise NothingToReconstructError(message)
         found.append(inside)
-        left[inside] = False
-    return sorted(found, key=len, reverse=True)
+        left[inside.points] = False
+    return sorted(found, key=lambda ball: len(ball.points), reverse=True)
 
 
-def plane_points(points_mm: FloatArray, normals: FloatArray) -> NDArray[np.intp]:
-    """Indices of the points on the plane that most points lie on; points_mm, normals : (n, 3) float64.
+def plane_points(points_mm: FloatArray, normals: FloatArray, length_mm: float) -> OnArtefact:
+    """The points on the plane that most points lie on; points_mm, normals : (n, 3) float64.
+
+    What lies within a hundredth of the plane's length of it is on it.
 
     Raises
     ------
@@ -191,8 +203,8 @@ def plane_points(points_mm: FloatArray, normals: FloatArray) -> NDArray[np.intp]
         votes = int(((off < 0.004 * extent_mm) & (facing @ facing[seed] > _TILT_COSINE)).sum())
         if votes > most:
             most, best = votes, (sparse[seed], facing[seed])
-    reach_mm = 0.01 * extent_mm
-    chosen = np.flatnonzero(np.abs((points_mm - best[0]) @ best[1]) < reach_mm)
+    near = np.abs((points_mm - best[0]) @ best[1]) < _SLAB * length_mm
+    chosen = np.flatnonzero(near)
     for _ in range(_ROUNDS):
         if len(chosen) < FEWEST_POINTS:
             message = (
@@ -200,29 +212,12 @@ def plane_points(points_mm: FloatArray, normals: FloatArray) -> NDArray[np.intp]
             )
             raise NothingToReconstructError(message)
         plane = fitted_plane(points_mm[chosen])
-        off = np.abs((points_mm - plane.centre_mm) @ plane.normal)
-        # What stands on the plane is far off; its own noise and form are not.
-        reach_mm = min(reach_mm, _DEVIATIONS * _deviation(off[chosen]))
-        chosen = np.flatnonzero((off < reach_mm) & (np.abs(normals @ plane.normal) > _TILT_COSINE))
-    return chosen
+        near = np.abs((points_mm - plane.centre_mm) @ plane.normal) < _SLAB * length_mm
+        chosen = np.flatnonzero(near & (np.abs(normals @ plane.normal) > _TURNED_COSINE))
+    return OnArtefact(chosen, int(near.sum()) - len(chosen))
 
 
-def seen_well(points_mm: FloatArray, normals: FloatArray, centres_mm: list[FloatArray]) -> NDArray[np.bool_]:
-    """(n,) bool: points whose normal is less than 60 degrees from the direction to every device.
-
-    centres_mm : the devices' centres of projection in the world, (3,) each.
-    """
-    good = np.ones(len(points_mm), dtype=bool)
-    for centre in centres_mm:
-        towards = centre - points_mm
-        towards /= np.linalg.norm(towards, axis=1)[:, None]
-        good &= (normals * towards).sum(axis=1) > np.cos(np.deg2rad(STEEPEST_DEG))
-    return good
-
-
-def _ball(
-    points_mm: FloatArray, normals: FloatArray, radius_mm: float, left: NDArray[np.bool_]
-) -> NDArray[np.intp] | None:
+def _ball(points_mm: FloatArray, normals: FloatArray, radius_mm: float, left: NDArray[np.bool_]) -> OnArtefact | None:
     candidates = np.flatnonzero(left)
     voters = candidates[:: max(len(candidates) // _MOST_VOTES, 1)]
     if len(voters) == 0:
@@ -241,22 +236,19 @@ def _ball(
             return None
         centre = votes[near].mean(axis=0)
     nominal_mm, shell_mm = radius_mm, _SHELL * radius_mm
-    inside = candidates
-    for _ in range(_ROUNDS):
+    near, inside = candidates, candidates
+    for turn in range(_ROUNDS):
         outwards = points_mm[candidates] - centre
         distance = np.linalg.norm(outwards, axis=1)
         along = (outwards * normals[candidates]).sum(axis=1) / np.maximum(distance, 1e-12)
-        inside = candidates[(np.abs(distance - radius_mm) < shell_mm) & (along > _TILT_COSINE)]
+        close = np.abs(distance - radius_mm) < shell_mm
+        # The centre that votes found is a rough one: at first, only what faces as the ball does tells a better one.
+        facing = along > (_TURNED_COSINE if turn else _TILT_COSINE)
+        near, inside = candidates[close], candidates[close & facing]
         if len(inside) < FEWEST_POINTS:
             return None
         fit = fitted_sphere(points_mm[inside])
         centre, radius_mm = fit.centre_mm, fit.radius_mm
         if abs(radius_mm - nominal_mm) > _SHELL * nominal_mm:
             return None
-        shell_mm = min(shell_mm, max(_DEVIATIONS * _deviation(fit.distances_mm), 1e-6))
-    return np.asarray(inside)
-
-
-def _deviation(distances_mm: FloatArray) -> float:
-    """Standard deviation by the median: what does not belong does not widen it."""
-    return 1.4826 * float(np.median(np.abs(distances_mm - np.median(distances_mm))))
+    return OnArtefact(inside, len(near) - len(inside))

@@ -6,7 +6,8 @@ away from the one who looks. Corners count from left to right, then from top to 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -19,6 +20,17 @@ DICTIONARY = "DICT_5X5_250"
 
 MARKER_SHARE = 0.75
 """A marker's side over the square that it lies in, unless given."""
+
+PRINT_SIGMA = 0.001
+"""Standard deviation of a print's width and of its height, over themselves, unless a certificate or a ruler says more:
+from dry to humid air bond paper grows by 0.1 to 0.2 % along its grain and by 0.2 to 0.4 % across it (usual figures of
+paper makers), and a room's air holds a part of that."""
+
+_READING_MM = 0.1
+"""Standard deviation of a length as a steel ruler tells it: an eighth of a mm either way at each end, evenly spread."""
+_LONGEST_RULER_MM = 300
+_MOST_OFF = 0.05
+"""A scale that is read as further off its print was not read at its ends."""
 
 _FEWEST, _MOST = 3, 60
 _LEAST_MM, _MOST_MM = 0.1, 1000.0
@@ -46,7 +58,9 @@ class Board:
 
     columns, rows : inner corners of a ChArUco board or chessboard; of asymmetric circles, the circles of one row, and
     the rows (OpenCV's 4 x 11). square_mm : side of a square; of circles, the distance of two neighbouring rows, which
-    is half of that of two circles in one row. marker_mm, dictionary : of a ChArUco board only.
+    is half of that of two circles in one row. marker_mm, dictionary : of a ChArUco board only. square_sigma : standard
+    deviation of the print's width, and independently of its height, over themselves. aspect : a square's height over
+    its width; square_mm is its width.
 
     Raises
     ------
@@ -60,6 +74,8 @@ class Board:
     square_mm: float
     marker_mm: float | None = None
     dictionary: str | None = None
+    square_sigma: float = PRINT_SIGMA
+    aspect: float = 1.0
 
     def __post_init__(self) -> None:
         charuco = self.kind is BoardKind.CHARUCO
@@ -72,6 +88,13 @@ class Board:
             faults.append(f"expected {_FEWEST} to {_MOST} corners each way, found {self.columns} x {self.rows}")
         if not _LEAST_MM <= self.square_mm <= _MOST_MM:
             faults.append(f"square_mm: expected {_LEAST_MM:g} to {_MOST_MM:g} mm, found {self.square_mm:g}")
+        if not 0 < self.square_sigma <= _MOST_OFF:
+            faults.append(
+                f"square_sigma: expected a share of a square's side above 0 and up to {_MOST_OFF:g}, 0.001 for a "
+                f"print, found {self.square_sigma:g}"
+            )
+        if not abs(self.aspect - 1) <= 2 * _MOST_OFF:
+            faults.append(f"aspect: expected a square's height over its width, about 1, found {self.aspect:g}")
         if charuco and not 0 < (self.marker_mm or 0) < self.square_mm:
             faults.append(f"marker_mm: expected less than the square's {self.square_mm:g} mm, found {self.marker_mm:g}")
         if not charuco and (self.marker_mm is not None or self.dictionary is not None):
@@ -90,14 +113,50 @@ class Board:
         """(n, 3) float64: every corner (the centre of every circle) in the board's frame."""
         row, column = np.divmod(np.arange(self.corner_count), self.columns)
         across = 2 * column + row % 2 if self.kind is BoardKind.CIRCLES else column
-        flat = np.column_stack([across, row, np.zeros_like(row)])
+        flat = np.column_stack([across, self.aspect * row, np.zeros_like(row)])
         return np.asarray(flat * self.square_mm, dtype=np.float64)
 
     @property
     def print_mm(self) -> FloatArray:
         """(2, 2) float64: the least and the greatest (x, y) of what is printed, in the board's frame."""
         across = 2 * self.columns if self.kind is BoardKind.CIRCLES else self.columns
-        return np.array([(-1.0, -1.0), (across, self.rows)]) * self.square_mm
+        return np.array([(-1.0, -1.0), (across, self.rows)]) * self.square_mm * [1.0, self.aspect]
+
+    @property
+    def rulers_mm(self) -> tuple[int, int]:
+        """Lengths of the scales that are printed below the board and left of it, as `slrig calibrate board` does."""
+        wide_mm, high_mm = (self.print_mm[1] - self.print_mm[0]).tolist()
+        return _ruler_mm(wide_mm), _ruler_mm(high_mm)
+
+    def as_read(self, across_mm: float, down_mm: float, /, *, square_sigma: float | None = None) -> Board:
+        """The board as its print turned out, by what is read from end to end of the two printed scales.
+
+        square_sigma : how sure the readings are; None takes them for those of a steel ruler.
+
+        Raises
+        ------
+        CalibrationError
+            A reading is further off than any printer is.
+        """
+        faults = [
+            f"the scale {where} the board is {printed_mm} mm long in print, read as {read_mm:g} mm"
+            for where, printed_mm, read_mm in zip(
+                ("below", "left of"), self.rulers_mm, (across_mm, down_mm), strict=True
+            )
+            if not abs(read_mm / printed_mm - 1) <= _MOST_OFF
+        ]
+        if faults:
+            message = (
+                f"{'; '.join(faults)}: read each from its first to its last tick; print again at 100 % if it is so"
+            )
+            raise CalibrationError(message)
+        wide, high = (read / printed for read, printed in zip((across_mm, down_mm), self.rulers_mm, strict=True))
+        marker_mm = None if self.marker_mm is None else self.marker_mm * wide
+        by_ruler = float(np.sqrt(np.mean([(_READING_MM / printed) ** 2 for printed in self.rulers_mm])))
+        sigma = by_ruler if square_sigma is None else square_sigma
+        return replace(
+            self, square_mm=self.square_mm * wide, marker_mm=marker_mm, square_sigma=sigma, aspect=high / wide
+        )
 
     @property
     def title(self) -> str:
@@ -119,6 +178,11 @@ class Board:
             return f"circles, {self.columns} in each of {self.rows} rows, rows {self.square_mm:g} mm apart"
         markers = f", markers of {self.marker_mm:g} mm from {self.dictionary}" if self.marker_mm is not None else ""
         return f"{self.kind}, {self.columns} x {self.rows} inner corners, squares of {self.square_mm:g} mm{markers}"
+
+
+def _ruler_mm(room_mm: float) -> int:
+    """How long a scale is that has so much room: whole centimetres, if there is one."""
+    return min(_LONGEST_RULER_MM, 10 * math.floor(room_mm / 10)) if room_mm >= 10 else math.floor(room_mm)
 
 
 USUAL_BOARD = Board(BoardKind.CHARUCO, 11, 8, 12.0)

@@ -46,6 +46,18 @@ class Moved:
     stated: FloatArray
 
 
+class RigidMotion(NamedTuple):
+    """How far points move as one: turn_deg, about their middle, and shift_mm, of their middle."""
+
+    turn_deg: float
+    shift_mm: float
+
+    @property
+    def words(self) -> str:
+        """As a sentence has it."""
+        return f"a turn of {self.turn_deg:.2g}° and a shift of {self.shift_mm:.2g} mm"
+
+
 class _Projected(NamedTuple):
     """by_point : (n, 2, 3) and by_parameter : (n, 2, 15) float64, of the pixel; inside : (n,) bool, in the image."""
 
@@ -111,6 +123,23 @@ def rigid_free(points_mm: FloatArray, fields: FloatArray, /) -> FloatArray:
     flat = fields.reshape(3 * len(points_mm), -1)
     basis, _ = np.linalg.qr(motions.reshape(-1, 6))
     return np.asarray((flat - basis @ (basis.T @ flat)).reshape(fields.shape))
+
+
+def without_rigid_motion(before_mm: FloatArray, after_mm: FloatArray, /) -> tuple[FloatArray, RigidMotion]:
+    """How far points (n, 3) moved beyond the rigid motion nearest to their moves, (n, 3); and that motion, of any size.
+
+    The turn and the shift are those that leave the least sum of squares (Kabsch 1976). Two solves of one rig differ by
+    such a motion, because each takes its own first camera for the world: no measurement of a shape notices it. mrcal's
+    difference of two camera models removes it for the same reason (mrcal.secretsauce.net/differencing.html).
+    """
+    # Late: the service knows the values of this module, and computes none of them.
+    from scipy.spatial.transform import Rotation
+
+    middle = before_mm.mean(axis=0)
+    shift = after_mm.mean(axis=0) - middle
+    turn, _ = Rotation.align_vectors(after_mm - middle - shift, before_mm - middle)
+    left = after_mm - middle - shift - turn.apply(before_mm - middle)
+    return left, RigidMotion(float(np.degrees(turn.magnitude())), float(np.linalg.norm(shift)))
 
 
 def modes_of(covariance: FloatArray, /) -> FloatArray:

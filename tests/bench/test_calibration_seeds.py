@@ -95,7 +95,6 @@ def row(seed: int, folder: Path) -> dict[str, Any]:
         "off": in_deviations(solution, truth),
         "rms_px": {name: left.rms_px for name, left in solution.residuals.items()},
         "held_out": {name: left.held_out_rms_px / left.rms_px for name, left in solution.residuals.items()},
-        "terms": dict(solution.distortion),
         "bow_mm": bow and [bow.height_mm, bow.sigma_mm, bow.solved],
         "outliers": dict(solution.outliers),
         "refused": refused,

@@ -82,7 +82,8 @@ tilt_deg = [15.0, 40.0]
 roll_deg = 25.0
 depth_mm = [-45.0, 45.0]
 """
-BOARD = Board(BoardKind.CHARUCO, 9, 6, 8.0)
+BOARD = Board(BoardKind.CHARUCO, 9, 6, 8.0, square_sigma=1e-6)
+"""The rendered board is as large as it says, for certain."""
 BOARD_SCENE = """name = "board"
 [[object]]
 name = "board"

@@ -68,7 +68,11 @@ def test_another_program_reads_the_devices_all_the_same(tmp_path: Path) -> None:
     [
         ("solved_at:", "solved_on:", "no solved_at, the unknown key solved_on; leave the whole map out"),
         ("expected_error_mm: 0.0071", "expected_error_mm: -0.0071", "expected_error_mm of 0 or more, found -0.0"),
-        ("expected_error_mm: 0.00711", 'expected_error_mm: "x" # 0.00711', "a number as expected_error_mm"),
+        (
+            "expected_error_mm: 0.00711",
+            'expected_error_mm: "x" # 0.00711',
+            "numbers as expected_error_mm and scale_sigma",
+        ),
         ("id: a1b2", "id: [ 1 ]", "text as id and solved_at"),
     ],
 )

@@ -69,7 +69,9 @@ def grown_lattice(level: FloatArray, points_px: FloatArray, steps: IntArray) -> 
     """
     column, row = (steps - steps.min(axis=0) + (_SIDE - 1 - np.ptp(steps, axis=0)) // 2).T
     order = np.argsort(row * _SIDE + column)
-    placed = placed_corners(level, _PLANE, (row * _SIDE + column)[order].astype(np.int32), points_px[order])
+    placed = placed_corners(
+        level, _PLANE, (row * _SIDE + column)[order].astype(np.int32), points_px[order], crossed=True
+    )
     for turn in range(_TURNS):
         if placed is None:
             return None
@@ -89,7 +91,7 @@ def grown_lattice(level: FloatArray, points_px: FloatArray, steps: IntArray) -> 
         everything = np.concatenate([corner[kept], near[more]])
         rough = np.concatenate([points[kept], guessed[more]])
         order = np.argsort(everything)
-        grown = placed_corners(level, _PLANE, everything[order], rough[order])
+        grown = placed_corners(level, _PLANE, everything[order], rough[order], crossed=True)
         if grown is None or set(grown.view.corner.tolist()) <= set(corner.tolist()):
             return _lattice(level, grown)
         placed = grown
@@ -97,14 +99,37 @@ def grown_lattice(level: FloatArray, points_px: FloatArray, steps: IntArray) -> 
 
 
 def _lattice(level: FloatArray, placed: PlacedCorners | None) -> Lattice | None:
-    if placed is None or len(placed.view.corner) < _FEWEST or _round(level, placed.board_map, placed.view.corner):
+    if placed is None or _round(level, placed.board_map, placed.view.corner):
         return None
     row, column = np.divmod(placed.view.corner, _SIDE)
-    places = np.column_stack([column - column.min(), row - row.min()]).astype(np.int32)
+    places = np.column_stack([column, row]).astype(np.int32)
+    whole = _in_whole_lines(places)
+    if whole.sum() < _FEWEST:
+        return None
+    places = places[whole] - places[whole].min(axis=0)
     columns, rows = (int(extent) + 1 for extent in places.max(axis=0))
     if min(columns, rows) < 3:
         return None
-    return Lattice(columns, rows, placed.view.points_px, places)
+    return Lattice(columns, rows, placed.view.points_px[whole], places)
+
+
+def _in_whole_lines(places: IntArray) -> NDArray[np.bool_]:
+    """(n,) bool: which of the places (n, 2) remain when outermost lines of which not half is there are taken off.
+
+    Where the light ends on the paper beside the print, the outermost squares, lit paper and paper in the dark may
+    alternate about one place of the print's outer edge, or two: so a grid gets a line too many. Counted as one of the
+    board's it would number all corners a square off.
+    """
+    kept = np.ones(len(places), dtype=np.bool_)
+    while kept.any():
+        least, most = places[kept].min(axis=0), places[kept].max(axis=0)
+        lines = [kept & (places[:, axis] == end[axis]) for axis in (0, 1) for end in (least, most)]
+        across = np.repeat((most - least + 1)[::-1], 2)
+        few = [line for line, length in zip(lines, across, strict=True) if 2 * line.sum() < length]
+        if not few:
+            break
+        kept &= ~few[0]
+    return kept
 
 
 def _places(corner: IntArray) -> FloatArray:

@@ -107,7 +107,7 @@ def _cause(grey: Grey, board: Board, seen: Lattice | None) -> str:
     sides = seen.cut_sides(grey.level.shape)
     if seen.fits_in(board) and (sides or not seen.complete(grey.level)):
         part = f"{len(seen.places)} of the {board.corner_count} corners, in a grid of {seen.columns} x {seen.rows},"
-        return half_words(part, sides)
+        return half_words(part, sides, dark=seen.dark_beyond(grey.level))
     return (
         f"another board: expected {board.columns} x {board.rows} inner corners, found a chessboard of "
         f"{max(seen.columns, seen.rows)} x {min(seen.columns, seen.rows)}: take the other board, or give its corners "

@@ -32,6 +32,8 @@ from slrig.model import FloatArray, IntArray
 
 _MARGIN = 1.3
 """Where to look for the paper about a chessboard, in squares from its outermost corners."""
+_LIGHT, _DARK = 0.7, 0.2
+"""Grey levels of lit paper, at least, and of what no light falls on, at most, between dark and light squares."""
 _BEYOND = 1.8
 """A grid is cut off where the squares about its next corner would not all lie in the image."""
 
@@ -61,18 +63,25 @@ class Lattice:
         """Whether a chessboard ends on all four sides: beyond its outermost squares lies paper as light as its light
         squares. False where it cannot be told.
         """
+        return all(float((side > _LIGHT).mean()) > 0.85 for side in self._beyond(level))
+
+    def dark_beyond(self, level: FloatArray) -> bool:
+        """Whether next to no light falls beyond one of a chessboard's sides. Of more squares half would be dark."""
+        return any(float((side < _DARK).mean()) > 0.6 for side in self._beyond(level))
+
+    def _beyond(self, level: FloatArray) -> list[FloatArray]:
+        """(n,) float64 for each of the four sides: grey levels beyond the outermost squares of a chessboard, 0 as its
+        dark squares and 1 as its light ones; NaN outside the image, and for all where it cannot be told.
+        """
         board_map = self.board_map()
         if board_map is None:
-            return False
+            return [np.full(1, np.nan)]
         inside = _line(np.arange(self.columns - 1) + 0.5, np.arange(self.rows - 1) + 0.5)
         low, high = np.nanpercentile(levels_at(level, board_map(inside)), [10, 90])
         x, y = np.arange(self.columns + 1) - 0.5, np.arange(self.rows + 1) - 0.5
         last = np.array([self.columns - 1, self.rows - 1])
-        light = [
-            levels_at(level, board_map(line)) > low + 0.7 * (high - low)
-            for line in _around(np.zeros(2) - _MARGIN, last + _MARGIN, x, y)
-        ]
-        return all(float(side.mean()) > 0.85 for side in light)
+        lines = _around(np.zeros(2) - _MARGIN, last + _MARGIN, x, y)
+        return [(levels_at(level, board_map(line)) - low) / max(high - low, 1e-9) for line in lines]
 
     def cut_sides(self, shape: tuple[int, ...]) -> list[str]:
         """The sides of the image of this shape (H, W) beyond which the grid would go on: left, right, upper, lower."""

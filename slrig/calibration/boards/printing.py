@@ -36,7 +36,6 @@ _LETTER = 0.53
 """Width of a letter of the font over its size, on average and a little more."""
 _LEAST_WIDTH_MM = 90.0
 """Of a page that is made to fit: a line of the foot wants some room."""
-_LONGEST_RULER_MM = 100
 _STROKE_MM = 0.15
 _BORDER_GREY, _INK_GREY = 0.8, 0.25
 
@@ -164,7 +163,8 @@ def solve_command(board: Board) -> str:
     further = f" --marker-mm {board.marker_mm:g} --dictionary {board.dictionary}" if charuco else ""
     return (
         f"slrig calibrate solve FOLDER --board {board.kind} --corners {board.columns}x{board.rows} "
-        f"--square-mm {board.square_mm:g}{further} --output calibration.json"
+        f"--square-mm {board.square_mm:g}{further} --measured-mm X Y "
+        "--output calibration.json"
     )
 
 
@@ -187,11 +187,12 @@ def _laid_out(board: Board, page: str) -> _Page:
     lines = [_Line(*one, *other, _BORDER_GREY) for one, other in pairwise(border)]
     foot_mm = height_mm - _MARGIN_MM - _LINE_MM * (len(texts) - 0.75)
     written = [_Text(text, _MARGIN_MM, foot_mm + _LINE_MM * index, _FONT_MM) for index, text in enumerate(texts)]
-    for upright, start_x, start_y, room_mm in (
-        (False, x_mm, below_mm + 1.0, wide_mm),
-        (True, x_mm - _QUIET_MM - 1.0, y_mm, high_mm),
+    across_mm, down_mm = board.rulers_mm
+    for upright, start_x, start_y, length_mm in (
+        (False, x_mm, below_mm + 1.0, across_mm),
+        (True, x_mm - _QUIET_MM - 1.0, y_mm, down_mm),
     ):
-        ticks, numbers = _ruler(start_x, start_y, room_mm, upright=upright)
+        ticks, numbers = _ruler(start_x, start_y, length_mm, upright=upright)
         lines += ticks
         written += numbers
     return _Page(width_mm, height_mm, f"slrig: {board.title}", shapes, circles, lines, written)
@@ -201,7 +202,7 @@ def _foot(board: Board, width_mm: float) -> list[str]:
     """The lines at the foot of a page of this width: what the board is, how to print it, how to calibrate with it."""
     said = (
         f"slrig: {board.description}",
-        "Print at 100 % (actual size). Hold a ruler to both scales: where they are off, give the lengths as measured.",
+        "Print at 100 % (actual size). Hold a ruler to both scales, and give their lengths as measured.",
         solve_command(board),
     )
     letters = max(20, int((width_mm - 2 * _MARGIN_MM) / (_LETTER * _FONT_MM)))
@@ -264,9 +265,8 @@ def _sides_mm(page: str) -> tuple[float, float]:
     return float(given[1]), float(given[2])
 
 
-def _ruler(x_mm: float, y_mm: float, room_mm: float, *, upright: bool) -> tuple[list[_Line], list[_Text]]:
+def _ruler(x_mm: float, y_mm: float, length: int, *, upright: bool) -> tuple[list[_Line], list[_Text]]:
     """A scale in mm from (x_mm, y_mm): to the right, its ticks downwards, or downwards, its ticks to the left."""
-    length = min(_LONGEST_RULER_MM, 10 * math.floor(room_mm / 10)) if room_mm >= 10 else math.floor(room_mm)
     ticks, numbers = [], []
 
     def place(along: float, away: float) -> tuple[float, float]:

@@ -114,8 +114,15 @@ def nothing_words(grey: Grey, board: Board) -> str:
     return other_words(grey, board) or f"no {board.title} found: {grey.likely_cause()}"
 
 
-def half_words(part: str, sides: list[str]) -> str:
-    """That only a part of the board is found, and what to do. sides : of the image, beyond which the board goes on."""
+def half_words(part: str, sides: list[str], *, dark: bool = False) -> str:
+    """That only a part of the board is found, and what to do. sides : of the image, beyond which the board goes on;
+    dark : whether it is dark beyond that part.
+    """
+    if dark:
+        return (
+            f"half a board: only {part} are found, and beyond them it is dark: most likely the projector's picture "
+            "ends on the board: bring all of the board into its light; if it is, take away what covers the board"
+        )
     if sides:
         return (
             f"half a board: only {part} are in view, the rest is beyond the image's {' and '.join(sides)} side: move "

@@ -84,7 +84,8 @@ def equations(poses: Sequence[PoseObservation], board: Board, calibration: Calib
         for each in devices_of(calibration).values()
     ])  # fmt: skip
     geometry = flat_geometry(board, devices, np.stack([_standing(pose, board, calibration) for pose in poses]))
-    modes = modes_of(covariance_of(calibration))
+    # The board is taken for the one that the calibration was made with: its size has not changed since then.
+    modes = modes_of(covariance_of(calibration, board=False))
     found = _linear(everything, geometry, modes)
     for _ in range(_TURNS):
         # The most likely board poses, modes and shared errors, with no change of the devices.

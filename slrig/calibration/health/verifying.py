@@ -113,7 +113,8 @@ def _errors_mm(
     ranked: Sequence[Hypothesis], calibration: Calibration, volume_mm: FloatArray
 ) -> tuple[float | None, float | None, float | None]:
     """Expected error of a point along the first camera's ray, rms over a box (2, 3), mm, without noise: with what
-    changed since; from the calibration alone; and what the likeliest change makes, 0 where none is likely.
+    changed since; from the calibration alone; and what the likeliest change makes, 0 where none is likely. What the
+    size of the board's squares is unsure by is in none of them: it is no change, and would cover one.
 
     None where the devices share too little of the box.
     """
@@ -137,4 +138,4 @@ def _errors_mm(
     square = sum(each.weight * (rms(each.mean) ** 2 + rms(each.modes) ** 2) for each in likely)
     square /= sum(each.weight for each in likely)
     drift_mm = 0.0 if ranked[0].kind is Change.NONE else rms(ranked[0].change)
-    return float(np.sqrt(square)), rms(modes_of(covariance_of(calibration))), drift_mm
+    return float(np.sqrt(square)), rms(modes_of(covariance_of(calibration, board=False))), drift_mm

@@ -1,18 +1,19 @@
-"""Two calibrations of one rig, compared: what changed of each device, in its σ, and by how much points move for it; and
-whether a new one has the scale of an earlier one, since a wrong square size shows nowhere else.
+"""Two calibrations of one rig, compared: what changed of each device, in its σ, and by how much points move for it.
+
+Points move together, as one rigid body, and each by itself. Only the second changes what is measured of a shape, so
+that both are told apart (`slrig.calibration.displacement.without_rigid_motion`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import cv2
 import numpy as np
 
-from slrig.calibration.board import Board
-from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution, covariance_of, device_title, devices_of
+from slrig.calibration.displacement import RigidMotion, without_rigid_motion
+from slrig.calibration.solution import PROJECTOR, covariance_of, device_title, devices_of
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole
 
@@ -22,11 +23,6 @@ SAME_SIGMA = 3.0
 _GRID = 4
 _TURNS = 10
 _STEP_MM = 1e-3
-_OFF = 0.01
-_ALIKE = 0.005
-_TURNED_DEG = 1.0
-_SURE = 3.0
-_SHIFT = PARAMETERS.index("x_mm")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +60,17 @@ class Comparison:
     """Two calibrations, compared. devices : those that both have. missing : those that only one has.
 
     moved_rms_mm, moved_most_mm : by how much points in the volume move that are measured with the second in place of
-    the first, from the same pixels; NaN where neither names a volume, or they have but one device in common. words :
-    one sentence each, the moves first.
+    the first, from the same pixels, once the rigid motion that they have in common is taken out: turn_deg about the
+    volume's middle, and shift_mm of it. All NaN where neither names a volume, or they have but one device in common.
+    words : one sentence each, the moves first.
     """
 
     devices: Mapping[str, DeviceDifference]
     missing: tuple[str, ...]
     moved_rms_mm: float
     moved_most_mm: float
+    turn_deg: float
+    shift_mm: float
     words: tuple[str, ...]
 
 
@@ -91,64 +90,15 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
         name: _device(name, here[name], there[name], _spread(first, name) + _spread(second, name), name == origin)
         for name in names
     }
-    moved_mm = _moves(here, there, names, _volume(first, second, origin))
+    moved_mm, motion = _moves(here, there, names, _volume(first, second, origin))
     rms, most = (float(np.sqrt((moved_mm**2).mean())), float(moved_mm.max())) if len(moved_mm) else (np.nan, np.nan)
     missing = tuple(sorted(set(devices_of(first)) ^ set(devices_of(second))))
-    words = [_move_words(rms, most, shared=len(names))]
+    words = [_move_words(rms, most, motion, shared=len(names))]
     words += [f"Only one of them has {name}; it is not compared." for name in missing]
     for each in devices.values():
         parts = (each.focal_percent, each.principal_px, each.rotation_deg, each.baseline_mm)
         words += [part.words for part in parts if part is not None]
-    return Comparison(devices, missing, rms, most, tuple(words))
-
-
-def check_scale(solution: Solution, earlier: Calibration, board: Board) -> tuple[str, ...]:
-    """Return in words what is wrong with the scale, nothing where it is that of the earlier calibration.
-
-    The distance of two devices is compared with what it was. All distances off by one ratio, by more than 1 % and more
-    than their own uncertainty, while the devices look in the same directions: the board's squares are not as large as
-    they were said to be. Off otherwise: the rig was rebuilt. Devices that are not in both are left out. Fewer than two
-    in both have no distance, and that is said.
-    """
-    now, before = devices_of(solution.calibration), devices_of(earlier)
-    common = [name for name in now if name in before]
-    if len(common) < 2:
-        shared = ", ".join(device_title(name) for name in common) or "no device"
-        return (
-            f"the scale is not checked: that takes two devices which the earlier calibration has too, found {shared}; "
-            "measure the printed ruler of the board",
-        )
-    order = list(now)
-    ratios: list[float] = []
-    changed: list[str] = []
-    turned = False
-    for first, second in combinations(common, 2):
-        new_mm, old_mm = _distance_mm(now, first, second), _distance_mm(before, first, second)
-        if old_mm <= 0 or new_mm <= 0:
-            continue
-        ratio = new_mm / old_mm
-        sigma = _sigma_mm(solution.covariance, order.index(first), order.index(second)) / old_mm
-        if abs(ratio - 1) > max(_OFF, _SURE * sigma):
-            ratios.append(ratio)
-            changed.append(f"{device_title(first)} to {device_title(second)}: {new_mm:.1f} mm, before {old_mm:.1f} mm")
-        angle = max(_angle_deg(now, before, first, second), _leaning_deg(now, before, first, second))
-        turned = turned or angle > _TURNED_DEG
-    if not ratios:
-        return ()
-    pairs = len(common) * (len(common) - 1) // 2
-    told = "; ".join(changed)
-    if len(ratios) == pairs and max(ratios) - min(ratios) < _ALIKE * min(ratios) and not turned:
-        ratio = float(np.mean(ratios))
-        side_mm = board.square_mm / ratio
-        return (
-            f"everything is {abs(ratio - 1):.1%} {'larger' if ratio > 1 else 'smaller'} than in the earlier "
-            f"calibration ({told}): the board's squares measure {side_mm:.4g} mm instead of {board.square_mm:.4g} mm, "
-            "or the rig was rebuilt; measure the printed ruler, and say the size that it has",
-        )
-    return (
-        f"the devices do not stand as in the earlier calibration ({told}): the rig was rebuilt, or a device was "
-        "bumped. If neither is so, measure the printed ruler of the board, and calibrate again",
-    )
+    return Comparison(devices, missing, rms, most, *motion, tuple(words))
 
 
 def _refuse_other_rigs(first: Calibration, second: Calibration) -> None:
@@ -249,15 +199,19 @@ def _volume(first: Calibration, second: Calibration, origin: str) -> FloatArray:
 
 def _moves(
     here: Mapping[str, Pinhole], there: Mapping[str, Pinhole], names: list[str], points_mm: FloatArray
-) -> FloatArray:
-    """(m,) float64: how far each point moves that is measured with other devices from the same pixels, mm.
+) -> tuple[FloatArray, RigidMotion]:
+    """(m,) float64: how far each point moves that is measured with other devices from the same pixels, mm, beyond the
+    rigid motion of them all; and that motion.
 
     A point is measured as a scan does: by both coordinates of each camera and the column of the projector.
     """
+    nowhere = RigidMotion(np.nan, np.nan)
     if not len(points_mm) or len(names) < 2:
-        return np.zeros(0)
+        return np.zeros(0), nowhere
     measured = _pixels(here, names, points_mm)
     inside = np.isfinite(measured).all(axis=1)
+    if not inside.any():
+        return np.zeros(0), nowhere
     points_mm, measured = points_mm[inside], measured[inside]
     found = points_mm.copy()
     for _ in range(_TURNS):
@@ -266,7 +220,10 @@ def _moves(
         jacobian = np.stack([(step - _pixels(there, names, found)) / _STEP_MM for step in steps], axis=-1)
         normal = jacobian.transpose(0, 2, 1) @ jacobian
         found = found + np.linalg.solve(normal, (jacobian.transpose(0, 2, 1) @ off[..., None]))[..., 0]
-    return np.asarray(np.linalg.norm(found - points_mm, axis=1), dtype=np.float64)
+    if not np.isfinite(found).all():
+        return np.full(len(found), np.nan), nowhere
+    left, motion = without_rigid_motion(points_mm, found)
+    return np.asarray(np.linalg.norm(left, axis=1), dtype=np.float64), motion
 
 
 def _pixels(devices: Mapping[str, Pinhole], names: list[str], points_mm: FloatArray) -> FloatArray:
@@ -281,37 +238,12 @@ def _pixels(devices: Mapping[str, Pinhole], names: list[str], points_mm: FloatAr
     return np.concatenate(found, axis=1)
 
 
-def _move_words(rms_mm: float, most_mm: float, *, shared: int) -> str:
+def _move_words(rms_mm: float, most_mm: float, motion: RigidMotion, *, shared: int) -> str:
     if shared < 2:
         return "By how much points move is not known: they have one device in common, and a point takes two."
     if not np.isfinite(rms_mm):
         return "By how much points move is not known: neither calibration names a working volume."
-    return f"Points in the working volume move by {rms_mm:.3g} mm rms, by {most_mm:.3g} mm at most."
-
-
-def _distance_mm(devices: Mapping[str, Pinhole], first: str, second: str) -> float:
-    return float(np.linalg.norm(devices[second].centre_mm - devices[first].centre_mm))
-
-
-def _angle_deg(now: Mapping[str, Pinhole], before: Mapping[str, Pinhole], first: str, second: str) -> float:
-    """Return by how much one device turned as the other sees it, degrees."""
-    new = now[second].rotation @ now[first].rotation.T
-    old = before[second].rotation @ before[first].rotation.T
-    return float(np.degrees(np.arccos(np.clip((np.trace(new @ old.T) - 1) / 2, -1, 1))))
-
-
-def _leaning_deg(now: Mapping[str, Pinhole], before: Mapping[str, Pinhole], first: str, second: str) -> float:
-    """Return by how much the direction to one device changed as the other sees it, degrees."""
-    ways = []
-    for devices in (now, before):
-        way = devices[first].rotation @ (devices[second].centre_mm - devices[first].centre_mm)
-        ways.append(way / np.linalg.norm(way))
-    return float(np.degrees(np.arccos(np.clip(ways[0] @ ways[1], -1, 1))))
-
-
-def _sigma_mm(covariance: FloatArray, first: int, second: int) -> float:
-    """Return a bound on the deviation of two devices' distance: that of both translations together."""
-    each = len(PARAMETERS)
-    starts = [each * index + _SHIFT for index in (first, second)]
-    blocks = [covariance[start : start + 3, start : start + 3] for start in starts]
-    return float(np.sqrt(sum(np.linalg.eigvalsh(block)[-1] for block in blocks)))
+    return (
+        f"Points in the working volume move by {rms_mm:.3g} mm rms, by {most_mm:.3g} mm at most, besides "
+        f"{motion.words} that all of them share, which change no shape."
+    )

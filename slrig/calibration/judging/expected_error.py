@@ -21,7 +21,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from slrig.calibration.displacement import Moved, cell_centres, modes_of, moved_points, rigid_free, stated_deviation
 from slrig.calibration.observations import COLUMN, ROW, Observations
-from slrig.calibration.solution import ExpectedError, Solution
+from slrig.calibration.solution import ExpectedError, Solution, scale_mode
 from slrig.errors import CalibrationError
 from slrig.model import Axis, Calibration, FloatArray, triangulated_axis
 
@@ -61,6 +61,8 @@ def expected_error(
         noise_px = _light_sigma_px(observations, calibration)
     noise_mm = _rms(noise_px * stated_deviation(moved.stated, moved.by_noise))
     calibration_mm = _rms(point_mm)
+    scale = solution.size.scale_sigma * scale_mode(calibration)
+    board_mm = _rms(stated_deviation(moved.stated, rigid_free(places, moved.by_parameter @ scale[:, None])))
     diagonal_mm = float(np.linalg.norm(volume_mm[1] - volume_mm[0]))
     length_share = _length_share(places, fields, diagonal_mm) if calibration.triangulates else float("nan")
     return ExpectedError(
@@ -72,6 +74,7 @@ def expected_error(
         grid_mm=places,
         grid_point_mm=point_mm,
         across=not calibration.triangulates,
+        board_mm=board_mm,
     )
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.calibration.board import Board
+from slrig.calibration.judging.board_size import ScaleCheck, judged_size, unattended_faults
+from slrig.calibration.judging.grades import Grade, Judgement, Limit
+from slrig.calibration.judging.odd_even import OddEven
 from slrig.calibration.poses.coverage import Coverage, place_words
 from slrig.calibration.solution import (
     CELLS,
@@ -20,39 +23,8 @@ from slrig.calibration.solution import (
     device_title,
     devices_of,
 )
+from slrig.errors import setting
 from slrig.model import FloatArray
-
-
-class Grade(StrEnum):
-    """What to do with a calibration."""
-
-    GOOD = "good"
-    USABLE = "usable"
-    DO_NOT_USE = "do_not_use"
-
-    @property
-    def words(self) -> str:
-        """As a sentence has it."""
-        return "do not use" if self is Grade.DO_NOT_USE else str(self.value)
-
-
-_ORDER = (Grade.GOOD, Grade.USABLE, Grade.DO_NOT_USE)
-
-
-@dataclass(frozen=True, slots=True)
-class Limit:
-    """Up to `good` a figure is good, up to `usable` usable. source : where the numbers come from."""
-
-    good: float
-    usable: float
-    source: str
-
-    def grade(self, value: float) -> Grade:
-        """Return the grade of a figure. One that is NaN, not measured, is usable at best."""
-        if np.isnan(value):
-            return Grade.USABLE
-        return Grade.GOOD if value <= self.good else Grade.USABLE if value <= self.usable else Grade.DO_NOT_USE
-
 
 _RMS = "what careful calibrations reach in practice; the upper bound is ours"
 _OURS = "ours"
@@ -61,24 +33,30 @@ LIMITS: Mapping[str, Limit] = {
     "camera_rms_px": Limit(0.2, 0.6, _RMS),
     "projector_rms_px": Limit(0.3, 0.8, _RMS),
     "held_out": Limit(1.3, 2.0, "practice: held out at most 1.3 × training; the upper bound is ours"),
-    "error_share": Limit(
-        1 / 10_000, 1 / 2_000, "classes of scanners: metrology from 1 : 20 000, robot vision 1 : 3 000 to 1 : 10 000"
-    ),
-    "principal_sigma_px": Limit(3.0, 20.0, _OURS),
-    "focal_sigma_share": Limit(0.001, 0.01, _OURS),
-    "stated_ratio": Limit(2.0, np.inf, _OURS),
     "outlying_share": Limit(0.02, 0.15, _OURS),
     "outlier_poses": Limit(0.0, 0.25, _OURS),
+    "principal_sigma_px": Limit(3.0, np.inf, _OURS),
+    "focal_sigma_share": Limit(0.001, np.inf, _OURS),
+    "stated_ratio": Limit(2.0, np.inf, _OURS),
     "bias_ratio": Limit(1.0, np.inf, _OURS),
-    "bend_mm": Limit(0.2, 2.0, _OURS),
-    "border": Limit(0.5, 0.9, _OURS),
+    "bend_mm": Limit(0.2, np.inf, _OURS),
+    "border": Limit(0.5, np.inf, _OURS),
 }
 """By figure. border : share of the cells along the image's border without any corner. bias_ratio : mean residual of a
 cell over the device's rms. bend_mm : how far the board is out of flat, where that was solved for. outlier_poses : share
 of all poses. stated_ratio : rms over what the observations' own noise predicts."""
 
 POSES = (10, 4)
-"""At least so many poses for a good, for a usable calibration (20 to 30 are usual)."""
+"""From so many poses on none are asked for; fewer leave none to hold out (20 to 30 are usual)."""
+
+USUAL_SHARE = 1 / 2000
+"""What a point may be wrong by over the volume's diagonal, where nobody said what the rig is for. Scanners for robots
+have standard deviations of 1 : 3 000 to 1 : 10 000; this is twice one of 1 : 4 000."""
+
+_SIGMAS = 2.0
+"""A point that is wrong by no more than what is wanted in 95 of 100 places is as wanted (ISO/IEC Guide 98-3, k = 2)."""
+_USABLE = 2.0
+"""Up to so many times what is wanted a calibration is usable; ours."""
 
 _POSE_STANDS_OUT = 1.7
 _LEAST_BIAS_PX = 0.05
@@ -86,60 +64,78 @@ _LEAST_SEEN = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
-    """One thing that was judged. figure : its name in `LIMITS`, or "poses"; device : which one, None for all together.
-
-    words : what was found, what is usual, and what to do.
-    """
-
-    grade: Grade
-    figure: str
-    device: str | None
-    value: float
-    words: str
-
-
-@dataclass(frozen=True, slots=True)
 class Verdict:
     """grade : the worst of all that was judged. summary : one sentence. reasons : the words of whatever keeps it from
-    being good, the worst first; none when it is good. judged : everything, the worst first.
+    being good, the worst first; none when it is good. remarks : what could be better, though its effect is in the
+    stated millimetres already. unattended : why a schedule leaves it to a person to put it in use; none if it does not.
+    judged : everything, the worst first. wanted_mm : what a point may be wrong by in 95 of 100 places.
     """
 
     grade: Grade
     summary: str
     reasons: tuple[str, ...]
     judged: tuple[Judgement, ...]
+    remarks: tuple[str, ...] = ()
+    unattended: tuple[str, ...] = ()
+    wanted_mm: float = float("nan")
 
 
-def verdict(solution: Solution, expected: ExpectedError | None, covered: Coverage | None = None) -> Verdict:
-    """Return what a solved calibration is good for.
+def verdict(
+    solution: Solution,
+    expected: ExpectedError | None,
+    covered: Coverage | None = None,
+    checked: OddEven | None = None,
+    *,
+    board: Board,
+    scale: ScaleCheck | None = None,
+    wanted_mm: float | None = None,
+) -> Verdict:
+    """Return what a solved calibration is good for: by what a point may be wrong by against what is wanted, and by
+    whether that can be believed.
 
-    expected : None where it could not be found; covered : of the poses that it was solved from, None where not known.
+    expected : None where it could not be found; covered : of the poses that it was solved from, checked : by halves of
+    them, both None where not known. scale : against an earlier calibration, None without one. wanted_mm : what a point
+    may be wrong by in 95 of 100 places; None takes 1/2000 of the diagonal of the volume in which the board was held.
     """
-    judged = [*_expected_error(expected), *_poses(solution)]
+    if wanted_mm is None:
+        wanted_mm = USUAL_SHARE * _diagonal_mm(expected) if expected is not None else float("nan")
+    judged = [*_expected_error(expected, wanted_mm), *judged_size(solution, scale), *_poses(solution)]
     for name, residuals in solution.residuals.items():
         judged += [*_rms(name, residuals), *_residual_shape(name, residuals)]
     judged += [*_knowledge(solution), *_bend(solution)]
     if covered is not None:
         judged += _border(covered)
-    judged.sort(key=lambda each: -_ORDER.index(each.grade))
+    if checked is not None:
+        grade = Grade.GOOD if checked.fits else Grade.USABLE
+        judged.append(Judgement(grade, "odd_even", None, checked.ratio, checked.words))
+    judged.sort(key=lambda each: (-each.grade.badness, not each.remarkable))
     grade = judged[0].grade
     reasons = tuple(each.words for each in judged if each.grade is not Grade.GOOD)
-    return Verdict(grade, _summary(grade, expected, len(reasons)), reasons, tuple(judged))
+    unusable = ("its verdict is not to use it",) if grade is Grade.DO_NOT_USE else ()
+    apart = () if checked is None or checked.fits else ("its odd and even poses differ by more than it states",)
+    return Verdict(
+        grade=grade,
+        summary=_summary(grade, expected, wanted_mm, len(reasons)),
+        reasons=reasons,
+        judged=tuple(judged),
+        remarks=tuple(each.words for each in judged if each.grade is Grade.GOOD and each.remarkable),
+        unattended=(*unusable, *apart, *unattended_faults(solution, board, scale)),
+        wanted_mm=wanted_mm,
+    )
 
 
-def _summary(grade: Grade, expected: ExpectedError | None, count: int) -> str:
+def _summary(grade: Grade, expected: ExpectedError | None, wanted_mm: float, count: int) -> str:
     error = ""
     if expected is not None and np.isfinite(expected.point_mm) and expected.point_mm > 0:
         fraction = _diagonal_mm(expected) / expected.point_mm
         error = (
             f": {expected.point_words} is expected within {expected.point_mm:.2g} mm{expected.way_words} "
-            f"(1 in {fraction:,.0f})"
+            f"(1 in {fraction:,.0f}{', by the size of the board most of all' if _by_board(expected) else ''})"
         )
     lone = expected is not None and expected.across
     alone = "; it cannot scan alone: that takes a projector or a second camera, calibrated with it" if lone else ""
     if grade is Grade.GOOD:
-        return f"good{error}; nothing speaks against it{alone}"
+        return f"good{error}; twice that is no more than the {wanted_mm:.2g} mm that are wanted{alone}"
     return f"{grade.words}{error}; {count} thing{'s' if count > 1 else ''} to look at{alone}"
 
 
@@ -147,50 +143,64 @@ def _diagonal_mm(expected: ExpectedError) -> float:
     return float(np.linalg.norm(expected.volume_mm[1] - expected.volume_mm[0]))
 
 
+def _by_board(expected: ExpectedError) -> bool:
+    """Whether more than half of the variance comes from the size of the board."""
+    return bool(expected.board_mm**2 > expected.point_mm**2 / 2)
+
+
 def _judged(
-    figure: str, device: str | None, value: float, what: str, usual: str, cure: str, *, grade: Grade | None = None
+    figure: str, device: str | None, value: float, what: str, usual: str, cure: str, *, fine: bool | None = None
 ) -> Judgement:
-    """By the limit of the figure, unless a grade is given. usual : with {good} where the limit is to stand."""
-    grade = LIMITS[figure].grade(value) if grade is None else grade
-    usual = usual.format(good=LIMITS[figure].good) if figure in LIMITS else usual
-    words = f"{what} ({usual})" if grade is Grade.GOOD else f"{what}, {usual}: {cure}"
-    return Judgement(grade, figure, device, value, words)
+    """By the limit of the figure. fine : whether it is worth no remark; else the limit says. usual : with {good} where
+    the limit is to stand.
+    """
+    limit = LIMITS[figure]
+    grade = limit.grade(value)
+    fine = grade is Grade.GOOD and (value <= limit.good if fine is None else fine)
+    usual = usual.format(good=limit.good)
+    words = f"{what} ({usual})" if fine else f"{what}, {usual}: {cure}"
+    return Judgement(grade, figure, device, value, words, remarkable=not fine)
 
 
-def _expected_error(expected: ExpectedError | None) -> Iterator[Judgement]:
-    figure = "error_share"
+def _expected_error(expected: ExpectedError | None, wanted_mm: float) -> Iterator[Judgement]:
+    figure = "error"
     if expected is None or not np.isfinite(expected.point_mm):
         words = "the error of a scan could not be told: add poses that all devices see, at three distances"
         yield Judgement(Grade.USABLE, figure, None, float("nan"), words)
         return
-    diagonal_mm = _diagonal_mm(expected)
-    usual = f"a good calibration has at most 1 in {1 / LIMITS[figure].good:,.0f}"
-    cure = "add poses where the map of the expected error is worst, tilted and at several distances"
-    length = expected.length_share / 2
+    diagonal_mm, error_mm = _diagonal_mm(expected), _SIGMAS * expected.point_mm
+    good, usable = error_mm <= wanted_mm, error_mm <= _USABLE * wanted_mm
+    grade = Grade.GOOD if good else Grade.USABLE if usable else Grade.DO_NOT_USE
     noisy = f" ({expected.total_mm:.2g} mm with the noise of the light)" if np.isfinite(expected.total_mm) else ""
-    point = f"{expected.point_words} is expected {expected.point_mm:.2g} mm off{expected.way_words} by the calibration"
-    for share, what in (
-        (expected.point_mm / diagonal_mm, f"{point}{noisy}"),
-        (length, f"a length of half the volume's diagonal is expected {length * diagonal_mm:.2g} mm wrong"),
-    ):
-        if np.isfinite(share):
-            fraction = (
-                f"1 in {1 / share:,.0f} of the volume's diagonal of {diagonal_mm:.0f} mm" if share > 0 else "none"
-            )
-            yield _judged(figure, None, share, f"{what}, {fraction}", usual, cure)
+    length_mm = expected.length_share * diagonal_mm / 2
+    lengths = f", and a length of {diagonal_mm / 2:.0f} mm {length_mm:.2g} mm wrong" if np.isfinite(length_mm) else ""
+    what = (
+        f"{expected.point_words} is expected {expected.point_mm:.2g} mm off{expected.way_words} by the calibration"
+        f"{noisy}{lengths}; twice that of a point is {error_mm:.2g} mm, wanted are {wanted_mm:.2g} mm"
+    )
+    cure = "add poses where the map of the expected error is worst, tilted and at several distances"
+    if _by_board(expected):
+        cure = (
+            f"limited by the board, whose size makes {expected.board_mm:.2g} mm of it: measure both rulers of the "
+            f"sheet ({setting('measured_mm')}), or use a board with a certificate ({setting('square_sigma')})"
+        )
+    words = what if good and not _by_board(expected) else f"{what}: {cure}"
+    yield Judgement(grade, figure, None, error_mm, words, remarkable=_by_board(expected))
 
 
 def _poses(solution: Solution) -> Iterator[Judgement]:
     used, left_out = len(solution.poses), len(solution.outliers)
-    good, usable = POSES
-    grade = Grade.GOOD if used >= good else Grade.USABLE if used >= usable else Grade.DO_NOT_USE
-    what, usual = f"{used} pose{'s' if used != 1 else ''} used", f"20 to 30 are usual, {good} the least"
-    yield _judged("poses", None, used, what, usual, "add poses", grade=grade)
+    good, least = POSES
+    grade = Grade.GOOD if used >= least else Grade.DO_NOT_USE
+    words = f"{used} pose{'s' if used != 1 else ''} used, 20 to 30 are usual"
+    if used < good:
+        words += ": add poses"
+    yield Judgement(grade, "poses", None, used, words, remarkable=used < good)
     if left_out:
         share = left_out / (used + left_out)
         named = "; ".join(f"{name}: {why}" for name, why in solution.outliers.items())
         words = f"{left_out} of {used + left_out} poses left out ({named}): shoot them again, and let nothing move"
-        yield Judgement(LIMITS["outlier_poses"].grade(share), "outlier_poses", None, share, words)
+        yield Judgement(LIMITS["outlier_poses"].grade(share), "outlier_poses", None, share, words, remarkable=True)
 
 
 def _rms(name: str, residuals: DeviceResiduals) -> Iterator[Judgement]:
@@ -205,33 +215,33 @@ def _rms(name: str, residuals: DeviceResiduals) -> Iterator[Judgement]:
         cure = "all poses are alike: look at the focus"
     what, usual = f"{title} has {residuals.rms_px:.2g} px rms", f"usual is {'0.1–0.3' if projector else '0.05–0.2'}"
     yield (whole := _judged(figure, name, residuals.rms_px, what, usual, cure))
-    if worst and whole.grade is Grade.GOOD:
+    if worst and not whole.remarkable:
         words = (
             f"{title}: {worst[0]} stands out, {worst[1]:.2g} px rms, {residuals.rms_px:.2g} px in all: shoot it again"
         )
-        yield Judgement(Grade.GOOD, figure, name, worst[1], words)
+        yield Judgement(Grade.GOOD, figure, name, worst[1], words, remarkable=True)
     ratio = residuals.held_out_rms_px / residuals.rms_px if residuals.rms_px > 0 else float("nan")
     if np.isnan(ratio):
         words = f"{title}: too few poses to keep some from the solve and test it with them: add poses"
         yield Judgement(Grade.USABLE, "held_out", name, ratio, words)
     else:
-        grade = LIMITS["held_out"].grade(ratio)
-        if residuals.held_out_rms_px <= usual_px:
-            grade = min(grade, Grade.USABLE, key=_ORDER.index)  # poor beside the rest, and still no more than is usual
         what = f"{title} has {residuals.held_out_rms_px:.2g} px rms at poses kept from the solve, {ratio:.2f} × its own"
         cure = "the lens is fitted to too few poses: add poses"
-        yield _judged("held_out", name, ratio, what, "at most {good:g} × is well", cure, grade=grade)
+        found = _judged("held_out", name, ratio, what, "at most {good:g} × is well", cure)
+        if residuals.held_out_rms_px <= usual_px:
+            found = replace(found, grade=Grade.GOOD)  # poor beside the rest, and still no more than is usual
+        yield found
     ratio = residuals.rms_px / residuals.stated_rms_px if residuals.stated_rms_px > 0 else float("nan")
     if not np.isnan(ratio):
         # Corners are found to a few thousandths of a pixel; a board printed on paper is not as good as that.
-        grade = LIMITS["stated_ratio"].grade(ratio) if residuals.rms_px > usual_px / 2 else Grade.GOOD
+        fine = ratio <= LIMITS["stated_ratio"].good or residuals.rms_px <= usual_px / 2
         what = f"{title} is {ratio:.1f} × as far off as the noise of its observations says"
         cure = (
             "look for light that the wall or the board's gloss throws back, a late frame, or a gamma that is not flat"
             if projector
             else "look for a bent board, a board or camera that moved, or a lens that the model does not fit"
         )
-        yield _judged("stated_ratio", name, ratio, what, "up to {good:g} × is usual", cure, grade=grade)
+        yield _judged("stated_ratio", name, ratio, what, "up to {good:g} × is usual", cure, fine=fine)
 
 
 def _residual_shape(name: str, residuals: DeviceResiduals) -> Iterator[Judgement]:
@@ -247,14 +257,13 @@ def _residual_shape(name: str, residuals: DeviceResiduals) -> Iterator[Judgement
         row, column = np.unravel_index(int(np.nanargmax(length)), length.shape)
         worst = float(length[row, column])
         ratio = worst / residuals.rms_px
-        grade = LIMITS["bias_ratio"].grade(ratio) if worst > _LEAST_BIAS_PX else Grade.GOOD
-        if grade is not Grade.GOOD:
+        if ratio > LIMITS["bias_ratio"].good and worst > _LEAST_BIAS_PX:
             where = place_words((int(column) * 3 // CELLS - 1, int(row) * 3 // CELLS - 1))
             words = (
                 f"{title}: in the {where} the residuals lean by {worst:.2g} px to one side, as much as their rms of "
                 f"{residuals.rms_px:.2g} px: the lens model does not fit there, or the board is bent; add poses there"
             )
-            yield Judgement(grade, "bias_ratio", name, ratio, words)
+            yield Judgement(Grade.GOOD, "bias_ratio", name, ratio, words, remarkable=True)
 
 
 def _knowledge(solution: Solution) -> Iterator[Judgement]:
@@ -279,10 +288,10 @@ def _bend(solution: Solution) -> Iterator[Judgement]:
     bow = solution.bow
     if bow is not None:
         # Where it was not solved for, the poses tell of no bow: what they leave open of it is in the covariance.
-        grade = None if bow.solved else Grade.GOOD
+        fine = None if bow.solved else True
         cure = "that is taken into account, but glue the print to glass or aluminium"
         what, usual = board_words(solution), "up to {good:g} mm is well"
-        yield _judged("bend_mm", None, bow.height_mm, what, usual, cure, grade=grade)
+        yield _judged("bend_mm", None, bow.height_mm, what, usual, cure, fine=fine)
 
 
 def board_words(solution: Solution) -> str:

@@ -29,6 +29,9 @@ from slrig.calibration.solving.projection import (
 from slrig.kernels import kernel
 from slrig.model import FloatArray, IntArray
 
+LENS_SIGMA = np.array([0.5, 0.5, 0.01, 0.01, 0.5])
+"""What is known beforehand of k1, k2, p1, p2 and k3 of any lens: standard deviations about 0. Lenses of rigs have k1 of
+some -0.4 to 0.1 and p1, p2 of a thousandth; where the poses tell of a term at all, they tell far more than this."""
 CAUCHY = 2.385
 OUTLYING = 6.0
 _MOST_STEPS = 60
@@ -211,6 +214,7 @@ def normal_equations(
         prior is not None and prior.offsets, matrix, gradient,
     )  # fmt: skip
     _add_matches(layout, measurements.match_where, matches, match_jacobian, weights[1], matrix, gradient)
+    _add_lens_prior(geometry, matrix, gradient)
     if prior is not None:
         _add_prior(geometry, prior, matrix, gradient)
     return matrix, gradient
@@ -260,8 +264,20 @@ def _add_matches(
         gradient[place] += pull
 
 
+def _add_lens_prior(geometry: Geometry, matrix: FloatArray, gradient: FloatArray) -> None:
+    """Lens terms are about as small as those of lenses are."""
+    for device, row in enumerate(geometry.devices):
+        own = DEVICE * device + 4 + np.arange(len(LENS_SIGMA))
+        matrix[own, own] += 1 / LENS_SIGMA**2
+        gradient[own] += row[4:9] / LENS_SIGMA**2
+
+
+def _lens_cost(geometry: Geometry) -> float:
+    return float(np.sum((geometry.devices[:, 4:9] / LENS_SIGMA) ** 2)) / 2
+
+
 def _add_prior(geometry: Geometry, prior: Prior, matrix: FloatArray, gradient: FloatArray) -> None:
-    """Offsets and bend are about as small as stated, and offsets move, turn and scale the board by nothing."""
+    """Offsets and bend are about as small as stated; offsets move, turn, scale and stretch the board by nothing."""
     layout, bend = geometry.layout, _bend(geometry.layout)
     matrix[bend, bend] += 1 / prior.bend_sigma_mm**2
     gradient[bend] += geometry.bend / prior.bend_sigma_mm**2
@@ -271,18 +287,29 @@ def _add_prior(geometry: Geometry, prior: Prior, matrix: FloatArray, gradient: F
     offsets = np.arange(layout.first_offset, layout.first_bend)
     matrix[offsets, offsets] += weight
     gradient[offsets] += weight * geometry.offsets.ravel()
-    x, y = ((geometry.points - geometry.frame[:2]) / geometry.frame[2]).T
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    for pair in ((one, zero), (zero, one), (-y, x), (x, y)):
-        row = np.stack(pair, axis=1).ravel() * np.sqrt(weight) * 1e3 / np.sqrt(len(x))
+    for row in _gauge_rows(geometry, prior.offset_sigma_mm):
         matrix[np.ix_(offsets, offsets)] += np.outer(row, row)
         gradient[offsets] += row * (row @ geometry.offsets.ravel())
 
 
+def _gauge_rows(geometry: Geometry, sigma_mm: float) -> FloatArray:
+    """(5, 2 corners) float64: what offsets move, turn, scale and stretch the board by, over a thousandth of their
+    deviation.
+    """
+    x, y = ((geometry.points - geometry.frame[:2]) / geometry.frame[2]).T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    pairs = ((one, zero), (zero, one), (-y, x), (x, y), (x, -y))
+    rows = np.array([np.stack(pair, axis=1).ravel() for pair in pairs])
+    return np.asarray(rows * 1e3 / sigma_mm / np.sqrt(len(x)))
+
+
 def _prior_cost(geometry: Geometry, prior: Prior) -> float:
-    bend = float(np.sum(geometry.bend**2)) / prior.bend_sigma_mm**2
-    offsets = float(np.sum(geometry.offsets**2)) / prior.offset_sigma_mm**2 if prior.offset_sigma_mm else 0.0
-    return (bend + offsets) / 2
+    cost = float(np.sum(geometry.bend**2)) / prior.bend_sigma_mm**2
+    if prior.offset_sigma_mm is not None:
+        offsets = geometry.offsets.ravel()
+        held = _gauge_rows(geometry, prior.offset_sigma_mm) @ offsets
+        cost += float(offsets @ offsets) / prior.offset_sigma_mm**2 + float(held @ held)
+    return cost / 2
 
 
 def _cost(geometry: Geometry, left: Residuals, deviations: Deviations, kept: Weights, prior: Prior | None) -> float:
@@ -291,7 +318,7 @@ def _cost(geometry: Geometry, left: Residuals, deviations: Deviations, kept: Wei
     total = float(np.sum(corner[kept[0] > 0]) + np.sum(matches[kept[1] > 0]))
     if not np.isfinite(total):
         return np.inf
-    return total / 2 + (0.0 if prior is None else _prior_cost(geometry, prior))
+    return total / 2 + _lens_cost(geometry) + (0.0 if prior is None else _prior_cost(geometry, prior))
 
 
 def losses_of(left: Residuals, deviations: Deviations) -> tuple[FloatArray, FloatArray]:

@@ -6,10 +6,14 @@ of squared residuals:
 
     gain = bᵀ S⁻¹ b,   S = D - Cᵀ H⁻¹ C,   b = g - Cᵀ H⁻¹ G,
 
-with H and G of all poses, and D, C and g of the later poses by the moved device's pose (a score test, Rao 1948).
+with H and G of all poses, and D, C and g of the later poses by the moved device's pose (a score test, Rao 1948). It is
+held against what the same step takes off without them, Gᵀ H⁻¹ G: a robust fit that gives the later poses up stands far
+from the least squares of all.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,41 +75,72 @@ def _bump(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[list[str
     kept = _within_groups(problem, fit)
     size = sizes_of(fit.residuals, sigma)
     weight = (kept[0] * sigma.corner_weight, kept[1] * sigma.match_weight)
-    total = sum(float(np.sum(k * one[w > 0] ** 2 * w[w > 0])) for k, one, w in zip((2, 1), size, weight, strict=True))
-    matrices, gradients = [], []
+    matrices, gradients, squares = [], [], []
     m = problem.measurements
     for pose in used:
         mask = np.zeros(len(problem.pose_names), dtype=np.bool_)
         mask[pose] = True
-        corners, matches = m.corner_where[:, 1] == pose, m.match_where[:, 1] == pose
-        weights = ((weight[0] / sigma.corners**2)[corners], (weight[1] / sigma.matches**2)[matches])
+        mine = (m.corner_where[:, 1] == pose, m.match_where[:, 1] == pose)
+        weights = ((weight[0] / sigma.corners**2)[mine[0]], (weight[1] / sigma.matches**2)[mine[1]])
         matrix, gradient = normal_equations(fit.geometry, m.of_poses(mask), weights)
         matrices.append(matrix)
         gradients.append(gradient)
-    gains = _gains(np.array(matrices), np.array(gradients), free, devices)
+        told = [own & (w > 0) for own, w in zip(mine, weight, strict=True)]
+        squares.append(
+            2 * float(np.sum(size[0][told[0]] ** 2 * weight[0][told[0]]))
+            + float(np.sum(size[1][told[1]] ** 2 * weight[1][told[1]]))
+        )
+    every, pulls, square = np.array(matrices), np.array(gradients), np.array(squares)
+    total = square.sum() - _taken(every.sum(axis=0), pulls.sum(axis=0), free)
+    gains = _gains(every, pulls, free, devices)
     device, after = np.unravel_index(int(np.argmax(gains)), gains.shape)
     best = float(gains[device, after])
     share = float(np.sqrt(max(total - best, 0.0) / total)) if total > 0 else 1.0
     if share > _BUMP_SHARE:
         return None
+    # A pose that is off by itself, among the last ones, looks like half a move; without it nothing is left to explain.
+    for alone in range(len(used)):
+        rest = np.arange(len(used)) != alone
+        left = square[rest].sum() - _taken(every[rest].sum(axis=0), pulls[rest].sum(axis=0), free)
+        if total - left > best:
+            return None
     # Which of several devices explains it as well: of two, either.
     correlated = [name for k, name in enumerate(problem.devices) if gains[k, after] >= _ALIKE_GAIN * best]
     return correlated, int(used[after]), share
 
 
-def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_], devices: int) -> FloatArray:
-    """(devices, poses): what a move of a device before a pose takes off the sum of squares; 0 where not told."""
-    gains = np.zeros((devices, len(matrices)))
-    whole, pull = matrices.sum(axis=0), gradients.sum(axis=0)
-    free = free & (np.diagonal(whole) > 0)
-    inner = whole[np.ix_(free, free)]
+def _factored(matrix: FloatArray, free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], FloatArray, Any] | None:
+    """Cholesky's factor of what is free of a matrix, scaled to a unit diagonal; which numbers these are, and the scale.
+    None where it is singular.
+    """
+    free = free & (np.diagonal(matrix) > 0)
+    inner = matrix[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.diagonal(inner))
     inner = inner * np.outer(scale, scale)
     inner[np.diag_indices_from(inner)] += 1e-12
     try:
-        factor = cho_factor(inner)
+        return free, scale, cho_factor(inner)
     except LinAlgError:
+        return None
+
+
+def _taken(matrix: FloatArray, pull: FloatArray, free: NDArray[np.bool_]) -> float:
+    """Gᵀ H⁻¹ G: what a step of Newton's method takes off a sum of squares; 0 where that is not told."""
+    made = _factored(matrix, free)
+    if made is None:
+        return 0.0
+    free, scale, factor = made
+    return float(pull[free] * scale @ cho_solve(factor, pull[free] * scale))
+
+
+def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_], devices: int) -> FloatArray:
+    """(devices, poses): what a move of a device before a pose takes off the sum of squares; 0 where not told."""
+    gains = np.zeros((devices, len(matrices)))
+    made = _factored(matrices.sum(axis=0), free)
+    if made is None:
         return gains
+    free, scale, factor = made
+    pull = gradients.sum(axis=0)[free] * scale
     for after in range(_LEAST_AFTER, len(matrices) - _LEAST_AFTER + 1):
         later, pulled = matrices[after:].sum(axis=0), gradients[after:].sum(axis=0)
         for device in range(devices):
@@ -114,7 +149,7 @@ def _gains(matrices: FloatArray, gradients: FloatArray, free: NDArray[np.bool_],
             solved = cho_solve(factor, crossed)
             square = later[np.ix_(own, own)]
             left = square - crossed.T @ solved
-            pull_left = pulled[own] - solved.T @ (pull[free] * scale)
+            pull_left = pulled[own] - solved.T @ pull
             unit = 1 / np.sqrt(np.maximum(np.diagonal(square), 1e-300))
             values, vectors = np.linalg.eigh(left * np.outer(unit, unit))
             # A move that the poses of the board can follow is none that can be told.

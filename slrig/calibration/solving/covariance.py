@@ -5,9 +5,9 @@ err alike (`slrig.calibration.solving.problem`). The robust weights lose about a
 errors where the estimate itself loses a twentieth, so that deviations are rather a few per cent too large than too
 small.
 
-A lens term that was left out was set to 0, not known to be 0, and so was the bend of a board that nobody said is flat.
-So the covariance is that of the solve with all of them, plus the square of the shift by which leaving some out moved
-the rest: what an estimate is wrong by is its distance from that solve, and what that solve is wrong by.
+The bend of a board that nobody said is flat, and that was left out, was set to 0, not known to be 0. So the covariance
+is that of the solve with it, plus the square of the shift by which leaving it out moved the rest: what an estimate is
+wrong by is its distance from that solve, and what that solve is wrong by.
 
 Where few poses leave a lens to bend between them, residuals are small at the poses that were seen and large at others,
 and a covariance that comes from the former is too small. Poses that were held out tell by how much: `allowing_for`.
@@ -19,43 +19,39 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from slrig.calibration.solution import Bow, DeviceResiduals
 from slrig.calibration.solving.adjustment import Prior, adjusted, kept_of, normal_equations, weights_of
 from slrig.calibration.solving.parameters import Geometry, difference
-from slrig.calibration.solving.problem import Fit, Problem, Terms, free_of
+from slrig.calibration.solving.problem import Fit, Problem, free_of
 from slrig.calibration.solving.projection import BEND, DEVICE
 from slrig.errors import SolveRefusedError
 from slrig.model import FloatArray
-from slrig.model.lens import LENS_TERMS
 
 LEAST_KNOWN = 0.05
 """The greatest deviation of a focal length, over it, with which a calibration still is one."""
 
 
-def covariance_of(problem: Problem, fit: Fit, terms: Terms, bend: Prior | None, /) -> tuple[FloatArray, Bow | None]:
+def covariance_of(problem: Problem, fit: Fit, bend: Prior | None, /) -> tuple[FloatArray, Bow | None]:
     """Covariance of all devices' parameters, (15 d, 15 d), 0 for the world's pose; and the bow of the board.
 
     bend : what is known beforehand of the board's bend; None if it is known to be flat, and the bow is None too.
 
     Raises SolveRefusedError where the poses leave a number open, or a focal length all but open.
     """
-    narrow, _ = _inverse(problem, fit, free_of(problem, fit.geometry, terms))
-    _refuse_open(problem, fit, narrow)
-    all_terms = dict.fromkeys(problem.devices, LENS_TERMS)
-    sigma = problem.deviations(fit.noise)
-    open_problem = problem if problem.prior is not None else replace(problem, prior=bend)
-    free = free_of(open_problem, fit.geometry, all_terms)
+    devices, bent = _inverse(problem, fit)
+    _refuse_open(problem, fit, devices)
+    if problem.prior is not None or bend is None:
+        return devices, None if bend is None else _bow_of(fit.geometry, bent, solved=True)
+    open_problem, sigma = replace(problem, prior=bend), problem.deviations(fit.noise)
     wide = adjusted(
-        fit.geometry, problem.measurements, free, sigma, prior=open_problem.prior, kept=kept_of(fit.residuals, sigma)
+        fit.geometry, problem.measurements, free_of(open_problem, fit.geometry), sigma, prior=bend,
+        kept=kept_of(fit.residuals, sigma),
     )  # fmt: skip
     shift = difference(wide.geometry.devices, fit.geometry.devices).ravel()
-    devices, bent = _inverse(open_problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals), free)
-    solved = problem.prior is not None
-    bow = None if bend is None else _bow_of(fit.geometry if solved else wide.geometry, bent, solved=solved)
-    return devices + np.outer(shift, shift), bow
+    devices, bent = _inverse(open_problem, replace(fit, geometry=wide.geometry, residuals=wide.residuals))
+    return devices + np.outer(shift, shift), _bow_of(wide.geometry, bent, solved=False)
 
 
 def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /) -> FloatArray:
@@ -69,14 +65,14 @@ def allowing_for(covariance: FloatArray, residuals: Sequence[DeviceResiduals], /
     return covariance * max([1.0, *(ratio for ratio in ratios if np.isfinite(ratio))]) ** 2
 
 
-def _inverse(problem: Problem, fit: Fit, free: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _inverse(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Covariance of the devices, (15 d, 15 d), and of the bend, (7, 7), which is 0 where it is held."""
     sigma = problem.deviations(fit.noise)
     kept = kept_of(fit.residuals, sigma)
     weights = weights_of(fit.residuals, sigma, kept)
     matrix = normal_equations(fit.geometry, problem.measurements, weights, prior=problem.prior)[0]
     # A pose of which everything is outlying has no say, and nothing to say.
-    free = free & (np.diagonal(matrix) > 0)
+    free = free_of(problem, fit.geometry) & (np.diagonal(matrix) > 0)
     matrix = matrix[np.ix_(free, free)]
     scale = 1 / np.sqrt(np.diagonal(matrix))
     try:

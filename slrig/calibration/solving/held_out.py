@@ -1,19 +1,19 @@
-"""Poses that a solve has not seen: what is left there, and which terms of a lens they are better with.
+"""Poses that a solve has not seen: what is left there, and which shape of the board they are better with.
 
 The poses are dealt into folds. For each fold all others are adjusted; then the devices are held, the fold's board poses
-are fitted to the cameras' corners alone, and all residuals of the fold are taken. A term of a lens is kept when the
-loss over all folds falls by more than MARGIN per term, in units of a squared deviation: a useless term lowers it by
-nothing, and one that is known to n of its own deviations by about n².
+are fitted to the cameras' corners alone, and all residuals of the fold are taken. All poses are of one board, so that
+what its shape takes off the residuals of some poses it takes off those of others, too. A shape is kept when the loss
+over all folds falls by more than MARGIN per term, in units of a squared deviation: a useless term lowers it by nothing,
+and one that is known to n of its own deviations by about n².
 
-A shape of the board is kept as a lens term is: all poses are of one board, so that what its shape takes off the
-residuals of some poses it takes off those of others, too. There are three, each a special case of the next: flat and as
-printed; bent; bent with every corner off its printed place. Lens and shape can be confused where the board always
-stands at one place of the image; how far is in the covariance.
+There are three shapes, each a special case of the next: flat and as printed; bent; bent with every corner off its
+printed place. Lens and shape can be confused where the board always stands at one place of the image; how far is in the
+covariance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,24 +36,19 @@ from slrig.calibration.solving.problem import (
     DeviceNoise,
     Fit,
     Problem,
-    Terms,
     deviations_of,
     fitted,
     free_of,
-    with_terms,
+    in_shape,
 )
 from slrig.calibration.solving.projection import BEND
 from slrig.model import FloatArray, IntArray
-from slrig.model.lens import LENS_TERMS
 
-LADDER: tuple[tuple[str, ...], ...] = tuple(LENS_TERMS[:count] for count in (0, 1, 2, 4, 5))
 FOLDS = 5
 MARGIN = 4.0
-"""What a lens term must take off the loss at held-out poses, in squared deviations."""
+"""What a term of a shape must take off the loss at held-out poses, in squared deviations."""
 _TRIAL_STEPS = 15
 """Of Levenberg-Marquardt, where a model is only tried."""
-_HOPELESS = 2.0
-"""Where a lens leaves so many times the loss of the richest on the poses that it has seen, no others are tried."""
 
 LEAST_POSES = 4
 """With fewer poses none can be held out."""
@@ -92,7 +87,7 @@ def folds_of(problem: Problem) -> list[NDArray[np.bool_]]:
 
 
 def held_out(
-    problem: Problem, geometry: Geometry, terms: Terms, noise: Sequence[DeviceNoise],
+    problem: Problem, geometry: Geometry, noise: Sequence[DeviceNoise],
     folds: Sequence[NDArray[np.bool_]], kept: Weights, /, *, judged: tuple[Measurements, Weights] | None = None,
 ) -> HeldOut:  # fmt: skip
     """What is left at held-out poses, over all folds. geometry : the start, for all poses.
@@ -108,7 +103,7 @@ def held_out(
         sigma = rest.deviations(noise)
         corners, matches = fold[trained_on.corner_where[:, 1]], fold[trained_on.match_where[:, 1]]
         trained = adjusted(
-            geometry, rest.measurements, free_of(rest, geometry, terms), sigma, prior=problem.prior,
+            geometry, rest.measurements, free_of(rest, geometry), sigma, prior=problem.prior,
             kept=(kept[0][~corners], kept[1][~matches]),
         )  # fmt: skip
         corners, matches = fold[m.corner_where[:, 1]], fold[m.match_where[:, 1]]
@@ -150,54 +145,9 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan
 
 
-def chosen_terms(
-    problem: Problem, fit: Fit, /, *, tell: Callable[[str, int], None] = lambda _device, _rung: None
-) -> dict[str, tuple[str, ...]]:
-    """The lens terms of each device that held-out poses are better with: cameras first, then the projector.
-
-    The loss is that of all devices: light ties them, and a lens that is wrong in one shows in the others. While one
-    device climbs the ladder, those that have not had their turn have four terms. With too few poses to hold any out: k1
-    for all.
-    """
-    dealt = folds_of(problem)
-    if not dealt:
-        return dict.fromkeys(problem.devices, LADDER[1])
-    terms = dict.fromkeys(problem.devices, LADDER[-2])
-    for device in problem.devices:
-        richest = fitted(
-            problem, fit.geometry, {**terms, device: LADDER[-1]}, rounds=2, correlated=True, noise=fit.noise
-        )
-        sigma = problem.deviations(richest.noise)
-        kept = kept_of(richest.residuals, sigma)
-        least = loss_of(richest.residuals, sigma, kept)
-        losses: list[float] = []
-        for rung, trial in enumerate(LADDER):
-            tell(device, rung)
-            chosen = {**terms, device: trial}
-            start = with_terms(richest.geometry, problem, chosen)
-            free = free_of(problem, start, chosen)
-            tried = adjusted(start, problem.measurements, free, sigma, kept=kept, most_steps=_TRIAL_STEPS)
-            if loss_of(tried.residuals, sigma, kept) > _HOPELESS * least:
-                losses.append(np.inf)
-                continue
-            losses.append(sum(held_out(problem, tried.geometry, chosen, richest.noise, dealt, kept).loss.values()))
-        terms[device] = LADDER[climbed(losses, MARGIN)]
-        fit = replace(richest, geometry=with_terms(richest.geometry, problem, terms))
-    return terms
-
-
 def loss_of(left: Residuals, sigma: Deviations, kept: Weights) -> float:
     """The loss of all that counts, in squared deviations."""
     return sum(float(np.nansum(loss[k > 0])) for loss, k in zip(losses_of(left, sigma), kept, strict=True))
-
-
-def climbed(losses: Sequence[float], margin: float) -> int:
-    """The highest rung that is better, by `margin` per term, than the best one below it."""
-    best = 0
-    for rung in range(1, len(LADDER)):
-        if losses[best] - losses[rung] > margin * (len(LADDER[rung]) - len(LADDER[best])):
-            best = rung
-    return best
 
 
 def shapes_of(board: Board, asked: BoardShape) -> tuple[Prior | None, ...]:
@@ -216,18 +166,16 @@ def bend_of(board: Board, asked: BoardShape) -> Prior | None:
     return Prior(_BEND_SIGMA * float(np.ptp(board.points_mm[:, :2], axis=0).max()) / 2)
 
 
-def chosen_shape(problem: Problem, fit: Fit, terms: Terms, shapes: Sequence[Prior | None], /) -> Prior | None:
+def chosen_shape(problem: Problem, fit: Fit, shapes: Sequence[Prior | None], /) -> Prior | None:
     """The shape that poses are better with by more than MARGIN per term, in squared deviations: both those that it is
     fitted to and those held out. The simplest where none can be held out.
 
-    shapes : the simplest first. terms : lens terms of each device, the same for every shape.
+    shapes : the simplest first.
     """
     dealt = folds_of(problem)
     if len(shapes) == 1 or not dealt:
         return shapes[0]
-    richest = fitted(
-        replace(problem, prior=shapes[-1]), fit.geometry, terms, rounds=2, correlated=True, noise=fit.noise
-    )
+    richest = fitted(replace(problem, prior=shapes[-1]), fit.geometry, rounds=2, correlated=True, noise=fit.noise)
     sigma = problem.deviations(richest.noise)
     kept = kept_of(richest.residuals, sigma)
     losses: list[float] = []
@@ -235,11 +183,11 @@ def chosen_shape(problem: Problem, fit: Fit, terms: Terms, shapes: Sequence[Prio
     best = 0
     for rung, shape in enumerate(shapes):
         trial = replace(problem, prior=shape)
-        start = with_terms(richest.geometry, trial, terms)
-        free = free_of(trial, start, terms)
+        start = in_shape(richest.geometry, trial)
+        free = free_of(trial, start)
         tried = adjusted(start, problem.measurements, free, sigma, prior=shape, kept=kept, most_steps=_TRIAL_STEPS)
         seen.append(loss_of(tried.residuals, sigma, kept))
-        losses.append(sum(held_out(trial, tried.geometry, terms, richest.noise, dealt, kept).loss.values()))
+        losses.append(sum(held_out(trial, tried.geometry, richest.noise, dealt, kept).loss.values()))
         # Of few poses, those held out lie far from what the others determine, and their loss is a matter of luck: a
         # shape that is there is seen by the poses that it is fitted to as well.
         enough = MARGIN * (_WORTH[rung] - _WORTH[best])

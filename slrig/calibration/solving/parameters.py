@@ -6,7 +6,6 @@ then 7 of the board's bend. Turns are small and act from the left: R' = exp([tur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from slrig.calibration.solution import PARAMETERS, BoardPose
 from slrig.calibration.solving.projection import BEND, DEVICE, POSE
 from slrig.model import FloatArray, Pinhole, Size
 
-_FIRST_LENS = PARAMETERS.index("k1")
 _FIRST_TURN = PARAMETERS.index("turn_x")
 
 
@@ -93,20 +91,15 @@ class Layout:
         """Length of the vector."""
         return self.first_bend + BEND
 
-    def free(
-        self, terms: Sequence[tuple[str, ...]], poses: NDArray[np.bool_], /, *, bend: bool = False,
-        offsets: bool = False,
-    ) -> NDArray[np.bool_]:  # fmt: skip
-        """(count,) bool: what may move. terms : lens terms of each device; poses : (m,) bool.
+    def free(self, poses: NDArray[np.bool_], /, *, bend: bool = False, offsets: bool = False) -> NDArray[np.bool_]:
+        """(count,) bool: what may move. poses : (m,) bool.
 
         The first device's pose is the world's and stays. Without `bend` the board is flat, without `offsets` its
         corners lie as printed.
         """
         free = np.zeros(self.count, dtype=np.bool_)
         devices = free[: self.first_pose].reshape(-1, DEVICE)
-        devices[:, :_FIRST_LENS] = True
-        for device, chosen in enumerate(terms):
-            devices[device, [PARAMETERS.index(term) for term in chosen]] = True
+        devices[:, :_FIRST_TURN] = True
         devices[1:, _FIRST_TURN:] = True
         free[self.first_pose : self.first_offset] = np.repeat(poses, POSE)
         free[self.first_offset : self.first_bend] = offsets

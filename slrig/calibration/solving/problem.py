@@ -10,7 +10,7 @@ seems to. It is taken over cells of several sizes, and the worst counts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,9 +28,7 @@ from slrig.calibration.solving.adjustment import (
 from slrig.calibration.solving.measurements import Measurements, groups
 from slrig.calibration.solving.parameters import Geometry
 from slrig.model import FloatArray, IntArray
-from slrig.model.lens import LENS_TERMS
 
-Terms = Mapping[str, tuple[str, ...]]
 _MEDIAN = 0.6745  # of the absolute value of a standard normal
 _MEDIAN_2 = 0.8326  # of the distance of two standard normals, over √2
 _LEAST_SCALE = 0.05
@@ -107,28 +105,22 @@ def flat_geometry(board: Board, devices: FloatArray, poses: FloatArray) -> Geome
     )
 
 
-def free_of(problem: Problem, geometry: Geometry, terms: Terms, /) -> NDArray[np.bool_]:
+def free_of(problem: Problem, geometry: Geometry, /) -> NDArray[np.bool_]:
     """(N,) bool over the whole vector: what may move."""
-    chosen = [terms[name] for name in problem.devices]
     prior = problem.prior
-    return geometry.layout.free(
-        chosen, problem.used, bend=prior is not None, offsets=prior is not None and prior.offsets
-    )
+    return geometry.layout.free(problem.used, bend=prior is not None, offsets=prior is not None and prior.offsets)
 
 
-def with_terms(geometry: Geometry, problem: Problem, terms: Terms, /) -> Geometry:
-    """The same geometry, those lens terms set to 0 that are not in `terms`, and of the shape what is not solved for."""
-    devices = geometry.devices.copy()
-    for device, name in enumerate(problem.devices):
-        devices[device, [4 + k for k, term in enumerate(LENS_TERMS) if term not in terms[name]]] = 0.0
+def in_shape(geometry: Geometry, problem: Problem, /) -> Geometry:
+    """The same geometry, of the board's shape that set to 0 which is not solved for."""
     bend = geometry.bend if problem.prior is not None else np.zeros_like(geometry.bend)
     keeps = problem.prior is not None and problem.prior.offsets
     offsets = geometry.offsets if keeps else np.zeros_like(geometry.offsets)
-    return replace(geometry, devices=devices, offsets=offsets, bend=bend)
+    return replace(geometry, offsets=offsets, bend=bend)
 
 
 def fitted(
-    problem: Problem, geometry: Geometry, terms: Terms, /, *, rounds: int = 4, correlated: bool = False,
+    problem: Problem, geometry: Geometry, /, *, rounds: int = 4, correlated: bool = False,
     noise: Sequence[DeviceNoise] | None = None,
 ) -> Fit:  # fmt: skip
     """The geometry that fits, and deviations that fit it: in turns, since the weights need both.
@@ -136,8 +128,8 @@ def fitted(
     correlated : take into account that neighbours err alike. noise : what to start from; without it, the residuals
     tell.
     """
-    geometry = with_terms(geometry, problem, terms)
-    free = free_of(problem, geometry, terms)
+    geometry = in_shape(geometry, problem)
+    free = free_of(problem, geometry)
     measurements, count = problem.measurements, len(problem.devices)
     current = noise or noise_of(residuals_of(geometry, measurements), measurements, count, problem.with_projector)
     left = None

@@ -10,27 +10,21 @@ from numpy.typing import NDArray
 
 from slrig.calibration.board import BoardShape
 from slrig.calibration.observations import Observations
-from slrig.calibration.solution import CELLS, PROJECTOR, DeviceResiduals, Solution
+from slrig.calibration.solution import CELLS, PROJECTOR, DeviceResiduals, Solution, scale_mode
 from slrig.calibration.solving.adjustment import Prior, kept_of, match_terms
 from slrig.calibration.solving.consistency import most_left_out, refuse_bump, worst_pose
 from slrig.calibration.solving.covariance import allowing_for, covariance_of
-from slrig.calibration.solving.held_out import (
-    LADDER,
-    bend_of,
-    chosen_shape,
-    chosen_terms,
-    folds_of,
-    held_out,
-    shapes_of,
-)
-from slrig.calibration.solving.held_out import LEAST_POSES as LEAST_HELD_OUT
+from slrig.calibration.solving.halves import halves_of
+from slrig.calibration.solving.held_out import bend_of, chosen_shape, folds_of, held_out, shapes_of
 from slrig.calibration.solving.initial import LEAST_POSES, start_of
 from slrig.calibration.solving.initial_projector import projector_start
 from slrig.calibration.solving.measurements import LEAST_CORNERS, measured
 from slrig.calibration.solving.parameters import Geometry, to_board_pose, to_pinhole
-from slrig.calibration.solving.problem import Fit, Problem, Terms, fitted, flat_geometry, free_of
+from slrig.calibration.solving.problem import Fit, Problem, fitted, flat_geometry, free_of
+from slrig.calibration.solving.stretch import size_of, with_stretch
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray, IntArray, Size
+from slrig.model.lens import LENS_TERMS
 
 Progress = Callable[[str, float, str], None]
 """Called with the stage's name, the share of the whole that is done (0 to 1), and words for a person."""
@@ -48,8 +42,8 @@ def solve(
 ) -> Solution:  # fmt: skip
     """Devices, the board's poses, and the covariance, by one bundle adjustment of all that was seen.
 
-    The first camera's frame is the world. With enough poses the lens terms of each device are those that held-out poses
-    are better with; poses that contradict the others are left out, by name. board_shape : whether the board may be bent
+    The first camera's frame is the world. Every lens has all its terms, held near 0 as lenses are where the poses tell
+    nothing of one; poses that contradict the others are left out, by name. board_shape : whether the board may be bent
     and its corners off their printed places (`slrig.calibration.solving.held_out`).
 
     Raises
@@ -68,15 +62,13 @@ def solve(
     outliers = {name: unseen for name, good in zip(poses, seen, strict=True) if not good}
     everything = Problem((*names,), poses, False, measurements.of_poses(seen))
     corners_only = replace(everything, measurements=everything.measurements.of_poses(seen, matches=False))
-    # Poses are compared under a lens that can be right: with one that cannot, those at the image's border are off.
-    terms = dict.fromkeys([*names, PROJECTOR], LADDER[-2] if int(seen.sum()) >= LEAST_HELD_OUT else LADDER[1])
     geometry = flat_geometry(observations.board, start.devices, start.poses)
     shapes = shapes_of(observations.board, board_shape)
+    # A stretched print would be taken for a bent one, and poses for contradicting.
+    fit, stretch = with_stretch(corners_only, fitted(corners_only, geometry), observations.board)
     if observations.projector is None:
-        corners_only, fit = _agreeing_in_shape(corners_only, geometry, terms, outliers, shapes)
-    else:
-        # Light tells which of two cameras moved; until then all poses stay in.
-        fit = fitted(corners_only, geometry, terms)
+        corners_only, fit = _agreeing_in_shape(corners_only, fit.geometry, outliers, shapes)
+    # Else light tells which of two cameras moved; until then all poses stay in.
 
     problem, sizes = corners_only, dict(observations.cameras)
     trial = problem
@@ -88,83 +80,85 @@ def solve(
         trial = replace(problem, measurements=matches.thinned(_TRIAL_MATCHES_PER_VIEW))
         beam = projector_start(fit.geometry.devices, fit.geometry.poses, trial.measurements, observations.projector)
         joined = replace(fit.geometry, devices=np.vstack([fit.geometry.devices, beam]))
-        trial, fit = _agreeing_in_shape(trial, joined, terms, outliers, shapes)
+        trial, fit = _agreeing_in_shape(trial, joined, outliers, shapes)
         problem = replace(problem.without(~trial.used), prior=trial.prior)
-
-    def tell(device: str, rung: int) -> None:
-        done = (trial.devices.index(device) + rung / len(LADDER)) / len(trial.devices)
-        words = f"which lens terms {device!r} is better with at held-out poses ({rung + 1}/{len(LADDER)})"
-        progress("lenses", 0.25 + 0.45 * done, words)
-
-    chosen = chosen_terms(trial, fit, tell=tell)
-    return _finished(observations, problem, fit, chosen, outliers, sizes, board_shape, progress)
+    return _finished(observations, problem, fit, outliers, sizes, board_shape, stretch.value, progress)
 
 
 def _finished(
-    observations: Observations, problem: Problem, fit: Fit, terms: Terms, outliers: dict[str, str],
-    sizes: dict[str, Size], board_shape: BoardShape, progress: Progress,
+    observations: Observations, problem: Problem, fit: Fit, outliers: dict[str, str], sizes: dict[str, Size],
+    board_shape: BoardShape, stretch_before: float, progress: Progress,
 ) -> Solution:  # fmt: skip
-    progress("adjustment", 0.7, "devices, poses and light together")
-    fit = fitted(problem, fit.geometry, terms, correlated=True)
-    refuse_bump(problem, fit, free_of(problem, fit.geometry, terms))
-    progress("held out", 0.85, "poses that the solve has not seen")
-    held = _held_out_px(problem, fit, terms)
-    progress("covariance", 0.95, "how well each number is known")
-    covariance, bow = covariance_of(problem, fit, terms, bend_of(observations.board, board_shape))
+    progress("adjustment", 0.5, "devices, poses and light together")
+    board = observations.board
+    fit = fitted(problem, fit.geometry, correlated=True)
+    fit, stretch = with_stretch(problem, fit, board, stretch_before, correlated=True)
+    refuse_bump(problem, fit, free_of(problem, fit.geometry))
+    progress("held out", 0.7, "poses that the solve has not seen")
+    held = _held_out_px(problem, fit)
+    progress("covariance", 0.85, "how well each number is known")
+    bend = bend_of(board, board_shape)
+    covariance, bow = covariance_of(problem, fit, bend)
+    covariance += np.outer(stretch.mode(), stretch.mode())
     devices = {
         name: to_pinhole(row, sizes[name]) for name, row in zip(problem.devices, fit.geometry.devices, strict=True)
     }
     used = [int(number) for number in np.flatnonzero(problem.used)]
     residuals = _residuals(problem, fit, sizes, held)
+    left = [residuals[name] for name in problem.devices]
+    progress("odd and even", 0.9, "half of the poses against the other half")
+    calibration = Calibration({name: devices[name] for name in observations.cameras}, devices.get(PROJECTOR))
+    size = size_of(board, stretch)
+    scale = size.scale_sigma * scale_mode(calibration)
     solution = Solution(
-        calibration=Calibration({name: devices[name] for name in observations.cameras}, devices.get(PROJECTOR)),
-        covariance=allowing_for(covariance, [residuals[name] for name in problem.devices]),
-        distortion={name: terms[name] for name in problem.devices},
+        calibration=calibration,
+        # Of what the poses tell, held-out poses say how much more it is; of the scale no pose says anything.
+        covariance=allowing_for(covariance, left) + np.outer(scale, scale),
+        distortion=dict.fromkeys(problem.devices, LENS_TERMS),
         poses={problem.pose_names[number]: to_board_pose(fit.geometry.poses[number]) for number in used},
         outliers=outliers,
         residuals=residuals,
         board_shape_mm=None if problem.prior is None else fit.geometry.shape_mm(),
         bow=bow,
+        size=size,
+        halves=halves_of(problem, fit, bend, left),
     )
     progress("done", 1.0, f"{len(used)} poses used, {len(outliers)} left out")
     return solution
 
 
-def _held_out_px(problem: Problem, fit: Fit, terms: Terms) -> dict[str, float]:
+def _held_out_px(problem: Problem, fit: Fit) -> dict[str, float]:
     trial = replace(problem, measurements=problem.measurements.thinned(_TRIAL_MATCHES_PER_VIEW))
     dealt = folds_of(trial)
     if not dealt:
         return {}
-    start = fitted(trial, fit.geometry, terms, rounds=1, noise=fit.noise)
+    start = fitted(trial, fit.geometry, rounds=1, noise=fit.noise)
     kept = kept_of(start.residuals, trial.deviations(fit.noise))
     counted = kept_of(fit.residuals, problem.deviations(fit.noise))
     judged = (problem.measurements, counted)
-    return dict(held_out(trial, start.geometry, terms, fit.noise, dealt, kept, judged=judged).rms_px)
+    return dict(held_out(trial, start.geometry, fit.noise, dealt, kept, judged=judged).rms_px)
 
 
 def _agreeing_in_shape(
-    problem: Problem, geometry: Geometry, terms: Terms, outliers: dict[str, str], shapes: Sequence[Prior | None],
-) -> tuple[Problem, Fit]:  # fmt: skip
+    problem: Problem, geometry: Geometry, outliers: dict[str, str], shapes: Sequence[Prior | None]
+) -> tuple[Problem, Fit]:
     """The same as `_agreeing`, of a board of the shape that held-out poses are best with."""
-    chosen = {name: terms[name] for name in problem.devices}
-    fit = None if len(shapes) == 1 else fitted(problem, geometry, chosen)
+    fit = None if len(shapes) == 1 else fitted(problem, geometry)
     while True:
         if fit is not None:
-            shape = chosen_shape(problem, fit, chosen, shapes)
-            problem = replace(problem, prior=shape)
+            problem = replace(problem, prior=chosen_shape(problem, fit, shapes))
         before = len(outliers)
-        problem, fit = _agreeing(problem, geometry, terms, outliers)
+        problem, fit = _agreeing(problem, geometry, outliers)
         # A pose that contradicts the others may have had its say in the choice.
         if len(shapes) == 1 or len(outliers) == before:
             return problem, fit
 
 
-def _agreeing(problem: Problem, geometry: Geometry, terms: Terms, outliers: dict[str, str]) -> tuple[Problem, Fit]:
+def _agreeing(problem: Problem, geometry: Geometry, outliers: dict[str, str]) -> tuple[Problem, Fit]:
     """Leave out one pose after another that contradicts the rest; what is left agrees."""
-    chosen = {name: terms[name] for name in problem.devices}
     while True:
-        fit = fitted(problem, geometry, chosen)
-        refuse_bump(problem, fit, free_of(problem, fit.geometry, chosen))
+        fit = fitted(problem, geometry)
+        refuse_bump(problem, fit, free_of(problem, fit.geometry))
         found = worst_pose(problem, fit)
         if found is None:
             _refuse_contradiction(problem, fit)

@@ -11,6 +11,8 @@ import numpy as np
 
 from slrig.calibrate.solving import CalibrationResult, ReadPose
 from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.displacement import RigidMotion
+from slrig.calibration.judging.odd_even import OddEven
 from slrig.calibration.judging.verdict import verdict
 from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.calibration.poses.coverage import coverage
@@ -33,6 +35,9 @@ POSES = tuple(f"pose_{number:02d}" for number in range(20))
 NOISE_PX = {"left": 0.045, PROJECTOR: 0.08}
 CALIBRATION_ID = "3f6c1f6e-9f0e-4c57-8a39-5f8a4f0c2b11"
 SOLVED_AT = "2026-11-22T09:30:00+01:00"
+
+HALVES = OddEven((10, 9), 0.0171, 0.0193, 0.52, RigidMotion(0.0021, 0.0345))
+"""What its odd poses say otherwise than its even ones."""
 
 _DEVIATIONS = {
     "left": (0.21, 0.22, 0.31, 0.28, 3e-4, 2e-3, 0.0, 0.0, 0.0, 0, 0, 0, 0, 0, 0),
@@ -176,4 +181,5 @@ def solved_result() -> CalibrationResult:
     sizes = {"left": rig["left"].size, PROJECTOR: rig[PROJECTOR].size}
     used = [pose.observation for name, pose in read_poses().items() if name != BUMPED]
     covered = coverage(used, BOARD, sizes)
-    return CalibrationResult(solution, calibration, expected, verdict(solution, expected, covered), covered)
+    judged = verdict(solution, expected, covered, HALVES, board=BOARD)
+    return CalibrationResult(solution, calibration, expected, judged, covered, HALVES)

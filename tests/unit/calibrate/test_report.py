@@ -15,7 +15,7 @@ from slrig.calibrate.charts import error_slices
 from slrig.calibrate.figures import baselines, device_figures, pose_figures
 from slrig.calibrate.report import report_html
 from slrig.calibrate.solving import CalibrationResult
-from slrig.calibration.judging.verdict import Grade
+from slrig.calibration.judging.grades import Grade
 from slrig.calibration.solution import PROJECTOR
 from tests.unit.calibrate.solved import (
     BOARD,
@@ -148,7 +148,6 @@ def test_whatever_a_person_or_a_device_named_is_text() -> None:
         solution=replace(solution, residuals=residuals, outliers={BUMPED: label}),
         calibration=replace(whole.calibration, cameras=cameras),
         verdict=replace(whole.verdict, summary=label, reasons=(label,)),
-        scale=(label,),
     )
     white = {BUMPED: {label: np.full((1024, 1280), 90, dtype=np.uint8)}}
     found = report_html(
@@ -186,17 +185,11 @@ def test_verdict_comes_first_and_in_words() -> None:
     assert "It is bad." in found.words
 
 
-def test_scale_that_disagrees_with_an_earlier_calibration_is_told() -> None:
-    told = replace(result(), scale=("everything is 4 % larger than before: is a square 12.5 mm?",))
-    assert (
-        "Everything is 4 % larger than before: is a square 12.5 mm?"
-        in Page(report_html(told, [], board=BOARD, title="x")).words
-    )
-
-
 def test_expected_error_is_the_results() -> None:
     expected = result().expected
     assert page().number("point_mm") == pytest.approx(expected.point_mm, rel=5e-3)
+    assert page().number("odd_even_mm") == pytest.approx(0.0171, rel=5e-3)
+    assert "0.89 times what is stated for two halves" in " ".join(" ".join(page().words).split())
     assert page().number("noise_mm") == pytest.approx(expected.noise_mm, rel=5e-3)
     assert page().number("total_mm") == pytest.approx(expected.total_mm, rel=5e-3)
     assert page().number("length_mm_per_m") == pytest.approx(1000 * expected.length_share, rel=5e-3)

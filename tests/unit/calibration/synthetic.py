@@ -110,10 +110,10 @@ def inside(pixels: FloatArray, size: Size) -> NDArray[np.bool_]:
     return np.asarray(((pixels > 2) & (pixels < np.array([size.width_px - 3, size.height_px - 3]))).all(axis=1))
 
 
-def made(recipe: Recipe) -> tuple[Observations, Calibration]:
-    """Observations of the true rig, and that rig."""
+def made(recipe: Recipe, truth: Calibration | None = None) -> tuple[Observations, Calibration]:
+    """Observations of the true rig, and that rig: of the recipe, unless another one is given."""
     rng = np.random.default_rng(recipe.seed)
-    truth = rig(recipe)
+    truth = rig(recipe) if truth is None else truth
     corners = recipe.board.points_mm.copy()
     if recipe.offsets_mm is not None:
         corners += recipe.offsets_mm

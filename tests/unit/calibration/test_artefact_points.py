@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from slrig.calibration.artefacts import ball_points, fitted_plane, fitted_sphere, plane_points, seen_well
+from slrig.calibration.artefacts import ball_points, fitted_plane, fitted_sphere, plane_points
 from slrig.errors import NothingToReconstructError
 from slrig.model import FloatArray
 from tests.unit.calibration.test_artefacts import cap
@@ -45,7 +45,7 @@ def scene() -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
 
 def test_two_balls_before_a_wall_are_found() -> None:
     points, normals, owner = scene()
-    first, second = ball_points(points, normals, 30.0, 2)
+    (first, _), (second, _) = ball_points(points, normals, 30.0, 2)
     assert (owner[first] == 1).mean() > 0.999
     assert (owner[second] == 2).mean() > 0.999
     assert len(first) > 0.98 * 6000
@@ -65,7 +65,8 @@ def test_a_third_ball_is_missed_in_words() -> None:
 def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
     points, normals, owner = scene()
     points[owner == 0], normals[owner == 0] = wall(tilt_deg)
-    chosen = plane_points(points, normals)
+    chosen, turned = plane_points(points, normals, 240.0)
+    assert turned == 0
     assert (owner[chosen] == 0).all()
     assert len(chosen) > 0.99 * (owner == 0).sum()
     true = np.array((np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))))
@@ -75,14 +76,23 @@ def test_the_wall_is_found_behind_the_balls(tilt_deg: float) -> None:
 def test_no_plane_is_told() -> None:
     points, normals = ball(400, 0.0, 1)
     with pytest.raises(NothingToReconstructError, match="expected a plane"):
-        plane_points(points[:90], normals[:90])
+        plane_points(points[:90], normals[:90], 240.0)
     with pytest.raises(NothingToReconstructError, match="expected a plane"):
-        plane_points(np.zeros((0, 3)), np.zeros((0, 3)))
+        plane_points(np.zeros((0, 3)), np.zeros((0, 3)), 240.0)
 
 
-def test_oblique_points_do_not_count() -> None:
+def test_a_rod_at_the_ball_is_counted_apart_and_a_point_far_off_is_not() -> None:
     points, normals = ball(3000, 0.0, 1)
-    good = seen_well(points, normals, [np.zeros(3)])
-    cosine = -(points * normals).sum(axis=1) / np.linalg.norm(points, axis=1)
-    np.testing.assert_array_equal(good, cosine > 0.5)
-    assert not seen_well(points, normals, [np.array((0.0, 0.0, 5000.0))]).any()
+    centre = np.array((0.0, 5.0, 500.0))
+    # A rod of half the ball's radius, from the ball's side outwards.
+    angle, along = np.meshgrid(np.linspace(np.pi, 2 * np.pi, 40), np.linspace(12.0, 30.0, 60))
+    outwards = np.column_stack([np.zeros(angle.size), np.cos(angle.ravel()), np.sin(angle.ravel())])
+    rod = centre + 7.5 * outwards + np.outer(along.ravel(), (1.0, 0.0, 0.0))
+    touching = int((np.abs(np.linalg.norm(rod - centre, axis=1) - 15.0) < 0.05 * 15.0).sum())
+    # Of the ball's own points some lie half a millimetre off, fifty times their noise.
+    far = np.arange(0, 3000, 10)
+    points[far] += 0.5 * normals[far]
+    ((found, turned),) = ball_points(np.vstack([points, rod]), np.vstack([normals, outwards]), 30.0, 1)
+    assert np.array_equal(found, np.arange(3000))
+    assert turned == pytest.approx(touching, abs=40)
+    assert touching > 100

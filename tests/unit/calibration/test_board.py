@@ -124,3 +124,21 @@ def test_every_dictionary_named_is_one_of_opencvs() -> None:
     board = board_option("charuco", "5x4", 10.0, dictionary="DICT_APRILTAG_36H11")
     assert charuco_board(board).getDictionary().markerSize == 6
     assert cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36H11).markerSize == 6
+
+
+def test_readings_of_both_scales_make_the_board_what_its_print_is() -> None:
+    board = Board(BoardKind.CHARUCO, 11, 8, 12.0)
+    assert board.rulers_mm == (140, 100)
+    read = board.as_read(140.7, 99.9)
+    assert read.square_mm == pytest.approx(12 * 1.005)
+    assert read.marker_mm == pytest.approx(9 * 1.005)
+    assert read.aspect == pytest.approx(0.999 / 1.005)
+    width, height = np.ptp(read.points_mm, axis=0)[:2]
+    assert (width, height) == (pytest.approx(120 * 1.005), pytest.approx(84 * 0.999))
+    # A steel ruler's tenth of a millimetre over each of the lengths.
+    assert read.square_sigma == pytest.approx(np.sqrt((0.1 / 140) ** 2 / 2 + (0.1 / 100) ** 2 / 2))
+    assert board.as_read(140.7, 99.9, square_sigma=2e-4).square_sigma == 2e-4
+    with pytest.raises(CalibrationError, match="the scale below the board is 140 mm long in print, read as 100 mm"):
+        board.as_read(100, 100)
+    with pytest.raises(CalibrationError, match="square_sigma: expected a share"):
+        Board(BoardKind.CHARUCO, 11, 8, 12.0, square_sigma=0.1)

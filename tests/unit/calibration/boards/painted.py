@@ -44,7 +44,9 @@ class Eye:
 
 @dataclass(frozen=True)
 class Print:
-    """How a board is printed and lit."""
+    """How a board is printed and lit. lit : a direction on the board, degrees from its x axis, how far that way the
+    projector's picture reaches, in squares from corner 0, and the share of its light that there is beyond.
+    """
 
     white: float = 0.75
     dark: float = 0.06
@@ -55,6 +57,7 @@ class Print:
     swapped: bool = False
     light_first: bool = False
     shading: tuple[float, float] = field(default=(0.0, 0.0))
+    lit: tuple[float, float, float] | None = None
 
 
 def looking(
@@ -170,7 +173,13 @@ def _reflectance(board: Board, look: Print, x_mm: Array, y_mm: Array) -> Array:
     dark = _circles(board, look, across, down) if circles else _squares(board, across, down, int(look.light_first))
     if look.swapped:
         dark = ~dark & (across > -1) & (across < width) & (down > -1) & (down < height)
-    return np.where(paper, np.where(dark, look.dark, look.white), look.beyond)
+    image = np.where(paper, np.where(dark, look.dark, look.white), look.beyond)
+    if look.lit is not None:
+        towards, reach, share = np.radians(look.lit[0]), look.lit[1], look.lit[2]
+        # In the board's own places, so that a mirrored print is lit from the same side.
+        ahead = np.cos(towards) * x_mm / board.square_mm + np.sin(towards) * down
+        image = np.where(ahead < reach, image, share * image)
+    return np.asarray(image, dtype=np.float64)
 
 
 def _circles(board: Board, look: Print, across: Array, down: Array) -> NDArray[np.bool_]:

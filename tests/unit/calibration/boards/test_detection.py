@@ -306,6 +306,42 @@ def test_a_covered_board_is_refused(board: Board) -> None:
     refused(image, board, "take away what covers")
 
 
+def light_to(towards_deg: float, squares: float) -> tuple[float, float, float]:
+    """Light that ends so many squares beyond the chessboard's outermost corner that way, and 2 % of it farther on."""
+    towards = np.array([np.cos(np.radians(towards_deg)), np.sin(np.radians(towards_deg))])
+    places = board_points(CHESSBOARD)[:, :2] / CHESSBOARD.square_mm
+    return towards_deg, float((places @ towards).max()) + squares, 0.02
+
+
+@pytest.mark.parametrize("towards", [(145.0, 1.1), (220.0, 0.6), (320.0, 0.6)])
+def test_light_that_ends_beside_the_print_makes_no_other_board(towards: tuple[float, float]) -> None:
+    """Lit and unlit paper alternate with the outermost squares there, as on a board with a line more."""
+    seen_by = eye(CHESSBOARD)
+    view = find_board(shot(CHESSBOARD, seen_by, look=Print(lit=light_to(*towards))), CHESSBOARD, full_scale=255)
+    assert len(view.corner) >= CHESSBOARD.corner_count - 3
+    assert np.abs(misses(view, CHESSBOARD, seen_by)).max() < 0.15
+
+
+@pytest.mark.slow
+def test_a_board_that_the_light_ends_on_is_numbered_rightly_or_refused_in_the_right_words() -> None:
+    found, refusals = 0, []
+    for number in range(14):
+        rng = np.random.default_rng(number)
+        seen_by = eye(CHESSBOARD, roll_deg=rng.uniform(-180, 180), tilt_deg=rng.uniform(-30, 30, 2))
+        look = Print(lit=light_to(rng.uniform(0, 360), rng.uniform(-2.0, 1.2)))
+        try:
+            view = find_board(shot(CHESSBOARD, seen_by, look=look), CHESSBOARD, full_scale=255)
+        except PoseRefusedError as refusal:
+            refusals.append(str(refusal))
+            continue
+        found += 1
+        # Corners in the dark are known to a pixel, and say so; one of another number would be 35 pixels off.
+        assert (np.abs(misses(view, CHESSBOARD, seen_by)).max(axis=1) < 0.15 + 5 * view.sigma_px).all(), number
+    assert found >= 4
+    assert len(refusals) >= 4
+    assert all("most likely the projector's picture ends on the board" in words for words in refusals)
+
+
 def test_too_little_of_a_charuco_board_is_refused() -> None:
     image = shot(CHARUCO, eye(CHARUCO, roll_deg=0.0, tilt_deg=(5.0, 5.0)))
     image[:, 240:] = 90

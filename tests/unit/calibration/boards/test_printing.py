@@ -83,10 +83,11 @@ def test_both_scales_are_true(board: Board, page: str, size_mm: tuple[float, flo
     spans = [[float(line.get(name, "")) for name in ("x1", "y1", "x2", "y2")] for line in black]
     across = sorted(x for x, y, to_x, to_y in spans if x == to_x and abs(to_y - y) < 5)
     down = sorted(y for x, y, to_x, to_y in spans if y == to_y and abs(to_x - x) < 5)
-    for ticks in (across, down):
-        assert len(ticks) == 101
+    for ticks, length_mm in zip((across, down), board.rulers_mm, strict=True):
+        assert len(ticks) == length_mm + 1
         assert np.allclose(np.diff(ticks), 1.0, atol=2e-4)
-        assert ticks[-1] - ticks[0] == pytest.approx(100.0, abs=1e-3)
+        assert ticks[-1] - ticks[0] == pytest.approx(length_mm, abs=1e-3)
+        assert length_mm >= 100
     assert size_mm[0] > across[-1]
     assert size_mm[1] > down[-1]
 
@@ -97,7 +98,7 @@ def test_a_page_says_what_it_is_and_how_to_go_on() -> None:
     assert "11 x 8 inner corners, squares of 12 mm, markers of 9 mm from DICT_5X5_250" in words
     assert "Print at 100 %" in words
     command = "--board charuco --corners 11x8 --square-mm 12 --marker-mm 9 --dictionary DICT_5X5_250"
-    assert f"slrig calibrate solve FOLDER {command} --output calibration.json" in words
+    assert f"slrig calibrate solve FOLDER {command} --measured-mm X Y --output calibration.json" in words
 
 
 def test_the_same_board_gives_the_same_bytes() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from slrig.calibration.displacement import rigid_free, without_rigid_motion
 from slrig.calibration.judging.comparison import comparison
 from slrig.errors import CalibrationError
 from slrig.model import Calibration, FloatArray, Pinhole, Size, Solved
@@ -94,10 +95,28 @@ def test_points_move_by_what_a_longer_baseline_makes_of_them() -> None:
         cameras, replace(first.projector, translation_mm=first.projector.translation_mm * share), first.solved
     )
     found = comparison(first, second)
-    # The grid's farthest point is a corner, 658 mm away.
-    assert found.moved_most_mm == pytest.approx((share - 1) * np.linalg.norm([80, 60, 650]), rel=1e-4)
-    assert found.moved_rms_mm == pytest.approx((share - 1) * 607, rel=0.01)
-    assert f"by {found.moved_most_mm:.3g} mm at most" in found.words[0]
+    # The middle of the volume moves away, by 0.6 mm, and the rest about it: the farthest point is a corner.
+    assert found.shift_mm == pytest.approx((share - 1) * 600, rel=1e-4)
+    assert found.turn_deg < 1e-6
+    assert found.moved_most_mm == pytest.approx((share - 1) * np.linalg.norm([80, 60, 50]), rel=1e-4)
+    assert found.moved_rms_mm < found.moved_most_mm
+    assert f"by {found.moved_most_mm:.3g} mm at most, besides a turn of" in found.words[0]
+    assert "and a shift of 0.6 mm that all of them share" in found.words[0]
+
+
+def test_a_motion_of_all_points_is_no_change_of_shape_however_large() -> None:
+    random = np.random.default_rng(4)
+    places = random.uniform([-80, -60, 550], [80, 60, 650], (200, 3))
+    turn = Rotation.from_rotvec([0.2, -0.7, 0.4])
+    strain = np.array([0.01, 0.0, 0.0]) * ((places - places.mean(axis=0)) / 80) ** 2
+    moved = places.mean(axis=0) + turn.apply(places - places.mean(axis=0)) + [30.0, -20.0, 7.0]
+    left, motion = without_rigid_motion(places, moved)
+    assert np.abs(left).max() < 1e-10
+    assert motion.turn_deg == pytest.approx(np.degrees(turn.magnitude()))
+    assert motion.shift_mm == pytest.approx(np.linalg.norm([30.0, -20.0, 7.0]))
+    # What is left of a small strain is what the least squares of a small motion leaves of it.
+    small, _ = without_rigid_motion(places, places + strain)
+    assert small == pytest.approx(rigid_free(places, strain[:, :, None])[:, :, 0], abs=1e-6)
 
 
 def test_world_frame_makes_no_difference() -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution
+from slrig.calibration.solution import PARAMETERS, PROJECTOR, Solution, scale_mode
 from slrig.calibration.solving.parameters import difference
 from slrig.model import Calibration, Pinhole
 from tests.unit.calibration.solving.test_projection import row_of
@@ -25,8 +25,13 @@ def in_first_camera(calibration: Calibration) -> Calibration:
     return Calibration({name: moved(each) for name, each in calibration.cameras.items()}, moved(calibration.projector))
 
 
-def in_deviations(solution: Solution, truth: Calibration) -> dict[str, float]:
-    """Focal lengths, principal points, turns and baselines of all devices: error over its own stated deviation."""
+def in_deviations(solution: Solution, truth: Calibration, *, exact_board: bool = True) -> dict[str, float]:
+    """Focal lengths, principal points, turns and baselines of all devices: error over its own stated deviation.
+
+    exact_board : the board was as large as it was said to be, so that no deviation of its size explains anything.
+    """
+    mode = solution.size.scale_sigma * scale_mode(solution.calibration)
+    stated = solution.covariance - np.outer(mode, mode) if exact_board else solution.covariance
     names = [*truth.cameras, *([PROJECTOR] if truth.projector else [])]
     rows = [
         np.array([row_of(one) for one in (*rig.cameras.values(), *([rig.projector] if rig.projector else []))])
@@ -36,7 +41,7 @@ def in_deviations(solution: Solution, truth: Calibration) -> dict[str, float]:
     found = {}
     for device, name in enumerate(names):
         own = slice(15 * device, 15 * device + 15)
-        covariance = solution.covariance[own, own]
+        covariance = stated[own, own]
         for k, parameter in enumerate(PARAMETERS[:12]):
             if parameter[0] in "fct" and covariance[k, k] > 0:
                 found[f"{name} {parameter}"] = float(off[device, k] / np.sqrt(covariance[k, k]))

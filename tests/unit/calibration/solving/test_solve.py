@@ -11,6 +11,7 @@ import pytest
 
 from slrig.calibration.board import BoardShape
 from slrig.calibration.solution import CELLS, PROJECTOR, Solution
+from slrig.calibration.solving.adjustment import LENS_SIGMA
 from slrig.calibration.solving.solve import solve
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, FloatArray
@@ -96,15 +97,16 @@ def test_progress_is_told_and_only_rises() -> None:
 def test_the_same_poses_give_the_same_numbers() -> None:
     first, again = (solve(made(replace(SMALL, poses=5))[0]) for _ in range(2))
     np.testing.assert_allclose(first.covariance, again.covariance, rtol=1e-3, atol=1e-9)
-    assert first.distortion == again.distortion
 
 
 @pytest.mark.slow
-def test_a_pose_in_which_the_board_moved_is_left_out_by_name() -> None:
-    solution, truth = solved(replace(SMALL, cameras=2, moved_pose=3, seed=5))
-    assert set(solution.outliers) == {"pose 3"}
-    assert "px from where the other poses put it" in solution.outliers["pose 3"]
-    assert "pose 3" not in solution.poses
+@pytest.mark.parametrize("number", [3, 6])
+def test_a_pose_in_which_the_board_moved_is_left_out_by_name(number: int) -> None:
+    """The last but one too, where a device that moved before it would explain half of what is off."""
+    solution, truth = solved(replace(SMALL, cameras=2, moved_pose=number, seed=5))
+    assert set(solution.outliers) == {f"pose {number}"}
+    assert "px from where the other poses put it" in solution.outliers[f"pose {number}"]
+    assert f"pose {number}" not in solution.poses
     assert max(np.abs(list(in_deviations(solution, truth).values()))) < 4
 
 
@@ -136,6 +138,14 @@ def test_a_pose_that_no_camera_saw_is_left_out_by_name() -> None:
         (replace(SMALL, cameras=2, bumped=("right", 5)), "^camera 'right' moved between pose 'pose 4' and"),
         (replace(SMALL, cameras=2, bumped=("left", 3)), "^camera 'left' moved between pose 'pose 2' and"),
         (replace(SMALL, cameras=2, bumped=(PROJECTOR, 5)), "^the projector moved between pose 'pose 4' and"),
+        (
+            replace(SMALL, poses=10, cameras=2, bumped=("right", 7), bump_mm=4.0),
+            "^camera 'right' moved between pose 'pose 6' and",
+        ),
+        (
+            replace(SMALL, poses=6, cameras=2, projector=False, bumped=("right", 4), bump_mm=4.0),
+            "moved between pose 'pose 3' and pose 'pose 4'",
+        ),
     ],
 )  # fmt: skip
 def test_a_device_that_was_bumped_is_named_with_the_pose(recipe: Recipe, words: str) -> None:
@@ -154,7 +164,10 @@ def test_too_few_poses_are_refused(count: int) -> None:
 def test_three_poses_solve_and_say_that_none_was_held_out() -> None:
     solution, _ = solved(replace(SMALL, poses=3, seed=7))
     assert all(np.isnan(left.held_out_rms_px) for left in solution.residuals.values())
-    assert all(terms == ("k1",) for terms in solution.distortion.values())
+    # A lens of which three poses tell next to nothing is as lenses are.
+    for device in (solution.calibration.cameras["left"], solution.calibration.projector):
+        assert device is not None
+        assert (np.abs(device.distortion) < 3 * LENS_SIGMA).all()
 
 
 def test_all_poses_parallel_are_refused() -> None:
