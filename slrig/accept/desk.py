@@ -48,17 +48,18 @@ class AcceptanceDesk:
         *,
         evaluate: Evaluate,
         report: Callable[[AcceptanceResult, Path], None],
+        wanted_mm: float | None = None,
         clock: Clock = utc_now,
     ) -> None:
         """`evaluate` : as `slrig.accept.running.evaluated`. report : writes the reports of a test. jobs : those of
-        positions.
+        positions. wanted_mm : what a point may be wrong by in what the rig is for, by the rig file.
         """
         self._data = folder
         self._store = AcceptanceStore(folder)
         self._queue = queue
         self.jobs = jobs
         self._work = RigJobs(jobs, queue, folder)
-        self._clock = clock
+        self._clock, self._wanted_mm = clock, wanted_mm
         self._evaluate, self._report = evaluate, report
         self._lock = threading.RLock()
         self._tests = {record.id: record for record in self._store.load()}
@@ -78,8 +79,8 @@ class AcceptanceDesk:
         """Put on record what the disk refused before. Idempotent."""
         self._work.close()
 
-    def open(self, plan_of: Callable[[Calibration], AcceptancePlan]) -> AcceptanceRecord:
-        """Open a test of the rig as it is calibrated now. Touches no device.
+    def open(self, plan_of: Callable[[Calibration, float | None], AcceptancePlan]) -> AcceptanceRecord:
+        """Open a test of the rig as it is calibrated now, and of what its rig file wants. Touches no device.
 
         Raises DeviceBusyError if the rig is not open yet, CalibrationError if it has no calibration, InvalidInputError
         if the plan cannot be done; StorageError.
@@ -93,7 +94,8 @@ class AcceptanceDesk:
             if calibration is None:
                 message = f"rig '{status.rig}' has no calibration, and nothing can be measured; calibrate it first"
                 raise CalibrationError(message)
-            number, plan = 1 + max((each.number for each in self._tests.values()), default=0), plan_of(calibration)
+            number = 1 + max((each.number for each in self._tests.values()), default=0)
+            plan = plan_of(calibration, self._wanted_mm)
             record = AcceptanceRecord(number, uuid4(), self._clock(), status.rig, calibration.solve_id, plan)
             self._store.save(record)
             self._tests[record.id] = record

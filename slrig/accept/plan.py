@@ -19,11 +19,15 @@ from slrig.model import FloatArray
 Numbers = Annotated[FloatArray, PlainValidator(lambda given: np.array(given, np.float64))]
 """An array, float64, that pydantic reads from lists."""
 
-USUAL_FORM_SIGMAS = 6.5
-"""Errors of form may be so many standard deviations of a point: noise alone gives 5.9 when 0.3 % are left out."""
+WANTED_SHARE = 1 / 5000
+"""Of L0: how far off a point may be where nobody says what the rig is for."""
 
 USUAL_REPEATS = 3
-_LIVE_SHARE, _RENDERED_SHARE = 1 / 10_000, 1 / 20_000
+STEEL_PER_K = 11.5e-6
+"""Thermal expansion of an artefact where it is not told: steel's (gauge blocks, ISO 3650: 11.5e-6 +- 1.0e-6)."""
+REFERENCE_C = 20.0
+"""What certified lengths hold at (ISO 1)."""
+_MOST_EXPANSION_PER_K = 1e-3  # ten times a plastic's: more is a slip of units
 _SPHERE_SHARES = (0.02, 0.2)
 _BAR_SHARE, _PLANE_SHARE, _PLANE_WIDTH_MM = 0.3, 0.5, 50.0
 _MADE_SPHERE_SHARE, _MADE_BAR_SHARE, _MADE_PLANE_SHARES = 0.11, 0.4, (0.6, 0.42)
@@ -69,8 +73,10 @@ class Artefacts:
     """The artefacts as certified, matt.
 
     diameter : of the sphere. distance : of the bar's ball centres; its balls have bar_diameter_mm, or the sphere's.
-    plane_mm : length and width. sphere_form_mm, plane_form_mm : by how much the artefact itself is out of form, an
-    expanded uncertainty like the others. certificate, temperature_c : as a person notes them.
+    plane_mm : length and width. sphere_form_mm, plane_form_mm : by how much the artefact itself is out of form, the
+    certificate's uncertainty of that included. certificate : as a person notes it. temperature_c : the artefacts', None
+    where not told; expansion_per_k : of their material, 0 if they have none. fixture_mm : by how much one may move or
+    bend where it stands while it is captured, an expanded uncertainty (k = 2).
     """
 
     diameter: Certified
@@ -81,43 +87,39 @@ class Artefacts:
     plane_form_mm: float | None = None
     certificate: str = ""
     temperature_c: float | None = None
+    expansion_per_k: float = STEEL_PER_K
+    fixture_mm: float = 0.0
 
     @property
     def ball_mm(self) -> float:
         """Diameter of the bar's balls."""
         return self.diameter.value_mm if self.bar_diameter_mm is None else self.bar_diameter_mm
 
-    def uncertainty_mm(self, quantity: Quantity) -> float | None:
-        """The expanded uncertainty (k = 2) that the artefact brings into an error; None where it was not told."""
-        return {
-            Quantity.FORM: self.sphere_form_mm,
-            Quantity.SIZE: self.diameter.uncertainty_mm,
-            Quantity.SPACING: self.distance.uncertainty_mm,
-            Quantity.FLATNESS: self.plane_form_mm,
-        }[quantity]
+    def expanded_mm(self, certified: Certified) -> float:
+        """A certified length as it is at the temperature told."""
+        warmer_k = 0.0 if self.temperature_c is None else self.temperature_c - REFERENCE_C
+        return certified.value_mm * (1 + self.expansion_per_k * warmer_k)
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The greatest permissible errors (MPE), mm. form_mm, size_mm, flatness_mm None: form_sigmas standard deviations of
-    a point there. For size, as for form: so makers of scanners state them.
+    """The greatest permissible errors (MPE), mm. They are agreed before the test, and nothing that is measured in it
+    moves them.
     """
 
+    form_mm: float
+    size_mm: float
     spacing_mm: float
-    form_mm: float | None = None
-    size_mm: float | None = None
-    flatness_mm: float | None = None
-    form_sigmas: float = USUAL_FORM_SIGMAS
+    flatness_mm: float
 
-    def limit_mm(self, quantity: Quantity, noise_mm: float) -> float:
-        """The limit of an error where a point has the standard deviation `noise_mm`."""
-        stated = {
+    def limit_mm(self, quantity: Quantity) -> float:
+        """The limit of an error."""
+        return {
             Quantity.FORM: self.form_mm,
             Quantity.SIZE: self.size_mm,
             Quantity.SPACING: self.spacing_mm,
             Quantity.FLATNESS: self.flatness_mm,
         }[quantity]
-        return self.form_sigmas * noise_mm if stated is None else stated
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,13 +174,18 @@ def diagonal_mm(volume_mm: FloatArray) -> float:
     return float(np.linalg.norm(volume_mm[1] - volume_mm[0]))
 
 
-def usual_limits(volume_mm: FloatArray, *, rendered: bool) -> Limits:
-    """The limits where none are given: L0 / 10 000 for sphere spacing on metal, L0 / 20 000 on a rendered rig.
+def usual_limits(volume_mm: FloatArray, wanted_mm: float | None = None) -> Limits:
+    """The limits where none are given, from what a point may be wrong by in what the rig is for: wanted_mm, or
+    L0 / 5000.
 
-    >>> round(usual_limits(np.array([[0.0, 0.0, 0.0], [200.0, 100.0, 200.0]]), rendered=False).spacing_mm, 6)
-    0.03
+    A size or a spacing may be wrong by wanted_mm. A form is a range, from the point furthest out to that furthest in,
+    each of which may be wrong by wanted_mm: 2 wanted_mm.
+
+    >>> usual_limits(np.array([[0.0, 0.0, 0.0], [200.0, 100.0, 200.0]]), 0.05)
+    Limits(form_mm=0.1, size_mm=0.05, spacing_mm=0.05, flatness_mm=0.1)
     """
-    return Limits(spacing_mm=diagonal_mm(volume_mm) * (_RENDERED_SHARE if rendered else _LIVE_SHARE))
+    length_mm = WANTED_SHARE * diagonal_mm(volume_mm) if wanted_mm is None else wanted_mm
+    return Limits(form_mm=2 * length_mm, size_mm=length_mm, spacing_mm=length_mm, flatness_mm=2 * length_mm)
 
 
 def exact_artefacts(volume_mm: FloatArray) -> Artefacts:
@@ -192,22 +199,24 @@ def exact_artefacts(volume_mm: FloatArray) -> Artefacts:
         sphere_form_mm=0.0,
         plane_form_mm=0.0,
         certificate="exact by construction",
+        expansion_per_k=0.0,
     )
 
 
-_CERTIFIED = {
-    Quantity.SIZE: "the sphere's diameter",
-    Quantity.SPACING: "the bar's distance",
-    Quantity.FORM: "the sphere's form",
-    Quantity.FLATNESS: "the plane's form",
-}
-"""What of the artefacts a certificate tells the uncertainty of, by the quantity that it enters."""
+def _certified(artefacts: Artefacts) -> dict[str, float | None]:
+    """What a certificate tells the uncertainty of; None where it was not told."""
+    return {
+        "the sphere's diameter": artefacts.diameter.uncertainty_mm,
+        "the bar's distance": artefacts.distance.uncertainty_mm,
+        "the sphere's form": artefacts.sphere_form_mm,
+        "the plane's form": artefacts.plane_form_mm,
+    }
 
 
 def require_fitting(artefacts: Artefacts, volume_mm: FloatArray, *, rendered: bool) -> None:
     """Refuse artefacts that a test of this volume cannot be done with. Raises InvalidInputError with all faults."""
     faults = _unusable(artefacts, volume_mm) or _unfit(artefacts, volume_mm)
-    unknown = [name for quantity, name in _CERTIFIED.items() if artefacts.uncertainty_mm(quantity) is None]
+    unknown = [name for name, uncertainty in _certified(artefacts).items() if uncertainty is None]
     if unknown and not rendered:
         faults.append(
             f"the certificate's expanded uncertainty of {', '.join(unknown)} is not told; without it nothing can "
@@ -234,10 +243,14 @@ def _unusable(artefacts: Artefacts, volume_mm: FloatArray) -> list[str]:
     for name, value in lengths.items():
         if not 0 < value < math.inf:
             faults.append(f"{name}: expected a length above 0 mm, found {value:g} mm")
-    for quantity, name in _CERTIFIED.items():
-        uncertainty = artefacts.uncertainty_mm(quantity)
+    for name, uncertainty in {**_certified(artefacts), "the fixture": artefacts.fixture_mm}.items():
         if uncertainty is not None and not 0 <= uncertainty < math.inf:
             faults.append(f"the uncertainty of {name}: expected 0 mm or more, found {uncertainty:g} mm")
+    if not 0 <= artefacts.expansion_per_k < _MOST_EXPANSION_PER_K:
+        faults.append(
+            f"the artefacts' expansion: expected 0 to {_MOST_EXPANSION_PER_K:g} per kelvin, as steel has "
+            f"{STEEL_PER_K:g}, found {artefacts.expansion_per_k:g}"
+        )
     return faults
 
 

@@ -70,7 +70,7 @@ def acceptance_plan(
         for artefact, found in lies.items()
         for number, each in enumerate(found, 1)
     )
-    chosen = usual_limits(volume_mm, rendered=rendered) if limits is None else limits
+    chosen = usual_limits(volume_mm) if limits is None else limits
     return AcceptancePlan(volume_mm, artefacts, chosen, steps, rendered, repeats, exposure_s, notes)
 
 

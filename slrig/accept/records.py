@@ -99,7 +99,7 @@ _records = TypeAdapter(AcceptanceRecord)
 
 def record_json(record: AcceptanceRecord) -> bytes:
     """A record as JSON text, without what its jobs say."""
-    document = {"format": _FORMAT, "version": 2, **plain(record), "created_at": record.created_at.isoformat()}
+    document = {"format": _FORMAT, "version": 3, **plain(record), "created_at": record.created_at.isoformat()}
     del document["progress"], document["fault"]
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 

@@ -11,13 +11,14 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from slrig.accept.evaluation import BORDER_RINGS, Evidence, Reading
+from slrig.accept.evaluation import Evidence, Reading
 from slrig.accept.plan import AcceptancePlan, Artefact, Step
 from slrig.accept.scene import turn_deg
 from slrig.accept.store import HTML, JSON, kept_points, points_file
-from slrig.accept.verdicts import FORMULA, AcceptanceResult
+from slrig.accept.uncertainty import FORMULA
+from slrig.accept.verdicts import AcceptanceResult
 from slrig.bundle.storage import write_file
-from slrig.calibration.artefacts import REJECTED_SHARE, STEEPEST_DEG
+from slrig.calibration.artefacts import REJECTED_SHARE
 from slrig.model import FloatArray, Pinhole, Pixels
 from slrig.reports.drawing import WIDTH, drawing, legend, path, polygon, ramp, shape
 from slrig.reports.page import filled, jpeg_uri
@@ -29,7 +30,7 @@ RULE = "passes if |error| <= MPE - U, fails if |error| > MPE + U, undecided betw
 _QUALITY = 88
 _MAP_PX = (240, 180)
 _MARGIN_SHARE = 0.06
-_PAPER, _UNUSED = (240, 236, 233), (205, 198, 192)  # blue, green, red: what is bare, and what does not count
+_PAPER = (240, 236, 233)  # blue, green, red
 _MARGIN = 26.0
 _NUMBER_LIFT = 3.5
 _MOST_CELL_PX = 12
@@ -48,7 +49,7 @@ def document(result: AcceptanceResult) -> dict[str, object]:
     artefacts = plan.artefacts
     return {
         "format": FORMAT,
-        "version": 1,
+        "version": 2,
         "manner": MANNER,
         "rig": result.rig,
         "rendered": plan.rendered,
@@ -64,10 +65,7 @@ def document(result: AcceptanceResult) -> dict[str, object]:
         "artefacts": artefacts,
         "notes": plan.notes,
         "rules": {
-            "steepest_deg": STEEPEST_DEG,
-            "border_rings": BORDER_RINGS,
             "rejected_share_at_most": REJECTED_SHARE,
-            "form_sigmas": plan.limits.form_sigmas,
             "repeats": plan.repeats,
         },
         "quantities": [
@@ -76,10 +74,13 @@ def document(result: AcceptanceResult) -> dict[str, object]:
                 "words": each.quantity.words,
                 "error_mm": each.error_mm,
                 "limit_mm": each.limit_mm,
-                "certificate_uncertainty_mm": each.certificate_mm,
+                "certificate_uncertainty_mm": each.uncertainty.certificate_mm,
+                "form_uncertainty_mm": each.uncertainty.form_mm,
+                "temperature_uncertainty_mm": each.uncertainty.temperature_mm,
+                "fixture_uncertainty_mm": each.uncertainty.fixture_mm,
+                "expanded_uncertainty_mm": each.uncertainty.expanded_mm,
                 "scatter_mm": each.scatter_mm,
                 "repeated_captures": each.repeats,
-                "expanded_uncertainty_mm": each.uncertainty_mm,
                 "decision": each.decision.value,
                 "position": each.step,
                 "capture": each.take + 1,
@@ -104,14 +105,11 @@ def _capture(reading: Reading) -> dict[str, object]:
     return {
         "capture": reading.take + 1,
         "errors_mm": {quantity.value: error for quantity, error in reading.errors_mm.items()},
-        "limits_mm": {quantity.value: limit for quantity, limit in reading.limits_mm.items()},
         "noise_mm": reading.noise_mm,
         "sigma_mm": reading.sigma_mm,
         "dispersion_95_mm": reading.dispersion_mm,
-        "points_on_artefact": reading.on_artefact,
-        "points_too_oblique": reading.steep,
-        "points_at_border": reading.at_border,
         "points_used": reading.used,
+        "points_turned": reading.turned,
         "rejected_share": reading.rejected_share,
         "points_file": points_file(reading.step, reading.take),
     }
@@ -135,8 +133,6 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
         rule=RULE,
         formula=FORMULA,
         sides_mm=tuple(plan.volume_mm[1] - plan.volume_mm[0]),
-        steepest_deg=STEEPEST_DEG,
-        border_rings=BORDER_RINGS,
         rejected_share=REJECTED_SHARE,
         words={step.name: step.words for step in plan.steps},
         # Of each artefact that was measured: its readings, and the error of the brightest colour of its pictures.
@@ -154,7 +150,7 @@ def report_html(result: AcceptanceResult, evidence_of: Callable[[Reading], Evide
 def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> Pixels:
     """An artefact as the camera sees it, coloured by how far its points lie off the fit: (H, W, 3) uint8, BGR.
 
-    Dark blue is most_mm inwards (below), yellow as much outwards; grey does not count.
+    Dark blue is most_mm inwards (below), yellow as much outwards.
     """
     on = np.flatnonzero(evidence.artefact > 0)
     seen = evidence.points_mm[on] @ camera.rotation.T + camera.translation_mm
@@ -168,11 +164,9 @@ def error_map(evidence: Evidence, camera: Pinhole, *, most_mm: float) -> Pixels:
     places = ((flat - (low + high) / 2) * scale + np.array(_MAP_PX) / 2) / cell
     columns, rows = np.clip(places.astype(int), 0, np.array(grid)[::-1] - 1).T
     picture = np.full((*grid, 3), _PAPER, np.uint8)
-    picture[rows, columns] = _UNUSED
-    used = evidence.used[on]
-    keys = rows[used] * grid[1] + columns[used]
+    keys = rows * grid[1] + columns
     count = np.bincount(keys, minlength=grid[0] * grid[1])
-    total = np.bincount(keys, weights=evidence.distances_mm[on][used], minlength=grid[0] * grid[1])
+    total = np.bincount(keys, weights=evidence.distances_mm[on], minlength=grid[0] * grid[1])
     filled = np.flatnonzero(count)
     shares = np.clip(0.5 + total[filled] / count[filled] / (2 * most_mm), 0, 1)
     picture.reshape(-1, 3)[filled] = ramp(shares)[:, ::-1]

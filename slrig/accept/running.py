@@ -48,7 +48,6 @@ def evaluated(
     plan: AcceptancePlan,
     step: Step,
     take: int,
-    calibration: Calibration,
     /,
     *,
     progress: Progress,
@@ -61,7 +60,7 @@ def evaluated(
     reconstruct_bundle(work / _BUNDLE, work / _MESH, plan=ReconstructionPlan(), progress=progress, cancelled=cancelled)
     with refusals_of(work):
         mesh = decode_mesh_ply((work / _MESH / "mesh.ply").read_bytes())
-    found, evidence = reading(mesh, step, take, plan, calibration)
+    found, evidence = reading(mesh, step, take, plan)
     keep_points(evidence, folder, step.name, take)
     return found
 
@@ -163,11 +162,11 @@ def _captured(
         with refusals_of(work):
             work.mkdir(parents=True)
         scan = ScanPlan(exposure_s=plan.exposure_s)
-        # The test must not use what a rendered rig knows of its scene; and the noise of a point, by which form
-        # is judged, is to hold nothing of the calibration's own error, which is what form is to show.
+        # The test must not use what a rendered rig knows of its scene; and the noise of a point, which is told beside
+        # its form, is to hold nothing of the calibration's own error, which is what form is to show.
         blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
         capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)
-        return evaluate(work, folder, plan, step, take, calibration, progress=progress, cancelled=cancelled)
+        return evaluate(work, folder, plan, step, take, progress=progress, cancelled=cancelled)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 

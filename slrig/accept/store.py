@@ -108,7 +108,6 @@ def keep_points(evidence: Evidence, folder: Path, step: str, take: int) -> None:
         packed,
         points_mm=evidence.points_mm.astype(np.float32),
         artefact=evidence.artefact,
-        used=evidence.used,
         distances_mm=evidence.distances_mm,
         sigma_mm=evidence.sigma_mm.astype(np.float32),
     )
@@ -125,7 +124,6 @@ def kept_points(folder: Path, step: str, take: int) -> Evidence:
         return Evidence(
             kept["points_mm"].astype(np.float64),
             kept["artefact"],
-            kept["used"],
             kept["distances_mm"],
             kept["sigma_mm"].astype(np.float64),
         )

@@ -10,19 +10,16 @@ import numpy as np
 
 from slrig.accept.evaluation import Reading
 from slrig.accept.plan import AcceptancePlan, Quantity
+from slrig.accept.uncertainty import ErrorUncertainty, error_uncertainty
 from slrig.calibration.artefacts import Decision, decision
 from slrig.model import Calibration
-
-FORMULA = "U = 2 * sqrt((U_certificate / 2)^2 + s^2)"
-"""Expanded uncertainty, k = 2: the certificate's, and the standard deviation s of repeated captures of one position."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One quantity over all positions. error_mm, limit_mm : of the reading that comes nearest to its limit, or is
-    furthest beyond, which is that of `step`, `take`. certificate_mm : the artefact's expanded uncertainty, None where
-    it was not told; scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats :
-    captures that tell it. uncertainty_mm : U by `FORMULA`, what is not known left out.
+    """One quantity over all positions. error_mm : of the reading with the largest, which is that of `step`, `take`.
+    scatter_mm : the standard deviation of repeated captures, NaN where none were made; repeats : captures that tell it.
+    It is told and decides nothing: the rig's own scatter is in its errors.
     """
 
     quantity: Quantity
@@ -30,10 +27,9 @@ class Verdict:
     limit_mm: float
     step: str
     take: int
-    certificate_mm: float | None
+    uncertainty: ErrorUncertainty
     scatter_mm: float
     repeats: int
-    uncertainty_mm: float
     decision: Decision
 
 
@@ -72,14 +68,12 @@ def verdicts(readings: Sequence[Reading], plan: AcceptancePlan) -> tuple[Verdict
 
 def _verdict(quantity: Quantity, readings: Sequence[Reading], plan: AcceptancePlan) -> Verdict:
     having = [each for each in readings if quantity in each.errors_mm]
-    worst = max(having, key=lambda each: abs(each.errors_mm[quantity]) - each.limits_mm[quantity])
-    scatter_mm, repeats = _scatter(quantity, having)
-    certificate = plan.artefacts.uncertainty_mm(quantity)
-    uncertainty = 2 * float(np.hypot((certificate or 0.0) / 2, 0.0 if np.isnan(scatter_mm) else scatter_mm))
-    error, limit = worst.errors_mm[quantity], worst.limits_mm[quantity]
+    worst = max(having, key=lambda each: abs(each.errors_mm[quantity]))
+    error, limit = worst.errors_mm[quantity], plan.limits.limit_mm(quantity)
+    uncertainty = error_uncertainty(quantity, plan.artefacts)
     return Verdict(
-        quantity, error, limit, worst.step, worst.take, certificate, scatter_mm, repeats, uncertainty,
-        decision(error, limit, uncertainty),
+        quantity, error, limit, worst.step, worst.take, uncertainty, *_scatter(quantity, having),
+        decision(error, limit, uncertainty.expanded_mm),
     )  # fmt: skip
 
 

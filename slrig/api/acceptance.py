@@ -12,6 +12,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, Field
 
 from slrig.accept.asking import AcceptanceRequest
+from slrig.accept.plan import Quantity
 from slrig.accept.records import AcceptanceRecord, AcceptanceState
 from slrig.accept.store import HTML, JSON
 from slrig.api.idempotency import IdempotencyKey, once, started_once
@@ -37,7 +38,6 @@ class ReadingBody(BaseModel):
     position: str
     capture: int
     errors_mm: dict[str, float]
-    limits_mm: dict[str, float]
     noise_mm: float
     points_used: int
     rejected_share: float
@@ -77,6 +77,7 @@ class AcceptanceBody(AcceptanceSummary):
 
     next: StepBody | None = Field(description="the position to measure next; null when all are")
     positions: list[StepBody]
+    limits_mm: dict[str, float] = Field(description="greatest permissible error of each quantity")
     readings: list[ReadingBody]
     progress: dict[str, Any] | None
     error: AnyFault = Field(description="why the last position was not measured; it may be measured again")
@@ -176,6 +177,7 @@ def _body(record: AcceptanceRecord) -> AcceptanceBody:
         _summary(record),
         next=None if following is None else next(each for each in steps if each.name == following[0].name),
         positions=steps,
+        limits_mm={quantity.value: record.plan.limits.limit_mm(quantity) for quantity in Quantity},
         readings=[
             filled(ReadingBody, each, position=each.step, capture=each.take + 1, points_used=each.used)
             for each in record.readings

@@ -39,6 +39,19 @@ class BoardRequest(BoardOptions):
     dictionary: Annotated[SafeText, Field(min_length=1, max_length=64)] | None = Field(
         default=None, description="of a ChArUco board's markers, by OpenCV's name. Default DICT_5X5_250"
     )
+    square_sigma: Annotated[float, Field(gt=0, le=0.05)] | None = Field(
+        default=None,
+        description="standard deviation of the print's width, and of its height, over themselves, as of a certificate. "
+        "Default 0.001; with measured_mm, that of a steel ruler",
+    )
+    aspect: Annotated[float, Field(gt=0.9, lt=1.1)] = Field(
+        default=1.0, description="a square's height over its width, as measured"
+    )
+    measured_mm: Annotated[list[Millimetres], Field(min_length=2, max_length=2)] | None = Field(
+        default=None,
+        description="what the two printed scales of the sheet measure from end to end: the one below the board, and "
+        "the one left of it",
+    )
 
 
 class CalibrationRequest(Strict):
@@ -140,6 +153,8 @@ class BoardBody(BaseModel):
     square_mm: float
     marker_mm: float | None
     dictionary: str | None
+    square_sigma: float = Field(description="deviation of the print's width and of its height, over themselves")
+    aspect: float = Field(description="a square's height over its width")
     title: str
 
 
@@ -175,7 +190,9 @@ class CalibrationBody(CalibrationSummary):
     error: FaultBody = Field(description="why the last solve failed")
     result: dict[str, Any] | None = Field(
         description="of the last solve that went well: devices with rms and values, each with its standard deviation; "
-        "the expected error in mm, of one camera alone `across` its line of sight; how far the board is out of flat; "
+        "the expected error in mm, of one camera alone `across` its line of sight; `odd_even`, by how many mm odd and "
+        "even poses differ that are solved apart, over what is stated for that, null where they are too few; how far "
+        "the board is out of flat; "
         "the verdict and why"
     )
     last_event: int = Field(description="to follow `links.events` from here: send it as Last-Event-ID")
@@ -213,8 +230,12 @@ class ComparisonBody(BaseModel):
     second: UUID
     devices: dict[str, DeviceDifferenceBody]
     missing: list[str] = Field(description="devices that only one of them has")
-    moved_rms_mm: Known = Field(description="by how much points in the volume move; null without a volume")
+    moved_rms_mm: Known = Field(
+        description="by how much points in the volume move, beyond the rigid motion of them all; null without a volume"
+    )
     moved_most_mm: Known
+    turn_deg: Known = Field(description="of that rigid motion, about the volume's middle")
+    shift_mm: Known = Field(description="of that rigid motion, of the volume's middle")
     words: list[str]
 
 

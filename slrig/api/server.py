@@ -101,6 +101,7 @@ def open_service(
             worker,
             rig_name=rig.name,
             refuse_when_stale=rig.refuse_when_stale,
+            wanted_mm=rig.wanted_mm,
         )
     except BaseException:
         store.database.close()

@@ -44,7 +44,7 @@ class Service:
     """One service: its settings, its data, the one that scans, those that calibrate, verify and test, and the schedule.
 
     Until `start` nothing works but what sends notices. worker : the runner's, which computes for all of them.
-    refuse_when_stale : whether the rig file has scans refused then.
+    refuse_when_stale : whether the rig file has scans refused then. wanted_mm : what it wants of a point's error.
 
     Raises
     ------
@@ -66,6 +66,7 @@ class Service:
         rig_name: str,
         calibration_tools: CalibrationTools | None = None,
         refuse_when_stale: bool = False,
+        wanted_mm: float | None = None,
     ) -> None:
         self.settings = settings
         self.scan_defaults = scan_defaults
@@ -85,6 +86,7 @@ class Service:
             rig_name=rig_name,
             tools=calibration_tools or usual_calibration_tools(worker),
             spare_bytes=spare_bytes,
+            wanted_mm=wanted_mm,
         )
         self.notices = Notices(settings.webhook_url, rig=rig_name)
         self.verifications = VerificationDesk(
@@ -102,6 +104,7 @@ class Service:
             JobStore(database, JobKind.POSITION),
             evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
+            wanted_mm=wanted_mm,
         )
         self.durations = Durations()
         self.traces = traces_by_environment()

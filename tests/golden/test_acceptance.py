@@ -25,6 +25,9 @@ RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
 
 SEEDS = 3
 
+FORM_SIGMAS = 7.5
+"""Noise alone gives a form of 5.9 standard deviations; the rim of a ball in a half-size picture adds of its own."""
+
 
 def seeded(config: RigConfig, seed: int) -> RigConfig:
     """The rig with other noise."""
@@ -73,7 +76,7 @@ def test_the_error_of_a_wrong_scale_is_found(tmp_path: Path) -> None:
     assert found[Quantity.SPACING].error_mm == pytest.approx(expected, abs=plan.diagonal_mm / 20_000)
     assert found[Quantity.SPACING].decision is result.decision is Decision.FAILS
     # The form is what it was: a scale does not bend.
-    assert found[Quantity.FORM].error_mm < found[Quantity.FORM].limit_mm
+    assert found[Quantity.FORM].error_mm < FORM_SIGMAS * result.readings[0].noise_mm
 
 
 @pytest.mark.slow
@@ -110,22 +113,22 @@ def test_reported_errors_agree_with_truth_whatever_the_noise(tmp_path: Path) -> 
             if Quantity.FORM in each.errors_mm:
                 forms.append(each.errors_mm[Quantity.FORM] / each.noise_mm)
                 # Against the sphere that was rendered, not the one that was fitted.
-                true = np.linalg.norm(points[kept["used"]] - step.centre_mm, axis=1)
+                true = np.linalg.norm(points[kept["artefact"] == 1] - step.centre_mm, axis=1)
                 true -= plan.artefacts.diameter.value_mm / 2
                 # A ball of 30 pixels' radius is seen some µm too deep, as the reported size says as well.
                 assert abs(float(true.mean())) < 2 * each.noise_mm
-                assert float(true.std()) == pytest.approx(each.sigma_mm, rel=0.25)
+                # The sphere that is fitted takes a part of that up, a quarter of the scatter on the smallest.
+                assert float(true.std()) == pytest.approx(each.sigma_mm, rel=0.35)
             if Quantity.SPACING in each.errors_mm:
-                ends = [fitted_sphere(points[kept["used"] & (kept["artefact"] == ball)]).centre_mm for ball in (1, 2)]
+                ends = [fitted_sphere(points[kept["artefact"] == ball]).centre_mm for ball in (1, 2)]
                 rendered = [
                     step.centre_mm + side * plan.artefacts.distance.value_mm / 2 * step.axis for side in (-1, 1)
                 ]
                 for end in ends:
-                    assert min(float(np.linalg.norm(end - centre)) for centre in rendered) < 0.03
+                    assert min(float(np.linalg.norm(end - centre)) for centre in rendered) < 0.035
     assert max(abs(error) for error in spacings) <= plan.diagonal_mm / 20_000
-    # Noise alone gives 5.9; the half-size picture of a ball adds a little of its own.
     assert np.median(forms) <= 6.5
-    assert max(forms) <= 7.5
+    assert max(forms) <= FORM_SIGMAS
 
 
 @pytest.mark.slow

@@ -13,8 +13,9 @@ from uuid import UUID, uuid4
 import pytest
 
 from slrig.accept import running as acceptance
+from slrig.accept.asking import AcceptanceRequest
 from slrig.accept.desk import AcceptanceDesk
-from slrig.accept.plan import AcceptancePlan
+from slrig.accept.plan import AcceptancePlan, usual_limits
 from slrig.accept.records import AcceptanceState, record_from_json, record_json
 from slrig.accept.report import write_reports
 from slrig.accept.running import evaluated
@@ -42,6 +43,7 @@ from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.scan.artefacts import encode_mesh_ply
+from tests.unit.accept.test_plan import VOLUME
 from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, scan_of
 from tests.unit.scan.fakes import WAIT_S
 
@@ -110,7 +112,7 @@ class Desk(AcceptanceDesk):
         return job
 
 
-Desks = Callable[[], Desk]
+Desks = Callable[..., Desk]
 
 
 @pytest.fixture
@@ -129,10 +131,10 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> 
 
     monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", reconstruct)
 
-    def make() -> Desk:
+    def make(*, wanted_mm: float | None = None) -> Desk:
         desk = Desk(
             folder, queue, JobStore(database, JobKind.POSITION),
-            evaluate=evaluated, report=write_reports,
+            evaluate=evaluated, report=write_reports, wanted_mm=wanted_mm,
         )  # fmt: skip
         desk.take_up()
         return desk
@@ -151,8 +153,17 @@ def failure_code(desk: Desk, test_id: UUID) -> str | None:
     return None if fault is None else fault.code
 
 
-def the_plan(_: Calibration) -> AcceptancePlan:
+def the_plan(_: Calibration, _wanted_mm: float | None) -> AcceptancePlan:
     return PLAN
+
+
+def test_limits_follow_the_rig_file_unless_asked_for(desks: Desks) -> None:
+    desk = desks(wanted_mm=0.04)
+    least, greatest = (tuple(corner) for corner in VOLUME.tolist())
+    asked = AcceptanceRequest(volume_mm=(least, greatest))
+    assert desk.open(asked.plan).plan.limits == usual_limits(VOLUME, 0.04)
+    assert desk.open(asked.model_copy(update={"wanted_mm": 0.01}).plan).plan.limits == usual_limits(VOLUME, 0.01)
+    assert desks().open(asked.plan).plan.limits == usual_limits(VOLUME)
 
 
 def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk, queue: TameQueue) -> None:
@@ -226,7 +237,7 @@ def test_a_held_rig_is_refused_and_the_test_stays_open(desk: Desk, queue: TameQu
 def test_what_cannot_be_tested_is_refused(desk: Desk, queue: TameQueue) -> None:
     with pytest.raises(JobNotFoundError, match="No acceptance test"):
         desk.get(uuid4())
-    exact = desk.open(lambda _: replace(PLAN, rendered=True))
+    exact = desk.open(lambda *_: replace(PLAN, rendered=True))
     desk.measure(exact.id, wait=False, scripted=True)
     assert failure_code(desk, exact.id) == InvalidInputError.code
     queue.rig.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]

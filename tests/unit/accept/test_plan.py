@@ -21,6 +21,7 @@ from slrig.accept.plan import (
 )
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.scene import turn_deg
+from slrig.accept.uncertainty import error_uncertainty
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import InvalidInputError
@@ -112,15 +113,35 @@ def test_the_first_position_of_each_artefact_is_measured_again() -> None:
     assert again == [(f"{artefact}-1", take) for artefact in ("sphere", "bar", "plane") for take in (1, 2)]
 
 
-def test_usual_limits_follow_the_diagonal_and_the_noise() -> None:
+def test_usual_limits_follow_the_diagonal_or_what_is_wanted() -> None:
     diagonal = float(np.linalg.norm(VOLUME[1] - VOLUME[0]))
-    assert plan_of().limits.spacing_mm == pytest.approx(diagonal / 10_000)
-    rendered = usual_limits(VOLUME, rendered=True)
-    assert rendered.limit_mm(Quantity.SPACING, 0.004) == pytest.approx(diagonal / 20_000)
-    assert rendered.limit_mm(Quantity.FORM, 0.004) == pytest.approx(0.026)
-    given = Limits(0.01, form_mm=0.02)
-    assert given.limit_mm(Quantity.FORM, 0.004) == 0.02
-    assert given.limit_mm(Quantity.FLATNESS, 0.004) == pytest.approx(0.026)
+    usual = {quantity: plan_of().limits.limit_mm(quantity) for quantity in Quantity}
+    lengths = {Quantity.SIZE: diagonal / 5000, Quantity.SPACING: diagonal / 5000}
+    assert usual == pytest.approx({**lengths, Quantity.FORM: diagonal / 2500, Quantity.FLATNESS: diagonal / 2500})
+    assert usual_limits(VOLUME, 0.02) == Limits(form_mm=0.04, size_mm=0.02, spacing_mm=0.02, flatness_mm=0.04)
+
+
+def test_a_warm_bar_is_longer_and_known_less_well_the_less_its_temperature_is() -> None:
+    told = replace(GOOD, temperature_c=24.0)
+    assert told.expanded_mm(told.distance) - 110.0 == pytest.approx(110 * 11.5e-6 * 4)
+    assert GOOD.expanded_mm(GOOD.distance) == 110.0
+    # By hand, half widths over the root of three: 110 mm * 11.5e-6/K * 1 K = 1.265 µm, 110 mm * 4 K * 1e-6/K = 0.44 µm.
+    found = error_uncertainty(Quantity.SPACING, told)
+    assert found.temperature_mm == pytest.approx(2 * np.hypot(1.265e-3, 0.44e-3) / np.sqrt(3))
+    assert error_uncertainty(Quantity.SPACING, GOOD).temperature_mm == pytest.approx(2 * 5 * 1.265e-3 / np.sqrt(3))
+    assert found.expanded_mm == pytest.approx(np.hypot(0.002, found.temperature_mm))
+
+
+def test_each_error_has_the_uncertainty_of_its_own_artefact() -> None:
+    still = replace(GOOD, expansion_per_k=0.0)
+    found = {quantity: error_uncertainty(quantity, still).expanded_mm for quantity in Quantity}
+    # Form; diameter and form; distance; form.
+    assert list(found.values()) == pytest.approx([0.001, np.hypot(0.001, 0.001), 0.002, 0.002])
+    loose = replace(still, fixture_mm=0.01)
+    assert all(
+        error_uncertainty(each, loose).expanded_mm == pytest.approx(np.hypot(known, 0.01))
+        for each, known in found.items()
+    )
 
 
 @pytest.mark.parametrize(
@@ -130,6 +151,8 @@ def test_usual_limits_follow_the_diagonal_and_the_noise() -> None:
         ({"diameter": Certified(-30.0, 0.001)}, "expected a length above 0 mm, found -30 mm"),
         ({"diameter": Certified(30.0, -1.0)}, "the uncertainty of the sphere's diameter: expected 0 mm or more"),
         ({"diameter": Certified(30.0)}, "uncertainty of the sphere's diameter is not told"),
+        ({"expansion_per_k": 11.5}, "expected 0 to 0.001 per kelvin, as steel has 1.15e-05, found 11.5"),
+        ({"fixture_mm": -1.0}, "the uncertainty of the fixture: expected 0 mm or more, found -1 mm"),
         ({"distance": Certified(60.0, 0.001)}, "expected 78.7 mm or more between the balls"),
         ({"distance": Certified(180.0, 0.001)}, "expected 170.0 mm or less between the balls"),
         ({"distance": Certified(float("nan"), 0.001)}, "the bar's distance: expected a length above 0 mm, found nan"),

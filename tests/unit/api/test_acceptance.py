@@ -54,7 +54,7 @@ def test_a_test_is_opened_and_says_what_to_do_first(client: TestClient) -> None:
 def test_positions_are_measured_to_the_end_and_the_report_is_fetched(
     client: TestClient, desk: AcceptanceDesk, tmp_path: Path
 ) -> None:
-    test = desk.open(lambda _: PLAN)
+    test = desk.open(lambda *_: PLAN)
     path = f"/acceptance/{test.id}"
     early = client.get(f"{path}/report.json")
     assert (early.status_code, early.json()["type"]) == (409, "/problems/artefact-not-ready")
@@ -89,7 +89,7 @@ def test_what_cannot_be_tested_is_refused(client: TestClient, body: dict[str, ob
 def test_a_held_rig_answers_409_and_an_unknown_test_404(
     client: TestClient, desk: AcceptanceDesk, queue: TameQueue
 ) -> None:
-    test = desk.open(lambda _: PLAN)
+    test = desk.open(lambda *_: PLAN)
     queue.busy = True
     answer = client.post(f"/acceptance/{test.id}/position")
     assert (answer.status_code, answer.json()["holder"]) == (409, "1")
@@ -126,7 +126,7 @@ def test_a_repeated_request_opens_and_measures_nothing_anew(
 
 
 def test_tests_are_listed_and_deleted(client: TestClient, desk: AcceptanceDesk) -> None:
-    first, second = desk.open(lambda _: PLAN), desk.open(lambda _: PLAN)
+    first, second = desk.open(lambda *_: PLAN), desk.open(lambda *_: PLAN)
     desk.measure(second.id, wait=False, scripted=True)
     listed = client.get("/acceptance").json()["tests"]
     assert [each["id"] for each in listed] == [str(second.id), str(first.id)]

@@ -79,6 +79,8 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient) -> 
         "square_mm": 10.0,
         "marker_mm": None,
         "dictionary": None,
+        "square_sigma": 0.001,
+        "aspect": 1.0,
         "title": "chessboard 4x3, 10 mm",
     }
     # Both axes unless the request says otherwise; the rest as the rig file says.
@@ -143,6 +145,8 @@ def test_board_that_no_request_names_is_the_usual_one(
         "square_mm": 12.0,
         "marker_mm": 9.0,
         "dictionary": "DICT_5X5_250",
+        "square_sigma": 0.001,
+        "aspect": 1.0,
         "title": "charuco 11x8, 12 mm",
     }
 
