@@ -104,9 +104,24 @@ class CameraTable(DriverTable):
 class SynchronisationTable(Strict):
     """What `slrig latency` measured: how much later than stated light comes, and the line time of rolling shutters."""
 
-    latency_s: Annotated[float, Field(ge=-10, le=10)]
-    latency_error_s: Annotated[float, Field(ge=0, le=10)]
+    latency_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    latency_error_s: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    earliest_s: Annotated[float, Field(ge=-10, le=10)] | None = None
+    """How much later than stated light begins to change at the earliest. With it, scans by free-running cameras wait
+    for no frame before the next pattern."""
+
     line_time_s: Annotated[dict[CameraName, LineSeconds], Field(default_factory=dict)]
+
+    trigger_period_s: Annotated[float, Field(gt=0, le=10)] | None = None
+    """By wire: the least time from one trigger pulse to the next, if the cameras need more than they tell."""
+
+    @model_validator(mode="after")
+    def _measured_whole(self) -> Self:
+        given = {"latency_s", "latency_error_s"} & self.model_fields_set
+        if len(given) == 1 or (not given and self.trigger_period_s is None):
+            message = "expected latency_s and latency_error_s, as slrig latency prints them, or trigger_period_s alone"
+            raise ValueError(message)
+        return self
 
 
 class VerificationTable(Strict):
@@ -115,6 +130,14 @@ class VerificationTable(Strict):
     refuse_when_stale: Annotated[
         bool, Field(description="refuse scans while the calibration is stale; they are stamped with it in any case")
     ] = False
+
+
+class AccuracyTable(Strict, use_attribute_docstrings=True):
+    """What the rig is for."""
+
+    wanted_mm: Annotated[float, Field(gt=0, le=1000)] | None = None
+    """What a point of a scan may be wrong by, in 95 of 100 places. Calibrations are graded by it, and the limits of an
+    acceptance test follow it."""
 
 
 class RigTable(Strict):
@@ -127,6 +150,7 @@ class RigTable(Strict):
     camera: Annotated[list[CameraTable], Field(default_factory=list)]
     synchronisation: SynchronisationTable | None = None
     verification: VerificationTable = VerificationTable()
+    accuracy: AccuracyTable = AccuracyTable()
     scan: ScanDefaults = ScanDefaults()
 
     @model_validator(mode="after")
@@ -170,6 +194,7 @@ class RigConfig:
     scan: ScanDefaults
     synchronisation: SynchronisationTable | None = None
     refuse_when_stale: bool = False
+    wanted_mm: float | None = None
 
 
 def read_rig(path: Path) -> RigConfig:
@@ -203,6 +228,7 @@ def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
         scan=table.scan,
         synchronisation=table.synchronisation,
         refuse_when_stale=table.verification.refuse_when_stale,
+        wanted_mm=table.accuracy.wanted_mm,
     )
 
 

@@ -13,7 +13,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from slrig.accept.plan import AcceptancePlan, Artefacts, Certified, Limits, Step, exact_artefacts, usual_limits
+from slrig.accept.plan import (
+    STEEL_PER_K,
+    AcceptancePlan,
+    Artefacts,
+    Certified,
+    Limits,
+    Step,
+    exact_artefacts,
+    usual_limits,
+)
 from slrig.accept.positions import acceptance_plan, rig_volume_mm
 from slrig.accept.report import document
 from slrig.accept.running import Place, required_calibration, run_acceptance
@@ -37,22 +46,26 @@ def plan_for(asked: AcceptanceOptions, rig: Rig) -> AcceptancePlan:
     calibration = required_calibration(rig)
     rendered = rig.truth() is not None
     volume = rig_volume_mm(calibration) if asked.volume_mm is None else np.array(asked.volume_mm).reshape(2, 3)
-    usual_mm = usual_limits(volume, rendered=rendered).spacing_mm
     return acceptance_plan(
         calibration,
         volume,
         _artefacts(asked, exact_artefacts(volume) if rendered else None),
         rendered=rendered,
-        limits=Limits(
-            usual_mm if asked.spacing_limit_mm is None else asked.spacing_limit_mm,
-            asked.form_limit_mm,
-            asked.size_limit_mm,
-            asked.flatness_limit_mm,
-        ),
+        limits=_limits(asked, usual_limits(volume, asked.wanted_mm)),
         repeats=asked.repeats,
         exposure_s=asked.exposure_s,
         notes=asked.notes,
     )
+
+
+def _limits(asked: AcceptanceOptions, usual: Limits) -> Limits:
+    told = {
+        "form_mm": asked.form_limit_mm,
+        "size_mm": asked.size_limit_mm,
+        "spacing_mm": asked.spacing_limit_mm,
+        "flatness_mm": asked.flatness_limit_mm,
+    }
+    return replace(usual, **{name: limit for name, limit in told.items() if limit is not None})
 
 
 def _artefacts(asked: AcceptanceOptions, made: Artefacts | None) -> Artefacts:
@@ -74,6 +87,8 @@ def _artefacts(asked: AcceptanceOptions, made: Artefacts | None) -> Artefacts:
         exact if asked.plane_form_mm is None else asked.plane_form_mm,
         asked.certificate,
         asked.temperature_c,
+        asked.expansion_per_k if asked.expansion_per_k is not None else STEEL_PER_K if made is None else 0.0,
+        asked.fixture_mm,
     )
 
 
@@ -87,6 +102,8 @@ def accept(rig_file: Path, asked: AcceptanceOptions, *, output: Path, scripted: 
     """
     set_up_logs_for_a_person()
     config = read_rig(rig_file)
+    if asked.wanted_mm is None:
+        asked = replace(asked, wanted_mm=config.wanted_mm)
     console = Console(stderr=as_json)
     with TemporaryDirectory(prefix="slrig-acceptance-") as scratch:
         if scripted:
@@ -138,7 +155,7 @@ def tell(result: AcceptanceResult, console: Console) -> None:
     for each in result.verdicts:
         table.add_row(
             f"{each.quantity} {each.quantity.words}",
-            *(f"{1000 * value:.1f} µm" for value in (each.error_mm, each.limit_mm, each.uncertainty_mm)),
+            *(f"{1000 * value:.1f} µm" for value in (each.error_mm, each.limit_mm, each.uncertainty.expanded_mm)),
             each.step,
             Text(each.decision.value, style=_COLOURS[each.decision]),
         )

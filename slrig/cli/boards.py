@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import astuple
+from dataclasses import replace
 from pathlib import Path
 
 import typer
@@ -28,7 +28,12 @@ def chosen_board(asked: BoardOptions) -> Board:
     needed = {"--board": asked.kind, "--corners": asked.corners, "--square-mm": asked.square_mm}
     missing = [name for name, value in needed.items() if value is None]
     if not missing:
-        return board_option(*astuple(asked))
+        return _as_printed(
+            board_option(
+                str(asked.kind), str(asked.corners), float(asked.square_mm or 0), asked.marker_mm, asked.dictionary
+            ),
+            asked,
+        )
     usual = (USUAL_BOARD.columns, USUAL_BOARD.rows)
     if asked.kind not in (None, USUAL_BOARD.kind) or (asked.corners is not None and _counted(asked.corners) != usual):
         message = (
@@ -38,9 +43,16 @@ def chosen_board(asked: BoardOptions) -> Board:
         raise CalibrationError(message)
     square_mm = USUAL_BOARD.square_mm if asked.square_mm is None else asked.square_mm
     corners = f"{USUAL_BOARD.columns}x{USUAL_BOARD.rows}"
-    board = board_option(USUAL_BOARD.kind, corners, square_mm, asked.marker_mm, asked.dictionary)
+    board = _as_printed(board_option(USUAL_BOARD.kind, corners, square_mm, asked.marker_mm, asked.dictionary), asked)
     typer.echo(f"board     {board.description} (--board, --corners and --square-mm name another)", err=True)
     return board
+
+
+def _as_printed(board: Board, asked: BoardOptions) -> Board:
+    """The board with what was said of the size of its print."""
+    if asked.square_sigma is not None:
+        board = replace(board, square_sigma=asked.square_sigma)
+    return board if asked.measured_mm is None else board.as_read(*asked.measured_mm, square_sigma=asked.square_sigma)
 
 
 def board_option(

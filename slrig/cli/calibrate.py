@@ -75,6 +75,12 @@ def solve(
     earlier: Annotated[
         Path | None, typer.Option(help="Calibration of the same rig: is the board's size what it was then?")
     ] = None,
+    wanted_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-4, max=1000.0, help="What a point may be wrong by, mm. Default: 1/2000 of the volume's diagonal."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate from recorded poses. Needs no service and no rig."""
@@ -84,7 +90,14 @@ def solve(
 
     shape = BoardShape(board_shape)
     solve_folder(
-        folder, chosen_board(asked), output, report=report, earlier=earlier, board_shape=shape, as_json=as_json
+        folder,
+        chosen_board(asked),
+        output,
+        report=report,
+        earlier=earlier,
+        board_shape=shape,
+        wanted_mm=wanted_mm,
+        as_json=as_json,
     )
 
 
@@ -182,6 +195,40 @@ def show(calibration: CalibrationId, service: Service, as_json: AsJson = False) 
 
 @app.command()
 @grouped
+def check(
+    poses: Annotated[
+        str, typer.Argument(metavar="FOLDER_OR_ID", help="Folder with one bundle per pose, or a calibration's id.")
+    ],
+    asked: BoardOptions,
+    board_shape: Shape = "auto",
+    *,
+    service: Service,
+    as_json: AsJson = False,
+) -> None:
+    """Check the stated error by odd against even poses.
+
+    They are solved apart and compared, in mm: a folder's here and now, by a service with every solve.
+    """
+    if Path(poses).is_dir():
+        from slrig.calibration.board import BoardShape
+        from slrig.cli.boards import chosen_board
+        from slrig.cli.calibrate_solve import check_folder
+
+        check_folder(Path(poses), chosen_board(asked), board_shape=BoardShape(board_shape), as_json=as_json)
+        return
+    from slrig.cli.calibration_screen import checked, tell_check
+    from slrig.cli.display import print_json
+
+    with service.client() as client:
+        session = client.get(_path(client, poses))
+    if session["result"] is None:
+        message = f"Calibration {session['id'][:8]} has no solve to check: it is {_unsolved(session)}."
+        raise ServiceError(message)
+    (print_json if as_json else tell_check)(checked(session["result"]))
+
+
+@app.command()
+@grouped
 def compare(
     first: Annotated[str, typer.Argument(metavar="FIRST", help=_ID_HELP)],
     second: Annotated[str, typer.Argument(metavar="SECOND", help="Id of the one to compare it with.")],
@@ -272,6 +319,10 @@ def submit(
         found = client.post(f"/calibration/import{query}", document)
     typer.echo(f"{'imported':<10}{found['id']}")
     typer.echo(f"To have scans use it: slrig calibrate activate {found['id'][:8]}")
+
+
+def _unsolved(session: Mapping[str, Any]) -> str:
+    return "imported, without its poses" if session["imported"] else f"{session['state']}; solve it first"
 
 
 def _path(client: ServiceClient, beginning: str) -> str:

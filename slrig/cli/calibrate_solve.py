@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
@@ -19,7 +19,7 @@ from slrig.calibrate.pose_frames import bundle_device_sizes
 from slrig.calibration.board import Board, BoardShape
 from slrig.calibration.poses.checks import check_same_devices
 from slrig.calibration.solution import PROJECTOR
-from slrig.cli.calibration_screen import tell_result
+from slrig.cli.calibration_screen import checked, tell_check, tell_result
 from slrig.cli.display import ProgressDisplay, counted, print_json, progress_shown
 from slrig.cli.reconstruct import keep_kernels
 from slrig.errors import BundleError, ConfigError, PatternError, PoseRefusedError, SolveRefusedError
@@ -53,19 +53,52 @@ def solve_folder(
     report: Path | None,
     earlier: Path | None,
     board_shape: BoardShape,
+    wanted_mm: float | None,
     as_json: bool,
 ) -> None:
     """Read the poses, solve, print how good the calibration is, and write it and its report.
 
     earlier : file of a calibration of the same devices, to compare the scale with. board_shape : whether the board may
-    be bowed.
+    be bowed. wanted_mm : what a point of a scan may be wrong by.
 
     Raises ConfigError or StorageError where the output cannot be written, BundleError where there are no bundles,
     CalibrationError where the poses are of different rigs or the earlier calibration cannot be read, PoseRefusedError
     where none of the poses can be used, SolveRefusedError where they determine no calibration.
     """
-    set_up_logs_for_a_person()
     _require_writable(output, report)
+    document = _solved(
+        folder, board, output, report=report, earlier=earlier, board_shape=board_shape, wanted_mm=wanted_mm
+    )
+    if as_json:
+        print_json({**document, "output": str(output), "report": report and str(report)})
+        return
+    tell_result(document, Console())
+    typer.echo(f"\n{'written':<10}{output}")
+    if report is not None:
+        typer.echo(f"{'report':<10}{report}")
+
+
+def check_folder(folder: Path, board: Board, *, board_shape: BoardShape, as_json: bool) -> None:
+    """Read the poses, solve odd and even ones apart, and print what they differ by.
+
+    Raises as `solve_folder` does, and ConfigError where the poses are too few to be halved.
+    """
+    document = _solved(folder, board, None, report=None, earlier=None, board_shape=board_shape, wanted_mm=None)
+    (print_json if as_json else tell_check)(checked(document))
+
+
+def _solved(
+    folder: Path,
+    board: Board,
+    output: Path | None,
+    *,
+    report: Path | None,
+    earlier: Path | None,
+    board_shape: BoardShape,
+    wanted_mm: float | None,
+) -> dict[str, Any]:
+    """Solve, write the calibration and its report where a file is named, and return what is told of it."""
+    set_up_logs_for_a_person()
     bundles = pose_bundles(folder)
     before = None if earlier is None else read_calibration(earlier)
     keep_kernels()
@@ -89,24 +122,26 @@ def solve_folder(
 
         try:
             result = solve_poses(
-                board, cameras, projector, found.poses, progress=solving, earlier=before, board_shape=board_shape
+                board,
+                cameras,
+                projector,
+                found.poses,
+                progress=solving,
+                earlier=before,
+                board_shape=board_shape,
+                wanted_mm=wanted_mm,
             )
         except SolveRefusedError as error:
             raise SolveRefusedError(_with_refused(str(error), found.refused)) from error
         document = {**summary(result), "refused": found.refused, "remarks": found.remarks}
-        write = write_calibration if output.suffix.lower() == ".json" else write_opencv_calibration
-        write(output, result.calibration)
+        if output is not None:
+            write = write_calibration if output.suffix.lower() == ".json" else write_opencv_calibration
+            write(output, result.calibration)
         if report is not None:
             display("writing the report", 1.0, "")
             write_file(report, _report(result, found, folder, bundles, setting).encode())
         display("done", 1.0, "")
-    if as_json:
-        print_json({**document, "output": str(output), "report": report and str(report)})
-        return
-    tell_result(document, Console())
-    typer.echo(f"\n{'written':<10}{output}")
-    if report is not None:
-        typer.echo(f"{'report':<10}{report}")
+    return document
 
 
 def pose_bundles(folder: Path) -> dict[str, Path]:

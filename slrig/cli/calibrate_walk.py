@@ -35,6 +35,8 @@ def opened(client: ServiceClient, board: Board, *, label: str | None, projector:
         "square_mm": board.square_mm,
         "marker_mm": board.marker_mm,
         "dictionary": board.dictionary,
+        "square_sigma": board.square_sigma,
+        "aspect": board.aspect,
     }
     return client.post("/calibration", {"board": asked, "label": label, "projector": projector})
 

@@ -13,8 +13,9 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from slrig.calibrate.words import rounded
-from slrig.calibration.solution import CELLS
+from slrig.calibration.solution import CELLS, LEAST_HALVED
 from slrig.cli.display import counted, plain_table
+from slrig.errors import ConfigError
 from slrig.printable import printable
 
 _COLOURS = {"good": "green", "usable": "yellow"}
@@ -30,7 +31,7 @@ _DIFFERENCES = {
     "rotation_deg": "turned, °",
     "baseline_mm": "baseline, mm",
 }
-_MOST_REASONS = 4
+_MOST_REASONS, _MOST_REMARKS = 4, 3
 _MOST_POSES = 6
 
 _SHADES = ("", "bold #10301c on #8fd19e", "bold #10301c on #5cb57c", "bold white on #338857", "bold white on #1f6b41")
@@ -82,6 +83,36 @@ def tell_comparison(found: Mapping[str, Any]) -> None:
     console.print(table)
 
 
+def checked(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Of what `pose_judging.summary` holds, the check by odd and even poses, and what it stands beside.
+
+    Raises ConfigError where there is none: too few poses, or solved before solves were checked.
+    """
+    if document.get("odd_even") is None:
+        message = (
+            f"odd and even poses were not solved apart: expected {LEAST_HALVED} poses or more, each half of which "
+            f"determines a calibration, found {len(document['poses'])} that could be used. Add poses, and solve again; "
+            "what was solved before solves were checked so is checked by that, too"
+        )
+        raise ConfigError(message)
+    return {key: document[key] for key in ("odd_even", "expected", "poses", "outliers")}
+
+
+def tell_check(found: Mapping[str, Any]) -> None:
+    """Print what `checked` returns."""
+    console, halves = Console(), found["odd_even"]
+    console.print(_listed("·" if halves["fits"] else "!", halves["words"]))
+    console.print()
+    table = plain_table(Column(style="bold", no_wrap=True), Column(), show_header=False)
+    table.add_row("poses", f"{halves['poses'][0]} odd, {halves['poses'][1]} even")
+    table.add_row("difference", f"{_mm(halves['difference_mm'])}, rms over the volume")
+    table.add_row(
+        "stated", f"{_mm(halves['stated_mm'])} (1 σ) for it; {_mm(found['expected']['point_mm'])} for all poses"
+    )
+    table.add_row("taken out", f"{rounded(halves['turn_deg'])}° and {_mm(halves['shift_mm'])}, which change no shape")
+    console.print(table)
+
+
 def tell_result(document: Mapping[str, Any], console: Console) -> None:
     """Print what `pose_judging.summary` of a session holds, and which poses were `refused` or have `remarks`."""
     verdict = document["verdict"]
@@ -89,13 +120,13 @@ def tell_result(document: Mapping[str, Any], console: Console) -> None:
     mark = (f" {words.upper()} ", f"bold reverse {_COLOURS.get(verdict['grade'], 'red')}")
     # The summary without the verdict's own word, which stands before it already.
     console.print(Text.assemble(mark, f"  {verdict['summary'].removeprefix(words).lstrip(':; ')}"))
-    for words in document.get("scale", ()):
-        console.print(_listed("!", words))
     for reason in verdict["reasons"][:_MOST_REASONS]:
         console.print(_listed("·", reason))
     more = len(verdict["reasons"]) - _MOST_REASONS
     if more > 0:
         console.print(f"   and {more} more, in the report and in --json", style="dim", highlight=False)
+    for remark in verdict.get("remarks", ())[:_MOST_REMARKS]:
+        console.print(_listed("·", remark), style="dim")
     console.print()
     console.print(_devices(document["devices"]))
     console.print()
@@ -148,7 +179,12 @@ def _figures(document: Mapping[str, Any]) -> Table:
         words += f", {_mm(expected['total_mm'])} with its noise"
     if expected["length_share"] is not None:
         words += f"; a length {rounded(1000 * expected['length_share'])} mm per metre"
+    if expected.get("board_mm"):
+        words += f"; of the point's error {_mm(expected['board_mm'])} by the size of the board"
     table.add_row("error", words)
+    if (halves := document.get("odd_even")) is not None:
+        apart = f"odd and even poses differ by {_mm(halves['difference_mm'])}, {halves['ratio']:.2f} × what is stated"
+        table.add_row("check", f"{apart} for halves")
     table.add_row("volume", f"{sides} mm, where the board was held")
     for pair in document["baselines"]:
         length = figure_words(pair["length_mm"]["value"], pair["length_mm"]["sigma"])

@@ -18,6 +18,7 @@ import typer.core
 from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
+from slrig.cli.patterns import patterns
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -376,6 +377,7 @@ def accept(
         raise typer.Exit(1)
 
 
+app.command()(patterns)
 app.command()(backup)
 app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")

@@ -247,7 +247,9 @@ def _nothing_there(lacking: Sequence[str], offered: Mapping[str, Sequence[FoundD
     """Words for a camera or a projector that is neither named nor plugged in, with what to check."""
     there = [f"{each.driver}:{each.device}" for kind in ("camera", "projector") for each in offered[kind]]
     flags = " ".join(f"--{kind} DRIVER:DEVICE" for kind in lacking)
-    screen = "a projector on HDMI must be switched on and a display of its own, in a session of X (see DISPLAY)"
+    screen = (
+        "a projector on HDMI must be on, and a display of its own in a session of X (see DISPLAY), or without a desktop"
+    )
     lines = [
         f"no {' and no '.join(lacking)} is plugged in that an installed driver can find",
         *([f"found: {', '.join(there)}"] if there else []),

@@ -60,6 +60,14 @@ class BoardOptions:
     dictionary: Annotated[
         str | None, typer.Option(help="Markers of a ChArUco board, by OpenCV's name. Default DICT_5X5_250.")
     ] = None
+    square_sigma: Annotated[
+        float | None,
+        typer.Option(help="Deviation of the print's width and height, over themselves. Default 0.001 (paper)."),
+    ] = None
+    measured_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="X Y", help="The printed scales as a ruler reads them: below the board, left of it."),
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,20 +138,48 @@ class AcceptanceOptions:
             "Default: that of the calibration.",
         ),
     ] = None
+    wanted_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-4,
+            max=1000.0,
+            help="What a point may be wrong by in what the rig is for; limits follow it. "
+            "Default: the rig file's, or 1/5000 of the volume's diagonal.",
+        ),
+    ] = None
     spacing_limit_mm: Annotated[
-        float | None, typer.Option(help="Limit of sphere spacing. Default: 1/10000 of the volume's diagonal.")
+        float | None, typer.Option(min=0.0, help="Limit of sphere spacing. Default: --wanted-mm.")
     ] = None
     form_limit_mm: Annotated[
-        float | None, typer.Option(help="Limit of probing form. Default: 6.5 standard deviations of a point.")
+        float | None, typer.Option(min=0.0, help="Limit of probing form. Default: twice --wanted-mm.")
     ] = None
-    size_limit_mm: Annotated[float | None, typer.Option(help="Limit of probing size. Default: as of form.")] = None
-    flatness_limit_mm: Annotated[float | None, typer.Option(help="Limit of flatness. Default: as of form.")] = None
+    size_limit_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="Limit of probing size. Default: --wanted-mm.")
+    ] = None
+    flatness_limit_mm: Annotated[
+        float | None, typer.Option(min=0.0, help="Limit of flatness. Default: twice --wanted-mm.")
+    ] = None
     repeats: Annotated[
         int, typer.Option(min=1, max=50, help="Captures of the first position of each artefact, for the scatter.")
     ] = 3
     exposure_s: Annotated[float | None, typer.Option(help="Exposure of every camera. Default: the rig file's.")] = None
     certificate: Annotated[str, typer.Option(help="Numbers of the artefacts' certificates, for the report.")] = ""
-    temperature_c: Annotated[float | None, typer.Option(help="Temperature of the room, for the report.")] = None
+    temperature_c: Annotated[
+        float | None,
+        typer.Option(
+            help="Temperature of the artefacts: certified lengths hold at 20 °C. Default: about 20, not known well."
+        ),
+    ] = None
+    expansion_per_k: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Thermal expansion of the artefacts per kelvin. Default: 11.5e-6, that of steel."),
+    ] = None
+    fixture_mm: Annotated[
+        float,
+        typer.Option(
+            min=0.0, help="By how much an artefact may move or bend where it stands while it is captured (k = 2)."
+        ),
+    ] = 0.0
     notes: Annotated[str, typer.Option(help="Free text for the report.")] = ""
 
 

@@ -16,7 +16,6 @@ from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import SessionState
 from slrig.calibration.board import Board
-from slrig.calibration.judging.verdict import Grade
 from slrig.errors import (
     CalibrationError,
     CalibrationNotFoundError,
@@ -185,7 +184,8 @@ class CalibrationTask:
         result = record.result or {}
         verdict = result.get("verdict") or {}
         # Nobody looks at the report before scans use it.
-        activated = asked.activate and verdict.get("grade") != Grade.DO_NOT_USE
+        unattended = verdict.get("unattended") or []
+        activated = asked.activate and not unattended
         if activated:
             self._calibrations.activate(session)
         return {
@@ -200,6 +200,7 @@ class CalibrationTask:
             "verdict": verdict.get("summary"),
             "expected_error_mm": (result.get("expected") or {}).get("point_mm"),
             "activated": activated,
+            "left_to_a_person": unattended if asked.activate else [],
         }
 
 
@@ -239,7 +240,7 @@ class AcceptanceTask:
                 str(each.quantity): {
                     "error_mm": each.error_mm,
                     "limit_mm": each.limit_mm,
-                    "uncertainty_mm": each.uncertainty_mm,
+                    "uncertainty_mm": each.uncertainty.expanded_mm,
                     "position": each.step,
                     "decision": str(each.decision),
                 }

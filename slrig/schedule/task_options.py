@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError
 
 from slrig.bundle.faults import Strict, explain, keys_of
 from slrig.bundle.free_text import FreeText
-from slrig.calibration.board import Board, BoardKind
+from slrig.calibration.board import PRINT_SIGMA, Board, BoardKind
 from slrig.errors import ScheduleError
 from slrig.rig.session import RigFacts
 
@@ -25,11 +25,18 @@ class BoardOptions(Strict):
     square_mm: float
     marker_mm: float | None = None
     dictionary: str | None = None
+    square_sigma: Annotated[float, Field(gt=0, le=0.05)] | None = None
+    aspect: Annotated[float, Field(gt=0.9, lt=1.1)] = 1.0
+    measured_mm: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
 
     def board(self) -> Board:
         """The board that is meant. Raises CalibrationError."""
         columns, rows = self.corners
-        return Board(self.kind, columns, rows, self.square_mm, self.marker_mm, self.dictionary)
+        sigma = PRINT_SIGMA if self.square_sigma is None else self.square_sigma
+        board = Board(
+            self.kind, columns, rows, self.square_mm, self.marker_mm, self.dictionary, sigma, self.aspect
+        )  # fmt: skip
+        return board if self.measured_mm is None else board.as_read(*self.measured_mm, square_sigma=self.square_sigma)
 
 
 class VerificationOptions(Strict):
@@ -42,7 +49,7 @@ class VerificationOptions(Strict):
 
 class CalibrationOptions(Strict):
     """Of a full set of poses with its solve. positions none : all of them. activate : have scans use what came of it,
-    unless its verdict is not to use it.
+    unless its verdict leaves that to a person.
     """
 
     board: BoardOptions

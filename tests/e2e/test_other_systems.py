@@ -80,7 +80,7 @@ def test_devices_says_which_drivers_are_for_linux_only() -> None:
     assert "not on this system" in states["v4l2"]
     assert states["opencv"].endswith("ok")
     found = json.loads(run("-m", "slrig.cli", "devices", "--json"))
-    assert [each["driver"] for each in found["elsewhere"]] == ["dlpc350", "v4l2"]
+    assert [each["driver"] for each in found["elsewhere"]] == ["dlpc350", "dlpc900", "v4l2"]
     assert found["faults"] == []
     assert all(driver["fault"] is None for driver in found["drivers"] if driver["package"] == "slrig")
 
@@ -94,5 +94,5 @@ def test_service_holds_its_rig_and_ends_in_good_order(start: Start, tmp_path: Pa
         scan = client.start({})
         states = [event.get("state") for event in client.follow(scan)]
         assert states[-1] == "succeeded", service.log.read_text()
-        assert [each["driver"] for each in client.get("/device")["elsewhere"]] == ["dlpc350", "v4l2"]
+        assert [each["driver"] for each in client.get("/device")["elsewhere"]] == ["dlpc350", "dlpc900", "v4l2"]
     assert service.stop() == 0

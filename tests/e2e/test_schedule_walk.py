@@ -63,7 +63,9 @@ def test_calibration_by_schedule_solves_and_is_used_and_an_old_one_goes(
     service = start(write_rig(tmp_path / "rig"))
     with Caller(service) as caller:
         old = caller.opened()["id"]
-        options = {"board": BOARD, "positions": list(range(1, 11)), "activate": True}
+        # The rig has no calibration yet: somebody has to vouch for the size of the board.
+        board = {**BOARD, "square_sigma": 2e-4}
+        options = {"board": board, "positions": list(range(1, 11)), "activate": True}
         made = caller.post("/schedule", 201, cron="* * * * *", task="calibration", enabled=False, options=options)
         at_once(caller, service, made)
         name = awaited(lambda: caller.get("/rig")["holder"], "the run")

@@ -165,6 +165,8 @@ class Desk:
                 "square_mm": 12.0,
                 "marker_mm": None,
                 "dictionary": None,
+                "square_sigma": 0.001,
+                "aspect": 1.0,
                 "title": BOARD.title,
             },
             "patterns": {

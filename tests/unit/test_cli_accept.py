@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from slrig.accept.plan import AcceptancePlan
+from slrig.accept.plan import AcceptancePlan, Limits
 from slrig.accept.running import run_acceptance
 from slrig.accept.scene import scripted_config
 from slrig.accept.verdicts import AcceptanceResult
@@ -42,7 +42,7 @@ def plan() -> AcceptancePlan:
 def test_a_rendered_rig_needs_no_artefacts_and_states_exact_ones(plan: AcceptancePlan) -> None:
     assert plan.rendered
     assert plan.artefacts.diameter.uncertainty_mm == 0
-    assert plan.limits.spacing_mm == pytest.approx(plan.diagonal_mm / 20_000)
+    assert plan.limits.spacing_mm == pytest.approx(plan.diagonal_mm / 5000)
     assert len(plan.steps) == 23
 
 
@@ -55,8 +55,27 @@ def test_metal_needs_the_certificates() -> None:
         with pytest.raises(InvalidInputError, match="the sphere's form, the plane's form is not told"):
             plan_for(given, metal)
         certain = replace(given, sphere_form_mm=0.001, plane_form_mm=0.002, spacing_limit_mm=0.05)
-        assert plan_for(certain, metal).limits.spacing_mm == 0.05
+        wanted = plan_for(replace(certain, wanted_mm=0.03), metal).limits
+        assert wanted == Limits(form_mm=0.06, size_mm=0.03, spacing_mm=0.05, flatness_mm=0.06)
         assert not plan_for(certain, metal).rendered
+
+
+@pytest.mark.slow
+def test_limits_follow_the_rig_file_unless_asked_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    planned: list[Limits] = []
+
+    def left(_rig: Rig, plan: AcceptancePlan, _output: Path, **_: object) -> AcceptanceResult:
+        planned.append(plan.limits)
+        message = "left"
+        raise ScanCancelledError(message)
+
+    monkeypatch.setattr(accepting, "_tested", left)
+    rig_file = tmp_path / "rig.toml"
+    told = BALL_BAR.read_text(encoding="utf-8").replace('"../', f'"{RIGS.parent}/')
+    rig_file.write_text(f"{told}\n[accuracy]\nwanted_mm = 0.04\n", encoding="utf-8")
+    for asked in ([], ["--wanted-mm", "0.01"]):
+        CliRunner().invoke(app, [str(rig_file), "--output", str(tmp_path / "out"), *asked])
+    assert [limits.spacing_mm for limits in planned] == [0.04, 0.01]
 
 
 def test_a_given_volume_is_used() -> None:

@@ -107,6 +107,18 @@ def test_folder_of_poses_becomes_a_calibration(poses: Path, solving: dict[str, A
     assert stages[-2:] == ["adjustment", "done"]
 
 
+def test_a_folder_of_poses_is_checked_without_writing_anything(
+    poses: Path, solving: dict[str, Any], tmp_path: Path
+) -> None:
+    result = run("check", poses, *BOARD_OPTIONS, "--board-shape", "flat")
+    assert result.exit_code == 0, result.output
+    assert (solving["poses"], solving["board_shape"]) == (list(GIVEN), BoardShape.FLAT)
+    assert "0.89 × what is stated for two halves" in " ".join(result.stdout.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["poses"]
+    # What names no folder is the beginning of an id.
+    assert "slrig serve RIG" in refused(run("check", tmp_path / "none", "--url", "http://127.0.0.1:9"))
+
+
 def test_json_says_what_the_screen_says(poses: Path, solving: dict[str, Any], tmp_path: Path) -> None:
     bundle(poses, "pose_20", camera="left")
     (poses / "pose_20" / "bundle.json").write_text('{"format": ')
@@ -383,5 +395,6 @@ def test_screen_fits_on_one_and_holds_the_figures() -> None:
         assert f"{device['rms_px']:.3f}" in text
         assert f"{device['held_out_rms_px']:.3f} (× {device['held_out_rms_px'] / device['rms_px']:.2f})" in text
     assert f"{figures['expected']['point_mm']:.4f} mm" in text
+    assert "odd and even poses differ by 0.0171 mm, 0.89 × what is stated for halves" in text
     assert "191.809 ± 0.015 mm apart" in text
     assert BUMP.partition(";")[0] in " ".join(text.split())

@@ -51,7 +51,15 @@ def walked(desk: Desk, *answers: str | BaseException) -> tuple[str, Hand]:
 def test_walk_opens_a_session_for_the_board() -> None:
     desk = Desk()
     text, _ = walked(desk, "q")
-    board = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0, "marker_mm": None, "dictionary": None}
+    board = {
+        "kind": "chessboard",
+        "corners": [11, 8],
+        "square_mm": 12.0,
+        "marker_mm": None,
+        "dictionary": None,
+        "square_sigma": 0.001,
+        "aspect": 1.0,
+    }
     assert desk.asked == [("POST", "/calibration", {"board": board, "label": None, "projector": True})]
     assert "Hold the board where every camera sees it" in text
     assert f"slrig calibrate run --id {ID[:8]}" in text

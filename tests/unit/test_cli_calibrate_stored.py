@@ -52,6 +52,8 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
         "missing": [],
         "moved_rms_mm": 0.01,
         "moved_most_mm": 0.03,
+        "turn_deg": 0.002,
+        "shift_mm": 0.1,
         "words": ["points move by 0.010 mm rms, 0.030 mm at most"],
     }
     ComparisonBody.model_validate(compared)
@@ -93,6 +95,36 @@ def test_show_tells_the_result(kept: list[httpx2.Request]) -> None:
     assert "1810.40 ± 0.21" in result.stdout
     assert json.loads(run("show", ID, "--json").stdout)["id"] == ID
     assert kept[1].url.path == f"/calibration/{ID}"
+
+
+def test_check_tells_what_the_solve_kept_of_its_halves(kept: list[httpx2.Request]) -> None:
+    result = run("check", ID[:4])
+    assert result.exit_code == 0, result.output
+    told = " ".join(result.stdout.split())
+    for words in ("differ by 0.017 mm at a point, 0.89 × what is stated", "10 odd, 9 even", "0.0193 mm (1 σ)"):
+        assert words in told
+    assert kept[-1].method == "GET"
+    found = json.loads(run("check", ID, "--json").stdout)
+    assert found["odd_even"]["ratio"] == pytest.approx(0.0171 / 0.0193)
+    assert found["expected"]["point_mm"] > 0
+
+
+def test_check_says_why_there_is_none(kept: list[httpx2.Request], monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = ServiceClient.get
+    lacking: dict[str, Any] = {"result": None}
+
+    def get(client: ServiceClient, path: str) -> Any:
+        found = whole(client, path)
+        return {**found, **lacking} if path.endswith(ID) else found
+
+    monkeypatch.setattr(ServiceClient, "get", get)
+    assert "has no solve to check: it is solved" in run("check", ID).stderr
+    lacking |= {"state": "solved", "imported": True}
+    assert "it is imported, without its poses" in run("check", ID).stderr
+    # A result on record from before solves were halved.
+    lacking["result"] = {"poses": ["pose 1"] * 7, "verdict": {}}
+    assert "expected 8 poses or more" in refused(run("check", ID))
+    assert len(kept) == 6
 
 
 def test_compare_tells_differences_in_their_deviations(kept: list[httpx2.Request]) -> None:

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from drivers.depthai import presence
-from drivers.dlpc350 import link
+from drivers.dlpc350.projector import DLPC350
+from drivers.dlpc900.projector import DLPC900
+from drivers.pattern_engine.link import TI
 from drivers.serial_projector.finding import MICROPYTHON_RP2
 from tests.npm import lacking
 
@@ -27,13 +29,17 @@ CLASSES = {
     "opencv": {"video4linux"},
     "depthai": {"usb_device"},
     "genicam": {"usb_device"},
+    "gentl": {"usb_device"},
     "dlpc350": {"hidraw"},
+    "dlpc900": {"hidraw"},
     "serial_projector": {"ttyACM", "ttyUSB", "ttyS", "ttyAMA"},
 }
 """Of each driver, the classes of device nodes that it opens."""
 
 NO_NODE = {
+    "kms": "graphics cards: in slrig-kms.conf, for most rigs have no use for them",
     "screen": "speaks to an X server through its socket: slrig-screen.conf",
+    "picamera2": "media and DMA nodes of one kind of computer: in the README beside the unit",
     "replay": "reads files",
     "simulated": "computes its pictures",
 }
@@ -71,7 +77,7 @@ def test_rules_name_the_devices_that_the_drivers_open() -> None:
     assert vendor is not None
     assert ids == {
         (vendor.group(1), None),
-        tuple(f"{part:04x}" for part in link.ENGINE),
+        *((f"{TI:04x}", f"{kind.product:04x}") for kind in (DLPC350, DLPC900)),
         tuple(f"{part:04x}" for part in MICROPYTHON_RP2),
     }
     # One equals sign assigns, two compare: "GROUP==" would be a rule that never holds.
@@ -99,7 +105,7 @@ def test_exposure_of_the_unit_is_low(tmp_path: Path) -> None:
     units = tmp_path / "units"
     _lay_out(units)
     limit = f"--threshold={10 * MOST_EXPOSURE:.0f}"
-    for unit in ("slrig.service", "slrig-screen.service"):
+    for unit in ("slrig.service", "slrig-screen.service", "slrig-kms.service"):
         found = _said("systemd-analyze", "security", "--offline=true", "--no-pager", limit, str(units / unit))
         level = re.search(r"exposure level for \S+: ([\d.]+)", found)
         assert level is not None, found
@@ -110,7 +116,16 @@ def test_systemd_reads_the_unit(tmp_path: Path) -> None:
     _require_systemd()
     _lay_out(tmp_path)
     assert _said("systemd-analyze", "verify", "--man=no", str(tmp_path / "slrig.service")) == ""
-    assert _said("systemd-analyze", "verify", "--man=no", str(tmp_path / "slrig-screen.service")) == ""
+    for unit in ("slrig-screen.service", "slrig-kms.service", "slrig-xorg.service"):
+        assert _said("systemd-analyze", "verify", "--man=no", str(tmp_path / unit)) == "", unit
+
+
+def test_graphics_cards_are_allowed_where_a_driver_opens_them() -> None:
+    alone = (DEPLOY / "slrig-kms.conf").read_text(encoding="utf-8")
+    assert re.findall(r"^DeviceAllow=(.+)$", alone, re.MULTILINE) == ["char-drm rw"]
+    # The guard has to outlive the service.
+    assert re.findall(r"^KillMode=(.+)$", alone, re.MULTILINE) == ["process"]
+    assert "char-drm" not in UNIT
 
 
 def _require_systemd() -> None:
@@ -126,8 +141,11 @@ def _lay_out(folder: Path) -> None:
     unit = UNIT.replace("/opt/slrig/bin/slrig", "/bin/true")
     assert unit != UNIT
     (folder / "slrig.service").write_text(unit, encoding="utf-8")
-    screen = (DEPLOY / "slrig-screen.conf").read_text(encoding="utf-8")
-    (folder / "slrig-screen.service").write_text(unit + screen, encoding="utf-8")
+    for name in ("slrig-screen", "slrig-kms"):
+        added = (DEPLOY / f"{name}.conf").read_text(encoding="utf-8")
+        (folder / f"{name}.service").write_text(unit + added, encoding="utf-8")
+    server = (DEPLOY / "slrig-xorg.service").read_text(encoding="utf-8")
+    (folder / "slrig-xorg.service").write_text(server.replace("/usr/lib/xorg/Xorg", "/bin/true"), encoding="utf-8")
 
 
 def _said(*command: str) -> str:

@@ -20,6 +20,7 @@ LIVE = {
     "oak-and-screen": ("screen", ["depthai", "depthai"]),
     "trigger-box-and-genicam": ("serial_projector", ["genicam"]),
     "lightcrafter-4500-and-two-cameras": ("dlpc350", ["genicam", "genicam"]),
+    "lightcrafter-6500-and-two-cameras": ("dlpc900", ["genicam", "genicam"]),
 }
 
 

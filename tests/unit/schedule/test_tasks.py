@@ -131,7 +131,7 @@ def checked(tasks: Tasks, task: TaskKind, options: Mapping[str, Any]) -> None:
         ("verification", {"board": {**BOARD, "corners": [1, 3]}}, "found 1 x 3"),
         ("calibration", {}, "board: missing.*are: board, positions, exposure_s, activate"),
         ("calibration", {"board": BOARD, "activate": "yes", "poses": 3}, "activate.*poses"),
-        ("acceptance", {"repeats": 0}, "repeats.*are: artefacts, volume_mm, limits"),
+        ("acceptance", {"repeats": 0}, "repeats.*are: artefacts, volume_mm, wanted_mm, limits"),
         ("acceptance", {"artefacts": {"plane_mm": [1, 2]}}, "sphere: missing"),
     ],
 )
@@ -205,10 +205,11 @@ def test_calibration_takes_every_pose_solves_and_is_used_only_if_asked(bench: Ta
 
 
 def test_calibration_that_is_not_to_be_used_is_not_activated(bench: TaskBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = {"verdict": {"grade": "do_not_use", "summary": "do not use: 9 px", "reasons": []}}
+    bad = {"verdict": {"grade": "do_not_use", "summary": "do not use: 9 px", "unattended": ["it is bad"]}}
     monkeypatch.setattr(bench.calibrations.solves, "tools", replace(bench.tame.tools(), summary=lambda _: bad))
     told = bench.do(TaskKind.CALIBRATION, board=BOARD, activate=True)
     assert (told["activated"], told["verdict"]) == (False, "do not use: 9 px")
+    assert told["left_to_a_person"] == ["it is bad"]
     assert bench.calibrations.active is None
 
 
