@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from drivers.depthai import open_camera
-from slrig.devices import Camera, Projector
-from slrig.model import Calibration, PatternSequence, Size, Truth
+from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench
 from tests.unit.capture.fake_rig import PROJECTOR, Scene
@@ -24,27 +24,12 @@ FPS = 60.0
 SOCKETS = {"left": "CAM_B", "right": "CAM_C"}
 
 
-@dataclass
-class OakHead:
-    """Implements `slrig.devices.Head`: cameras of one device, and a projector on the same stage."""
+@dataclass(frozen=True)
+class OakHead(BenchHead):
+    """Cameras of one device, and a projector on the same stage."""
 
     oak: Any
     stage: Stage
-    options: Mapping[str, Mapping[str, object]]
-    cameras: Mapping[str, Camera] = field(init=False)
-    projector: Projector = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.projector = StagedProjector(self.stage)
-        with self.oak.connected():
-            self.cameras = {name: open_camera(name, options, Path()) for name, options in self.options.items()}
-
-    @property
-    def calibration(self) -> Calibration | None:
-        return None
-
-    def truth(self) -> Truth | None:
-        return None
 
     def close(self) -> None:
         self.projector.close()
@@ -66,7 +51,10 @@ def oak_head(stage: Stage, *, fps: float = FPS, options: Mapping[str, object] | 
     tables = {
         name: {"device": DEVICE, "socket": socket, "fps": fps, **(options or {})} for name, socket in SOCKETS.items()
     }
-    return OakHead(FakeOak(stage, **oak), stage, tables)
+    device = FakeOak(stage, **oak)
+    with device.connected():
+        cameras = {name: open_camera(name, table, Path()) for name, table in tables.items()}
+    return OakHead(cameras, StagedProjector(stage), device, stage)
 
 
 def bench(folder: Path, **oak: Any) -> Bench:  # noqa: ARG001 - every bench takes a folder

@@ -35,10 +35,11 @@ from slrig.errors import DeviceBusyError, DeviceGoneError
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract import dlpc900_bench
+from tests.contract.bench_head import BenchHead
 from tests.contract.dlpc350_device import Cable, FakeEngine, UhidEngine
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench, rig_of
-from tests.contract.wired_camera import WiredCamera, WiredHead
+from tests.contract.wired_camera import WiredCamera
 from tests.unit.capture.fake_rig import Scene
 
 PICTURES = "pictures"
@@ -88,12 +89,12 @@ class Table:
         """The engine's table in a rig file."""
         return {"patterns": PICTURES, "image_load_s": _MOST_LOAD_S, "light_margin_s": 0.002, **PROVEN, **more}
 
-    def head(self, projector: Projector) -> WiredHead:
+    def head(self, projector: Projector) -> BenchHead:
         """The projector and a new camera."""
         self._camera = WiredCamera("left", self.stage, usual_s=1 / 60, exposures_s=_EXPOSURES_S, gains=_GAINS)
-        return WiredHead(projector, self._camera)
+        return BenchHead({"left": self._camera}, projector)
 
-    def connected(self, **more: object) -> WiredHead:
+    def connected(self, **more: object) -> BenchHead:
         """The driver at the other end of a new cable."""
         flash = read_flash(self.folder / PICTURES)
         link = Link(Cable(self.engine).host, "light engine", DLPC350)
@@ -101,7 +102,7 @@ class Table:
             LightEngine(link, EngineOptions.model_validate(self.options(**more)), flash, serial="LC4500-1")
         )
 
-    def opened(self, **more: object) -> WiredHead:
+    def opened(self, **more: object) -> BenchHead:
         """The driver as a rig opens it, on whatever engine the kernel has."""
         return self.head(dlpc350.open_projector(self.options(**more), self.folder))
 

@@ -12,11 +12,12 @@ from drivers.pattern_engine.link import Link
 from slrig.devices import Projector
 from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.dlpc350_device import Cable
 from tests.contract.dlpc900_device import Fake900
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench
-from tests.contract.wired_camera import WiredCamera, WiredHead
+from tests.contract.wired_camera import WiredCamera
 from tests.unit.capture.fake_rig import Scene
 
 MIRRORS = Size(1920, 1080)
@@ -50,18 +51,18 @@ class Table:
         self._camera: WiredCamera | None = None
         self.engine = Fake900(light=self.stage.show, pulse=self._pulse, **engine)
 
-    def connected(self, **more: object) -> WiredHead:
+    def connected(self, **more: object) -> BenchHead:
         """The driver at the other end of a new cable, and a new camera."""
         link = Link(Cable(self.engine).host, "light engine", DLPC900, answer_s=5.0)
         return self._head(LightEngine(link, EngineOptions.model_validate(_USUAL | more), serial="LCR6500-1"))
 
-    def opened(self, **more: object) -> WiredHead:
+    def opened(self, **more: object) -> BenchHead:
         """The driver as a rig opens it, on whatever engine the kernel has."""
         return self._head(dlpc900.open_projector(_USUAL | more, Path()))
 
-    def _head(self, projector: Projector) -> WiredHead:
+    def _head(self, projector: Projector) -> BenchHead:
         self._camera = WiredCamera("left", self.stage, usual_s=1 / 60, exposures_s=(1e-4, 0.5), gains=(1.0, 8.0))
-        return WiredHead(projector, self._camera)
+        return BenchHead({"left": self._camera}, projector)
 
     def _pulse(self, t_ns: int) -> None:
         if self._camera is not None:

@@ -21,9 +21,9 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.genicam import open_camera
-from slrig.devices import Camera, Projector
-from slrig.model import Calibration, PatternSequence, Pixels, Size, Truth
+from slrig.model import PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_peer import ANSWERED, ASKED, BEGIN, DELAY, END, INTERFACE, PIXEL_FORMATS, read_exactly
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench
@@ -177,34 +177,6 @@ def table(**options: object) -> dict[str, object]:
     return {"device": INTERFACE, "region": region, **options}
 
 
-class GigEHead:
-    """Implements `slrig.devices.Head`: the driver's camera, and a staged projector."""
-
-    def __init__(self, peer: FakeGigE, options: Mapping[str, object]) -> None:
-        peer.start()
-        self._projector = StagedProjector(peer.stage)
-        self._cameras = {"left": open_camera("left", options, Path())}
-
-    @property
-    def cameras(self) -> Mapping[str, Camera]:
-        """See `Head`."""
-        return self._cameras
-
-    @property
-    def projector(self) -> Projector:
-        """See `Head`."""
-        return self._projector
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """See `Head`."""
-        return None
-
-    def truth(self) -> Truth | None:
-        """See `Head`."""
-        return None
-
-
 def scene(**options: int | float) -> Scene:
     """What the fake camera looks at."""
     return Scene(camera=CAMERA, projector=PROJECTOR, columns_per_px=0.5, rows_per_px=0.5, white=0.4, **options)  # type: ignore[arg-type]
@@ -222,4 +194,9 @@ def bench(folder: Path) -> Bench:
     del folder
     require_aravis()
     peer = FakeGigE(Stage(scene(noise_dn=0.5), latency_s=0.002, jitter_s=0.002))
-    return Bench(lambda: GigEHead(peer, table()), sequence())
+
+    def open_head() -> BenchHead:
+        peer.start()
+        return BenchHead({"left": open_camera("left", table(), Path())}, StagedProjector(peer.stage))
+
+    return Bench(open_head, sequence())

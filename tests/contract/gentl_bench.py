@@ -7,15 +7,13 @@ import importlib.util
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
 from drivers.genicam import open_gentl_camera
-from slrig.devices import Camera, Projector
-from slrig.model import Calibration, Truth
+from tests.contract.bench_head import BenchHead
 from tests.contract.genicam_bench import CAMERA, scene, sequence
 from tests.contract.gentl_camera import MemoryCamera
 from tests.contract.gentl_producer import FakeProducer, build
@@ -58,22 +56,13 @@ def table(served: FakeProducer, **options: object) -> dict[str, object]:
     return {"device": device, "producer": str(served.file), "region": region, **options}
 
 
-class GentlHead:
-    """Implements `slrig.devices.Head`: the driver's camera, and a staged projector."""
-
-    calibration: Calibration | None = None
-
-    def __init__(self, producer: FakeProducer) -> None:
-        self.projector: Projector = StagedProjector(producer.camera.stage)
-        self.cameras: Mapping[str, Camera] = {"left": open_gentl_camera("left", table(producer), Path())}
-
-    def truth(self) -> Truth | None:
-        """See `Head`."""
-        return None
-
-
 def bench(folder: Path) -> Bench:
     """The driver before a stage, with a software trigger, a wire and a clock that can be latched."""
     del folder
     producer = serving(MemoryCamera(Stage(scene(noise_dn=0.5), latency_s=0.002, jitter_s=0.002)))
-    return Bench(lambda: GentlHead(producer), sequence())
+
+    def open_head() -> BenchHead:
+        camera = open_gentl_camera("left", table(producer), Path())
+        return BenchHead({"left": camera}, StagedProjector(producer.camera.stage))
+
+    return Bench(open_head, sequence())

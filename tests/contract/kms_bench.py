@@ -30,8 +30,9 @@ from slrig.conformance import run
 from slrig.devices import Projector
 from slrig.errors import DeviceBusyError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
+from tests.contract.bench_head import BenchHead
 from tests.contract.guest.scanout import HeadPixels, Monitor
-from tests.contract.screen_bench import CAMERA, ScreenCamera, ScreenHead, sequence
+from tests.contract.screen_bench import CAMERA, ScreenCamera, sequence
 from tests.contract.suite import Bench
 from tests.unit.capture.fake_rig import Scene
 
@@ -386,9 +387,9 @@ def main(target: Path, host_folder: str, chosen: list[str]) -> None:
         told[check.__name__] = {"fault": fault, "seconds": round(time.monotonic() - begun, 2), "notes": notes}
         target.write_text(json.dumps(told, indent=1))
 
-    def open_head() -> ScreenHead:
+    def open_head() -> BenchHead:
         projector = kms.open_projector(options(), Path())
-        return ScreenHead(
+        return BenchHead(
             {"eye": GuestCamera("eye", heads.first, Scene(camera=CAMERA, projector=HERE, noise_dn=1.0))}, projector
         )
 

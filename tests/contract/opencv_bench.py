@@ -25,9 +25,8 @@ import cv2
 import pytest
 
 from drivers import opencv
-from slrig.devices import Camera, Projector
-from slrig.model import Calibration, Truth
 from tests.contract import v4l2_host
+from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench
 from tests.contract.v4l2_bench import CAMERA, Faked, FakeDevice, sequence, staged, why_not
@@ -183,26 +182,14 @@ class DeviceHost(FakeDevice):
         return super()._start(own, environment)
 
 
-@dataclass(frozen=True)
-class OpenCvHead:
-    """One camera through the driver, before a staged projector."""
-
-    cameras: Mapping[str, Camera]
-    projector: Projector
-    calibration: Calibration | None = None
-
-    def truth(self) -> Truth | None:
-        return None
-
-
 def stream_bench(_folder: Path) -> Bench:
     """A network camera."""
     light = staged(noise_dn=1.0)
     served = Served(NetworkCamera(light))
 
-    def open_head() -> OpenCvHead:
+    def open_head() -> BenchHead:
         camera = opencv.open_camera("eye", served.camera.options(served.url), Path())
-        return OpenCvHead({"eye": camera}, StagedProjector(light))
+        return BenchHead({"eye": camera}, StagedProjector(light))
 
     return Bench(open_head, sequence())
 
@@ -212,9 +199,9 @@ def file_bench(folder: Path) -> Bench:
     light = staged(noise_dn=1.0)
     Piped(NetworkCamera(light), folder / "video.mjpeg")
 
-    def open_head() -> OpenCvHead:
+    def open_head() -> BenchHead:
         camera = opencv.open_camera("eye", NetworkCamera(light).options("video.mjpeg"), folder)
-        return OpenCvHead({"eye": camera}, StagedProjector(light))
+        return BenchHead({"eye": camera}, StagedProjector(light))
 
     return Bench(open_head, sequence())
 
@@ -225,9 +212,9 @@ def device_bench(folder: Path, faked: Faked | None = None, **options: object) ->
         pytest.skip(why_not())
     device = DeviceHost(folder, staged(noise_dn=1.0), faked or Faked())
 
-    def open_head() -> OpenCvHead:
+    def open_head() -> BenchHead:
         usual = {"fourcc": "GREY", "size_px": [CAMERA.width_px, CAMERA.height_px], "frame_rate_hz": 50}
-        return OpenCvHead({"left": device.open_camera(**usual, **options)}, StagedProjector(device.stage))
+        return BenchHead({"left": device.open_camera(**usual, **options)}, StagedProjector(device.stage))
 
     return Bench(open_head, sequence())
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -16,10 +14,11 @@ from numpy.typing import NDArray
 
 from drivers import screen
 from drivers.screen import guarding
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Projector, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import FrameTimeoutError
-from slrig.model import Calibration, Frame, PatternSequence, Pixels, Size, Truth
+from slrig.model import Frame, PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.screen_server import DummyServer, OutputPixels
 from tests.contract.suite import Bench
 from tests.unit.capture.fake_rig import Scene
@@ -171,18 +170,6 @@ class ScreenCamera:
         )
 
 
-@dataclass(frozen=True)
-class ScreenHead:
-    """A camera before an output."""
-
-    cameras: Mapping[str, Camera]
-    projector: Projector
-    calibration: Calibration | None = None
-
-    def truth(self) -> Truth | None:
-        return None
-
-
 def scene() -> Scene:
     return Scene(camera=CAMERA, projector=PROJECTOR, noise_dn=1.0)
 
@@ -204,11 +191,11 @@ def bench_on(server: DummyServer, output: str, *, backend: str) -> Bench:
     """The driver on one of a server's two outputs, the right one; the left one is the desktop's."""
     places = server.arrange(**dict.fromkeys(("DUMMY0", "DUMMY1"), PROJECTOR))
 
-    def open_head() -> ScreenHead:
+    def open_head() -> BenchHead:
         options = rig_options(output, PROJECTOR, backend=backend)
         projector = screen.open_projector(options, Path())
         pixels = OutputPixels(server.display, places[output], PROJECTOR)
-        return ScreenHead({"eye": ScreenCamera("eye", pixels, scene())}, projector)
+        return BenchHead({"eye": ScreenCamera("eye", pixels, scene())}, projector)
 
     return Bench(open_head, sequence())
 

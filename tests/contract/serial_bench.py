@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import atexit
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from drivers.serial_projector import open_projector
 from drivers.serial_projector.pattern_set import crc32_of_each
-from slrig.devices import Camera, Projector
-from slrig.model import Calibration, PatternSequence, Size, Truth
+from slrig.devices import Projector
+from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench
 from tests.contract.wired_camera import WiredCamera
@@ -64,30 +64,15 @@ class TriggerBox:
             camera.pulse(time.monotonic_ns())
 
 
-@dataclass
-class SerialHead:
-    """Implements `slrig.devices.Head`: a box and the cameras on its wire."""
-
-    cameras: Mapping[str, Camera]
-    projector: Projector
-
-    @property
-    def calibration(self) -> Calibration | None:
-        return None
-
-    def truth(self) -> Truth | None:
-        return None
-
-
 def bench(folder: Path, *, noise: Noise | None = None, **options: object) -> Bench:  # noqa: ARG001 - as every bench
     """A box and two cameras as an instrument for the contract suite; `options` are the driver's."""
     flashed = sequence()
     stage = Stage(World(noise_dn=0.8))
     box = TriggerBox(stage, flashed, noise or Noise())
 
-    def open_head() -> SerialHead:
+    def open_head() -> BenchHead:
         projector = box.projector(**options)
         box.cameras = {name: WiredCamera(name, stage) for name in ("left", "right")}
-        return SerialHead(dict(box.cameras), projector)
+        return BenchHead(dict(box.cameras), projector)
 
     return Bench(open_head, flashed)

@@ -23,9 +23,10 @@ from typing import Any, Self, cast
 
 import pytest
 
-from slrig.devices import Camera, FoundDevice, Projector
-from slrig.model import Calibration, PatternSequence, Size, Truth
+from slrig.devices import Camera, FoundDevice
+from slrig.model import PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.stage import Stage, StagedProjector
 from tests.contract.suite import Bench
 from tests.contract.v4l2_host import AUTHKEY, Host
@@ -227,18 +228,6 @@ class FakeDevice:
         self.close()
 
 
-@dataclass(frozen=True)
-class V4L2Head:
-    """One camera through the driver, before a staged projector."""
-
-    cameras: Mapping[str, Camera]
-    projector: Projector
-    calibration: Calibration | None = None
-
-    def truth(self) -> Truth | None:
-        return None
-
-
 def staged(code: str = "GREY", *, camera: Size = CAMERA, noise_dn: float = 0.0, latency_s: float = 0.002) -> Stage:
     """The light before a fake camera of this pixel format."""
     scene = Scene(
@@ -268,8 +257,8 @@ def bench(folder: Path, faked: Faked | None = None, *, frame_rate_hz: float = 50
         pytest.skip(why_not())
     device = FakeDevice(folder, staged(noise_dn=1.0), faked or Faked())
 
-    def open_head() -> V4L2Head:
+    def open_head() -> BenchHead:
         camera = device.open_camera(frame_rate_hz=frame_rate_hz, gain_unity=GAIN_UNITS, **options)
-        return V4L2Head({"left": camera}, StagedProjector(device.stage))
+        return BenchHead({"left": camera}, StagedProjector(device.stage))
 
     return Bench(open_head, sequence())

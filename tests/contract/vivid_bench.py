@@ -12,9 +12,10 @@ from functools import cache
 from pathlib import Path
 
 from drivers import opencv, v4l2
-from slrig.devices import Camera, Projector, ProjectorInfo, ProjectorState, Shown
-from slrig.model import Calibration, PatternSequence, Pixels, Size, Truth
+from slrig.devices import Camera, ProjectorInfo, ProjectorState, Shown
+from slrig.model import PatternSequence, Pixels, Size
 from slrig.patterns.sequence import encode, scan_patterns
+from tests.contract.bench_head import BenchHead
 from tests.contract.guest.vivid import Control, Node, Output, nodes
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench
@@ -119,33 +120,6 @@ class LoopedProjector:
         self._state.closed.set()
 
 
-class LoopedHead:
-    """Implements `slrig.devices.Head`: one camera before the looped projector."""
-
-    def __init__(self, camera: Camera, projector: Projector) -> None:
-        self._camera = camera
-        self._projector = projector
-
-    @property
-    def cameras(self) -> Mapping[str, Camera]:
-        """See `Head`."""
-        return {"left": self._camera}
-
-    @property
-    def projector(self) -> Projector:
-        """See `Head`."""
-        return self._projector
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """See `Head`. None: nothing is measured here."""
-        return None
-
-    def truth(self) -> Truth | None:
-        """See `Head`."""
-        return None
-
-
 def options(instance: int, driver: str = "v4l2", /, **more: object) -> dict[str, object]:
     """The camera's table in a rig file."""
     return {
@@ -156,10 +130,10 @@ def options(instance: int, driver: str = "v4l2", /, **more: object) -> dict[str,
     }
 
 
-def head(folder: Path, driver: str = "v4l2") -> LoopedHead:
+def head(folder: Path, driver: str = "v4l2") -> BenchHead:
     """A driver's camera before the looped projector."""
     projector = LoopedProjector(output(0))
-    return LoopedHead(DRIVERS[driver]("left", options(0, driver), folder), projector)
+    return BenchHead({"left": DRIVERS[driver]("left", options(0, driver), folder)}, projector)
 
 
 def bench(folder: Path, driver: str = "v4l2") -> Bench:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 
-from slrig.devices import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Projector, Trigger
+from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.errors import FrameTimeoutError
-from slrig.model import Calibration, Frame, Truth
+from slrig.model import Frame
 from tests.contract.stage import Stage
 
 WIRE_NS = 20_000
@@ -136,30 +135,3 @@ class WiredCamera:
             settings.exposure_s,
             settings.gain,
         )
-
-
-class WiredHead:
-    """Implements `slrig.devices.Head`: a projector, and a camera on its wire."""
-
-    def __init__(self, projector: Projector, camera: Camera) -> None:
-        self._projector = projector
-        self._camera = camera
-
-    @property
-    def cameras(self) -> Mapping[str, Camera]:
-        """See `Head`."""
-        return {self._camera.info.name: self._camera}
-
-    @property
-    def projector(self) -> Projector:
-        """See `Head`."""
-        return self._projector
-
-    @property
-    def calibration(self) -> Calibration | None:
-        """See `Head`. None: nothing is measured here."""
-        return None
-
-    def truth(self) -> Truth | None:
-        """See `Head`."""
-        return None

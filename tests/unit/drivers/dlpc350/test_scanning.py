@@ -12,15 +12,15 @@ from slrig.capture.evidence import Evidence
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig
 from slrig.errors import ScanEvidenceError
+from tests.contract.bench_head import BenchHead
 from tests.contract.dlpc350_bench import Table, sequence
 from tests.contract.dlpc350_device import FakeEngine
 from tests.contract.suite import rig_of
-from tests.contract.wired_camera import WiredHead
 
 FAST = CameraSettings(0.005)
 
 
-def rig(head: WiredHead) -> Rig:
+def rig(head: BenchHead) -> Rig:
     return replace(rig_of(head), settings=dict.fromkeys(head.cameras, FAST))
 
 

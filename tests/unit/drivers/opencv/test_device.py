@@ -15,7 +15,8 @@ import pytest
 from slrig.devices import Camera, CameraSettings, Rig, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from slrig.model import Pixels
-from tests.contract.opencv_bench import DeviceHost, OpenCvHead
+from tests.contract.bench_head import BenchHead
+from tests.contract.opencv_bench import DeviceHost
 from tests.contract.pairing import FRAMES, wrong_pairings
 from tests.contract.stage import StagedProjector
 from tests.contract.suite import rig_of
@@ -189,9 +190,9 @@ def test_no_wrong_pairing_in_many_frames_by_stamps(plugged: Plug, stamp: str) ->
     device = plugged(stamp=stamp, jitter_s=0.001, readout_s=0.001, bands=4, lost=0.1)
     light = device.stage
 
-    def open_head() -> OpenCvHead:
+    def open_head() -> BenchHead:
         camera = device.open_camera(**{**GREY, "frame_rate_hz": 200})
-        return OpenCvHead({"left": camera}, StagedProjector(light))
+        return BenchHead({"left": camera}, StagedProjector(light))
 
     def open_rig() -> Rig:
         return replace(rig_of(open_head()), settings={"left": CameraSettings(exposure_s)})

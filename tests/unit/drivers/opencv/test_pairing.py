@@ -12,7 +12,8 @@ import pytest
 from drivers.opencv import open_camera
 from slrig.devices import Camera
 from slrig.model import Pixels
-from tests.contract.opencv_bench import NetworkCamera, OpenCvHead, Piped, Served
+from tests.contract.bench_head import BenchHead
+from tests.contract.opencv_bench import NetworkCamera, Piped, Served
 from tests.contract.pairing import FRAMES, PairingResult, wrong_pairings
 from tests.contract.stage import StagedProjector
 from tests.contract.v4l2_bench import sequence, staged
@@ -42,12 +43,12 @@ def counted(
             else:
                 tables[f"eye{index}"] = own.options(running.enter_context(Served(own)).url)
 
-        def open_head() -> OpenCvHead:
+        def open_head() -> BenchHead:
             cameras: dict[str, Camera] = {}
             for name, table in tables.items():
                 told = {} if told_s is None else {"delay_s": told_s}
                 cameras[name] = open_camera(name, {**table, **told}, folder)
-            return OpenCvHead(cameras, StagedProjector(light))
+            return BenchHead(cameras, StagedProjector(light))
 
         def expected(_: str, index: int) -> Pixels:
             return light.expected(shown.profiles[index], exposure_s=EXPOSURE_S)
