@@ -40,7 +40,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from drivers.linux import require_linux
 from slrig.bundle.faults import checked
 from slrig.devices import FoundDevice, Projector
 
@@ -70,13 +69,13 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         It may not be opened, or failed.
     """
-    _require_system()
     from drivers.dlpc350.flash import read_flash
     from drivers.dlpc350.options import EngineOptions
     from drivers.dlpc350.projector import DLPC350, LightEngine
-    from drivers.pattern_engine.finding import engines, resolved
+    from drivers.pattern_engine.finding import engines, require_hidraw, resolved
     from drivers.pattern_engine.link import open_link
 
+    require_hidraw(DLPC350)
     table = checked(EngineOptions, options, "the [projector] table of a light engine")
     flash = read_flash(folder / table.patterns)
     node = resolved(table.device, engines(DLPC350))
@@ -91,15 +90,10 @@ def find_devices() -> tuple[FoundDevice, ...]:
     WrongSystemError
         This is not Linux.
     """
-    _require_system()
     from drivers.dlpc350.projector import DLPC350
-    from drivers.pattern_engine.finding import engines, found_devices
+    from drivers.pattern_engine.finding import found_devices
 
-    return found_devices(DLPC350, engines(DLPC350))
-
-
-def _require_system() -> None:
-    require_linux("dlpc350", through="the kernel's /dev/hidraw*", instead="run slrig on Linux for it")
+    return found_devices(DLPC350)
 
 
 __all__ = ["find_devices", "open_projector"]

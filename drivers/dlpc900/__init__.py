@@ -34,7 +34,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from drivers.linux import require_linux
 from slrig.bundle.faults import checked
 from slrig.devices import FoundDevice, Projector
 
@@ -64,12 +63,12 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:  #
     DeviceError
         It may not be opened, or failed.
     """
-    _require_system()
     from drivers.dlpc900.options import EngineOptions
     from drivers.dlpc900.projector import DLPC900, LightEngine
-    from drivers.pattern_engine.finding import engines, resolved
+    from drivers.pattern_engine.finding import engines, require_hidraw, resolved
     from drivers.pattern_engine.link import open_link
 
+    require_hidraw(DLPC900)
     table = checked(EngineOptions, options, "the [projector] table of a light engine")
     node = resolved(table.device, engines(DLPC900))
     return LightEngine(open_link(node.path, DLPC900), table, serial=node.name)
@@ -83,15 +82,10 @@ def find_devices() -> tuple[FoundDevice, ...]:
     WrongSystemError
         This is not Linux.
     """
-    _require_system()
     from drivers.dlpc900.projector import DLPC900
-    from drivers.pattern_engine.finding import engines, found_devices
+    from drivers.pattern_engine.finding import found_devices
 
-    return found_devices(DLPC900, engines(DLPC900))
-
-
-def _require_system() -> None:
-    require_linux("dlpc900", through="the kernel's /dev/hidraw*", instead="run slrig on Linux for it")
+    return found_devices(DLPC900)
 
 
 __all__ = ["find_devices", "open_projector"]

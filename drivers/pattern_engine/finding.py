@@ -13,6 +13,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from drivers.linux import require_linux
 from drivers.pattern_engine.link import TI, Kind
 from slrig.devices import FoundDevice
 from slrig.errors import ConfigError, DeviceGoneError
@@ -47,9 +48,15 @@ def engines(kind: Kind, sysfs: Path = SYSFS, dev: Path = DEV) -> tuple[Node, ...
     return tuple(nodes)
 
 
-def found_devices(kind: Kind, found: tuple[Node, ...]) -> tuple[FoundDevice, ...]:
-    """The engines in the words of `slrig devices`."""
-    return tuple(FoundDevice(kind.driver, node.name, f"{node.label} ({node.path})") for node in found)
+def require_hidraw(kind: Kind) -> None:
+    """Raise WrongSystemError unless this is Linux."""
+    require_linux(kind.driver, through="the kernel's /dev/hidraw*", instead="run slrig on Linux for it")
+
+
+def found_devices(kind: Kind, sysfs: Path = SYSFS) -> tuple[FoundDevice, ...]:
+    """The engines in the words of `slrig devices`. Raises WrongSystemError: this is not Linux."""
+    require_hidraw(kind)
+    return tuple(FoundDevice(kind.driver, node.name, f"{node.label} ({node.path})") for node in engines(kind, sysfs))
 
 
 def resolved(device: str | None, found: tuple[Node, ...]) -> Node:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers import dlpc350
+from drivers import dlpc350, dlpc900
 from drivers.dlpc350.projector import DLPC350
 from drivers.pattern_engine.finding import engines, found_devices, resolved
 from slrig.errors import ConfigError, DeviceGoneError, WrongSystemError
@@ -31,7 +31,7 @@ def test_engines_are_told_from_other_devices(tmp_path: Path) -> None:
     (tmp_path / "hidraw3").mkdir()
     found = engines(DLPC350, tmp_path)
     assert [(node.name, str(node.path)) for node in found] == [("A", "/dev/hidraw2"), ("B", "/dev/hidraw10")]
-    (first, _) = found_devices(DLPC350, found)
+    (first, _) = found_devices(DLPC350, tmp_path)
     assert (first.driver, first.device) == ("dlpc350", "A")
     assert first.label == "Texas Instruments DLPC350 (/dev/hidraw2)"
 
@@ -67,6 +67,11 @@ def test_none_is_no_error_for_the_finder(tmp_path: Path) -> None:
 
 def test_other_systems_have_no_hidraw(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
-    for ask in (dlpc350.find_devices, lambda: dlpc350.open_projector({"patterns": "p"}, tmp_path)):
-        with pytest.raises(WrongSystemError, match=r"^dlpc350: Linux only: .*/dev/hidraw.*, and this is macOS; run"):
-            ask()
+    told = r"^%s: Linux only: .*/dev/hidraw.*, and this is macOS; run"
+    for driver, name, options in ((dlpc350, "dlpc350", {"patterns": "p"}), (dlpc900, "dlpc900", {})):
+        with pytest.raises(WrongSystemError, match=told % name):
+            driver.find_devices()
+        # What else is wrong does not matter then.
+        for table in (options, {"colour": "none such"}):
+            with pytest.raises(WrongSystemError, match=told % name):
+                driver.open_projector(table, tmp_path)
