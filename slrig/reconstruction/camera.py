@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.centroid import at_pixel_centres
-from slrig.reconstruction.compression import edge_loss, line_loss
+from slrig.reconstruction.compression import loss_variance
+from slrig.reconstruction.correlation import PixelSum, edge_sum, phase_sum, shared_noise
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
@@ -76,7 +77,7 @@ class CameraCurves:
     there was no phase. unresolved : (H, W) uint8, how many of the finest bits are left out at each pixel; None where
     bits only number lines. lost_lines : (H, W) bool, where code edges stand for lines that the camera does not resolve;
     None if nowhere. compression_dn : standard deviation of the noise that would err positions by as much as what
-    compression took from the frames; 0 for frames without loss.
+    compression took from the frames; 0 for frames without loss. shared_noise : as of `correlation.shared_noise`.
     """
 
     ensemble: StripeEnsemble
@@ -91,6 +92,7 @@ class CameraCurves:
     unresolved: NDArray[np.uint8] | None = None
     lost_lines: NDArray[np.bool_] | None = None
     compression_dn: float = 0.0
+    shared_noise: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +102,8 @@ class _Coded:
     near_shadow : (H, W) bool, for a fit to pixels; contrast_deviation : (H, W) float32, of white minus black by noise;
     unresolved : as of `CameraCurves`; loss_variance : what compression adds to the variance of each sample for whoever
     finds positions, camera units squared. It bends stripes and edges, but turns no bit over: reading the code with it
-    refused a tenth of a vase at quality 50, and saved it from no wrong point.
+    refused a tenth of a vase at quality 50, and saved it from no wrong point. shared : how much more variance sums of
+    pixels have than independent noise would give them, as of `correlation.shared_noise`.
     """
 
     frames: AxisFrames
@@ -110,11 +113,17 @@ class _Coded:
     contrast_deviation: NDArray[np.float32]
     unresolved: NDArray[np.uint8] | None
     loss_variance: float = 0.0
+    shared: float = 1.0
 
     @property
     def position_noise(self) -> NoiseModel:
         """Noise as positions have it."""
-        return self.noise.with_more(self.loss_variance)
+        return self.noise.times(self.shared).with_more(self.loss_variance)
+
+    def summed(self, images: NDArray[np.float32], pixels: PixelSum) -> _Coded:
+        """The same with what noise and compression of these images, (n, H, W), do to positions that sum pixels so."""
+        loss = loss_variance(self.frames, self.noise, self.code, images, pixels)
+        return replace(self, loss_variance=loss, shared=shared_noise(self.frames, self.noise, ~self.unlit, pixels))
 
     @property
     def unlit(self) -> NDArray[np.bool_]:
@@ -202,7 +211,7 @@ class CameraStream:
             self._entered("locate stripes")
             scale_px = self._limits.stripes.sigma_px or _FINEST_SCALE_PX
             self._scales = _Scales(scale_px, _FINEST_SCALE_PX)
-            coded = replace(coded, loss_variance=edge_loss(coded.frames, coded.noise, coded.code, scale_px=scale_px))
+            coded = coded.summed(coded.frames.bits, edge_sum(scale_px))
             self._points = _edge_points(coded, self._limits.stripes, scale_px)
         # By shift, whatever came first: the first one's stripes tell the scale for all.
         for pattern in self._stacks.patterns.lines[len(self._points) :]:
@@ -210,8 +219,9 @@ class CameraStream:
                 break
             self._entered("locate stripes")
             if self._scales is None:
-                coded = replace(
-                    coded, loss_variance=line_loss(coded.frames, coded.noise, coded.code, self._tables.cell_position)
+                # The first frame tells for all.
+                coded = coded.summed(
+                    coded.frames.lines[:1], phase_sum(coded.frames, coded.code, self._tables.cell_position)
                 )
             image, deviation = _normalised_line(coded, len(self._points))
             lit = ~coded.unlit
@@ -268,7 +278,7 @@ def _curves(
         near_step = near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
         if noise.falls:
-            seen = by_scatter(seen, usable, coded.loss_variance / noise.read_variance)
+            seen = by_scatter(seen, usable, coded.loss_variance / noise.read_variance, coded.shared)
         refinement = refined(found, seen, usable, code, tables.position_of)
         disagreement_px = refinement.disagreement_px
         steady = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)
@@ -314,6 +324,7 @@ def _curves(
         unresolved=coded.unresolved,
         lost_lines=lost,
         compression_dn=float(np.sqrt(coded.loss_variance)),
+        shared_noise=coded.shared,
     )
 
 

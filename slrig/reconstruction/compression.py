@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, IntArray, Refusal
+from slrig.reconstruction.correlation import PixelSum
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.surface_fit import stencils
 
 Images = Sequence[NDArray[Any]] | NDArray[Any]
 
@@ -78,53 +78,24 @@ def compression_loss(images: Images, code: Images, where: NDArray[np.bool_], ful
     return loss + _ROUNDING_VARIANCE
 
 
-def white_equivalent(loss: FloatArray, weights: FloatArray, cycles_per_px: tuple[float, float] = (0.0, 0.0)) -> float:
-    """Variance of independent pixels that errs a weighted sum of pixels by as much as this loss does.
-
-    weights : (k, k) float64 with k odd; cycles_per_px : (x, y) of stripes whose phase is what the pixels tell. Then an
-    error at that frequency is a constant error of phase: weights apply to what is left of the error's frequency.
-    """
-    reach = len(weights) // 2
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    turned = weights * np.exp(-2j * np.pi * (cycles_per_px[0] * x + cycles_per_px[1] * y))
+def white_equivalent(loss: FloatArray, summed: PixelSum) -> float:
+    """Variance of independent pixels that errs a sum of pixels by as much as this loss does."""
+    reach = len(summed.weights) // 2
     waves = np.einsum("ua,vb->uvab", _transform(), _transform())
     heard = np.zeros((_SIDE, _SIDE, _SIDE + 2 * reach, _SIDE + 2 * reach), dtype=np.complex128)
-    for (row, column), weight in np.ndenumerate(turned[::-1, ::-1]):
+    for (row, column), weight in np.ndenumerate(summed.turned()[::-1, ::-1]):
         heard[:, :, row : row + _SIDE, column : column + _SIDE] += weight * waves
     power = np.sum(np.abs(heard) ** 2, axis=(2, 3))
     return float(np.sum(loss * power) / np.sum(power))
 
 
-def line_loss(frames: AxisFrames, noise: NoiseModel, code: CodeMap, cell_position: FloatArray) -> float:
-    """What compression adds to the variance of each sample of line frames, as the fit to their phase takes it.
-
-    The first frame tells for all, and 0 that none was compressed. cell_position : (cells,) float64, px.
-    """
-    loss = _loss(frames, noise, code, frames.lines[:1])
-    if not loss.any():
-        return 0.0
-    position = np.where(code.refusal == Refusal.NONE, cell_position[code.lowest], np.nan)
-    # Over as many pixels as a block has: cells are steps.
-    rises = position[:, _SIDE:] - position[:, :-_SIDE], position[_SIDE:] - position[:-_SIDE]
-    per_cycle = _SIDE * frames.line_patterns[0].period_px
-    across, down = (float(np.nanmedian(np.abs(rise))) / per_cycle if np.isfinite(rise).any() else 0.0 for rise in rises)
-    weights = stencils()[0][0, :25].reshape(5, 5).astype(np.float64)
-    return white_equivalent(loss, weights, (across, down))
-
-
-def edge_loss(frames: AxisFrames, noise: NoiseModel, code: CodeMap, *, scale_px: float) -> float:
-    """The same for code frames whose edges a Gaussian of this scale finds."""
-    loss = _loss(frames, noise, code, frames.bits)
-    reach = int(np.ceil(3 * scale_px))
-    gaussian = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * scale_px**2))
-    return white_equivalent(loss, np.outer(gaussian, gaussian))
-
-
-def _loss(frames: AxisFrames, noise: NoiseModel, code: CodeMap, images: Images) -> FloatArray:
-    if noise.loss is not None:
-        return noise.loss
-    told_by = (*frames.bits, *(() if frames.inverses is None else frames.inverses))
-    return compression_loss(images, told_by, code.refusal != Refusal.NOT_LIT, frames.full_scale)
+def loss_variance(frames: AxisFrames, noise: NoiseModel, code: CodeMap, images: Images, summed: PixelSum) -> float:
+    """What compression adds to the variance of each sample of these images, as positions sum them; 0 for none."""
+    loss = noise.loss
+    if loss is None:
+        told_by = (*frames.bits, *(() if frames.inverses is None else frames.inverses))
+        loss = compression_loss(images, told_by, code.refusal != Refusal.NOT_LIT, frames.full_scale)
+    return white_equivalent(loss, summed) if loss.any() else 0.0
 
 
 @cache

@@ -53,6 +53,10 @@ class NoiseModel:
         read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
         return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
 
+    def times(self, factor: float) -> NoiseModel:
+        """The same with the variance of every sample multiplied."""
+        return replace(self, read_variance=self.read_variance * factor, slope=self.slope * factor)
+
     def with_more(self, variance: float) -> NoiseModel:
         """The same with that much more variance in every sample of a frame, whatever its level."""
         return replace(self, read_variance=self.read_variance + variance)

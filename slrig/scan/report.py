@@ -67,6 +67,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
             "read_variance": curves.noise.read_variance,
             "slope": curves.noise.slope,
             "compression_dn": curves.compression_dn,
+            "shared_by_neighbours": curves.shared_noise,
         },
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,

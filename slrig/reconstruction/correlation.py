@@ -1,0 +1,113 @@
+"""Noise that neighbouring pixels share.
+
+A position is found in a weighted sum of pixels. Where their noise is independent, its variance is that of one pixel
+times Σ w². A camera that interpolates colours of its mosaic, sharpens, subtracts rows or looks at lamps on mains gives
+neighbours the same noise, and the sum averages less of it. How much less is read from the frames: a bit and its inverse
+add up to white plus black, and what these sums of several bits differ by is noise alone, summed here as positions are.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.model import FloatArray, Refusal
+from slrig.reconstruction.decoding import CodeMap
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.noise import NoiseModel
+from slrig.reconstruction.surface_fit import stencils
+
+_MOST_WINDOWS = 40_000  # whose median is known to a hundredth
+_LEAST_WINDOWS = 200
+_CLEAR_SHARE = 0.8  # of the contrast: less is an edge of the code, where a camera that bends its values breaks the sum
+_FEWEST_BITS = 3  # as for `noise.estimate_noise`
+_STEP_PX = 8  # over which stripes are counted: cells of the code are steps
+
+
+class PixelSum(NamedTuple):
+    """How a position sums pixels.
+
+    weights : (k, k) float64 with k odd. cycles_per_px : (x, y) of stripes whose phase is what the pixels tell; 0 where
+    their values themselves do. Noise at that frequency is a constant error of phase.
+    """
+
+    weights: FloatArray
+    cycles_per_px: tuple[float, float] = (0.0, 0.0)
+
+    def turned(self) -> NDArray[np.complex128]:
+        """(k, k): the weights as they apply to a frame's noise."""
+        reach = len(self.weights) // 2
+        y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+        across, down = self.cycles_per_px
+        return np.asarray(self.weights * np.exp(-2j * np.pi * (across * x + down * y)))
+
+
+def phase_sum(frames: AxisFrames, code: CodeMap, cell_position: FloatArray) -> PixelSum:
+    """As the fit to the phase of line frames sums pixels. cell_position : (cells,) float64, px."""
+    position = np.where(code.refusal == Refusal.NONE, cell_position[code.lowest], np.nan)
+    rises = position[:, _STEP_PX:] - position[:, :-_STEP_PX], position[_STEP_PX:] - position[:-_STEP_PX]
+    per_cycle = _STEP_PX * frames.line_patterns[0].period_px
+    across, down = (float(np.nanmedian(np.abs(rise))) / per_cycle if np.isfinite(rise).any() else 0.0 for rise in rises)
+    return PixelSum(stencils()[0][0, :25].reshape(5, 5).astype(np.float64), (across, down))
+
+
+def edge_sum(scale_px: float) -> PixelSum:
+    """As a Gaussian of this scale, which finds edges of the code, sums pixels."""
+    reach = int(np.ceil(3 * scale_px))
+    gaussian = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * scale_px**2))
+    return PixelSum(np.outer(gaussian, gaussian))
+
+
+def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], summed: PixelSum) -> float:
+    """Variance of sums of pixels, over what it would be by `noise` if it were independent; 1 where it is not more.
+
+    where : (H, W) bool, pixels to look at. Only the coarser half of the bits counts, as for `noise.estimate_noise`, and
+    that away from their edges. Bits without inverses tell nothing, and few windows no more than that.
+    """
+    if frames.inverses is None or len(frames.bits) < _FEWEST_BITS:
+        return 1.0
+    count = max(_FEWEST_BITS, len(frames.bits) // 2)
+    bits, inverses = frames.bits[:count], frames.inverses[:count]
+    corner = _windows(where, len(summed.weights))
+    if len(corner[0]) < _LEAST_WINDOWS:
+        return 1.0
+    direct, inverse = _seen_in(bits, corner, summed), _seen_in(inverses, corner, summed)
+    contrast = _seen_in(frames.contrast[np.newaxis], corner, summed)
+    clear = np.abs(direct - inverse) > _CLEAR_SHARE * contrast
+    clear &= (np.minimum(direct, inverse) > 0) & (np.maximum(direct, inverse) < frames.clipped_at)
+    kept = clear.all(axis=(0, 2))
+    sums = (direct + inverse)[:, kept]
+    if sums.shape[1] < _LEAST_WINDOWS:
+        return 1.0
+    by_noise = sums - sums.mean(axis=0)
+    weights = summed.turned().ravel()
+    squares = (np.abs(weights) ** 2).astype(np.float32)
+    found = np.mean(np.abs(by_noise @ weights.astype(np.complex64)) ** 2, dtype=np.float64)
+    # By the pixels of the windows themselves, and by the model: it takes a median, which pixels that a camera
+    # interpolated make too small, and those that scatter more count most in a sum.
+    alone = np.mean(by_noise**2 @ squares, dtype=np.float64)
+    ends = noise.variance(frames.white) + noise.variance(frames.black)
+    # A bit and its inverse are white and black, in either order; the mean of all took one degree of freedom.
+    told = (1 - 1 / count) * np.mean(_seen_in(ends[np.newaxis], corner, summed)[0, kept] @ squares, dtype=np.float64)
+    return max([1.0, *(float(found / each) for each in (alone, told) if each > 0)])
+
+
+def _windows(where: NDArray[np.bool_], side: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of the upper left pixel of an even sample of windows that lie within `where`."""
+    rows, columns = where.shape
+    step = max(1, int(np.sqrt(rows * columns / _MOST_WINDOWS)))
+    whole = cv2.erode(where.view(np.uint8), np.ones((side, side), dtype=np.uint8), anchor=(0, 0), borderValue=0)
+    row, column = np.nonzero(whole[::step, ::step])
+    return row * step, column * step
+
+
+def _seen_in(
+    images: NDArray[np.float32], corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum
+) -> NDArray[np.float32]:
+    """(images, windows, k²): the pixels of each window."""
+    side = len(summed.weights)
+    views = np.lib.stride_tricks.sliding_window_view(images, (side, side), axis=(1, 2))
+    return np.asarray(views[:, corner[0], corner[1]].reshape(len(images), len(corner[0]), -1))
