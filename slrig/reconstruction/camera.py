@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.centroid import at_pixel_centres
-from slrig.reconstruction.compression import loss_variance
+from slrig.reconstruction.compression import frames_loss, loss_variance
 from slrig.reconstruction.correlation import PixelSum, edge_sum, phase_sum, shared_noise
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
@@ -23,6 +23,7 @@ from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import by_scatter, has_phase, position_map
 from slrig.reconstruction.refinement import refined
 from slrig.reconstruction.resolution import lost_lines, unresolved_bits
+from slrig.reconstruction.response import found_gamma, gain
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -78,6 +79,7 @@ class CameraCurves:
     bits only number lines. lost_lines : (H, W) bool, where code edges stand for lines that the camera does not resolve;
     None if nowhere. compression_dn : standard deviation of the noise that would err positions by as much as what
     compression took from the frames; 0 for frames without loss. shared_noise : as of `correlation.shared_noise`.
+    gamma : how the camera bent its values, which was taken out.
     """
 
     ensemble: StripeEnsemble
@@ -93,6 +95,7 @@ class CameraCurves:
     lost_lines: NDArray[np.bool_] | None = None
     compression_dn: float = 0.0
     shared_noise: float = 1.0
+    gamma: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +117,7 @@ class _Coded:
     unresolved: NDArray[np.uint8] | None
     loss_variance: float = 0.0
     shared: float = 1.0
+    gamma: float = 1.0
 
     @property
     def position_noise(self) -> NoiseModel:
@@ -194,8 +198,16 @@ class CameraStream:
 
     def _decoded(self, frames: AxisFrames) -> _Coded:
         self._entered("decode")
-        noise = estimate_noise(frames) if self._noise is None else self._noise
         tables, limits = self._tables, self._limits.decoding
+        noise, gamma = self._noise, 1.0
+        if noise is None:
+            noise, gamma = estimate_noise(frames), found_gamma(frames)
+        if gamma != 1:
+            # What compression took is seen in its own values only.
+            loss = frames_loss(frames, lit_pixels(frames, noise, limits)) * gain(frames.bits, gamma, frames.full_scale)
+            self._stacks.straighten(gamma)
+            frames = self._stacks.frames()
+            noise = replace(estimate_noise(frames), loss=loss)
         unresolved = None
         if not self._stacks.patterns.lines:
             unresolved = unresolved_bits(frames, lit_pixels(frames, noise, limits))
@@ -204,7 +216,8 @@ class CameraStream:
         )  # fmt: skip
         near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
         ends = noise.variance(frames.white) + noise.variance(frames.black)
-        return _Coded(frames, noise, code, near_shadow, np.sqrt(ends / np.float32(frames.ends_repeats)), unresolved)
+        deviation = np.sqrt(ends / np.float32(frames.ends_repeats))
+        return _Coded(frames, noise, code, near_shadow, deviation, unresolved, gamma=gamma)
 
     def _locate(self, coded: _Coded) -> _Coded:
         if self._scales is None and not self._stacks.patterns.lines:
@@ -325,6 +338,7 @@ def _curves(
         lost_lines=lost,
         compression_dn=float(np.sqrt(coded.loss_variance)),
         shared_noise=coded.shared,
+        gamma=coded.gamma,
     )
 
 

@@ -93,9 +93,14 @@ def loss_variance(frames: AxisFrames, noise: NoiseModel, code: CodeMap, images: 
     """What compression adds to the variance of each sample of these images, as positions sum them; 0 for none."""
     loss = noise.loss
     if loss is None:
-        told_by = (*frames.bits, *(() if frames.inverses is None else frames.inverses))
-        loss = compression_loss(images, told_by, code.refusal != Refusal.NOT_LIT, frames.full_scale)
+        loss = frames_loss(frames, code.refusal != Refusal.NOT_LIT, images)
     return white_equivalent(loss, summed) if loss.any() else 0.0
+
+
+def frames_loss(frames: AxisFrames, lit: NDArray[np.bool_], images: Images | None = None) -> FloatArray:
+    """`compression_loss` of these images, of one camera and axis; by default of its code. lit : (H, W) bool."""
+    told_by = (*frames.bits, *(() if frames.inverses is None else frames.inverses))
+    return compression_loss(frames.bits if images is None else images, told_by, lit, frames.full_scale)
 
 
 @cache

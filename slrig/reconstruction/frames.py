@@ -168,6 +168,7 @@ class FrameStacks:
         self._lines = np.zeros((len(patterns.lines), *shape), dtype=np.float32)
         self._ends: dict[Pattern, Image] = {}
         self._missing = set(patterns.needed)
+        self._gamma = 1.0
 
     @classmethod
     def of(cls, frames: AxisFrames) -> FrameStacks:
@@ -191,6 +192,8 @@ class FrameStacks:
         """Take the (H, W) image of a pattern; of one that this axis does not need, nothing is kept."""
         if pattern not in self._missing:
             return
+        if self._gamma != 1:
+            image = self._straight(image)
         if isinstance(pattern, Gray):
             (self._inverses if pattern.inverted else self._bits)[pattern.bit] = image
         elif isinstance(pattern, LineShift):
@@ -198,6 +201,22 @@ class FrameStacks:
         else:
             self._ends[pattern] = image.astype(np.float32)
         self._missing.discard(pattern)
+
+    def straighten(self, gamma: float) -> None:
+        """Make all values proportional to light, of the images that are in and of those that come.
+
+        gamma : of a camera whose values are light to the power of 1/gamma.
+        """
+        self._gamma = gamma
+        # Into new arrays: the old ones may be somebody else's.
+        self._bits, self._inverses, self._lines = (
+            self._straight(each) for each in (self._bits, self._inverses, self._lines)
+        )
+        self._ends = {pattern: self._straight(image) for pattern, image in self._ends.items()}
+
+    def _straight(self, image: NDArray[Any]) -> NDArray[np.float32]:
+        share = np.maximum(image, 0).astype(np.float32) / np.float32(self._scales["full_scale"])
+        return np.asarray(np.float32(self._scales["full_scale"]) * share ** np.float32(self._gamma))
 
     def has(self, pattern: Pattern) -> bool:
         """Whether the image of a pattern is in."""

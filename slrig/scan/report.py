@@ -69,6 +69,7 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
             "compression_dn": curves.compression_dn,
             "shared_by_neighbours": curves.shared_noise,
         },
+        "gamma": round(curves.gamma, 2),
         "stripe_scale_px": curves.scale_px,
         "stripe_points_found": curves.stripe_points,
         "stripe_points_coded": len(curves.ensemble.points_px),

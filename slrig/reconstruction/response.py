@@ -1,0 +1,60 @@
+"""Cameras whose values bend against light, told by their own frames and made straight.
+
+Cameras made for displays give v = full · (light/full)^(1/γ) (Rec. 709, sRGB: γ of about 2.2 as a whole). All that is
+done with frames takes light: stripes add up with the room's light, a pixel's light is a mean over its blur. On bent
+values a stripe's first harmonic is mixed with its others, which makes waves of the surface, and a print reaches further
+over its edges than a blur can.
+
+The code tells γ: where a bit and its inverse are alike, at the middle of an edge, each has half of the projector's
+light, 2 m^γ = white^γ + black^γ. A lens and a projector that is out of focus blur light, and keep that; sharpening is
+the same on both sides of an edge. A projector or cable that blurs the signal, before the projector's own gamma, loses
+light at edges, which looks like γ < 1, and nothing is made straight then.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.reconstruction.frames import AxisFrames
+
+_LEAST = 1.2  # chosen: cameras bend by 1.8 and more if at all, and edges of straight ones tell 0.98 to 1.05
+_MOST = 4.0
+_ALIKE = 0.15  # of the contrast, between a bit and its inverse: their mean is then the middle to 2 %
+_CLEAR_LEVELS = 20.0  # of 255: of white over black, so that rounding tells nothing of the middle
+_LEAST_EDGES = 500
+_MOST_PIXELS = 200_000
+_TURNS = 20  # each halves what γ may be
+
+
+def found_gamma(frames: AxisFrames) -> float:
+    """How a camera bends light into values, by the edges of the code; 1 where that is not told, or next to nothing."""
+    if frames.inverses is None or frames.exposure_ratio != 1.0:
+        return 1.0
+    full = frames.full_scale
+    # Rows enough: an edge of the code crosses most of them.
+    step = max(1, frames.white.size // _MOST_PIXELS)
+    white, black = frames.white[::step], frames.black[::step]
+    clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < frames.clipped_at)
+    found = []
+    for bit, inverse in zip(frames.bits[:, ::step], frames.inverses[:, ::step], strict=True):
+        alike = clear & (np.abs(bit - inverse) < _ALIKE * (white - black))
+        found.append(np.stack([(bit[alike] + inverse[alike]) / 2, white[alike], black[alike]]))
+    middle, bright, dark = np.maximum(np.concatenate(found, axis=1), 0).astype(np.float64) / full
+    if len(middle) < _LEAST_EDGES:
+        return 1.0
+    low, high = 1 / _MOST, _MOST
+    for _ in range(_TURNS):
+        gamma = float(np.sqrt(low * high))
+        # Bent values have the middle too high, and the more so the less is made of γ.
+        if np.median((2 * middle**gamma - bright**gamma - dark**gamma) / bright**gamma) > 0:
+            low = gamma
+        else:
+            high = gamma
+    return low if low >= _LEAST else 1.0
+
+
+def gain(image: NDArray[np.float32], gamma: float, full_scale: float) -> float:
+    """Mean square slope of light over values, of one full scale, over an image: by what variances grow on average."""
+    share = np.maximum(image, 0) / np.float32(full_scale)
+    return float(np.mean((gamma * share ** np.float32(gamma - 1)) ** 2, dtype=np.float64))
