@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.centroid import at_pixel_centres
-from slrig.reconstruction.compression import frames_loss, loss_variance
+from slrig.reconstruction.compression import loss_variance
 from slrig.reconstruction.correlation import PixelSum, edge_sum, phase_sum, shared_noise
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.identification import identify, with_refused_points
 from slrig.reconstruction.linking import StripeEnsemble, link
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
-from slrig.reconstruction.phase import by_scatter, has_phase, position_map
+from slrig.reconstruction.noise import NoiseModel
+from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.refinement import refined
 from slrig.reconstruction.resolution import lost_lines, unresolved_bits
-from slrig.reconstruction.response import found_gamma, gain
+from slrig.reconstruction.response import in_light
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -160,6 +160,7 @@ class CameraStream:
         self._limits = limits
         self._entered = entered
         self._coded: _Coded | None = None
+        self._ends: tuple[NDArray[np.float32], NDArray[np.float32]]
         self._scales: _Scales | None = None
         self._points: list[LinePoints] = []
         self._curves: CameraCurves | None = None
@@ -170,7 +171,7 @@ class CameraStream:
         self._go_on()
 
     def finish(self) -> tuple[CameraCurves, AxisFrames]:
-        """The curves, and the frames that they were found in.
+        """The curves, and the frames that they were found in, but white and black as the camera gave them.
 
         Raises
         ------
@@ -182,12 +183,13 @@ class CameraStream:
             missing = sorted(map(repr, self._stacks.missing))
             message = f"{len(missing)} of the frames announced did not come: {'; '.join(missing)}; capture them again"
             raise PatternError(message)
-        return self._curves, coded.frames
+        white, black = self._ends
+        return self._curves, replace(coded.frames, white=white, black=black)
 
     def _go_on(self) -> _Coded | None:
         """Do what the frames so far allow."""
         if self._coded is None and self._stacks.coded:
-            self._coded = self._decoded(self._stacks.frames())
+            self._coded = self._decoded()
         if self._coded is not None:
             self._coded = self._locate(self._coded)
             if self._curves is None and self._scales is not None and not self._stacks.missing:
@@ -196,18 +198,14 @@ class CameraStream:
                 )
         return self._coded
 
-    def _decoded(self, frames: AxisFrames) -> _Coded:
+    def _decoded(self) -> _Coded:
         self._entered("decode")
+        frames = self._stacks.frames()
         tables, limits = self._tables, self._limits.decoding
-        noise, gamma = self._noise, 1.0
+        self._ends = frames.white, frames.black
+        gamma, noise = 1.0, self._noise
         if noise is None:
-            noise, gamma = estimate_noise(frames), found_gamma(frames)
-        if gamma != 1:
-            # What compression took is seen in its own values only.
-            loss = frames_loss(frames, lit_pixels(frames, noise, limits)) * gain(frames.bits, gamma, frames.full_scale)
-            self._stacks.straighten(gamma)
-            frames = self._stacks.frames()
-            noise = replace(estimate_noise(frames), loss=loss)
+            frames, noise, gamma = in_light(self._stacks, limits)
         unresolved = None
         if not self._stacks.patterns.lines:
             unresolved = unresolved_bits(frames, lit_pixels(frames, noise, limits))
@@ -290,8 +288,6 @@ def _curves(
         )  # fmt: skip
         near_step = near_steps(seen, resolution_px, limits.edges)
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
-        if noise.falls:
-            seen = by_scatter(seen, usable, coded.loss_variance / noise.read_variance, coded.shared)
         refinement = refined(found, seen, usable, code, tables.position_of)
         disagreement_px = refinement.disagreement_px
         steady = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)

@@ -23,9 +23,10 @@ from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.code_edges import EdgeCrossings, edge_crossings
 from slrig.reconstruction.compression import compression_loss
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
-from slrig.reconstruction.frames import AxisFrames
-from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.phase import has_phase, position_map
+from slrig.reconstruction.response import in_light
 
 Mask = NDArray[np.bool_]
 
@@ -89,12 +90,14 @@ def projector_positions(
     noise : where it is known already. Positions outside those that `tables` knows, near the projector's border, are
     left out: see `slrig.patterns.positions`.
     """
-    noise = estimate_noise(frames) if noise is None else noise
+    if noise is None:
+        frames, noise, _ = in_light(FrameStacks.of(frames), limits.decoding)
     code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits.decoding)
     lit = np.asarray(code.refusal != Refusal.NOT_LIT)
     # Each pixel stands alone here, so that what compression took from all waves counts alike.
     told_by = frames.lines if has_phase(frames) else frames.bits
-    noise = noise.with_more(float(np.mean(compression_loss(told_by, frames.bits, lit, frames.full_scale))))
+    loss = compression_loss(told_by, frames.bits, lit, frames.full_scale) if noise.loss is None else noise.loss
+    noise = noise.with_more(float(np.mean(loss)))
     decoded = np.asarray(code.refusal == Refusal.NONE)
     contrast = frames.contrast
     ends = noise.variance(frames.white) + noise.variance(frames.black)

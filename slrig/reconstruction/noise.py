@@ -34,16 +34,14 @@ class NoiseModel:
     read_variance, slope : of a frame as the camera gives it.
     read_share, shot_share : (H, W) float32, what is left of them at each pixel of frames that are fused of several
     exposures (`slrig.reconstruction.fusion`); None for frames as the camera gives them, where both are 1.
-    falls : bright samples have less noise than dark ones, as with no sensor: the camera bent them (gamma), and what is
-    fitted to all levels is too much for the bright ones. loss : of a bracket, as `compression.compression_loss` gives
-    it; fused frames do not show it any more.
+    loss : of a bracket and of a camera that bends its values, as `compression.compression_loss` gives it: fused and
+    straightened frames do not show it any more.
     """
 
     read_variance: float
     slope: float
     read_share: NDArray[np.float32] | None = None
     shot_share: NDArray[np.float32] | None = None
-    falls: bool = False
     loss: FloatArray | None = None
 
     def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -165,5 +163,5 @@ def _fitted(level: NDArray[np.float32], variance: NDArray[np.float32]) -> NoiseM
     root = np.sqrt(weight) / np.maximum(y, _QUANTISATION_VARIANCE)
     slope, read = np.linalg.lstsq(np.stack([x, np.ones_like(x)], axis=1) * root[:, None], y * root, rcond=None)[0]
     if slope <= 0:
-        return NoiseModel(max(float(np.average(y, weights=weight)), _QUANTISATION_VARIANCE), 0.0, falls=True)
+        return NoiseModel(max(float(np.average(y, weights=weight)), _QUANTISATION_VARIANCE), 0.0)
     return NoiseModel(max(float(read), _QUANTISATION_VARIANCE), float(slope))

@@ -18,7 +18,7 @@ from slrig.model import FloatArray
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.surface_fit import scatter, stencils
+from slrig.reconstruction.surface_fit import stencils
 
 
 class PositionMap(NamedTuple):
@@ -72,19 +72,6 @@ def _phases(lines: NDArray[np.float32], *given: Any) -> tuple[NDArray[np.float32
     position, sigma = (np.full(lines.shape[1:], np.nan, dtype=np.float32) for _ in range(2))
     in_bands(_phase_kernel, len(position), lines, *given, position, sigma)
     return position, sigma
-
-
-def by_scatter(seen: PositionMap, usable: NDArray[np.bool_], compressed: float, shared: float) -> PositionMap:
-    """The map with deviations that its own scatter tells, of a camera whose noise falls where light rises.
-
-    What is fitted to the noise of all levels is too much for the bright ones, which tell a position. compressed : the
-    share of the variance that compression adds, which scatters less than it errs, and stays. shared : the factor for
-    noise that neighbours share, by which it scatters less than it errs.
-    """
-    found = scatter(seen.position, seen.sigma, windows(seen, usable)[3])
-    if not np.isfinite(found):
-        return seen
-    return seen._replace(sigma=seen.sigma * np.float32(np.sqrt(min(found * shared, 1 - compressed) + compressed)))
 
 
 @kernel

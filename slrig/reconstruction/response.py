@@ -13,10 +13,15 @@ light at edges, which looks like γ < 1, and nothing is made straight then.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.compression import frames_loss
+from slrig.reconstruction.decoding import DecodingLimits, lit_pixels
+from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from slrig.reconstruction.noise import NoiseModel, estimate_noise
 
 _LEAST = 1.2  # chosen: cameras bend by 1.8 and more if at all, and edges of straight ones tell 0.98 to 1.05
 _MOST = 4.0
@@ -54,7 +59,20 @@ def found_gamma(frames: AxisFrames) -> float:
     return low if low >= _LEAST else 1.0
 
 
-def gain(image: NDArray[np.float32], gamma: float, full_scale: float) -> float:
+def in_light(stacks: FrameStacks, limits: DecodingLimits) -> tuple[AxisFrames, NoiseModel, float]:
+    """The frames so far in proportion to light, their noise, and how the camera had bent them; `stacks` goes on so."""
+    frames = stacks.frames()
+    noise, gamma = estimate_noise(frames), found_gamma(frames)
+    if gamma == 1:
+        return frames, noise, gamma
+    # What compression took is seen in its own values only.
+    loss = frames_loss(frames, lit_pixels(frames, noise, limits)) * _gain(frames.bits, gamma, frames.full_scale)
+    stacks.straighten(gamma)
+    frames = stacks.frames()
+    return frames, replace(estimate_noise(frames), loss=loss), gamma
+
+
+def _gain(image: NDArray[np.float32], gamma: float, full_scale: float) -> float:
     """Mean square slope of light over values, of one full scale, over an image: by what variances grow on average."""
     share = np.maximum(image, 0) / np.float32(full_scale)
     return float(np.mean((gamma * share ** np.float32(gamma - 1)) ** 2, dtype=np.float64))

@@ -18,7 +18,6 @@ _LEAST_FOR_LINEAR = 5  # pixels: two more than a plane has numbers, to tell its 
 _LONGEST_MOVE_PX = 1.0  # chosen; half and double change the rms error of a rendered vase by 2 and 1 %
 LEAST_GRADIENT = 0.05  # projector px per camera px; the deviation of a point is that of the position over it
 _LEAST_FREEDOM = 0.5  # with less the residuals tell nothing of the scatter, and the noise stands
-_MOST_FOR_SCATTER = 4000  # neighbourhoods, whose median misfit is known to a hundredth
 _PIXELS = (2 * _REACH + 1) ** 2
 _LANES = 32  # 25 pixels, or points side by side: whole vectors
 POINTS = 1024  # that are worth calling the kernel for
@@ -48,28 +47,6 @@ def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.flo
     plane = np.exp(-(x * x + y * y) / (2 * _LINEAR_SCALE_PX**2))
     quadratic, terms, linear = (np.pad(each, padding).astype(np.float32) for each in (sums, basis, plane[None]))
     return quadratic, terms, linear[0], freedom
-
-
-def scatter(position: NDArray[np.float32], sigma: NDArray[np.float32], whole: NDArray[np.uint8]) -> float:
-    """Variance of positions about the quadratic surfaces fitted to them, over what sigma tells; NaN of none.
-
-    position, sigma : (H, W) float32; whole : as for `fit_kernel`. The median of an even sample.
-    """
-    rows, columns = np.nonzero(whole[_REACH:-_REACH, _REACH:-_REACH])
-    step = max(1, -(-len(rows) // _MOST_FOR_SCATTER))
-    if not len(rows):
-        return np.nan
-    windows = (2 * _REACH + 1,) * 2
-    at = rows[::step], columns[::step]
-    values, deviations = (
-        np.lib.stride_tricks.sliding_window_view(each, windows)[at].reshape(-1, _PIXELS) for each in (position, sigma)
-    )
-    sums, basis, _, freedom = stencils()
-    values = values - values[:, _PIXELS // 2, np.newaxis]
-    residuals = values - values @ sums[:, :_PIXELS].T @ basis[:, :_PIXELS]
-    misfit = np.sum((residuals / deviations) ** 2, axis=1) / freedom
-    # The median of a chi-square lies below its mean (Wilson-Hilferty).
-    return float(np.median(misfit)) / (1 - 2 / (9 * freedom)) ** 3
 
 
 @kernel

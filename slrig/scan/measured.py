@@ -27,7 +27,7 @@ from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
 from slrig.scan.report import capture_notes, capture_report
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
-from slrig.scan.triangulated import Triangulated, compression_notes, triangulated, unresolved_notes
+from slrig.scan.triangulated import Triangulated, camera_notes, triangulated, unresolved_notes
 
 _STAGES = ("decode", "locate stripes", "refine stripes", "identify stripes", "link stripes")
 
@@ -206,7 +206,7 @@ def _walked(
     notes = [
         *cut_short,
         *capture_notes(stream.capture, stream.axis, evidence),
-        *compression_notes(seen),
+        *camera_notes(seen),
         *unresolved_notes(seen, step, cell),
     ]
     return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes)

@@ -181,15 +181,23 @@ def _steps_px(curves: CameraCurves, step_px: float, cell_px: float) -> NDArray[n
     return edges_px if curves.unresolved.any() else None
 
 
-def compression_notes(cameras: Sequence[CameraResult]) -> list[str]:
-    """One sentence for each camera whose frames were JPEG once."""
-    return [
-        f"camera '{seen.name}': its frames were compressed as JPEG, which errs by as much as "
-        f"{seen.curves.compression_dn:.1f} grey levels of noise in every pixel would: take frames without compression "
-        "(GREY, YUYV; PNG, TIFF or BMP files) for a finer surface"
-        for seen in cameras
-        if seen.curves.compression_dn > 0
-    ]
+def camera_notes(cameras: Sequence[CameraResult]) -> list[str]:
+    """A sentence for each camera whose frames were JPEG once, and for each whose values were bent."""
+    notes = []
+    for seen in cameras:
+        if seen.curves.compression_dn > 0:
+            notes.append(
+                f"camera '{seen.name}': its frames were compressed as JPEG, which errs by as much as "
+                f"{seen.curves.compression_dn:.1f} grey levels of noise in every pixel would: take frames without "
+                "compression (GREY, YUYV; PNG, TIFF or BMP files) for a finer surface"
+            )
+        if seen.curves.gamma != 1:
+            notes.append(
+                f"camera '{seen.name}': its values are made for a display (gamma {seen.curves.gamma:.1f}), as edges of "
+                "the code tell; they were made proportional to light again. Switch its gamma correction off to keep "
+                "the levels that it costs"
+            )
+    return notes
 
 
 def unresolved_notes(cameras: Sequence[CameraResult], step_px: float, cell_px: float) -> list[str]:

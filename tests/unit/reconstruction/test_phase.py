@@ -17,7 +17,7 @@ from slrig.model import Axis, FloatArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
 from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
-from slrig.reconstruction.phase import PositionMap, by_scatter, has_phase, position_map
+from slrig.reconstruction.phase import PositionMap, has_phase, position_map
 from tests.unit.reconstruction.builders import bars, cells_of, code_frames, grid, nearest_lines
 from tests.unit.reconstruction.refining import fitted_points
 
@@ -398,16 +398,3 @@ def test_flat_ground_far_lines_and_the_images_border_give_no_point() -> None:
     corners = np.array([[0.0, 30.0], [30.0, 0.0], [SHAPE[1] - 1.0, 30.0], [30.0, SHAPE[0] - 1.0], [-7.0, 900.0]])
     found = fitted_points(steep, usable, corners, plane(1.0, 0.0, *corners.T))[3]
     assert not found.any()
-
-
-@pytest.mark.parametrize(("stated", "compressed", "told"), [(3.0, 0.0, 1.0), (0.5, 0.0, 0.5), (3.0, 0.5, 2.35)])
-def test_scatter_lowers_an_overstated_deviation_and_raises_none(stated: float, compressed: float, told: float) -> None:
-    """Told is √(scatter + what compression adds), in units of the scatter, and no more than what was stated."""
-    y, x = np.mgrid[:60, :80]
-    scattered = 0.02 * np.random.default_rng(4).standard_normal(x.shape)
-    position = (0.5 * x + 0.01 * y + 0.001 * x * y + scattered).astype(np.float32)
-    seen = PositionMap(position, np.full(x.shape, 0.02 * stated, dtype=np.float32))
-    found = by_scatter(seen, np.ones(x.shape, dtype=np.bool_), compressed)
-    assert found.sigma == pytest.approx(np.full(x.shape, 0.02 * told), rel=0.05)
-    unseen = by_scatter(seen, np.zeros(x.shape, dtype=np.bool_), compressed)
-    assert (unseen.sigma == seen.sigma).all()

@@ -1,0 +1,107 @@
+"""Noise that neighbours share, drawn with a known spectrum; and noise that they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import convolve
+
+from slrig.model import FloatArray
+from slrig.reconstruction.correlation import PixelSum, edge_sum, shared_noise
+from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.noise import NoiseModel, estimate_noise
+from tests.unit.reconstruction.builders import code_frames, grid
+
+SHAPE = (300, 400)
+BITS = 9
+EVERYWHERE = np.ones(SHAPE, dtype=np.bool_)
+STENCIL = np.outer([1.0, 2.0, 3.0, 2.0, 1.0], [1.0, 2.0, 3.0, 2.0, 1.0])
+PHASES = PixelSum(STENCIL, (0.12, 0.02))
+
+
+def noisy(kernel: FloatArray, *, bits: int = BITS, deviation: float = 2.0, rows: float = 0.0) -> AxisFrames:
+    """A plate under a code, with white noise run through a kernel, and with noise of whole rows."""
+    random = np.random.default_rng(5)
+    x, _ = grid(SHAPE)
+
+    def seen(light: FloatArray | float) -> NDArray[np.float32]:
+        noise = deviation * convolve(random.standard_normal(SHAPE), kernel, mode="wrap")
+        noise += rows * random.standard_normal((SHAPE[0], 1))
+        return np.asarray(30.0 + 0.02 * x + 120.0 * light + noise, dtype=np.float32)
+
+    lit = [(x // (200 / 2**bit) % 2).astype(np.float64) for bit in range(bits)]
+    return code_frames(
+        bits=np.array([seen(each) for each in lit]),
+        inverses=np.array([seen(1 - each) for each in lit]),
+        white=seen(1.0),
+        black=seen(0.0),
+        full_scale=255.0,
+    )
+
+
+def by_sums(kernel: FloatArray, summed: PixelSum) -> float:
+    """Σ |w * k|² over Σ|w|² Σ k²: what noise of that kernel does to the sum."""
+    reach = len(summed.weights) // 2
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    across, down = summed.cycles_per_px
+    turned = np.pad(summed.weights * np.exp(-2j * np.pi * (across * x + down * y)), len(kernel))
+    both = convolve(turned.real, kernel, mode="constant") + 1j * convolve(turned.imag, kernel, mode="constant")
+    return float(np.sum(np.abs(both) ** 2) / (np.sum(summed.weights**2) * np.sum(kernel**2)))
+
+
+@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_sum(1.0)], ids=["phases", "values", "edges"])
+@pytest.mark.parametrize(
+    "kernel",
+    [np.outer([1, 2, 1], [1, 2, 1]) / 16, np.array([[0, 0, 0], [1, 2, 1], [0, 0, 0]]) / 4],
+    ids=["interpolated", "along rows"],
+)
+def test_sums_err_more_by_noise_that_neighbours_share(kernel: FloatArray, summed: PixelSum) -> None:
+    frames = noisy(kernel)
+    expected = by_sums(kernel, summed)
+    assert expected > 1.4
+    assert shared_noise(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(expected, rel=0.08)
+
+
+@pytest.mark.parametrize("summed", [PHASES, PixelSum(STENCIL), edge_sum(1.0)], ids=["phases", "values", "edges"])
+def test_independent_noise_stays_as_it_is(summed: PixelSum) -> None:
+    frames = noisy(np.array([[1.0]]))
+    assert shared_noise(frames, estimate_noise(frames), EVERYWHERE, summed) == pytest.approx(1.0, abs=0.05)
+
+
+def test_rows_that_err_as_a_whole_are_told() -> None:
+    frames = noisy(np.array([[1.0]]), rows=1.0)
+    # Of the sums' variance, rows add Σ over rows of (Σ over columns of w)², a quarter as strong as pixels' noise.
+    rows = np.sum(STENCIL.sum(axis=1) ** 2) / np.sum(STENCIL**2)
+    found = shared_noise(frames, estimate_noise(frames), EVERYWHERE, PixelSum(STENCIL))
+    assert found == pytest.approx((4 + rows) / 5, rel=0.1)
+
+
+def test_a_model_that_is_too_small_is_made_up_for_and_one_too_large_is_not() -> None:
+    frames = noisy(np.array([[1.0]]))
+    assert shared_noise(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)
+    assert shared_noise(frames, NoiseModel(8.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(1.0, abs=0.05)
+
+
+def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
+    frames = noisy(np.array([[1.0]]))
+    assert frames.inverses is not None
+    broken = frames.bits.copy()
+    # A camera that bends its values has the middle of an edge too bright.
+    at_edges = np.abs(np.diff(frames.bits, axis=2, append=frames.bits[:, :, -1:])) > 60
+    broken[at_edges] = 110
+    inverses = np.where(at_edges, 110, frames.inverses).astype(np.float32)
+    found = shared_noise(replace(frames, bits=broken, inverses=inverses), NoiseModel(4.0, 0.0), EVERYWHERE, PHASES)
+    assert found == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_tells_nothing_changes_nothing() -> None:
+    frames = noisy(np.outer([1, 2, 1], [1, 2, 1]) / 16)
+    noise = estimate_noise(frames)
+    assert shared_noise(replace(frames, inverses=None), noise, EVERYWHERE, PHASES) == 1.0
+    assert shared_noise(frames, noise, ~EVERYWHERE, PHASES) == 1.0
+    assert shared_noise(noisy(np.array([[1.0]]), bits=2), noise, EVERYWHERE, PHASES) == 1.0
+    clipped = replace(frames, full_scale=100.0)
+    assert shared_noise(clipped, noise, EVERYWHERE, PHASES) == 1.0

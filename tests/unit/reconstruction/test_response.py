@@ -1,0 +1,112 @@
+"""Frames of cameras that bend their values, and of those that only seem to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+
+from slrig.model import Black, FloatArray, Gray, White
+from slrig.reconstruction.decoding import DecodingLimits
+from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from slrig.reconstruction.response import found_gamma, in_light
+from tests.unit.reconstruction.builders import code_frames, grid
+
+SHAPE = (240, 400)
+BITS = 7
+FULL = 255.0
+
+
+def seen_by(
+    gamma: float, *, signal_blur_px: float = 0.0, unsharp: float = 0.0, room: float = 0.02, quality: float = 0.8,
+    paired: bool = True,
+) -> AxisFrames:  # fmt: skip
+    """A printed plate under a code that a lens blurs, in whole grey levels of a camera.
+
+    signal_blur_px : of the projector's signal, before a gamma of 2.2 of its own.
+    """
+    random = np.random.default_rng(2)
+    x, y = grid(SHAPE)
+    print_ = quality * np.where((x // 37 + y // 29) % 2 == 0, 1.0, 0.4)
+
+    def camera(shown: FloatArray) -> NDArray[np.float32]:
+        signal = gaussian_filter1d(shown, signal_blur_px, axis=1) if signal_blur_px else shown
+        light = gaussian_filter(print_ * (signal ** (2.2 if signal_blur_px else 1.0) + room), 0.9)
+        light += 0.003 * random.standard_normal(SHAPE)
+        value = FULL * np.maximum(light, 0) ** (1 / gamma)
+        value += unsharp * (value - gaussian_filter(value, 1.0))
+        return np.clip(np.rint(value), 0, FULL).astype(np.float32)
+
+    # A slanting code, so that its edges lie anywhere in a pixel.
+    codes = [np.clip(0.5 + np.sin(np.pi * 2**bit * (x + 0.13 * y) / 200) * 64 / 2**bit, 0, 1) for bit in range(BITS)]
+    return code_frames(
+        bits=np.array([camera(each) for each in codes]),
+        inverses=np.array([camera(1 - each) for each in codes]) if paired else None,
+        white=camera(np.ones(SHAPE)),
+        black=camera(np.zeros(SHAPE)),
+        full_scale=FULL,
+    )
+
+
+@pytest.mark.parametrize("gamma", [1.8, 2.2, 2.6])
+@pytest.mark.parametrize("seen", [{}, {"room": 0.2}, {"quality": 0.3}], ids=["dark room", "bright room", "dark plate"])
+def test_edges_of_the_code_tell_how_values_are_bent(gamma: float, seen: dict[str, Any]) -> None:
+    assert found_gamma(seen_by(gamma, **seen)) == pytest.approx(gamma, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [{}, {"unsharp": 1.5}, {"signal_blur_px": 1.5}, {"room": 0.2, "unsharp": 1.0}],
+    ids=["as it is", "sharpened", "behind a scaler", "in a bright room"],
+)
+def test_values_in_proportion_to_light_stay_as_they_are(seen: dict[str, Any]) -> None:
+    assert found_gamma(seen_by(1.0, **seen)) == 1.0
+
+
+def test_frames_that_do_not_tell_are_left_alone() -> None:
+    bent = seen_by(2.2)
+    assert found_gamma(replace(bent, inverses=None)) == 1.0
+    assert found_gamma(replace(bent, exposure_ratio=4.0)) == 1.0
+    dark = replace(bent, white=bent.black)
+    assert found_gamma(dark) == 1.0
+
+
+def test_straight_frames_are_those_of_a_straight_camera() -> None:
+    bent, linear = seen_by(2.2), seen_by(1.0)
+    given = bent.bits.copy()
+    frames, noise, gamma = in_light(FrameStacks.of(bent), DecodingLimits())
+    assert gamma == pytest.approx(2.2, rel=0.03)
+    # A level of the camera is up to two of light: 1/2.2 of the full scale is one in the middle.
+    assert frames.white == pytest.approx(linear.white, abs=8)
+    assert frames.bits == pytest.approx(linear.bits, abs=8)
+    assert noise.loss is not None
+    assert not noise.loss.any()
+    # What was given is somebody else's.
+    assert (bent.bits == given).all()
+
+
+def test_images_that_come_later_are_made_straight_as_they_come() -> None:
+    bent = seen_by(2.2)
+    stacks = FrameStacks.of(bent)
+    early = FrameStacks(stacks.patterns, SHAPE, full_scale=FULL)
+    late = FrameStacks(stacks.patterns, SHAPE, full_scale=FULL)
+    late.straighten(2.2)
+    assert bent.inverses is not None
+    for bit, (direct, inverse) in enumerate(zip(bent.bits, bent.inverses, strict=True)):
+        for each in (early, late):
+            each.put(Gray(bent.axis, bit, bent.gray.bits, bent.gray.cell_px, bent.gray.offset_px), direct)
+            each.put(
+                Gray(bent.axis, bit, bent.gray.bits, bent.gray.cell_px, bent.gray.offset_px, inverted=True), inverse
+            )
+    for each in (early, late):
+        each.put(White(), bent.white)
+        each.put(Black(), bent.black)
+    early.straighten(2.2)
+    one, other = early.frames(), late.frames()
+    assert (one.bits == other.bits).all()
+    assert (one.white == other.white).all()
+    assert (one.black == FULL * (bent.black / FULL) ** np.float32(2.2)).mean() > 0.99
