@@ -20,9 +20,10 @@ from slrig.reconstruction.frames import AxisFrames
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.surface_fit import stencils
 
-_MOST_WINDOWS = 40_000  # whose median is known to a hundredth
+_MOST_WINDOWS = 10_000  # whose mean is known to a hundredth
 _LEAST_WINDOWS = 200
 _CLEAR_SHARE = 0.8  # of the contrast: less is an edge of the code, where a camera that bends its values breaks the sum
+_LEAST_RATIO = 1.1  # the model is no better than that; of independent noise the windows tell 0.98 to 1.08
 _FEWEST_BITS = 3  # as for `noise.estimate_noise`
 _STEP_PX = 8  # over which stripes are counted: cells of the code are steps
 
@@ -77,7 +78,8 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
     direct, inverse = _seen_in(bits, corner, summed), _seen_in(inverses, corner, summed)
     contrast = _seen_in(frames.contrast[np.newaxis], corner, summed)
     clear = np.abs(direct - inverse) > _CLEAR_SHARE * contrast
-    clear &= (np.minimum(direct, inverse) > 0) & (np.maximum(direct, inverse) < frames.clipped_at)
+    # Where the dark one of both is cut off at zero, pixels and sums lose alike.
+    clear &= np.maximum(direct, inverse) < frames.clipped_at
     kept = clear.all(axis=(0, 2))
     sums = (direct + inverse)[:, kept]
     if sums.shape[1] < _LEAST_WINDOWS:
@@ -92,7 +94,8 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
     ends = noise.variance(frames.white) + noise.variance(frames.black)
     # A bit and its inverse are white and black, in either order; the mean of all took one degree of freedom.
     told = (1 - 1 / count) * np.mean(_seen_in(ends[np.newaxis], corner, summed)[0, kept] @ squares, dtype=np.float64)
-    return max([1.0, *(float(found / each) for each in (alone, told) if each > 0)])
+    ratio = max([1.0, *(float(found / each) for each in (alone, told) if each > 0)])
+    return ratio if ratio >= _LEAST_RATIO else 1.0
 
 
 def _windows(where: NDArray[np.bool_], side: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
