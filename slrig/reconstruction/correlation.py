@@ -3,7 +3,9 @@
 A position is found in a weighted sum of pixels. Where their noise is independent, its variance is that of one pixel
 times Σ w². A camera that interpolates colours of its mosaic, sharpens, subtracts rows or looks at lamps on mains gives
 neighbours the same noise, and the sum averages less of it. How much less is read from the frames: a bit and its inverse
-add up to white plus black, and what these sums of several bits differ by is noise alone, summed here as positions are.
+add up to white plus black and differ by white less black. What bits differ by in either is noise alone, summed here as
+positions are. Lamps may have the same phase in a bit and its inverse, or not: their sum and difference then err by
+unlike amounts. For single frames the larger counts.
 """
 
 from __future__ import annotations
@@ -32,11 +34,13 @@ class PixelSum(NamedTuple):
     """How a position sums pixels.
 
     weights : (k, k) float64 with k odd. cycles_per_px : (x, y) of stripes whose phase is what the pixels tell; 0 where
-    their values themselves do. Noise at that frequency is a constant error of phase.
+    their values themselves do. Noise at that frequency is a constant error of phase. of_swings : whether the pixels are
+    of a bit less its inverse, and not of single frames.
     """
 
     weights: FloatArray
     cycles_per_px: tuple[float, float] = (0.0, 0.0)
+    of_swings: bool = False
 
     def turned(self) -> NDArray[np.complex128]:
         """(k, k): the weights as they apply to a frame's noise."""
@@ -59,7 +63,7 @@ def edge_sum(scale_px: float) -> PixelSum:
     """As a Gaussian of this scale, which finds edges of the code, sums pixels."""
     reach = int(np.ceil(3 * scale_px))
     gaussian = np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * scale_px**2))
-    return PixelSum(np.outer(gaussian, gaussian))
+    return PixelSum(np.outer(gaussian, gaussian), of_swings=True)
 
 
 def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_], summed: PixelSum) -> float:
@@ -81,21 +85,30 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
     # Where the dark one of both is cut off at zero, pixels and sums lose alike.
     clear &= np.maximum(direct, inverse) < frames.clipped_at
     kept = clear.all(axis=(0, 2))
-    sums = (direct + inverse)[:, kept]
-    if sums.shape[1] < _LEAST_WINDOWS:
+    if np.count_nonzero(kept) < _LEAST_WINDOWS:
         return 1.0
-    by_noise = sums - sums.mean(axis=0)
+    ends = _seen_in((noise.variance(frames.white) + noise.variance(frames.black))[np.newaxis], corner, summed)[0, kept]
+    direct, inverse = direct[:, kept], inverse[:, kept]
+    swings = _ratio(np.abs(direct - inverse), ends, summed)
+    ratio = swings if summed.of_swings else max(swings, _ratio(direct + inverse, ends, summed))
+    return ratio if ratio >= _LEAST_RATIO else 1.0
+
+
+def _ratio(steady: NDArray[np.float32], variance: NDArray[np.float32], summed: PixelSum) -> float:
+    """Variance of sums of pixels by what differs from bit to bit, over that of independent noise, at least 1.
+
+    steady : (bits, windows, k²); variance : (windows, k²), of its pixels by the model.
+    """
+    by_noise = steady - steady.mean(axis=0)
     weights = summed.turned().ravel()
     squares = (np.abs(weights) ** 2).astype(np.float32)
     found = np.mean(np.abs(by_noise @ weights.astype(np.complex64)) ** 2, dtype=np.float64)
     # By the pixels of the windows themselves, and by the model: it takes a median, which pixels that a camera
     # interpolated make too small, and those that scatter more count most in a sum.
     alone = np.mean(by_noise**2 @ squares, dtype=np.float64)
-    ends = noise.variance(frames.white) + noise.variance(frames.black)
-    # A bit and its inverse are white and black, in either order; the mean of all took one degree of freedom.
-    told = (1 - 1 / count) * np.mean(_seen_in(ends[np.newaxis], corner, summed)[0, kept] @ squares, dtype=np.float64)
-    ratio = max([1.0, *(float(found / each) for each in (alone, told) if each > 0)])
-    return ratio if ratio >= _LEAST_RATIO else 1.0
+    # The mean of all bits took one degree of freedom.
+    told = (1 - 1 / len(steady)) * np.mean(variance @ squares, dtype=np.float64)
+    return max([1.0, *(float(found / each) for each in (alone, told) if each > 0)])
 
 
 def _windows(where: NDArray[np.bool_], side: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -79,6 +79,16 @@ def test_rows_that_err_as_a_whole_are_told() -> None:
     assert found == pytest.approx((4 + rows) / 5, rel=0.1)
 
 
+def test_lamps_that_a_bit_shares_with_its_inverse_err_frames_but_not_their_difference() -> None:
+    frames = noisy(np.array([[1.0]]))
+    assert frames.inverses is not None
+    lamp = 3.0 * np.random.default_rng(6).standard_normal((BITS, 1, 1)).astype(np.float32)
+    lit = replace(frames, bits=frames.bits + lamp, inverses=frames.inverses + lamp)
+    noise = NoiseModel(4.0, 0.0)
+    assert shared_noise(lit, noise, EVERYWHERE, edge_sum(1.0)) == 1.0
+    assert shared_noise(lit, noise, EVERYWHERE, PixelSum(STENCIL)) > 10.0
+
+
 def test_a_model_that_is_too_small_is_made_up_for_and_one_too_large_is_not() -> None:
     frames = noisy(np.array([[1.0]]))
     assert shared_noise(frames, NoiseModel(2.0, 0.0), EVERYWHERE, PHASES) == pytest.approx(2.0, rel=0.05)
