@@ -39,10 +39,12 @@ def found_gamma(frames: AxisFrames) -> float:
     full = frames.full_scale
     # Rows enough: an edge of the code crosses most of them.
     step = max(1, frames.white.size // _MOST_PIXELS)
-    white, black = frames.white[::step], frames.black[::step]
+    bits, inverses = frames.bits[:, ::step], frames.inverses[:, ::step]
+    # At most bits a pixel is clear of edges. White does not tell: projectors may dim a picture that is all white.
+    white, black = (np.median(each(bits, inverses), axis=0) for each in (np.maximum, np.minimum))
     clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < frames.clipped_at)
     found = []
-    for bit, inverse in zip(frames.bits[:, ::step], frames.inverses[:, ::step], strict=True):
+    for bit, inverse in zip(bits, inverses, strict=True):
         alike = clear & (np.abs(bit - inverse) < _ALIKE * (white - black))
         found.append(np.stack([(bit[alike] + inverse[alike]) / 2, white[alike], black[alike]]))
     middle, bright, dark = np.maximum(np.concatenate(found, axis=1), 0).astype(np.float64) / full

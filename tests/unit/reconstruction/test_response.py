@@ -67,12 +67,18 @@ def test_values_in_proportion_to_light_stay_as_they_are(seen: dict[str, Any]) ->
     assert found_gamma(seen_by(1.0, **seen)) == 1.0
 
 
+def test_a_projector_that_dims_all_white_pictures_bends_nothing() -> None:
+    linear = seen_by(1.0)
+    assert found_gamma(replace(linear, white=0.7 * linear.white)) == 1.0
+
+
 def test_frames_that_do_not_tell_are_left_alone() -> None:
     bent = seen_by(2.2)
     assert found_gamma(replace(bent, inverses=None)) == 1.0
     assert found_gamma(replace(bent, exposure_ratio=4.0)) == 1.0
-    dark = replace(bent, white=bent.black)
-    assert found_gamma(dark) == 1.0
+    assert bent.inverses is not None
+    dark = np.stack([bent.bits, bent.inverses]) / np.float32(20)
+    assert found_gamma(replace(bent, bits=dark[0], inverses=dark[1])) == 1.0
 
 
 def test_straight_frames_are_those_of_a_straight_camera() -> None:
