@@ -23,7 +23,7 @@ from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.refinement import refined
 from slrig.reconstruction.resolution import lost_lines, unresolved_bits
-from slrig.reconstruction.response import in_light
+from slrig.reconstruction.response import gain, in_light
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
@@ -127,6 +127,8 @@ class _Coded:
     def summed(self, images: NDArray[np.float32], pixels: PixelSum) -> _Coded:
         """The same with what noise and compression of these images, (n, H, W), do to positions that sum pixels so."""
         loss = loss_variance(self.frames, self.noise, self.code, images, pixels)
+        if loss:
+            loss *= gain(images[:, ~self.unlit], self.gamma, self.frames.full_scale)
         return replace(self, loss_variance=loss, shared=shared_noise(self.frames, self.noise, ~self.unlit, pixels))
 
     @property

@@ -26,7 +26,7 @@ from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.phase import has_phase, position_map
-from slrig.reconstruction.response import in_light
+from slrig.reconstruction.response import gain, in_light
 
 Mask = NDArray[np.bool_]
 
@@ -90,14 +90,15 @@ def projector_positions(
     noise : where it is known already. Positions outside those that `tables` knows, near the projector's border, are
     left out: see `slrig.patterns.positions`.
     """
+    gamma = 1.0
     if noise is None:
-        frames, noise, _ = in_light(FrameStacks.of(frames), limits.decoding)
+        frames, noise, gamma = in_light(FrameStacks.of(frames), limits.decoding)
     code = decode(frames, noise, tables.index_of_word, len(tables.cell_position), limits.decoding)
     lit = np.asarray(code.refusal != Refusal.NOT_LIT)
     # Each pixel stands alone here, so that what compression took from all waves counts alike.
     told_by = frames.lines if has_phase(frames) else frames.bits
     loss = compression_loss(told_by, frames.bits, lit, frames.full_scale) if noise.loss is None else noise.loss
-    noise = noise.with_more(float(np.mean(loss)))
+    noise = noise.with_more(float(np.mean(loss)) * gain(told_by, gamma, frames.full_scale))
     decoded = np.asarray(code.refusal == Refusal.NONE)
     contrast = frames.contrast
     ends = noise.variance(frames.white) + noise.variance(frames.black)

@@ -62,19 +62,25 @@ def found_gamma(frames: AxisFrames) -> float:
 
 
 def in_light(stacks: FrameStacks, limits: DecodingLimits) -> tuple[AxisFrames, NoiseModel, float]:
-    """The frames so far in proportion to light, their noise, and how the camera had bent them; `stacks` goes on so."""
+    """The frames so far in proportion to light, their noise, and how the camera had bent them; `stacks` goes on so.
+
+    The noise has the loss of the camera's own values, of which `gain` makes one of light.
+    """
     frames = stacks.frames()
     noise, gamma = estimate_noise(frames), found_gamma(frames)
     if gamma == 1:
         return frames, noise, gamma
     # What compression took is seen in its own values only.
-    loss = frames_loss(frames, lit_pixels(frames, noise, limits)) * _gain(frames.bits, gamma, frames.full_scale)
+    loss = frames_loss(frames, lit_pixels(frames, noise, limits))
     stacks.straighten(gamma)
     frames = stacks.frames()
     return frames, replace(estimate_noise(frames), loss=loss), gamma
 
 
-def _gain(image: NDArray[np.float32], gamma: float, full_scale: float) -> float:
-    """Mean square slope of light over values, of one full scale, over an image: by what variances grow on average."""
-    share = np.maximum(image, 0) / np.float32(full_scale)
-    return float(np.mean((gamma * share ** np.float32(gamma - 1)) ** 2, dtype=np.float64))
+def gain(light: NDArray[np.float32], gamma: float, full_scale: float) -> float:
+    """By what an error's variance grew on average where values were made straight: the mean square slope, 1 for γ = 1.
+
+    light : straight values of one full scale. Light v^γ has the slope γ v^(γ - 1) over the value v.
+    """
+    share = np.maximum(light, 0) / np.float32(full_scale)
+    return float(np.mean((gamma * share ** np.float32(1 - 1 / gamma)) ** 2, dtype=np.float64))

@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from slrig.model import Black, FloatArray, Gray, White
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
-from slrig.reconstruction.response import found_gamma, in_light
+from slrig.reconstruction.response import found_gamma, gain, in_light
 from tests.unit.reconstruction.builders import code_frames, grid
 
 SHAPE = (240, 400)
@@ -93,6 +93,16 @@ def test_straight_frames_are_those_of_a_straight_camera() -> None:
     assert not noise.loss.any()
     # What was given is somebody else's.
     assert (bent.bits == given).all()
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.8, 2.4])
+def test_errors_grow_as_the_slope_of_light_over_values(gamma: float) -> None:
+    random = np.random.default_rng(8)
+    value = random.uniform(20, 240, 200_000)
+    seen = value + random.normal(0, 0.5, value.shape)
+    light, wanted = (FULL * (each / FULL) ** gamma for each in (seen, value))
+    grown = float(np.mean((light - wanted) ** 2)) / 0.25
+    assert gain(wanted.astype(np.float32), gamma, FULL) == pytest.approx(grown, rel=0.02)
 
 
 def test_images_that_come_later_are_made_straight_as_they_come() -> None:
