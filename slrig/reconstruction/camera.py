@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
 from slrig.reconstruction.centroid import at_pixel_centres
-from slrig.reconstruction.compression import loss_variance
-from slrig.reconstruction.correlation import PixelSum, edge_sum, phase_sum, shared_noise
+from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image
+from slrig.reconstruction.correlation import edge_sum, phase_sum
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode, lit_pixels
 from slrig.reconstruction.edges import EdgeLimits, near_edges, near_shadows, near_steps
 from slrig.reconstruction.frames import AxisFrames, FrameStacks
@@ -23,15 +23,12 @@ from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.phase import has_phase, position_map
 from slrig.reconstruction.refinement import refined
 from slrig.reconstruction.resolution import lost_lines, unresolved_bits
-from slrig.reconstruction.response import gain, in_light
+from slrig.reconstruction.response import in_light
 from slrig.reconstruction.stripes import (
     LinePoints,
     StripeLimits,
     chained,
-    edge_points,
     measured_sigma_px,
-    normalised,
-    normalised_line,
     stripe_points,
 )
 
@@ -98,44 +95,6 @@ class CameraCurves:
     gamma: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Coded:
-    """What white, black and code frames tell of every pixel.
-
-    near_shadow : (H, W) bool, for a fit to pixels; contrast_deviation : (H, W) float32, of white minus black by noise;
-    unresolved : as of `CameraCurves`; loss_variance : what compression adds to the variance of each sample for whoever
-    finds positions, camera units squared. It bends stripes and edges, but turns no bit over: reading the code with it
-    refused a tenth of a vase at quality 50, and saved it from no wrong point. shared : how much more variance sums of
-    pixels have than independent noise would give them, as of `correlation.shared_noise`.
-    """
-
-    frames: AxisFrames
-    noise: NoiseModel
-    code: CodeMap
-    near_shadow: NDArray[np.bool_]
-    contrast_deviation: NDArray[np.float32]
-    unresolved: NDArray[np.uint8] | None
-    loss_variance: float = 0.0
-    shared: float = 1.0
-    gamma: float = 1.0
-
-    @property
-    def position_noise(self) -> NoiseModel:
-        """Noise as positions have it."""
-        return self.noise.times(self.shared).with_more(self.loss_variance)
-
-    def summed(self, images: NDArray[np.float32], pixels: PixelSum) -> _Coded:
-        """The same with what noise and compression of these images, (n, H, W), do to positions that sum pixels so."""
-        loss = loss_variance(self.frames, self.noise, self.code, images, pixels)
-        if loss:
-            loss *= gain(images[:, ~self.unlit], self.gamma, self.frames.full_scale)
-        return replace(self, loss_variance=loss, shared=shared_noise(self.frames, self.noise, ~self.unlit, pixels))
-
-    @property
-    def unlit(self) -> NDArray[np.bool_]:
-        return np.asarray(self.code.refusal == Refusal.NOT_LIT)
-
-
 class CameraStream:
     """The reconstruction of one camera and axis, fed frame by frame.
 
@@ -161,7 +120,7 @@ class CameraStream:
         self._tables = tables
         self._limits = limits
         self._entered = entered
-        self._coded: _Coded | None = None
+        self._coded: Coded | None = None
         self._ends: tuple[NDArray[np.float32], NDArray[np.float32]]
         self._scales: _Scales | None = None
         self._points: list[LinePoints] = []
@@ -188,7 +147,7 @@ class CameraStream:
         white, black = self._ends
         return self._curves, replace(coded.frames, white=white, black=black)
 
-    def _go_on(self) -> _Coded | None:
+    def _go_on(self) -> Coded | None:
         """Do what the frames so far allow."""
         if self._coded is None and self._stacks.coded:
             self._coded = self._decoded()
@@ -200,7 +159,7 @@ class CameraStream:
                 )
         return self._coded
 
-    def _decoded(self) -> _Coded:
+    def _decoded(self) -> Coded:
         self._entered("decode")
         frames = self._stacks.frames()
         tables, limits = self._tables, self._limits.decoding
@@ -217,15 +176,15 @@ class CameraStream:
         near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
         ends = noise.variance(frames.white) + noise.variance(frames.black)
         deviation = np.sqrt(ends / np.float32(frames.ends_repeats))
-        return _Coded(frames, noise, code, near_shadow, deviation, unresolved, gamma=gamma)
+        return Coded(frames, noise, code, near_shadow, deviation, unresolved, gamma=gamma)
 
-    def _locate(self, coded: _Coded) -> _Coded:
+    def _locate(self, coded: Coded) -> Coded:
         if self._scales is None and not self._stacks.patterns.lines:
             self._entered("locate stripes")
             scale_px = self._limits.stripes.sigma_px or _FINEST_SCALE_PX
             self._scales = _Scales(scale_px, _FINEST_SCALE_PX)
             coded = coded.summed(coded.frames.bits, edge_sum(scale_px))
-            self._points = _edge_points(coded, self._limits.stripes, scale_px)
+            self._points = code_edge_points(coded, self._limits.stripes, scale_px)
         # By shift, whatever came first: the first one's stripes tell the scale for all.
         for pattern in self._stacks.patterns.lines[len(self._points) :]:
             if not self._stacks.has(pattern):
@@ -236,7 +195,7 @@ class CameraStream:
                 coded = coded.summed(
                     coded.frames.lines[:1], phase_sum(coded.frames, coded.code, self._tables.cell_position)
                 )
-            image, deviation = _normalised_line(coded, len(self._points))
+            image, deviation = line_image(coded, len(self._points))
             lit = ~coded.unlit
             if self._scales is None:
                 blur_px = measured_sigma_px(image, deviation, lit)
@@ -269,7 +228,7 @@ class _Scales:
 
 
 def _curves(
-    coded: _Coded,
+    coded: Coded,
     found: list[LinePoints],
     scales: _Scales,
     tables: CodeTables,
@@ -281,7 +240,7 @@ def _curves(
     points, disagreement_px, steady = found, np.zeros(0), False
     entered("refine stripes")
     seen = position_map(frames, noise, code, tables.cell_position)
-    resolution_px = _resolution_px(coded)
+    resolution_px = cell_width_px(coded)
     if has_phase(frames):
         resolution_px = 0.0
         near_shadow = coded.near_shadow
@@ -310,10 +269,10 @@ def _curves(
     if lost is not None and tables.edges_of is not None:
         entered("locate stripes")
         coded, code = _with_fewer_bits(coded, code, lost, tables, limits)
-        edges = _edge_points(coded, limits.stripes, scales.filter_px, within=lost)
+        edges = code_edge_points(coded, limits.stripes, scales.filter_px, within=lost)
         beside = limits.edges.for_filters(scales.blur_px)
         middles = position_map(frames, noise, code, tables.cell_position, by_phase=False)
-        shadow, step = near_edges(middles, coded.unlit, _resolution_px(coded), beside)
+        shadow, step = near_edges(middles, coded.unlit, cell_width_px(coded), beside)
         near_shadow, near_step = np.where(lost, shadow, near_shadow), np.where(lost, step, near_step)
         entered("identify stripes")
         stripes = chained([*(_outside(each, lost) for each in points), *edges], code.refusal.shape)
@@ -340,15 +299,9 @@ def _curves(
     )
 
 
-def _resolution_px(coded: _Coded) -> float | NDArray[np.float32]:
-    """Width of a decoded cell, px: for all pixels, or (H, W)."""
-    cell_px = coded.frames.gray.cell_px
-    return float(cell_px) if coded.unresolved is None else cell_px * np.exp2(coded.unresolved, dtype=np.float32)
-
-
 def _with_fewer_bits(
-    coded: _Coded, code: CodeMap, lost: NDArray[np.bool_], tables: CodeTables, limits: Limits
-) -> tuple[_Coded, CodeMap]:
+    coded: Coded, code: CodeMap, lost: NDArray[np.bool_], tables: CodeTables, limits: Limits
+) -> tuple[Coded, CodeMap]:
     """The code without bits that do not resolve, where its edges stand for lines; and the code map with that."""
     frames, noise = coded.frames, coded.noise
     bits = unresolved_bits(frames, lit_pixels(frames, noise, limits.decoding))
@@ -370,21 +323,6 @@ def _outside(points: LinePoints, lost: NDArray[np.bool_]) -> LinePoints:
     return LinePoints(*(each[kept] for each in points))
 
 
-def _normalised_line(coded: _Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Line frame `index` relative to white, and its noise."""
-    frames, noise, line = coded.frames, coded.position_noise, coded.frames.lines[index]
-    if noise.read_share is None:
-        return normalised_line(
-            line, frames.white, frames.black, noise.read_variance, noise.slope, frames.ends_repeats
-        )  # fmt: skip
-    above = line - frames.black
-    light = np.clip(above / np.maximum(frames.contrast, np.float32(1)), 0, 1)
-    # As there: (I - black)/(white - black) takes 1 - light of black's noise and light of white's.
-    ends = (1 - light) ** 2 * noise.variance(frames.black) + light**2 * noise.variance(frames.white)
-    deviation = np.sqrt(noise.variance(line) + ends / np.float32(frames.ends_repeats))
-    return normalised(line, frames.black, frames.contrast, deviation)
-
-
 def _matched_scale_px(stripe_sigma_px: float) -> float:
     """Scale of the Gaussian for stripes of this width, px.
 
@@ -393,28 +331,3 @@ def _matched_scale_px(stripe_sigma_px: float) -> float:
     """
     more = np.sqrt(max(_LEAST_SMOOTHED_PX**2 - stripe_sigma_px**2, 0.0))
     return float(np.clip(max(stripe_sigma_px, more), _FINEST_SCALE_PX, _COARSEST_SCALE_PX))
-
-
-def _edge_points(
-    coded: _Coded, limits: StripeLimits, scale_px: float, *, within: NDArray[np.bool_] | None = None
-) -> list[LinePoints]:
-    """Points of each code bit's edges, where the bit resolves. within : (H, W) bool, to look for them nowhere else."""
-    frames, noise = coded.frames, coded.position_noise
-    contrast, lit = frames.contrast, ~coded.unlit
-    none = np.zeros_like(contrast)
-    ends_variance = (noise.variance(frames.white) + noise.variance(frames.black)) / frames.ends_repeats
-    parts = []
-    for index, bit in enumerate(frames.bits):
-        if frames.inverses is not None:
-            inverse = frames.inverses[index]
-            swing = bit - inverse
-            variance = noise.variance(bit) + noise.variance(inverse)
-        else:
-            swing = 2 * bit - frames.white - frames.black
-            variance = 4 * noise.variance(bit) + ends_variance
-        image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
-        read = lit if coded.unresolved is None else lit & (index < len(frames.bits) - coded.unresolved)
-        if within is not None:
-            read &= within
-        parts.append(edge_points(image, deviation, read, limits, sigma_px=scale_px))
-    return parts

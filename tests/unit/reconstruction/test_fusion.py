@@ -25,7 +25,7 @@ from slrig.model import (
     White,
 )
 from slrig.patterns.positions import cell_positions, index_of_word
-from slrig.reconstruction.camera import _Coded, _normalised_line
+from slrig.reconstruction.coded import Coded, line_image
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.frames import AxisFrames, axis_frames
 from slrig.reconstruction.fusion import FusedFrames, exposure_use, fused_frames
@@ -287,9 +287,7 @@ def test_shares_of_one_are_frames_as_they_are() -> None:
     none = np.zeros(SHAPE, dtype=np.bool_)
     code = CodeMap(np.zeros(SHAPE, dtype=np.int32), np.zeros(SHAPE, dtype=np.int32), np.zeros(SHAPE, dtype=np.uint8))
     images = [
-        _normalised_line(_Coded(frames, noise, code, none, ones, None), index)
-        for index in (0, 5)
-        for noise in (plain, shared)
+        line_image(Coded(frames, noise, code, none, ones, None), index) for index in (0, 5) for noise in (plain, shared)
     ]
     for first in (0, 2):
         np.testing.assert_allclose(images[first][0], images[first + 1][0], atol=1e-5)
