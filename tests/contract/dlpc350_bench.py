@@ -13,8 +13,8 @@ import os
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,7 @@ from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract import dlpc900_bench
 from tests.contract.bench_head import BenchHead
 from tests.contract.dlpc350_device import Cable, FakeEngine, UhidEngine
+from tests.contract.guest.outcome import Notes, outcome
 from tests.contract.stage import Stage
 from tests.contract.suite import Bench, rig_of
 from tests.contract.wired_camera import WiredCamera
@@ -116,9 +117,6 @@ def bench(folder: Path) -> Bench:
     shown = sequence()
     table = Table(folder, shown)
     return Bench(table.connected, shown)
-
-
-Notes = dict[str, float | int | str]
 
 
 def a_dlpc900_beside_it_is_told_from_it_and_scans(_: Table, notes: Notes) -> None:
@@ -242,15 +240,7 @@ def main(target: Path) -> None:
     told: dict[str, object] = {"contract": run(bench.open_rig, bench.sequence).document()}
     target.write_text(json.dumps(told, indent=1))
     for check in CHECKS:
-        notes: Notes = {}
-        fault: str | None = None
-        begun = time.monotonic()
-        try:
-            check(table, notes)
-        # Whatever it is (pytest's failures are no Exception), the other checks have their turn.
-        except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001
-            fault = "".join(traceback.format_exception(error))
-        told[check.__name__] = {"fault": fault, "seconds": round(time.monotonic() - begun, 2), "notes": notes}
+        told[check.__name__] = outcome(partial(check, table))
         target.write_text(json.dumps(told, indent=1))
 
 

@@ -13,9 +13,9 @@ import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
@@ -31,6 +31,7 @@ from slrig.devices import Projector
 from slrig.errors import DeviceBusyError, DeviceGoneError, UnsupportedByDeviceError
 from slrig.model import Size
 from tests.contract.bench_head import BenchHead
+from tests.contract.guest.outcome import Notes, outcome
 from tests.contract.guest.scanout import HeadPixels, Monitor
 from tests.contract.screen_bench import CAMERA, ScreenCamera, sequence
 from tests.contract.suite import Bench
@@ -46,8 +47,6 @@ DEVICES = (
 )
 WHITE, BLACK = 0, 1
 FAR_S = 60.0
-
-Notes = dict[str, float | int | str]
 
 
 class Heads:
@@ -376,15 +375,7 @@ def main(target: Path, host_folder: str, chosen: list[str]) -> None:
             continue
         whiten()
         until(lambda: is_console(heads.first))
-        notes: Notes = {}
-        fault: str | None = None
-        begun = time.monotonic()
-        try:
-            check(heads, notes)
-        # Whatever it is (pytest's failures are no Exception), the other checks have their turn.
-        except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001
-            fault = "".join(traceback.format_exception(error))
-        told[check.__name__] = {"fault": fault, "seconds": round(time.monotonic() - begun, 2), "notes": notes}
+        told[check.__name__] = outcome(partial(check, heads))
         target.write_text(json.dumps(told, indent=1))
 
     def open_head() -> BenchHead:

@@ -11,7 +11,6 @@ import json
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -27,11 +26,10 @@ from slrig.conformance.bench import usual_settings
 from slrig.devices import Camera, Trigger
 from slrig.errors import DeviceBusyError, DeviceGoneError, FrameTimeoutError, UnsupportedByDeviceError
 from tests.contract import vivid_bench
+from tests.contract.guest.outcome import Notes, outcome
 from tests.contract.guest.vivid import BARE, LOOPED, Control, Output, nodes
 from tests.contract.suite import rig_of
 from tests.contract.vivid_bench import DRIVERS
-
-Notes = dict[str, float | int | str]
 
 FRAMES = {"v4l2": 1_000, "opencv": 300}
 """Patterns shown per time stamp source, each paired with a frame under disturbance."""
@@ -293,18 +291,6 @@ ALL: dict[str, Callable[[Notes], None]] = {
     },
     **{f"{driver}: {check.__name__}": partial(check, driver) for driver in DRIVERS for check in _OF_EACH},
 }
-
-
-def outcome(check: Callable[[Notes], None]) -> dict[str, object]:
-    notes: Notes = {}
-    fault: str | None = None
-    begun = time.monotonic()
-    try:
-        check(notes)
-    # Whatever it is (pytest's failures are no Exception), the other checks have their turn.
-    except (Exception, pytest.fail.Exception) as error:  # noqa: BLE001
-        fault = "".join(traceback.format_exception(error))
-    return {"fault": fault, "seconds": round(time.monotonic() - begun, 2), "notes": notes}
 
 
 def main(target: Path, chosen: list[str]) -> None:
