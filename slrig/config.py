@@ -247,10 +247,12 @@ class ServiceSettings(BaseSettings):
     the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
     are removed with their poses, but for the one in use and those that a scan or an acceptance test names. Scans are
     kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes` sets a limit: beyond it the oldest are
-    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `drain_s` is how
-    long, after SIGTERM, the job that has the rig may take to come to its end before it is interrupted; what waits or
-    computes goes on at the next start. Nobody but the service's own user may read the data, and the users of
-    `data_group`, if it is set. `log_format` auto is text on a terminal, and JSON lines elsewhere.
+    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `backlog_length`
+    is how many scans may be reconstructed, or wait for that, while the rig shoots the next one. `drain_s` is how long,
+    after SIGTERM, the job that has the rig and scans that are reconstructed may take to come to their end before they
+    are interrupted; what waits or computes goes on at the next start. Nobody but the service's own user may read the
+    data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, and JSON lines
+    elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -265,6 +267,7 @@ class ServiceSettings(BaseSettings):
     require_key: bool = True
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     queue_length: Annotated[int, Field(ge=0, le=1000)] = 8
+    backlog_length: Annotated[int, Field(ge=1, le=1000)] = 4
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
     max_event_streams: Annotated[int, Field(ge=1)] = 32

@@ -6,6 +6,7 @@ import os
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
@@ -36,16 +37,26 @@ KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an E
 
 def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
     """Name to URL path of each file of a scan that can be fetched now."""
-    place = folder.scan(record.id)
-    if not record.state.final or not (place.is_dir() and folder.owns(place)):
+    if record.state is JobState.COMPUTING:
+        # One that is put in its place meanwhile has its files there: whoever asks once more is told of all.
+        names = _known_files(folder.result(record.id))
+    elif record.state.final and folder.owns(folder.scan(record.id)):
+        names = _known_files(folder.scan(record.id))
+        if MESH in names:
+            names |= set(ON_REQUEST)
+        if folder.owns(folder.scan(record.id) / "bundle"):
+            names.add(BUNDLE_ZIP)
+    else:
         return {}
-    known = [path for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png"]
-    names = {path.name for path in known if not path.is_symlink()}
-    if MESH in names:
-        names |= set(ON_REQUEST)
-    if folder.owns(place / "bundle"):
-        names.add(BUNDLE_ZIP)
     return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
+
+
+def _known_files(place: Path) -> set[str]:
+    try:
+        known = [path for path in place.iterdir() if path.name in MEDIA_TYPES or path.suffix == ".png"]
+    except FileNotFoundError:
+        return set()
+    return {path.name for path in known if not path.is_symlink()}
 
 
 def _refuse_absent(record: JobRecord, name: str) -> None:
@@ -71,12 +82,28 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
         with _converting:
             if not os.path.lexists(path):
                 write_converted(place, name)
-    if not record.state.final or not service.folder.owns(path):
+    made = _made_so_far(service.folder, record, name)
+    if made is None and not (record.state.final and service.folder.owns(path)):
         _refuse_absent(record, name)
     headers = _headers(scan_id, name)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
+    if made is not None:
+        headers["Content-Disposition"] = f'inline; filename="{name}"'
+        return Response(made, media_type=media_type, headers=headers)
     return FileResponse(path, media_type=media_type, filename=name, content_disposition_type="inline", headers=headers)
+
+
+def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | None:
+    """A file of a scan that is being reconstructed, once it is there. Read as a whole: the scan may be put in its place
+    at any moment.
+    """
+    if record.state is not JobState.COMPUTING:
+        return None
+    for place in (folder.result(record.id), folder.scan(record.id)):
+        with suppress(FileNotFoundError):
+            return folder.read(place / name)
+    return None
 
 
 def _headers(scan_id: UUID, name: str) -> dict[str, str]:
@@ -96,7 +123,10 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
         return _file(service, scan_id, name, media_type, known)
 
     made = " It is made of mesh.ply when it is first asked for, and kept." if name in ON_REQUEST else ""
-    fetch.__doc__ = f"Return {name} of a scan that succeeded.{made} Ranges and ETags are honoured."
+    fetch.__doc__ = (
+        f"Return {name} of a scan that succeeded, or that is being reconstructed, as soon as it is there.{made} ETags "
+        "are honoured, and ranges once the scan is over."
+    )
     return fetch
 
 

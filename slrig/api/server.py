@@ -87,6 +87,7 @@ def open_service(
         worker,
         capture=capture_bundle,
         queue_length=settings.queue_length,
+        backlog_length=settings.backlog_length,
         spare_bytes=settings.min_free_bytes,
         give_up=give_up,
     )

@@ -74,16 +74,32 @@ def json_bytes(data: object) -> bytes:
     return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()
 
 
-def write_file(path: Path, data: bytes) -> None:
+def sync_tree(folder: Path) -> None:
+    """Make every file below `folder`, and every folder, durable."""
+    for place, _, files in os.walk(folder):
+        for file in (Path(place, name) for name in files):
+            # What a link leads to is not ours.
+            if not file.is_symlink():
+                sync_file(file)
+        sync_folder(Path(place))
+
+
+def write_file(path: Path, data: bytes, *, durable: bool = True) -> None:
     """Replace the file `path` by `data`, whole or not at all.
     Raises StorageError: the disk refused; what was there before is still there.
+
+    durable : False in a folder that `sync_tree` brings to disk before anybody relies on it.
     """
     staging = staging_name(path)
     with refusals_of(path):
         try:
-            write_durably(staging, data)
+            if durable:
+                write_durably(staging, data)
+            else:
+                staging.write_bytes(data)
             staging.replace(path)
-            sync_folder(path.parent)
+            if durable:
+                sync_folder(path.parent)
         except BaseException:
             with suppress(OSError):
                 staging.unlink(missing_ok=True)

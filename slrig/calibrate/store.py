@@ -25,13 +25,13 @@ from uuid import UUID
 import numpy as np
 
 from slrig.bundle.calibration_file import read_calibration
-from slrig.bundle.storage import sync_folder, write_durably, write_file
+from slrig.bundle.storage import sync_folder, sync_tree, write_durably, write_file
 from slrig.calibrate.records import SessionRecord, session_from_json, session_json
 from slrig.calibrate.solving import ReadPose
 from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.data_folder import DataFolder, sync_tree
+from slrig.jobs.data_folder import DataFolder
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 

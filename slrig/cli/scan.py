@@ -48,7 +48,7 @@ def scan_with(
                 if event["kind"] == "progress":
                     fraction = event["fraction"]
                     told(event["stage"], fraction, event["detail"])
-                elif event["state"] in _STATES:
+                elif event["kind"] == "state" and event["state"] in _STATES:
                     told(_STATES[event["state"]], fraction, "")
         except KeyboardInterrupt:
             with suppress(ServiceError):

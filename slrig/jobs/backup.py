@@ -22,9 +22,9 @@ from typing import BinaryIO, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from slrig.bundle.storage import refusals_of, staging_name, sync_folder
+from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tree
 from slrig.errors import StorageError
-from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS, sync_tree
+from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS
 from slrig.jobs.database import PATIENCE_S
 from slrig.jobs.records import JobKind, JobState, utc_now
 

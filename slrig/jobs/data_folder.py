@@ -22,13 +22,13 @@ from uuid import UUID
 import structlog
 from filelock import FileLock, Timeout
 
-from slrig.bundle.storage import sync_file, sync_folder
+from slrig.bundle.storage import sync_folder, sync_tree
 from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 
 DATABASE, SCANS, ORPHANS = "slrig.sqlite", "scans", ".orphans"
 
-_HOLDER = "holder"
+_HOLDER, _RESULT = "holder", "result"
 
 _log = structlog.get_logger(__name__)
 
@@ -179,6 +179,10 @@ class DataFolder:
         """Where the files of a running scan are made."""
         return self.incoming / str(scan_id)
 
+    def result(self, scan_id: UUID) -> Path:
+        """Where the files of a scan that is being reconstructed lie, once each is there."""
+        return self.staging(scan_id) / _RESULT
+
     def hidden(self, scan_id: UUID) -> str:
         """What is left out of words that outlast the staging folder: where that lies."""
         return f"{self.staging(scan_id)}/"
@@ -190,14 +194,21 @@ class DataFolder:
             folder.mkdir()
         return folder
 
+    def stage_result(self, scan_id: UUID) -> Path:
+        """Make the folder, in that of a staged scan, in which its reconstruction puts one whole file after another."""
+        folder = self.result(scan_id)
+        with disk_errors(folder):
+            folder.mkdir()
+        return folder
+
     def commit(self, scan_id: UUID) -> None:
         """Move a staged scan to its place, whole and durable: fsync everything, then one rename.
 
-        The reconstruction's own folder `result` is dissolved, so that its files lie beside the bundle.
+        The reconstruction's own folder is dissolved, so that its files lie beside the bundle.
         """
         staged = self.staging(scan_id)
         with disk_errors(staged):
-            result = staged / "result"
+            result = self.result(scan_id)
             if result.is_dir():
                 for file in sorted(result.iterdir()):
                     file.rename(staged / file.name)
@@ -243,13 +254,3 @@ def remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink()
-
-
-def sync_tree(folder: Path) -> None:
-    """Make every file below `folder`, and every folder, durable."""
-    for place, _, files in os.walk(folder):
-        for file in (Path(place, name) for name in files):
-            # What a link leads to is not ours.
-            if not file.is_symlink():
-                sync_file(file)
-        sync_folder(Path(place))

@@ -57,10 +57,20 @@ class FrameSink(Protocol):
 class FrameFeed:
     """Sends the frames of one capture to the reconstruction process, on a thread of its own.
 
-    send : sends one message, and returns False when nobody receives it any more; it may block.
+    send : sends one message, and returns False when nobody receives it any more; it may block. number : of the task
+    that will use the frames. receiver : what they are sent to, by which the task's process is known.
     """
 
-    def __init__(self, send: Callable[[object], bool], *, most_bytes: int = MOST_WAITING_BYTES) -> None:
+    def __init__(
+        self,
+        send: Callable[[object], bool],
+        *,
+        number: int = 0,
+        receiver: object = None,
+        most_bytes: int = MOST_WAITING_BYTES,
+    ) -> None:
+        self.number = number
+        self.receiver = receiver
         self._send = send
         self._most_bytes = most_bytes
         self._waiting: queue.Queue[Begin | Shot | EvidenceSummary | Abandon] = queue.Queue()
@@ -160,3 +170,27 @@ class FedFrames:
     def forget(self) -> None:
         """Let the frames go."""
         self._live = None
+
+
+class FedCaptures:
+    """The frames of the captures that no task has used yet, by the number of the task: of one that is computed next,
+    and one that is under way. receiver : makes what takes the frames of a capture.
+    """
+
+    def __init__(self, receiver: Callable[[], FedFrames]) -> None:
+        self._receiver = receiver
+        self._captures: dict[int, FedFrames] = {}
+
+    def hear(self, number: int, message: object) -> None:
+        """Take a message of a capture's feed."""
+        if number not in self._captures:
+            if self._captures and number < max(self._captures):
+                return
+            self._captures = {each: self._captures[each] for each in sorted(self._captures)[-1:]}
+            self._captures[number] = self._receiver()
+        self._captures[number].hear(message)
+
+    def taken(self, number: int) -> Any:
+        """What has taken the frames of a capture, None when nothing has; they are let go here."""
+        frames = self._captures.pop(number, None)
+        return None if frames is None else frames.taken()

@@ -27,18 +27,20 @@ class Holder:
 class Job:
     """A piece of work with the rig. Its first end stands: whatever ends it again later is not told.
 
-    work : called on the thread that owns the rig; the projector is darkened afterwards, whatever happened. clear_up :
-    does what remains and needs no light, on the same thread; the rig is not free yet. concluded : takes note, on any
-    thread, how it ended; the rig is being freed, and a lock is held: it returns at once. ended : called once, when the
-    rig is free again. These three are given what was raised, None where nothing was. stop : set when it is to end
-    early.
+    work : called on the thread that owns the rig; the projector is darkened afterwards, whatever happened. None where
+    only the second part is left to be done. compute : the second part, called on a thread of its own when the rig is
+    free for the next job; None where there is none. clear_up : does what remains, on the same thread as the part that
+    was done last; after `work` the rig is not free yet. concluded : takes note, on any thread, how it ended; a lock is
+    held: it returns at once. ended : called once, when the rig is free. These three are given what was raised, None
+    where nothing was. stop : set when it is to end early.
     """
 
     id: UUID
     holder: Holder
     since: datetime
-    work: Callable[[RigSession, Job], None]
+    work: Callable[[RigSession, Job], None] | None
     ended: Callable[[Exception | None], None]
+    compute: Callable[[Job], None] | None = None
     clear_up: Callable[[Exception | None], None] = lambda _: None
     concluded: Callable[[Exception | None], None] = lambda _: None
     stop: threading.Event = field(default_factory=threading.Event)
@@ -46,6 +48,11 @@ class Job:
     _noted: bool = False
     _telling: threading.Lock = field(default_factory=threading.Lock)
     _told: bool = False
+
+    @property
+    def concluded_early(self) -> bool:
+        """Whether its end was noted while it was still under way."""
+        return self._noted
 
     def conclude(self, error: Exception | None) -> None:
         """Take note of its end, with the lock held under which the rig is given and taken."""

@@ -42,6 +42,13 @@ class ProgressRecorder:
         self._start, self._end = span
         self._told = JobProgress("", -1.0, "")
 
+    def file_made(self, name: str) -> None:
+        """Take note of a file that can be fetched before the job is over; refused as the rest."""
+        try:
+            self._store.file_made(self._job_id, name)
+        except StorageError as error:
+            _log.warning("a file of a job could not be announced", job=str(self._job_id), file=name, cause=str(error))
+
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
         """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)

@@ -1,4 +1,7 @@
-"""The queue of jobs on a rig: one at a time on one owner thread, a few that wait, pictures in between."""
+"""The queue of jobs on a rig: one at a time on one owner thread, a few that wait, pictures in between.
+
+A job whose light is over leaves the rig to the next one, and computes beside it.
+"""
 
 from __future__ import annotations
 
@@ -35,28 +38,39 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class QueueStatus:
-    """Who holds the rig, since when, how many wait, and whether the service is ending."""
+    """Who holds the rig, since when, how many wait, who computes without it, and whether the service is ending."""
 
     holder: Holder | None
     since: datetime | None
     waiting: int
+    computing: tuple[Holder, ...]
     ending: bool
 
 
 class JobQueue:
     """Runs jobs with the rig in the order in which they came.
 
-    Every public method may be called from any thread. `give_up` is told, on the owner thread, when the first opening
-    shows that the rig file is wrong.
+    Every public method may be called from any thread. While `backlog_length` jobs compute, none begins that will. Of an
+    earlier run of the service there may be more. `give_up` is told, on the owner thread, when the first opening shows
+    that the rig file is wrong.
     """
 
-    def __init__(self, rig: RigSession, *, queue_length: int, give_up: Callable[[InvalidInputError], None]) -> None:
+    def __init__(
+        self,
+        rig: RigSession,
+        *,
+        queue_length: int,
+        backlog_length: int,
+        give_up: Callable[[InvalidInputError], None],
+    ) -> None:
         self.queue_length = queue_length
+        self.backlog_length = backlog_length
         self.rig = rig
         self._give_up = give_up
         self._changed = threading.Condition()
         self._waiting: deque[Job] = deque()
         self._active: Job | None = None
+        self._computing: list[Job] = []
         self._previews = Previews(self._wake)
         self._ending = False
         self._owner = threading.Thread(target=self._own_rig, name="slrig-rig", daemon=True)
@@ -66,6 +80,8 @@ class JobQueue:
         """Start the owner thread, which opens the rig."""
         self._owner.start()
         self._watchdog.start()
+        for job in list(self._computing):
+            self._begin_computing(job)
 
     def refuse_while_stuck(self) -> None:
         """Raise DeviceError while a driver hangs."""
@@ -100,8 +116,9 @@ class JobQueue:
         self._previews.interrupt()
 
     def take_up(self, jobs: Sequence[Job]) -> None:
-        """Put jobs of an earlier run in line, however many; before `start`."""
-        self._waiting.extend(jobs)
+        """Put jobs of an earlier run in line, or have them computed, however many; before `start`."""
+        self._waiting.extend(job for job in jobs if job.work is not None)
+        self._computing.extend(job for job in jobs if job.work is None)
 
     def cancel(self, job_id: UUID) -> bool:
         """Have a job end early. Returns whether it is under way and was told; one that waited has ended."""
@@ -111,9 +128,10 @@ class JobQueue:
                 self._waiting.remove(queued)
                 message = f"{_begun(queued.holder.words)} was cancelled while it waited for the rig."
                 queued.conclude(ScanCancelledError(message))
-            elif self._active is not None and self._active.id == job_id:
-                self._active.stop.set()
-                return True
+            for job in self._under_way():
+                if job.id == job_id:
+                    job.stop.set()
+                    return True
         if queued is not None:
             queued.settle()
         return False
@@ -153,7 +171,8 @@ class JobQueue:
         with self._changed:
             active = self._active
             holder, since = (None, None) if active is None else (active.holder, active.since)
-            return QueueStatus(holder, since, len(self._waiting), self._ending)
+            computing = tuple(job.holder for job in self._computing)
+            return QueueStatus(holder, since, len(self._waiting), computing, self._ending)
 
     @property
     def ending(self) -> bool:
@@ -161,14 +180,14 @@ class JobQueue:
         return self._ending
 
     def drain(self, timeout_s: float, hurry: threading.Event) -> None:
-        """Begin no further job, and wait until the one that has the rig is over, for so long, or until `hurry`.
+        """Begin no further job, and wait until those under way are over, for so long, or until `hurry`.
 
         What waits stays on record as it is: the next start of the service goes on with it. `end` has to follow.
         """
         give_up = time.monotonic() + timeout_s
         with self._changed:
             self._ending = True
-            while self._active is not None and not hurry.is_set() and time.monotonic() < give_up:
+            while self._under_way() and not hurry.is_set() and time.monotonic() < give_up:
                 self._changed.wait(_LOOK_S)
 
     def end(self) -> None:
@@ -177,8 +196,8 @@ class JobQueue:
             self._ending = True
             cut_off = list(self._waiting)
             self._waiting.clear()
-            if self._active is not None:
-                self._active.stop.set()
+            for job in self._under_way():
+                job.stop.set()
             for job in cut_off:
                 job.conclude(interruption())
             self._changed.notify_all()
@@ -188,31 +207,38 @@ class JobQueue:
             job.settle()
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the owner thread, which darkens and closes the rig; one that hangs is left behind, and darkened
-        past, as far as its driver lets.
+        """Wait for the owner thread, which darkens and closes the rig, and for what computes; an owner that hangs is
+        left behind, and darkened past, as far as its driver lets.
         """
+        give_up = time.monotonic() + timeout_s
         if self._owner.is_alive():
             self._owner.join(timeout_s)
         if self._owner.is_alive():
             _log.error("the rig's driver does not return; the service ends without it", rig=self.rig.name)
             self.rig.darken_from_outside()
-        self._cut_off_active(interruption())
+        with self._changed:
+            self._changed.wait_for(lambda: not self._computing, max(give_up - time.monotonic(), 0.0))
+        self._cut_off(interruption(), self._under_way)
 
     def _give_up_on(self, call: Call) -> None:
         """End, on the watchdog's thread, what waits for a call that hangs."""
         _log.error("a driver hangs", rig=self.rig.name, device=call.device, step=call.step)
         error = DeviceError(self.rig.give_up(call).message)
         self.rig.darken_from_outside()
-        self._cut_off_active(error)
+        self._cut_off(error, lambda: [job for job in (self._active,) if job is not None])
         self._previews.fail(error)
 
-    def _cut_off_active(self, error: SlrigError) -> None:
+    def _cut_off(self, error: SlrigError, jobs: Callable[[], list[Job]]) -> None:
         with self._changed:
-            active = self._active
-            if active is not None:
-                active.conclude(error)
-        if active is not None:
-            active.settle()
+            cut_off = jobs()
+            for job in cut_off:
+                job.conclude(error)
+        for job in cut_off:
+            job.settle()
+
+    def _under_way(self) -> list[Job]:
+        """The jobs that have the rig or compute; with the lock held."""
+        return [*([] if self._active is None else [self._active]), *self._computing]
 
     def _own_rig(self) -> None:
         error = self.rig.try_open()
@@ -234,13 +260,15 @@ class JobQueue:
                 self._changed.wait_for(lambda: self._wanted() or self._previews.wanted)
                 if self._ending:
                     return None
-                if self._waiting:
+                if self._wanted():
                     self._active = self._waiting.popleft()
                     return self._active
             self._show()
 
     def _wanted(self) -> bool:
-        return self._ending or bool(self._waiting)
+        """Whether the service ends, or a job waits that may begin: in their order, while few enough compute."""
+        full = len(self._computing) >= self.backlog_length
+        return self._ending or bool(self._waiting and not (full and self._waiting[0].compute is not None))
 
     def _wake(self) -> None:
         with self._changed:
@@ -249,24 +277,67 @@ class JobQueue:
     def _run(self, job: Job) -> None:
         # What is no Exception, and ends the thread, is no success either.
         error: Exception | None = RuntimeError("the thread that owns the rig was ended")
+        goes_on = False
         try:
             try:
                 with structlog.contextvars.bound_contextvars(job=str(job.id)):
-                    job.work(self.rig, job)
+                    if job.work is not None:
+                        job.work(self.rig, job)
                 error = None
             except Exception as raised:  # noqa: BLE001 - the owner thread outlives whatever happens to one job
                 error = interruption() if self._ending else raised
             finally:
                 self.rig.darken()
-            job.clear_up(error)
+            goes_on = error is None and self._begun_computing(job)
+            if not goes_on:
+                job.clear_up(error)
         finally:
-            # The rig is free before anyone can read that the work is over: a client may start its next one at once.
-            with self._changed:
-                self._active = None
-                job.conclude(error)
-            job.settle()
+            if not goes_on:
+                # The rig is free before anyone can read that the work is over: a client may start its next one at once.
+                with self._changed:
+                    self._active = None
+                    job.conclude(error)
+                    self._changed.notify_all()
+                job.settle()
         if not self._ending:
             self._log_unopened(self.rig.recover())
+
+    def _begun_computing(self, job: Job) -> bool:
+        """Free the rig of a job whose second part is begun. One that was given up while its driver hung is over,
+        although the driver has returned.
+        """
+        with self._changed:
+            if job.compute is None or job.concluded_early:
+                return False
+            self._active = None
+            self._computing.append(job)
+            self._changed.notify_all()
+        self._begin_computing(job)
+        return True
+
+    def _begin_computing(self, job: Job) -> None:
+        # A daemon, so that it never holds up the end of the service.
+        threading.Thread(target=self._compute, args=(job,), name="slrig-compute", daemon=True).start()
+
+    def _compute(self, job: Job) -> None:
+        error: Exception | None = RuntimeError("the thread that computes was ended")
+        try:
+            try:
+                with structlog.contextvars.bound_contextvars(job=str(job.id)):
+                    if job.compute is not None:
+                        job.compute(job)
+                error = None
+            except Exception as raised:  # noqa: BLE001 - it is told as the end of the job
+                error = interruption() if self._ending else raised
+            job.clear_up(error)
+        except Exception:  # noqa: BLE001 - as on the owner thread
+            _log.exception("the end of work that computes went wrong", work=job.holder.words)
+        finally:
+            with self._changed:
+                self._computing.remove(job)
+                job.conclude(error)
+                self._changed.notify_all()
+            job.settle()
 
     def _show(self) -> None:
         """Take pictures for those who look, until a job wants the rig."""

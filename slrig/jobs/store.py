@@ -169,6 +169,13 @@ class JobStore:
             _append(session, row, "progress", {**progress.as_json(), "state": row.state})
         self._wake(job_id, row.parent)
 
+    def file_made(self, job_id: UUID, name: str) -> None:
+        """Record that a file of a running job can be fetched. Refused as `progress` is."""
+        with self.database.changing(patience_s=_PROGRESS_PATIENCE_S) as session:
+            row = self._find(session, job_id)
+            _append(session, row, "file", {"name": name, "state": row.state})
+        self._wake(job_id, row.parent)
+
     def finish(
         self,
         job_id: UUID,

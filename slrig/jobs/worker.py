@@ -28,7 +28,7 @@ from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.failure import errors_by_code, interruption
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, Run, Task, Unloadable, received, sent, serve
-from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Told
+from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Made, Told
 
 SILENCE_TOLD_S = 5.0
 """From when on `condition` tells that the process shows no sign of life."""
@@ -47,6 +47,10 @@ class UnexpectedWorkerError(Exception):
 
 
 def _silent(_stage: str, _fraction: float, _detail: str) -> None:
+    pass
+
+
+def _unheard(_file: str) -> None:
     pass
 
 
@@ -70,7 +74,7 @@ class Worker:
         self._turns: deque[int] = deque()
         self._turn = threading.Condition()
         self._numbers = itertools.count(1)
-        self._fed: tuple[FrameFeed, Connection | None, int] | None = None
+        self._feeding: FrameFeed | None = None
         self._closed = False
         self._running = False
         self._condition, self._loading = LOADING, True
@@ -151,7 +155,11 @@ class Worker:
             stops.close()
 
     def feed(self) -> FrameFeed:
-        """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards."""
+        """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards.
+
+        While those of an earlier capture still wait to be sent, it is abandoned from the start: the process is busy,
+        and frames of one capture are enough to be kept in memory.
+        """
         self.start()
         number = next(self._numbers)
         with self._guard:
@@ -162,8 +170,10 @@ class Worker:
             with self._sending:
                 return pipe is not None and sent(pipe, Fed(number, message))
 
-        self._fed = FrameFeed(send), pipe, number
-        return self._fed[0]
+        earlier, self._feeding = self._feeding, FrameFeed(send, number=number, receiver=pipe)
+        if earlier is not None and earlier.receiver is pipe and not earlier.settled(0.0):
+            self._feeding.abandon()
+        return self._feeding
 
     def run(
         self,
@@ -171,9 +181,11 @@ class Worker:
         *,
         progress: Told = _silent,
         cancelled: Callable[[], bool] = _never,
+        made: Made = _unheard,
         feed: FrameFeed | None = None,
     ) -> Any:
         """Do a task when it is its turn, and return its result. Frames that `feed` has sent, all of them, are used.
+        made : is told the name of each file of the result that is there before the task is over.
 
         Whatever but an answer ends the wait, the process is replaced: what it still computes belongs to nobody.
 
@@ -199,9 +211,9 @@ class Worker:
                 raise interruption()
             number, fed = next(self._numbers), False
             # A process that was started since the capture has not seen its frames.
-            if feed is not None and self._fed is not None and self._fed[:2] == (feed, pipe):
-                number, fed = self._fed[2], True
-            job = JobWait(task, number, process, pipe, stops, self._heartbeat, progress, cancelled, self._noted)
+            if feed is not None and feed.receiver is pipe:
+                number, fed = feed.number, True
+            job = JobWait(task, number, process, pipe, stops, self._heartbeat, progress, cancelled, made, self._noted)
             try:
                 if fed and feed is not None:
                     fed = job.settled(feed)

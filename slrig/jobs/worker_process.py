@@ -23,6 +23,7 @@ from typing import Any
 import structlog
 
 from slrig.failure import JobFailure, failure_of
+from slrig.jobs.frame_feed import FedCaptures
 from slrig.logs import LogSettings, set_up_logs
 
 _log = structlog.get_logger(__name__)
@@ -35,9 +36,9 @@ HEARTBEAT_S = 0.5
 class Task:
     """A task of the worker: a function that is named rather than passed, so that the service need not load it.
 
-    function : "module:function". It is given `progress` and `cancelled` if it takes arguments of these names, and
-    `live`, what received the frames of a capture, if there were any. what : the task in words. remedy : what a person
-    can do when the worker is lost in the middle of it.
+    function : "module:function". It is given `progress`, `cancelled` and `made` if it takes arguments of these names,
+    and `live`, what received the frames of a capture, if there were any. what : the task in words. remedy : what a
+    person can do when the worker is lost in the middle of it.
     """
 
     function: str
@@ -102,6 +103,14 @@ class Progressed:
 
 
 @dataclass(frozen=True, slots=True)
+class FileMade:
+    """Child to parent: a file of the result is there, whole; the job goes on."""
+
+    number: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
 class Done:
     """Child to parent: the job ended well."""
 
@@ -155,18 +164,16 @@ def serve(
     threading.Thread(target=_beat, args=(heartbeat,), name="slrig-heartbeat", daemon=True).start()
     try:
         loaded = importlib.import_module(module)
-        frames = loaded.frame_receiver()
+        fed = FedCaptures(loaded.frame_receiver)
         loaded.warm_kernels(lambda prepared: sent(pipe, Preparing(prepared.done, prepared.total)))
     except Exception as error:  # noqa: BLE001 - whatever it is, the parent and the log are told
         sent(pipe, Unloadable(f"{type(error).__name__}: {error}"))
         _log.exception("the worker cannot load what it computes with", module=module)
         raise SystemExit(1) from None
     sent(pipe, Ready())
-    capture = 0
     while (message := received(pipe)) is not None:
         if isinstance(message, Run):
-            live = frames.taken() if message.fed and message.number == capture else None
-            frames.forget()
+            live = fed.taken(message.number) if message.fed else None
             try:
                 with structlog.contextvars.bound_contextvars(**message.named):
                     answer = _answer(pipe, stops, message, live)
@@ -175,11 +182,8 @@ def serve(
             del live
             sent(pipe, answer)
             del answer
-        elif isinstance(message, Fed) and message.number >= capture:
-            if message.number > capture:
-                capture = message.number
-                frames.forget()
-            frames.hear(message.message)
+        elif isinstance(message, Fed):
+            fed.hear(message.number, message.message)
 
 
 def _beat(heartbeat: c_double) -> None:
@@ -200,6 +204,9 @@ def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | 
     def progress(stage: str, fraction: float, detail: str) -> None:
         pipe.send(Progressed(run.number, stage, fraction, detail))
 
+    def made(name: str) -> None:
+        pipe.send(FileMade(run.number, name))
+
     def cancelled() -> bool:
         nonlocal stopped
         while stops.poll():
@@ -207,7 +214,7 @@ def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | 
         return stopped
 
     try:
-        given = {"progress": progress, "cancelled": cancelled}
+        given = {"progress": progress, "cancelled": cancelled, "made": made}
         if live is not None:
             given["live"] = live
         return Done(run.number, _called(run.task, given))

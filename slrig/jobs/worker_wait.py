@@ -14,7 +14,7 @@ import structlog
 
 from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.jobs.frame_feed import FrameFeed
-from slrig.jobs.worker_process import Done, Failed, Preparing, Progressed, Task, Unloadable, received, sent
+from slrig.jobs.worker_process import Done, Failed, FileMade, Preparing, Progressed, Task, Unloadable, received, sent
 
 CANCEL_LIMIT_S = 10.0
 """A job that has not stopped this long after it was asked to is stopped by ending its process."""
@@ -35,6 +35,9 @@ POLL_S = 0.1
 Told = Callable[[str, float, str], None]
 """Is told the stage of a job, the fraction of it that is done, and a detail for people."""
 
+Made = Callable[[str], None]
+"""Is told the name of a file that is there, whole, while the job goes on."""
+
 _log = structlog.get_logger(__name__)
 
 
@@ -52,6 +55,7 @@ class JobWait:
     heartbeat: c_double
     progress: Told
     cancelled: Callable[[], bool]
+    made: Made
     noted: Callable[[object | None], None]
     answered: bool = False
     _answer: Done | Failed | None = None
@@ -88,9 +92,11 @@ class JobWait:
                 case Progressed(number, stage, fraction, detail) if number == self.number:
                     self._standstill_s = 0.0
                     self.progress(stage, fraction, detail)
+                case FileMade(number, name) if number == self.number:
+                    self.made(name)
                 case Done(number) | Failed(number) as answer if number == self.number:
                     self.answered, self._answer = True, answer
-                case Progressed() | Done() | Failed():
+                case Progressed() | FileMade() | Done() | Failed():
                     _log.warning("an answer that nobody waits for was dropped")
                 case None | Unloadable() as told:
                     self.noted(told)

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.storage import refusals_of, staging_name, sync_folder, write_file
+from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tree, write_file
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, Mesh, PointCurves
-from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
+from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl
 
 MESH = "mesh.ply"
 REPORT = "report.json"
@@ -45,16 +45,6 @@ _NO_MESH = Mesh(
 )
 
 
-def write_mesh(mesh: Mesh, folder: Path, *, sigma_calibration_mm: FloatArray | None = None) -> None:
-    """Write mesh.ply and mesh.glb into `folder`; other formats are made of them on request. Raises StorageError.
-
-    sigma_calibration_mm : as for `encode_mesh_ply`.
-    """
-    # One at a time: each is as large as the mesh.
-    write_file(folder / MESH, encode_mesh_ply(mesh, sigma_calibration_mm=sigma_calibration_mm))
-    write_file(folder / "mesh.glb", encode_mesh_glb(mesh))
-
-
 def write_converted(folder: Path, name: str) -> None:
     """Write one of `ON_REQUEST` beside the mesh.ply of a finished scan, of which it is made.
 
@@ -71,17 +61,20 @@ def write_converted(folder: Path, name: str) -> None:
 
 
 def write_report(report: Mapping[str, object], path: Path) -> None:
-    """Write a report as JSON, keys in the order given. Numbers that are not finite become null.
+    """Write a report, see `encode_report`. Raises StorageError: the disk refused."""
+    write_file(path, encode_report(report))
+
+
+def encode_report(report: Mapping[str, object]) -> bytes:
+    """A report as JSON, keys in the order given. Numbers that are not finite become null.
 
     Raises
     ------
-    StorageError
-        The disk refused.
     TypeError
         The report holds something that JSON has no form for; the message says where.
     """
     text = json.dumps(_plain(report, "report"), indent=2, ensure_ascii=False, allow_nan=False)
-    write_file(path, (text + "\n").encode())
+    return (text + "\n").encode()
 
 
 def encode_mesh_ply(mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
@@ -250,7 +243,7 @@ def staged_folder(output: Path) -> Iterator[Path]:
     try:
         yield staging
         with refusals_of(output):
-            sync_folder(staging)
+            sync_tree(staging)
             _put_in_place(staging, output)
             sync_folder(output.parent)
     finally:

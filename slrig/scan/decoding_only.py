@@ -16,7 +16,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from slrig.bundle.reading import read_capture
-from slrig.bundle.storage import refusals_of
+from slrig.bundle.storage import refusals_of, write_file
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
 from slrig.patterns.positions import cell_positions, index_of_word
@@ -27,7 +27,7 @@ from slrig.reconstruction.noise import NoiseModel, estimate_noise
 from slrig.reconstruction.phase import position_map
 from slrig.reconstruction.resolution import unresolved_bits
 from slrig.scan.artefacts import REPORT, REPORT_FORMAT, staged_folder, write_report
-from slrig.scan.pictures import rejection_picture, write_png
+from slrig.scan.pictures import encode_png, rejection_picture
 
 _FEW, _MANY = 0.05, 0.25
 
@@ -116,9 +116,11 @@ def _decoded(capture: Capture, camera: str, axis: Axis, folder: Path) -> Decoded
     name = f"{camera}-{axis.value}"
     with refusals_of(folder):
         tifffile.imwrite(folder / f"position-{name}.tiff", position)
-    write_png(folder / f"position-{name}.png", _coloured(position, capture.projector.along(axis)))
+    coloured = encode_png(_coloured(position, capture.projector.along(axis)))
+    write_file(folder / f"position-{name}.png", coloured)
     white = np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    write_png(folder / f"rejected-{name}.png", rejection_picture(code.refusal, white, int(frames.clipped_at)))
+    refused = encode_png(rejection_picture(code.refusal, white, int(frames.clipped_at)))
+    write_file(folder / f"rejected-{name}.png", refused)
     count = max(int(lit.sum()), 1)
     return Decoded(
         camera=camera,

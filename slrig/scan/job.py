@@ -1,4 +1,6 @@
-"""A scan on the rig: captured, reconstructed, put in its place, and ended in one final state whatever happens."""
+"""A scan on the rig: captured, reconstructed when the rig is free, put in its place, and ended in one final state
+whatever happens.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,11 @@ from typing import Any, Protocol
 import structlog
 
 from slrig.bundle.health import write_health
+from slrig.bundle.storage import sync_tree
 from slrig.devices import Rig
 from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.data_folder import DataFolder, missing_files, sync_tree
+from slrig.jobs.data_folder import DataFolder, missing_files
 from slrig.jobs.endings import Ending, Endings, ending_by
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
 from slrig.jobs.job import Holder, Job
@@ -71,7 +74,7 @@ class ScanTools:
     """What every scan is made with.
 
     spare_bytes : left free on the disk. health : who knows whether the calibration still holds, if anybody does.
-    after : called, on the rig's thread, when a scan is over.
+    after : called, on any thread, when a scan is over.
     """
 
     store: JobStore
@@ -88,7 +91,11 @@ def scan_job(record: JobRecord, tools: ScanTools) -> Job:
     """The work with the rig that a scan on record asks for."""
     scan = _Scan(record, tools)
     holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
-    return Job(record.id, holder, record.created_at, scan.run, scan.ended, scan.clear_up, scan.concluded)
+    # Where the service was killed while it reconstructed, all that is needed lies there.
+    work = None if record.state is JobState.COMPUTING else scan.capture
+    return Job(
+        record.id, holder, record.created_at, work, scan.ended, scan.reconstruct, scan.clear_up, scan.concluded
+    )  # fmt: skip
 
 
 class _Scan:
@@ -100,18 +107,9 @@ class _Scan:
         self._plan = plan_from_json(record.plan)
         self._tools = tools
         self._job: Job | None = None
+        self._feed: FrameFeed | None = None
         self._captured = self._worked = False
         self._summary: Mapping[str, Any] | None = None
-
-    def run(self, held: RigSession, job: Job) -> None:
-        """See `Job.work`."""
-        self._job = job
-        self._tools.endings.settle()
-        if self._record.state is JobState.COMPUTING:
-            # The service was killed in the middle of it: all that is needed lies there.
-            self._reconstruct(job, self._tools.folder.clear_results(self._id), None)
-        else:
-            self._reconstruct(job, *self._capture(held, job))
 
     def clear_up(self, error: Exception | None) -> None:
         """Keep the bundle of a scan that failed, if it has one, so that its cause can be found; clear away all else."""
@@ -154,9 +152,11 @@ class _Scan:
         """Whether the next start of the service takes the scan up, as `slrig.scan.sweep` does."""
         return isinstance(error, ScanInterruptedError) and (self._job is None or self._captured)
 
-    def _capture(self, held: RigSession, job: Job) -> tuple[Path, FrameFeed]:
-        """Record a bundle; return the staging folder that holds it, and what has sent its frames to the worker."""
+    def capture(self, held: RigSession, job: Job) -> None:
+        """Record a bundle in staging, and send its frames to the worker meanwhile. See `Job.work`."""
+        self._job = job
         tools = self._tools
+        tools.endings.settle()
         job.since = tools.store.advance(self._id, JobState.CAPTURING)
         rig = held.open()
         held.refuse_misfit()
@@ -165,7 +165,7 @@ class _Scan:
             tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
         staged = tools.folder.stage(self._id)
         bundle = staged / "bundle"
-        feed = tools.worker.feed()
+        feed = self._feed = tools.worker.feed()
         progress = self._progress(0.0, CAPTURE_SHARE)
         try:
             with driver_errors(held.name):
@@ -183,20 +183,24 @@ class _Scan:
             feed.abandon()
             message = "The scan was cancelled."
             raise ScanCancelledError(message)
-        return staged, feed
 
-    def _reconstruct(self, job: Job, staged: Path, feed: FrameFeed | None) -> None:
-        """Make the mesh of the bundle in staging, and put the scan in its place."""
-        tools, bundle = self._tools, staged / "bundle"
+    def reconstruct(self, job: Job) -> None:
+        """Make the mesh of the bundle in staging, and put the scan in its place. See `Job.compute`."""
+        self._job, tools = job, self._tools
+        staged = tools.folder.clear_results(self._id)
+        bundle, result = staged / "bundle", tools.folder.stage_result(self._id)
         try:
             tools.store.advance(self._id, JobState.COMPUTING)
             self._captured = True
         except StorageError as error:
             _log.warning("that a scan is reconstructed could not be recorded", scan=str(self._id), cause=str(error))
-        call = reconstruction(tools.worker.module, bundle, staged / "result", self._plan.reconstruction)
+        call = reconstruction(tools.worker.module, bundle, result, self._plan.reconstruction)
         progress = self._progress(CAPTURE_SHARE, 1.0)
-        report: Mapping[str, Any] = tools.worker.run(call, progress=progress, cancelled=job.stop.is_set, feed=feed)
-        _require_promised(staged / "result")
+        feed, self._feed = self._feed, None
+        report: Mapping[str, Any] = tools.worker.run(
+            call, progress=progress, cancelled=job.stop.is_set, made=progress.file_made, feed=feed
+        )
+        _require_promised(result)
         record = self._record
         write_record(
             staged,
@@ -218,11 +222,11 @@ class _Scan:
         )
 
 
-def reconstruction(pipeline: str, bundle: Path, output: Path, plan: ReconstructionPlan) -> Task:
-    """The worker's job of reconstructing a bundle. pipeline : `Worker.module`."""
+def reconstruction(pipeline: str, bundle: Path, folder: Path, plan: ReconstructionPlan) -> Task:
+    """The worker's job of reconstructing a bundle into a folder that is there. pipeline : `Worker.module`."""
     return Task(
-        f"{pipeline}:reconstruct_bundle",
-        (bundle, output),
+        f"{pipeline}:reconstruct_into",
+        (bundle, folder),
         {"plan": plan},
         what="reconstruction",
         remedy="The bundle is kept: download bundle.zip and run `slrig reconstruct` on it, or scan again.",

@@ -6,14 +6,12 @@ Pictures are (H, W, 3) uint8, blue, green, red, as OpenCV has them.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.storage import write_file
 from slrig.errors import StorageError
 from slrig.meshing.rasteriser import rasterised
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, Refusal, Size
@@ -126,13 +124,13 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     return page
 
 
-def write_png(path: Path, image: Picture) -> None:
-    """Write a picture, (H, W, 3) or (H, W) uint8, as PNG. Raises StorageError."""
+def encode_png(image: Picture) -> bytes:
+    """A picture, (H, W, 3) or (H, W) uint8, as PNG. Raises StorageError: it has no such form."""
     done, data = cv2.imencode(".png", image)
     if not done:
-        message = f"could not encode '{path}': a picture of shape {image.shape} {image.dtype} has no PNG form"
+        message = f"could not encode a picture of shape {image.shape} {image.dtype}: it has no PNG form"
         raise StorageError(message)
-    write_file(path, data.tobytes())
+    return data.tobytes()
 
 
 def _displayed(white: Pixels, full_scale: int, size: Size) -> tuple[Picture, float]:

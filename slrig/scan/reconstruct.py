@@ -6,7 +6,7 @@ again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -27,11 +27,12 @@ from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, 
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
-from slrig.scan.artefacts import REPORT, encode_points_ply, staged_folder, write_mesh, write_report
+from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.measured import Walked, measured
+from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.offered import rejected_picture
-from slrig.scan.pictures import preview, rejection_picture, write_png
+from slrig.scan.pictures import Picture, encode_png, preview, rejection_picture
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
@@ -75,12 +76,40 @@ def reconstruct_bundle(
     cancelled: Callable[[], bool],
     live: LiveScan | None = None,
 ) -> dict[str, object]:
-    """Reconstruct a recorded bundle into `output` and return the report.
+    """Reconstruct a recorded bundle into `output`, as `reconstruct_into` does, and return the report. `output` appears
+    whole or not at all; results of an earlier run there are replaced.
+
+    Raises
+    ------
+    InvalidInputError
+        `output` holds something else.
+    BundleError, CalibrationError, PatternError, NothingToReconstructError, ScanCancelledError, StorageError
+        See `reconstruct_into`.
+    """
+    with staged_folder(output) as staging:
+        return reconstruct_into(
+            bundle, staging, plan=plan, calibration=calibration, progress=progress, cancelled=cancelled, live=live
+        )
+
+
+def reconstruct_into(
+    bundle: Path,
+    folder: Path,
+    *,
+    plan: ReconstructionPlan,
+    calibration: Path | None = None,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    made: Callable[[str], None] = lambda _: None,
+    live: LiveScan | None = None,
+) -> dict[str, object]:
+    """Reconstruct a recorded bundle into a folder that only its maker knows yet, and return the report.
 
     `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
 
-    Writes mesh.ply, mesh.glb, points.ply, report.json, preview.png and a picture of the refused pixels per
-    camera. `output` appears whole or not at all; results of an earlier run there are replaced.
+    Writes mesh.ply first, then mesh.glb and points.ply, then preview.png and a picture of the refused pixels per
+    camera, and report.json. Each file appears whole, and `made` is told its name; whoever keeps the folder has to bring
+    it to disk.
 
     Raises
     ------
@@ -90,6 +119,8 @@ def reconstruct_bundle(
         The frames hold no surface.
     ScanCancelledError
         `cancelled()` became true.
+    StorageError
+        The disk refused.
     """
     watch = Stopwatch() if live is None else live.watch
 
@@ -108,17 +139,23 @@ def reconstruct_bundle(
         # What only some scans need is compiled when the first one comes.
         progress(*at, f"preparing kernels, first time only: {kernel}")
 
-    with compilations_told(compiling), staged_folder(output) as staging:
+    def place(name: str, data: bytes) -> None:
+        write_file(folder / name, data, durable=False)
+        made(name)
+
+    with compilations_told(compiling):
         entered("read bundle", 0.0, str(bundle))
         walked, found = measured(bundle, calibration, live, entered, axis=plan.axis)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
-        points = encode_points_ply(meshed.curves, sigma_calibration_mm=meshed.share_mm)
-        write_file(staging / "points.ply", points)
-        write_mesh(mesh, staging, sigma_calibration_mm=meshed.mesh_share_mm)
+        # One at a time: each is as large as the mesh.
+        place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_share_mm))
+        place("mesh.glb", encode_mesh_glb(mesh))
+        place("points.ply", encode_points_ply(meshed.curves, sigma_calibration_mm=meshed.share_mm))
         entered("pictures", 0.85, "")
-        _write_pictures(mesh, cameras, staging)
+        for name, picture in _pictures(mesh, cameras):
+            place(name, encode_png(picture))
         covered = covered_share(mesh, cameras[0])
         known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
         entered("write report", 0.98, "")
@@ -136,7 +173,7 @@ def reconstruct_bundle(
             **known,
             "stages_s": seconds,
         }
-        write_report(report, staging / REPORT)
+        place(REPORT, encode_report(report))
     progress("done", 1.0, f"{len(mesh.faces)} triangles")
     return report
 
@@ -239,12 +276,12 @@ def _calibration_share(
     return calibration_sigma(modes, points.points_mm, normals, points.source, found.joined.camera, tangents)
 
 
-def _write_pictures(mesh: Mesh, cameras: list[CameraResult], staging: Path) -> None:
+def _pictures(mesh: Mesh, cameras: list[CameraResult]) -> Iterator[tuple[str, Picture]]:
+    """The name of each picture, and the picture."""
     first = cameras[0]
-    write_png(staging / "preview.png", preview(mesh, first.device, first.white, int(first.full_scale)))
+    yield "preview.png", preview(mesh, first.device, first.white, int(first.full_scale))
     for seen in cameras:
-        picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
-        write_png(staging / rejected_picture(seen.name), picture)
+        yield rejected_picture(seen.name), rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
 
 
 def _compared_with_truth(

@@ -34,11 +34,12 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RunnerStatus:
-    """What the runner is at: the rig as far as it is known, who holds it and since when, and how many wait.
+    """What the runner is at: the rig as far as it is known, who holds it and since when, how many wait, and which scans
+    are reconstructed, or wait for that, while the rig is free of them.
 
-    `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` is
-    `Holder.name`. `opening` is what the rig's driver told last, while it is opened. `reconstruction` is
-    `Worker.condition`, `preparing` whether that is on its way to ready.
+    `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` and
+    those of `computing` are `Holder.name`. `opening` is what the rig's driver told last, while it is opened.
+    `reconstruction` is `Worker.condition`, `preparing` whether that is on its way to ready.
     """
 
     rig: str
@@ -50,6 +51,8 @@ class RunnerStatus:
     since: datetime | None
     waiting: int
     queue_length: int
+    computing: tuple[str, ...]
+    backlog_length: int
     opening: str
     reconstruction: str
     preparing: bool
@@ -79,6 +82,7 @@ class Runner:
         *,
         capture: CaptureBundle,
         queue_length: int = 8,
+        backlog_length: int = 4,
         spare_bytes: int = 0,
         give_up: Callable[[InvalidInputError], None] = lambda _: None,
     ) -> None:
@@ -88,7 +92,7 @@ class Runner:
         self._worker = worker
         self._closing = threading.Lock()
         self._closed = False
-        self._queue = JobQueue(rig, queue_length=queue_length, give_up=give_up)
+        self._queue = JobQueue(rig, queue_length=queue_length, backlog_length=backlog_length, give_up=give_up)
         self._endings = Endings(store)
         self._tools = ScanTools(store, folder, worker, capture, self._endings, spare_bytes)
 
@@ -189,7 +193,7 @@ class Runner:
         self._tools.health = health
 
     def after_each(self, told: Callable[[], None]) -> None:
-        """Have `told` called, on the rig's thread, after each scan."""
+        """Have `told` called, on any thread, after each scan."""
         self._tools.after = told
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:
@@ -261,6 +265,8 @@ class Runner:
             since=held.since,
             waiting=held.waiting,
             queue_length=self._queue.queue_length,
+            computing=tuple(each.name for each in held.computing),
+            backlog_length=self._queue.backlog_length,
             opening=rig.calls.doing,
             reconstruction=self._worker.condition,
             preparing=self._worker.loading,
@@ -268,7 +274,7 @@ class Runner:
         )
 
     def drain(self, timeout_s: float, hurry: threading.Event) -> None:
-        """Let what has the rig come to its end: see `JobQueue.drain`."""
+        """Let what is under way come to its end: see `JobQueue.drain`."""
         self._queue.drain(timeout_s, hurry)
 
     def close(self, *, timeout_s: float = 3.0) -> None:
@@ -281,7 +287,7 @@ class Runner:
             if not self._closed:
                 self._closed = True
                 self._queue.end()
-                # The owner thread may be waiting for a reconstruction.
+                # What computes waits for it.
                 self._worker.close()
                 self._queue.join(timeout_s)
                 self._endings.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import threading
 import zipfile
 from typing import Any
 from uuid import UUID, uuid4
@@ -14,8 +15,10 @@ from fastapi.testclient import TestClient
 
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
+from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from tests.unit.api.conftest import ServedBench, ended
+from tests.unit.scan.fakes import WAIT_S
 
 
 def events_of(text: str) -> list[dict[str, Any]]:
@@ -240,6 +243,44 @@ def test_file_is_not_ready_until_it_is(client: TestClient, served: ServedBench) 
     assert (early.status_code, early.json()["type"]) == (409, "/problems/artefact-not-ready")
     assert "capturing" in early.json()["detail"]
     assert client.get(f"/scan/{scan['id']}/bundle.zip").status_code == 409
+
+
+def test_mesh_can_be_fetched_while_pictures_and_figures_are_made(client: TestClient, served: ServedBench) -> None:
+    served.order = "mesh-first"
+    scan_id = client.post("/scan").json()["id"]
+    await_announcement(served.service.store, UUID(scan_id))
+    scan = client.get(f"/scan/{scan_id}").json()
+    assert (scan["state"], list(scan["links"]["files"])) == ("computing", ["mesh.ply"])
+    early = client.get(scan["links"]["files"]["mesh.ply"])
+    assert (early.status_code, early.headers["ETag"]) == (200, f'"{scan_id}/mesh.ply"')
+    # The rig is free of it, and says what it computes.
+    rig = client.get("/rig").json()
+    assert (rig["holder"], rig["computing"], rig["backlog_length"]) == (None, [scan_id], 4)
+    # What is made of the mesh, and what is not there yet, waits for the end.
+    for name in ("mesh.stl", "report.json", "bundle.zip"):
+        refused = client.get(f"/scan/{scan_id}/{name}")
+        assert (refused.status_code, refused.json()["type"]) == (409, "/problems/artefact-not-ready")
+    (served.service.folder.staging(UUID(scan_id)) / "bundle" / "go-on").touch()
+    lines = client.get(f"/scan/{scan_id}/events").text.splitlines()
+    names = [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
+    assert names.index("file") < len(names) - 1
+    scan = ended(client, scan_id)
+    assert (scan["state"], "report.json" in scan["links"]["files"]) == ("succeeded", True)
+    assert client.get(f"/scan/{scan_id}/mesh.ply").content == early.content
+
+
+def await_announcement(store: JobStore, scan_id: UUID) -> None:
+    """Wait until a file of a scan was announced."""
+    announced = threading.Event()
+
+    def look() -> None:
+        if any(event.kind == "file" for event in store.events(scan_id, after=0)):
+            announced.set()
+
+    unwatch = store.watch(scan_id, look)
+    look()
+    assert announced.wait(WAIT_S)
+    unwatch()
 
 
 def test_failed_scan_tells_why_and_gives_its_bundle(client: TestClient, served: ServedBench) -> None:

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slrig.kernels import Prepared
-from tests.unit.scan.fake_pipeline import frame_receiver, reconstruct_bundle
+from tests.unit.scan.fake_pipeline import frame_receiver, reconstruct_into
 
-__all__ = ["frame_receiver", "reconstruct_bundle", "warm_kernels"]
+__all__ = ["frame_receiver", "reconstruct_into", "warm_kernels"]
 
 
 def warm_kernels(told: Callable[[Prepared], None]) -> None:

@@ -172,7 +172,7 @@ def run(worker: Worker, tmp_path: Path) -> Ran:
         (bundle / "order").write_text(order)
         count = len(list(tmp_path.iterdir()))
         output = tmp_path / str(count) / "result"
-        output.parent.mkdir()
+        output.mkdir(parents=True)
         job = reconstruction(PIPELINE, bundle, output, ReconstructionPlan())
         return worker.run(job, progress=lambda *_: None, cancelled=cancelled, feed=feed).get("live")
 
@@ -252,6 +252,7 @@ def test_frames_that_wait_for_the_kernels_arrive_and_the_wait_is_told(
     bundle = tmp_path / "bundle"
     bundle.mkdir()
     (bundle / "order").write_text("finish")
+    (tmp_path / "result").mkdir()
     report = worker.run(
         reconstruction(worker.module, bundle, tmp_path / "result", ReconstructionPlan()),
         progress=hear,

@@ -126,7 +126,7 @@ def test_work_and_scans_wait_in_one_line(bench: Bench, works: Callable[..., Work
     assert not second.began.is_set()
     bench.gate.set()
     assert second.over.wait(WAIT_S)
-    assert bench.store.get(running.id).state is JobState.SUCCEEDED
+    assert bench.until(running.id).state is JobState.SUCCEEDED
 
 
 def test_recalled_work_ends_early_and_waiting_work_at_once(bench: Bench, works: Callable[..., Work]) -> None:

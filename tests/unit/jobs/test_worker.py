@@ -26,7 +26,7 @@ from slrig.failure import failure_of, interruption
 from slrig.jobs import worker as worker_module
 from slrig.jobs import worker_wait
 from slrig.jobs.worker import LOADING, READY, WAITING, UnexpectedWorkerError, Worker, prepare_kernel_cache
-from slrig.jobs.worker_process import Done, Failed, Progressed, Task, serve
+from slrig.jobs.worker_process import Done, Failed, FileMade, Progressed, Task, serve
 from slrig.jobs.worker_wait import JobWait
 from slrig.scan.job import reconstruction
 from slrig.scan.plan import ReconstructionPlan
@@ -57,6 +57,7 @@ def job(tmp_path: Path, order: str) -> Task:
     bundle = tmp_path / "bundle"
     bundle.mkdir(exist_ok=True, parents=True)
     (bundle / "order").write_text(order)
+    (tmp_path / "result").mkdir(exist_ok=True)
     return reconstruction(PIPELINE, bundle, tmp_path / "result", ReconstructionPlan(keep_holes=True))
 
 
@@ -141,17 +142,21 @@ def test_an_answer_that_came_too_late_is_nobodys(worker: Worker, tmp_path: Path,
 def test_an_answer_of_another_job_is_dropped() -> None:
     near, far = multiprocessing.Pipe()
     stops, _ = multiprocessing.Pipe(duplex=False)
+    made: list[str] = []
     process = multiprocessing.get_context("spawn").Process(target=time.monotonic)
     process.start()
-    job = JobWait(task("process_id"), 7, process, near, stops, c_double(), Told(), never, lambda _: None)
+    job = JobWait(task("process_id"), 7, process, near, stops, c_double(), Told(), never, made.append, lambda _: None)
     for answer in (
         Done(6, "of the job before"),
         Progressed(6, "mesh", 0.5, ""),
+        FileMade(6, "mesh.ply"),
+        FileMade(7, "points.ply"),
         Failed(8, failure_of(interruption()), ""),
     ):
         far.send(answer)
     far.send(Done(7, "its own"))
     assert job.answer() == Done(7, "its own")
+    assert made == ["points.ply"]
     process.join()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from uuid import UUID
 
@@ -37,6 +38,7 @@ class Bench(TameBench):
             self.worker,
             capture=self.capture,
             queue_length=1,
+            backlog_length=2,
             give_up=self.given_up.append,
         )
 
@@ -53,18 +55,25 @@ class Bench(TameBench):
 
     def until(self, scan_id: UUID, state: JobState | None = None) -> JobRecord:
         """The scan once it has reached `state`, or any final state."""
-        reached = threading.Event()
         states = {state} if state is not None else {state for state in JobState if state.final}
+        self._wait(scan_id, lambda: self.store.get(scan_id).state in states)
+        return self.store.get(scan_id)
+
+    def until_event(self, scan_id: UUID, kind: str) -> None:
+        """Wait until an event of this kind happened to a scan."""
+        self._wait(scan_id, lambda: any(event.kind == kind for event in self.store.events(scan_id, after=0)))
+
+    def _wait(self, scan_id: UUID, reached: Callable[[], bool]) -> None:
+        found = threading.Event()
 
         def look() -> None:
-            if self.store.get(scan_id).state in states:
-                reached.set()
+            if reached():
+                found.set()
 
         unwatch = self.store.watch(scan_id, look)
         look()
-        assert reached.wait(WAIT_S)
+        assert found.wait(WAIT_S)
         unwatch()
-        return self.store.get(scan_id)
 
     def close(self) -> None:
         self.gate.set()

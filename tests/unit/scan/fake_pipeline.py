@@ -17,7 +17,8 @@ from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.model import Calibration, Mesh, Shot
 from slrig.model.header import CaptureHeader
-from slrig.scan.artefacts import write_mesh
+from slrig.scan.artefacts import MESH, encode_mesh_ply
+from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import ReconstructionPlan
 
 ARTEFACTS = ("points.ply", "preview.png")
@@ -93,13 +94,14 @@ def exhaust(*_given: object, **_options: object) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
-def reconstruct_bundle(
+def reconstruct_into(
     bundle: Path,
-    output: Path,
+    folder: Path,
     *,
     plan: ReconstructionPlan,
     progress: Callable[[str, float, str], None],
     cancelled: Callable[[], bool],
+    made: Callable[[str], None] = lambda _: None,
     live: LiveScan | None = None,
 ) -> Mapping[str, object]:
     """Do what `bundle/order` says: finish, fail, break, die, or wait to be cancelled."""
@@ -119,12 +121,16 @@ def reconstruct_bundle(
             threading.Event().wait(0.01)
         message = "The reconstruction was cancelled."
         raise ScanCancelledError(message)
-    partial = output.with_name("result.part")
-    partial.mkdir()
-    for name in ARTEFACTS:
-        (partial / name).write_bytes(f"{name} of {plan}".encode())
     # A real one, because other formats are made of it.
-    write_mesh(TRIANGLE, partial)
+    (folder / MESH).write_bytes(encode_mesh_ply(TRIANGLE))
+    made(MESH)
+    if order == "mesh-first":
+        while not (bundle / "go-on").exists():
+            progress("pictures", 0.8, "")
+            threading.Event().wait(0.01)
+    (folder / "mesh.glb").write_bytes(encode_mesh_glb(TRIANGLE))
+    for name in ARTEFACTS:
+        (folder / name).write_bytes(f"{name} of {plan}".encode())
     report: dict[str, object] = {
         "bundle": bundle.parent.name,
         "seconds": 1.5,
@@ -133,7 +139,6 @@ def reconstruct_bundle(
     }
     if live is not None:
         report["live"] = [live.taken, live.listed, live.ended]
-    (partial / "report.json").write_text(json.dumps(report))
-    partial.rename(output)
+    (folder / "report.json").write_text(json.dumps(report))
     progress("done", 1.0, "")
     return report

@@ -19,12 +19,13 @@ import trimesh
 from slrig.errors import InvalidInputError, StorageError
 from slrig.model import Mesh, PointCurves, Refusal, Size
 from slrig.scan.artefacts import (
+    MESH,
     ON_REQUEST,
+    REPORT,
     decode_mesh_ply,
     encode_mesh_ply,
     encode_points_ply,
     write_converted,
-    write_mesh,
     write_report,
 )
 from slrig.scan.mesh_formats import encode_mesh_glb, encode_mesh_obj, encode_mesh_stl
@@ -65,7 +66,7 @@ def load(path: Path) -> Any:
 
 def test_ply_holds_every_property_of_the_mesh(tmp_path: Path) -> None:
     mesh = example_mesh()
-    write_mesh(mesh, tmp_path)
+    (tmp_path / MESH).write_bytes(encode_mesh_ply(mesh))
     found = load(tmp_path / "mesh.ply")
     data = found.metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(found.vertices, mesh.vertices_mm)
@@ -136,8 +137,7 @@ def test_a_ply_that_was_cut_is_refused() -> None:
 @pytest.mark.parametrize("name", ON_REQUEST)
 def test_other_formats_are_made_of_the_ply_beside_them(tmp_path: Path, name: str) -> None:
     mesh = example_mesh()
-    write_mesh(mesh, tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.glb", "mesh.ply"]
+    (tmp_path / MESH).write_bytes(encode_mesh_ply(mesh))
     write_converted(tmp_path, name)
     assert (tmp_path / name).read_bytes() == ON_REQUEST[name](mesh)
     (tmp_path / "mesh.ply").unlink()
@@ -233,4 +233,4 @@ def test_a_folder_that_is_a_file_is_named(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"")
     with pytest.raises(StorageError, match="a part of the path is a file"):
-        write_mesh(example_mesh(), file)
+        write_report({}, file / REPORT)

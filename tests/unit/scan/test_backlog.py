@@ -1,0 +1,103 @@
+"""The rig is free when the light of a scan is over: the next one is shot while earlier ones are reconstructed."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+import pytest
+
+from slrig.errors import DeviceGoneError, RigBusyError
+from slrig.jobs.records import JobRecord, JobState
+from slrig.scan.sweep import sweep
+from tests.unit.scan.bench import Bench, failure_code
+
+
+def computing(bench: Bench) -> JobRecord:
+    """A scan whose mesh is there, and whose reconstruction goes on until `go_on`."""
+    bench.order = "mesh-first"
+    scan = bench.until(bench.scan().id, JobState.COMPUTING)
+    bench.order = "finish"
+    return scan
+
+
+def go_on(bench: Bench, scan_id: UUID) -> None:
+    """Let a reconstruction come to its end."""
+    (bench.folder.staging(scan_id) / "bundle" / "go-on").touch()
+
+
+def test_the_next_scan_is_shot_while_one_is_reconstructed(bench: Bench) -> None:
+    first = computing(bench)
+    status = bench.runner.status()
+    assert (status.holder, status.computing, status.backlog_length) == (None, (str(first.id),), 2)
+    # Not in line: the rig is free.
+    second = bench.until(bench.scan().id, JobState.COMPUTING)
+    assert bench.runner.status().computing == (str(first.id), str(second.id))
+    go_on(bench, first.id)
+    for scan_id in (first.id, second.id):
+        record = bench.until(scan_id)
+        assert record.state is JobState.SUCCEEDED
+        assert record.summary is not None
+        assert record.summary["bundle"] == str(scan_id)
+    assert bench.runner.status().computing == ()
+
+
+def test_scans_in_a_row_take_their_frames_along(bench: Bench) -> None:
+    first = computing(bench)
+    second = bench.until(bench.scan().id, JobState.COMPUTING)
+    go_on(bench, first.id)
+    bench.until(second.id)
+    bench.until(first.id)
+    for scan_id in (first.id, second.id):
+        assert b'"live": [2, 2, true]' in (bench.folder.scan(scan_id) / "report.json").read_bytes()
+
+
+def test_no_further_scan_begins_while_as_many_are_reconstructed_as_may(bench: Bench) -> None:
+    first, second = computing(bench), bench.until(bench.scan().id, JobState.COMPUTING)
+    bench.began.clear()
+    third = bench.scan()
+    status = bench.runner.status()
+    assert (status.holder, status.waiting, len(status.computing)) == (None, 1, 2)
+    with pytest.raises(RigBusyError):
+        bench.scan()
+    assert not bench.began.is_set()
+    assert bench.store.get(third.id).state is JobState.QUEUED
+    go_on(bench, first.id)
+    for scan in (first, second, third):
+        assert bench.until(scan.id).state is JobState.SUCCEEDED
+
+
+def test_cancel_reaches_a_scan_that_waits_to_be_reconstructed(bench: Bench) -> None:
+    first, second = computing(bench), bench.until(bench.scan().id, JobState.COMPUTING)
+    bench.runner.cancel(second.id)
+    assert bench.until(second.id).state is JobState.CANCELLED
+    assert not bench.folder.staging(second.id).exists()
+    assert bench.store.get(first.id).state is JobState.COMPUTING
+    go_on(bench, first.id)
+    assert bench.until(first.id).state is JobState.SUCCEEDED
+
+
+def test_a_capture_that_fails_costs_the_scans_before_it_nothing(bench: Bench) -> None:
+    first = computing(bench)
+    bench.error = DeviceGoneError("Camera 'cam0' was unplugged.")
+    failed = bench.until(bench.scan().id)
+    assert (failed.state, failure_code(failed)) == (JobState.FAILED, "device-gone")
+    go_on(bench, first.id)
+    assert bench.until(first.id).state is JobState.SUCCEEDED
+
+
+def test_closing_leaves_all_that_are_reconstructed_to_the_next_start(bench: Bench) -> None:
+    first, second = computing(bench), bench.until(bench.scan().id, JobState.COMPUTING)
+    bench.runner.close()
+    assert {bench.store.get(each.id).state for each in (first, second)} == {JobState.COMPUTING}
+    assert sweep(bench.store, bench.folder).resumed == (first.id, second.id)
+
+
+def test_the_mesh_is_announced_before_the_scan_is_over(bench: Bench) -> None:
+    scan = computing(bench)
+    bench.until_event(scan.id, "file")
+    events = bench.store.events(scan.id, after=0)
+    assert [event.data for event in events if event.kind == "file"] == [{"name": "mesh.ply", "state": "computing"}]
+    assert (bench.folder.result(scan.id) / "mesh.ply").stat().st_size > 0
+    assert not bench.folder.scan(scan.id).exists()
+    go_on(bench, scan.id)
+    assert bench.until(scan.id).state is JobState.SUCCEEDED
