@@ -34,7 +34,7 @@ from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
 from slrig.logs import set_up_logs
 from slrig.rig.session import RigSession
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.job import PIPELINE
 from slrig.scan.runner import Runner
 from slrig.scan.sweep import sweep
@@ -85,7 +85,7 @@ def open_service(
         folder,
         RigSession(rig.name, lambda: open_rig(rig)),
         worker,
-        capture=capture_bundle,
+        capture=capture_frames,
         queue_length=settings.queue_length,
         backlog_length=settings.backlog_length,
         spare_bytes=settings.min_free_bytes,

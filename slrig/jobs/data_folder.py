@@ -179,6 +179,18 @@ class DataFolder:
         """Where the files of a running scan are made."""
         return self.incoming / str(scan_id)
 
+    def recording(self, scan_id: UUID) -> Path:
+        """Where a running scan's frames are recorded, until `keep_recording`."""
+        return self.staging(scan_id) / "recording"
+
+    def keep_recording(self, scan_id: UUID) -> None:
+        """Make what was recorded the scan's bundle, durable: where a bundle is staged, it is whole."""
+        staged = self.staging(scan_id)
+        with disk_errors(staged):
+            sync_tree(self.recording(scan_id))
+            self.recording(scan_id).rename(staged / "bundle")
+            sync_folder(staged)
+
     def result(self, scan_id: UUID) -> Path:
         """Where the files of a scan that is being reconstructed lie, once each is there."""
         return self.staging(scan_id) / _RESULT
@@ -219,7 +231,13 @@ class DataFolder:
             sync_folder(self.incoming)
 
     def keep_bundle(self, scan_id: UUID) -> None:
-        """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it."""
+        """Commit the bundle of a scan that got no mesh, whole or cut short, and nothing else of it. Does nothing where
+        none was recorded.
+        """
+        if self.recording(scan_id).is_dir():
+            self.keep_recording(scan_id)
+        if not (self.staging(scan_id) / "bundle").is_dir():
+            return
         self.clear_results(scan_id)
         self.commit(scan_id)
 

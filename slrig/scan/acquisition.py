@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,9 +26,9 @@ from slrig.capture.exposure import whole_refreshes_s
 from slrig.capture.sequencer import choose_triggers
 from slrig.capture.session import SETTINGS_TOLERANCE
 from slrig.devices import Rig, Trigger
-from slrig.errors import FrameTimeoutError, ScanEvidenceError
+from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink
-from slrig.model import Shot
+from slrig.model import Shot, Truth
 from slrig.model.header import CaptureHeader
 from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import Progress, ScanPlan
@@ -39,6 +40,32 @@ MOST_WAITING_BYTES = 256 * 2**20
 _LEAST_FRAME_BYTES = 2**18  # a smaller camera's frames do not wait in thousands
 
 _log = structlog.get_logger(__name__)
+
+
+class Recording:
+    """A bundle whose frames are all taken, and may still be on their way to the disk. `finish` or `discard` it, once,
+    on any thread: the rig is not needed for either.
+    """
+
+    def __init__(self, folder: Path, writing: ExitStack, notes: Sequence[str], truth: Truth | None) -> None:
+        self._folder = folder
+        self._writing = writing
+        self._notes = notes
+        self._truth = truth
+
+    def finish(self) -> None:
+        """Wait until the bundle is in its place, and write what belongs to it. Raises StorageError: the disk refused,
+        and nothing is left.
+        """
+        self._writing.close()
+        write_notes(self._folder, self._notes)
+        if self._truth is not None:
+            write_truth(self._folder, self._truth)
+
+    def discard(self) -> None:
+        """Let it go. Nothing is left of it."""
+        ended = ScanCancelledError("the recording is not wanted any more")
+        self._writing.__exit__(ScanCancelledError, ended, None)
 
 
 class Recorder:
@@ -120,7 +147,21 @@ def capture_bundle(
     cancelled: Callable[[], bool],
     frames: FrameSink | None = None,
 ) -> None:
-    """Play the plan's patterns on the rig and record a bundle in `folder`, which must not exist.
+    """Play the plan's patterns on the rig and record a bundle in `folder`. Raises as `capture_frames` does."""
+    capture_frames(rig, plan, folder, progress=progress, cancelled=cancelled, frames=frames).finish()
+
+
+def capture_frames(
+    rig: Rig,
+    plan: ScanPlan,
+    folder: Path,
+    *,
+    progress: Progress,
+    cancelled: Callable[[], bool],
+    frames: FrameSink | None = None,
+) -> Recording:
+    """Play the plan's patterns on the rig, and return when the last frame is proven. What comes back brings the bundle
+    to `folder`, which must not exist.
 
     `frames` is shown each frame that has passed its test, and once more the frames that took another one's place.
 
@@ -155,7 +196,9 @@ def capture_bundle(
     writer = BundleWriter(
         folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
     )
-    with writer, Recorder(writer) as recorder:
+    with ExitStack() as writing:
+        writing.enter_context(writer)
+        recorder = writing.enter_context(Recorder(writer))
         exposing = Exposing(rig, sequence, exposures_s, cancelled=cancelled, refused=recorder.refuse)
         if frames is not None:
             once = tuple((index, name) for index in range(len(sequence)) for name in formats)
@@ -172,13 +215,9 @@ def capture_bundle(
             writer.keep(str(error))
             message = f"{error}. The frames are kept: see bundle.json for those that counted, {FOLDER}/ for the others"
             raise type(error)(message) from error
-        recorder.finish()
         if frames is not None:
             frames.end(exposing.summary())
-    write_notes(folder, told)
-    truth = rig.truth()
-    if truth is not None:
-        write_truth(folder, truth)
+        return Recording(folder, writing.pop_all(), told, rig.truth())
 
 
 def _of_the_rig(rig: Rig) -> list[str]:

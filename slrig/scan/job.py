@@ -12,7 +12,6 @@ from typing import Any, Protocol
 import structlog
 
 from slrig.bundle.health import write_health
-from slrig.bundle.storage import sync_tree
 from slrig.devices import Rig
 from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
 from slrig.failure import disk_errors
@@ -39,8 +38,20 @@ CAPTURE_SHARE = 0.5
 _log = structlog.get_logger(__name__)
 
 
-class CaptureBundle(Protocol):
-    """`slrig.scan.acquisition.capture_bundle`, or what a test puts in its place."""
+class Recorded(Protocol):
+    """`slrig.scan.acquisition.Recording`, or what a test puts in its place."""
+
+    def finish(self) -> None:
+        """Bring the bundle to its place."""
+        ...
+
+    def discard(self) -> None:
+        """Let it go."""
+        ...
+
+
+class CaptureFrames(Protocol):
+    """`slrig.scan.acquisition.capture_frames`, or what a test puts in its place."""
 
     def __call__(
         self,
@@ -52,8 +63,8 @@ class CaptureBundle(Protocol):
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
         frames: FrameSink,
-    ) -> None:
-        """Play the patterns and write a complete bundle into `folder`; show each frame to `frames`."""
+    ) -> Recorded:
+        """Play the patterns, record a bundle for `folder`, and show each frame to `frames`."""
         ...
 
 
@@ -80,7 +91,7 @@ class ScanTools:
     store: JobStore
     folder: DataFolder
     worker: Worker
-    capture: CaptureBundle
+    capture: CaptureFrames
     endings: Endings
     spare_bytes: int
     health: WatchesHealth | None = None
@@ -108,6 +119,8 @@ class _Scan:
         self._tools = tools
         self._job: Job | None = None
         self._feed: FrameFeed | None = None
+        self._recording: Recorded | None = None
+        self._stamp: Mapping[str, Any] | None = None
         self._captured = self._worked = False
         self._summary: Mapping[str, Any] | None = None
 
@@ -117,7 +130,9 @@ class _Scan:
         folder = self._tools.folder
         if error is not None and not self._goes_on(error):
             try:
-                if not isinstance(error, ScanCancelledError) and (folder.staging(self._id) / "bundle").is_dir():
+                if self._recording is not None:
+                    self._recording.discard()
+                elif not isinstance(error, ScanCancelledError):
                     folder.keep_bundle(self._id)
             except Exception:  # noqa: BLE001 - see below
                 # The scan's own fault is the one to tell; without its bundle it is told all the same.
@@ -163,22 +178,21 @@ class _Scan:
         if held.facts is not None:
             frame_bytes = check_plan(self._plan, held.facts, rig.calibration)
             tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
-        staged = tools.folder.stage(self._id)
-        bundle = staged / "bundle"
+        tools.folder.stage(self._id)
         feed = self._feed = tools.worker.feed()
         progress = self._progress(0.0, CAPTURE_SHARE)
         try:
             with driver_errors(held.name):
-                tools.capture(rig, self._plan, bundle, progress=progress, cancelled=job.stop.is_set, frames=feed)
+                self._recording = tools.capture(
+                    rig, self._plan, tools.folder.recording(self._id),
+                    progress=progress, cancelled=job.stop.is_set, frames=feed,
+                )  # fmt: skip
         except Exception as error:
             feed.abandon()
             held.doubt(error)
             raise
         held.darken()
-        with disk_errors(staged):
-            if tools.health is not None and (stamp := tools.health.stamp()) is not None:
-                write_health(bundle, stamp)
-            sync_tree(bundle)
+        self._stamp = None if tools.health is None else tools.health.stamp()
         if job.stop.is_set():
             feed.abandon()
             message = "The scan was cancelled."
@@ -187,13 +201,11 @@ class _Scan:
     def reconstruct(self, job: Job) -> None:
         """Make the mesh of the bundle in staging, and put the scan in its place. See `Job.compute`."""
         self._job, tools = job, self._tools
+        on_record = self._on_record_as_computing()
+        self._keep_recording()
+        self._captured = on_record
         staged = tools.folder.clear_results(self._id)
         bundle, result = staged / "bundle", tools.folder.stage_result(self._id)
-        try:
-            tools.store.advance(self._id, JobState.COMPUTING)
-            self._captured = True
-        except StorageError as error:
-            _log.warning("that a scan is reconstructed could not be recorded", scan=str(self._id), cause=str(error))
         call = reconstruction(tools.worker.module, bundle, result, self._plan.reconstruction)
         progress = self._progress(CAPTURE_SHARE, 1.0)
         feed, self._feed = self._feed, None
@@ -215,6 +227,32 @@ class _Scan:
             except Exception:  # noqa: BLE001 - the scan stands, whatever becomes of that
                 _log.exception("what a scan says of its calibration could not be noted")
         self._summary = report_summary(report)
+
+    def _on_record_as_computing(self) -> bool:
+        """Record that the rig is free of the scan, and return whether that could be done."""
+        try:
+            self._tools.store.advance(self._id, JobState.COMPUTING)
+        except StorageError as error:
+            _log.warning("that a scan is reconstructed could not be recorded", scan=str(self._id), cause=str(error))
+            return False
+        return True
+
+    def _keep_recording(self) -> None:
+        """Make what was captured, if it was in this run of the service, the scan's bundle."""
+        recording, self._recording = self._recording, None
+        if recording is None:
+            return
+        folder = self._tools.folder
+        try:
+            recording.finish()
+            if self._stamp is not None:
+                with disk_errors(folder.recording(self._id)):
+                    write_health(folder.recording(self._id), self._stamp)
+            folder.keep_recording(self._id)
+        except Exception:
+            if self._feed is not None:
+                self._feed.abandon()
+            raise
 
     def _progress(self, start: float, end: float) -> ProgressRecorder:
         return ProgressRecorder(

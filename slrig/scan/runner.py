@@ -24,7 +24,7 @@ from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.rig.preview import Light, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_errors
-from slrig.scan.job import CaptureBundle, ScanTools, WatchesHealth, scan_job
+from slrig.scan.job import CaptureFrames, ScanTools, WatchesHealth, scan_job
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
 from slrig.scan.records import plan_json
@@ -80,7 +80,7 @@ class Runner:
         rig: RigSession,
         worker: Worker,
         *,
-        capture: CaptureBundle,
+        capture: CaptureFrames,
         queue_length: int = 8,
         backlog_length: int = 4,
         spare_bytes: int = 0,

@@ -48,7 +48,7 @@ def sweep(store: JobStore, folder: DataFolder) -> Swept:
             store.finish(record.id, JobState.SUCCEEDED, summary=report_summary(report))
             recovered.append(record.id)
             continue
-        # Reconstruction starts only after the bundle was made durable, so this bundle is whole.
+        # Frames become the bundle when they are durable, so this one is whole.
         whole = record.state is JobState.COMPUTING and folder.owns(folder.staging(record.id) / "bundle")
         if record.state is JobState.QUEUED or (whole and store.attempts(record.id) == 1):
             resumed.append(record.id)

@@ -14,7 +14,7 @@ from fastapi.testclient import TestClient
 
 from slrig.devices import Rig
 from slrig.jobs.frame_feed import FrameSink
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import Recording, capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.unit.api.conftest import KEY, ServedBench, ended
 from tests.unit.capture.fake_rig import CameraFaults, fake_rig
@@ -40,9 +40,11 @@ class FaultyBench(ServedBench):
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
         frames: FrameSink,
-    ) -> None:
+    ) -> Recording:
         del plan
-        capture_bundle(rig, ScanPlan(PatternPlan()), folder, progress=progress, cancelled=cancelled, frames=frames)
+        return capture_frames(
+            rig, ScanPlan(PatternPlan()), folder, progress=progress, cancelled=cancelled, frames=frames
+        )
 
 
 @pytest.fixture

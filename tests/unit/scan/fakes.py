@@ -112,6 +112,21 @@ class TameProjector:
         self.dark = self.closed = True
 
 
+class TameRecording:
+    """A bundle that was written while it was captured. `error` is raised in place of its end."""
+
+    def __init__(self) -> None:
+        self.error: Exception | None = None
+        self.discarded = 0
+
+    def finish(self) -> None:
+        if self.error is not None:
+            raise self.error
+
+    def discard(self) -> None:
+        self.discarded += 1
+
+
 class TameBench:
     """Opens rigs, and captures with them as told.
 
@@ -122,6 +137,7 @@ class TameBench:
 
     def __init__(self) -> None:
         self.order = "finish"
+        self.recording = TameRecording()
         self.error: Exception | None = None
         self.open_error: Exception | None = None
         self.deaf = False
@@ -150,7 +166,7 @@ class TameBench:
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
         frames: FrameSink,
-    ) -> None:
+    ) -> TameRecording:
         rig.projector.show(0)
         frames.begin(OUTLINE, CALIBRATION)
         frames.take(SHOTS[0])
@@ -171,3 +187,4 @@ class TameBench:
         frames.take(SHOTS[1])
         frames.end(EVIDENCE)
         progress("capture", 1.0, "frame 2 of 2")
+        return self.recording

@@ -6,8 +6,10 @@ from uuid import UUID
 
 import pytest
 
-from slrig.errors import DeviceGoneError, RigBusyError
+from slrig.errors import DeviceGoneError, RigBusyError, StorageError
 from slrig.jobs.records import JobRecord, JobState
+from slrig.scan.plan import ScanPlan
+from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
 from tests.unit.scan.bench import Bench, failure_code
 
@@ -83,6 +85,25 @@ def test_a_capture_that_fails_costs_the_scans_before_it_nothing(bench: Bench) ->
     assert (failed.state, failure_code(failed)) == (JobState.FAILED, "device-gone")
     go_on(bench, first.id)
     assert bench.until(first.id).state is JobState.SUCCEEDED
+
+
+def test_a_disk_that_refuses_after_the_light_fails_the_scan_in_words(bench: Bench) -> None:
+    bench.recording.error = StorageError("recording/frames: the disk refused: No space left on device")
+    failed = bench.until(bench.scan().id)
+    assert (failed.state, failure_code(failed)) == (JobState.FAILED, "storage")
+    assert not bench.folder.staging(failed.id).exists()
+    bench.recording.error = None
+    assert bench.until(bench.scan().id).state is JobState.SUCCEEDED
+
+
+def test_frames_are_a_bundle_only_when_they_are_all_on_the_disk(bench: Bench) -> None:
+    """A kill between the light and the end of the recording leaves nothing to go on with."""
+    scan = bench.store.create(plan_json(ScanPlan()), rig="bench", label=None)
+    bench.store.advance(scan.id, JobState.COMPUTING)
+    bench.folder.stage(scan.id)
+    bench.folder.recording(scan.id).mkdir()
+    assert sweep(bench.store, bench.folder).interrupted == (scan.id,)
+    assert not bench.folder.staging(scan.id).exists()
 
 
 def test_closing_leaves_all_that_are_reconstructed_to_the_next_start(bench: Bench) -> None:

@@ -1,0 +1,166 @@
+"""What a user's clock shows: from the last frame to each file of a scan, and from one scan to the next.
+
+    pytest tests/bench/test_user_clock.py -s
+
+The frames of the bench scan (`test_pipeline_speed`) are played to a real service at 30 a second by the replay driver, so
+that nothing is rendered beside what is measured. Medians; processor seconds are those of the service and its worker.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from slrig.cli.client import ServiceClient
+from slrig.config import read_rig
+from slrig.discovery import open_rig
+from slrig.scan.acquisition import capture_bundle
+from slrig.scan.plan import ScanPlan
+from tests.bench.test_pipeline_speed import RIG
+from tests.e2e.conftest import ServiceProcess, Start, start
+
+__all__ = ["start"]
+
+RUNS, ROW = 5, 10
+FRAMES_PER_S = 30
+TO_MESH_S, TO_ALL_S, BETWEEN_S = 0.40, 0.80, 0.10
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig that plays the frames of the bench scan, without their truth."""
+    folder = tmp_path_factory.mktemp("clock")
+    (folder / "rendered.toml").write_text(RIG)
+    with open_rig(read_rig(folder / "rendered.toml")) as rig:
+        capture_bundle(rig, ScanPlan(), folder / "recording", progress=lambda *_: None, cancelled=lambda: False)
+    for truth in (folder / "recording").glob("truth*"):
+        truth.unlink()
+    description = folder / "recording" / "bundle.json"
+    recorded = json.loads(description.read_text())
+    for number, frame in enumerate(recorded["frames"]):
+        frame["time_s"] = number / FRAMES_PER_S
+    description.write_text(json.dumps(recorded))
+    (folder / "rig.toml").write_text('name = "clock"\n[head]\ndriver = "replay"\nbundle = "recording"\nspeed = 1\n')
+    return folder / "rig.toml"
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When what was told of a scan, by the clock of who asked for it.
+
+    captured_s : the last frame is proven; free_s : the rig is free; files_s : each file can be fetched; over_s : the
+    scan has succeeded.
+    """
+
+    posted_s: float
+    began_s: float
+    captured_s: float
+    free_s: float
+    files_s: Mapping[str, float]
+    over_s: float
+
+
+class Watched:
+    """A scan that is followed; `until` goes on to the next event of a kind."""
+
+    def __init__(self, client: ServiceClient) -> None:
+        self.posted_s = time.perf_counter()
+        self.scan = client.start({})
+        self._events = client.follow(self.scan)
+        self._times: dict[str, float] = {}
+        self._files: dict[str, float] = {}
+
+    def until(self, state: str) -> None:
+        for event in self._events:
+            now = time.perf_counter()
+            if event["kind"] == "file":
+                self._files[event["name"]] = now
+            elif event["kind"] == "progress" and event["stage"] == "capture":
+                self._times["captured"] = now
+            elif event["kind"] == "state":
+                self._times[event["state"]] = now
+                if event["state"] == state:
+                    return
+        message = f"the scan did not come to {state}: {self._times}"
+        raise AssertionError(message)
+
+    def clock(self) -> Clock:
+        self.until("succeeded")
+        seen = self._times
+        return Clock(
+            self.posted_s, seen["capturing"], seen["captured"], seen["computing"], self._files, seen["succeeded"]
+        )  # fmt: skip
+
+
+def processor_s(service: ServiceProcess) -> float:
+    """Seconds that the service and its worker have computed."""
+    ticks = 0
+    for process in (service.process.pid, service.worker_id()):
+        ticks += sum(map(int, Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11:13]))
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def warmed(client: ServiceClient) -> None:
+    for _ in range(2):
+        Watched(client).clock()
+
+
+def told(rows: Mapping[str, tuple[float, float | None]], title: str) -> None:
+    load = f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+    sys.stdout.write(f"\n{title}, {load}\n")
+    for what, (seconds, goal) in rows.items():
+        sys.stdout.write(f"{what:36} {seconds:7.3f}{'' if goal is None else f'   goal {goal:.2f}'}\n")
+    missed = {what: seconds for what, (seconds, goal) in rows.items() if goal is not None and seconds > goal}
+    assert not missed
+
+
+def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
+    service = start(replayed)
+    with service.client() as client:
+        warmed(client)
+        before_s = processor_s(service)
+        clocks = [Watched(client).clock() for _ in range(RUNS)]
+        computed_s = (processor_s(service) - before_s) / RUNS
+
+    def median(of: Any) -> float:
+        return statistics.median(of(each) for each in clocks)
+
+    rows: dict[str, tuple[float, float | None]] = {
+        "POST to last frame": (median(lambda c: c.captured_s - c.posted_s), None),
+        "last frame to free rig": (median(lambda c: c.free_s - c.captured_s), None),
+    }
+    for name in clocks[0].files_s:
+        goal = TO_MESH_S if name == "mesh.ply" else None
+        rows[f"last frame to {name}"] = (median(lambda c, name=name: c.files_s[name] - c.captured_s), goal)
+    rows["last frame to the end"] = (median(lambda c: c.over_s - c.captured_s), TO_ALL_S)
+    rows["processor seconds, service and worker"] = (computed_s, None)
+    told(rows, f"one scan at a time, medians of {RUNS}")
+
+
+def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
+    service = start(replayed)
+    with service.client() as client:
+        warmed(client)
+        followed = []
+        for _ in range(ROW):
+            followed.append(Watched(client))
+            followed[-1].until("computing")
+        clocks = [each.clock() for each in followed]
+    cycle_s = statistics.median(b.posted_s - a.posted_s for a, b in zip(clocks, clocks[1:], strict=False))
+    capture_s = statistics.median(each.captured_s - each.began_s for each in clocks)
+    rows: dict[str, tuple[float, float | None]] = {
+        "capture": (capture_s, None),
+        "from one scan to the next": (cycle_s, capture_s + BETWEEN_S),
+        "last frame to mesh.ply": (statistics.median(c.files_s["mesh.ply"] - c.captured_s for c in clocks), None),
+        "last POST to last end": (clocks[-1].over_s - clocks[-1].posted_s, None),
+    }
+    told(rows, f"{ROW} scans in a row, each sent when the rig is free")
