@@ -16,18 +16,15 @@ from numpy.typing import NDArray
 from slrig.bundle.storage import write_file
 from slrig.errors import StorageError
 from slrig.meshing.quality import weighted_percentiles
-from slrig.meshing.rasteriser import normals_seen, rasterised
 from slrig.model import FloatArray, Mesh, Pinhole, Pixels, Refusal, Size
-from slrig.scan.placing import placed_vertices, resampled
-
-Picture = NDArray[np.uint8]
+from slrig.scan.placing import resampled
+from slrig.scan.shading import Picture, resized, shaded
 
 _PANEL_PX = 520
 _PANEL_HEIGHT_PX = 640
 _GAP_PX = 10
 _CAPTION_PX = 34
 _TURN_DEG = 35.0
-_SUPERSAMPLING = 2
 _FILL = 0.86
 _SHOWN_PERCENTS = (0.2, 99.8)
 # Triangles that say where the object is: the share of its area beyond a border of the view is then known to 0.03 %,
@@ -40,12 +37,7 @@ _PNG = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_COMPR
         cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)  # fmt: skip
 
 _PAGE = (43, 38, 36)
-_BACKDROP = (74, 67, 63)
 _INK = (235, 233, 230)
-_CLAY = np.array((196, 209, 219), dtype=np.float32)
-_BACK_OF_CLAY = np.array((92, 92, 176), dtype=np.float32)
-_SIDE_LIGHT = np.array((0.55, -0.65, -0.52), dtype=np.float64)  # from above and one side, camera frame
-_TO_VIEWER = np.array((0.0, 0.0, -1.0), dtype=np.float64)
 
 _LEGEND_PX = 330
 _REJECTION_WIDTH_PX = 1600 - _LEGEND_PX
@@ -88,14 +80,14 @@ def preview(mesh: Mesh, camera: Pinhole, white: Pixels, full_scale: int) -> Pict
     triangles = f"{len(mesh.faces):,} triangles"
     panels = [
         _captioned(seen, "white image" + (f", brightened {gain:.1f} x" if gain > 1 else ""), str(camera.size) + " px"),
-        _captioned(_shaded(mesh, at_panel), "mesh from the camera", triangles),
+        _captioned(shaded(mesh, at_panel), "mesh from the camera", triangles),
     ]
     if len(mesh.faces):
         sample = _sampled(mesh, camera)
         middle = np.array([sample.percentiles(ordinates, (50.0,)) for ordinates in sample.points_mm]).ravel()
         _draw_scale(panels[1], size, at_panel.matrix[0, 0] / middle[2])
         aside = _turned_to_show(sample, middle, camera, size)
-        panels.append(_captioned(_shaded(mesh, aside), f"turned by {_TURN_DEG:.0f} degrees", "backs are red"))
+        panels.append(_captioned(shaded(mesh, aside), f"turned by {_TURN_DEG:.0f} degrees", "backs are red"))
         _draw_scale(panels[2], size, aside.matrix[0, 0] / middle[2])
     return _side_by_side(panels)
 
@@ -118,7 +110,7 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     enlarged = max(1, min(math.ceil(least_rows / rows), _REJECTION_WIDTH_PX // columns))
     factor = min(float(enlarged), _REJECTION_WIDTH_PX / columns)
     size = Size(max(1, round(columns * factor)), max(1, round(rows * factor)))
-    picture = _resized(picture, size)
+    picture = resized(picture, size)
     height = max(size.height_px, least_rows)
     page = np.full((height, size.width_px + _LEGEND_PX, 3), _PAGE, dtype=np.uint8)
     page[: size.height_px, : size.width_px] = picture
@@ -139,18 +131,9 @@ def _displayed(white: Pixels, full_scale: int, size: Size) -> tuple[Picture, flo
     """The white image as a picture of `size`, and how much it was brightened to be legible (1 if not at all)."""
     bright = float(np.percentile(white, 99.5)) / full_scale
     gain = min(max(1.0, 0.9 / max(bright, 1e-6)), 8.0) if bright < 0.6 else 1.0
-    grey = _resized(white, size) * np.float32(gain * 255.0 / full_scale)
+    grey = resized(white, size) * np.float32(gain * 255.0 / full_scale)
     grey = np.clip(grey, 0, 255, out=grey).astype(np.uint8)
     return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8), gain
-
-
-def _resized(picture: Pixels, size: Size) -> Pixels:
-    """The picture, (H, W) or (H, W, 3), at another size; itself if it has that size."""
-    if picture.shape[:2] == size.shape:
-        return picture
-    larger = size.width_px > picture.shape[1]
-    how = cv2.INTER_NEAREST if larger else cv2.INTER_AREA
-    return np.asarray(cv2.resize(picture, (size.width_px, size.height_px), interpolation=how))
 
 
 class _Sample(NamedTuple):
@@ -204,32 +187,6 @@ def _turned_to_show(sample: _Sample, middle_mm: FloatArray, camera: Pinhole, siz
         rotation=turn @ camera.rotation,
         translation_mm=turn @ (camera.translation_mm - middle_mm) + middle_mm,
     )
-
-
-def _shaded(mesh: Mesh, camera: Pinhole) -> Picture:
-    """The mesh under a headlight and a light from above, on the side to which the surface leans."""
-    wide, high = (extent * _SUPERSAMPLING for extent in (camera.size.width_px, camera.size.height_px))
-    finer = resampled(camera, _SUPERSAMPLING, Size(wide, high))
-    placed = placed_vertices(mesh.vertices_mm, finer)
-    view = rasterised(placed, mesh.faces, finer.size)
-    normals, front = normals_seen(view, placed, mesh.normals, mesh.faces)
-    # Normals are in the world: rather than each of them, the lights are turned.
-    leaning = float(_towards(camera.rotation[0], normals).sum(dtype=np.float64))
-    side_light = _SIDE_LIGHT * (math.copysign(1.0, leaning), 1.0, 1.0)
-    light = np.full(view.face.shape, np.float32(0.12))
-    for strength, direction in ((0.46, _TO_VIEWER), (0.44, side_light / np.linalg.norm(side_light))):
-        light += np.maximum(_towards(strength * direction @ camera.rotation, normals), 0)
-    picture = np.zeros((*view.face.shape, 3), dtype=np.uint8)
-    for channel in range(3):
-        lit = np.where(front, _CLAY[channel], _BACK_OF_CLAY[channel]) * light
-        picture[..., channel] = np.where(view.face >= 0, lit, _BACKDROP[channel])
-    return _resized(picture, camera.size)
-
-
-def _towards(direction: FloatArray, normals: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W) float32: scalar products of the normals, (H, W, 3), with a direction."""
-    x, y, z = direction.astype(np.float32)
-    return np.asarray(normals[..., 0] * x + normals[..., 1] * y + normals[..., 2] * z)
 
 
 def _captioned(panel: Picture, title: str, detail: str) -> Picture:
