@@ -1,4 +1,4 @@
-"""What a camera sees of a mesh: depth and normal at every pixel, by a z-buffer."""
+"""What a camera sees of a mesh, by a z-buffer: the nearest triangle at every pixel, and then the normal there."""
 
 from __future__ import annotations
 
@@ -7,86 +7,124 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.kernels import kernel
-from slrig.model import FloatArray, IntArray, Size
+from slrig.kernels import in_bands, kernel
+from slrig.model import IntArray, Size
+
+_MOST_BANDS = 4  # each has a picture of its own, which is 8 bytes a pixel
+_FACES_AT_LEAST = 50_000  # in a band: a millisecond of work, as much as it takes to bring two pictures together
 
 
 class View(NamedTuple):
-    """The nearest surface at every pixel centre.
+    """The nearest triangle at every pixel centre.
 
-    depth_mm : (H, W) float64, along the optical axis, NaN where nothing is seen.
-    normals : (H, W, 3) float64, in the frame of the normals that were given, unit, 0 where nothing is seen.
-    front : (H, W) bool, the triangle is counter-clockwise in the picture.
+    depth_mm : (H, W) float32, along the optical axis, NaN where nothing is seen.
+    face : (H, W) int32, which triangle, -1 where nothing is seen; the first of those that are equally near.
     """
 
-    depth_mm: FloatArray
-    normals: FloatArray
-    front: NDArray[np.bool_]
+    depth_mm: NDArray[np.float32]
+    face: IntArray
 
 
-def rasterised(
-    pixels_px: FloatArray,
-    depth_mm: FloatArray,
-    normals: NDArray[np.floating[Any]],
-    faces: IntArray,
-    size: Size,
-) -> View:
-    """The view of a mesh whose vertices fall on `pixels_px`, (V, 2) (column, row), at `depth_mm`, (V,).
+def rasterised(placed: NDArray[np.float32], faces: IntArray, size: Size) -> View:
+    """The view of a mesh whose vertices are `placed`, (V, 3) float32: column and row, pixels, and depth, mm.
 
-    Inverse depth is linear in the picture, so depth and normals (V, 3) are interpolated over it.
+    Inverse depth is linear in the picture, so it is what is interpolated.
     Triangles with a vertex that is not in front of the camera are left out, whole.
     """
-    z, n, front = _z_buffer(
-        np.ascontiguousarray(pixels_px, dtype=np.float64),
-        np.ascontiguousarray(depth_mm, dtype=np.float64),
-        np.ascontiguousarray(np.nan_to_num(normals), dtype=np.float64),
-        np.ascontiguousarray(faces),
-        size.height_px,
-        size.width_px,
-    )
-    return View(z, n, front)
+    at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
+    given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
+    (inverse, face), *others = in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least)
+    while others:
+        next_inverse, next_face = others.pop(0)
+        # Only what is nearer: of equally near triangles the first stays, as inside a band.
+        nearer = next_inverse > inverse
+        np.copyto(inverse, next_inverse, where=nearer)
+        np.copyto(face, next_face, where=nearer)
+    unseen = inverse == 0
+    inverse[unseen] = np.nan
+    face[unseen] = -1
+    return View(np.reciprocal(inverse, out=inverse), face)
+
+
+def normals_seen(
+    view: View, placed: NDArray[np.float32], normals: NDArray[np.float32], faces: IntArray
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The normal of the side that is seen, at every pixel of a view of a mesh, and whether that is the front.
+
+    Parameters
+    ----------
+    placed, faces : as they were given to `rasterised`.
+    normals : (V, 3) float32 of the vertices, in any frame; NaN counts as 0.
+
+    Returns
+    -------
+    normals : (H, W, 3) float32, in that frame, unit, turned round for backs; 0 where nothing is seen.
+    front : (H, W) bool, the triangle is counter-clockwise in the picture.
+    """
+    seen, front = np.zeros((*view.face.shape, 3), dtype=np.float32), np.zeros(view.face.shape, dtype=np.bool_)
+    given = np.ascontiguousarray(placed), np.ascontiguousarray(normals), np.ascontiguousarray(faces)
+    in_bands(_normals, len(seen), view.face, *given, seen, front, rows_at_least=16)
+    return seen, front
 
 
 @kernel
 def _z_buffer(
-    pixels: FloatArray, depth: FloatArray, normals: FloatArray, faces: IntArray, height: int, width: int
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    nearest = np.full((height, width), np.nan)
-    normal = np.zeros((height, width, 3))
-    front = np.zeros((height, width), dtype=np.bool_)
-    for face in range(len(faces)):
-        a, b, c = faces[face]
-        if not (depth[a] > 0.0 and depth[b] > 0.0 and depth[c] > 0.0):
+    first: int, last: int, placed: Any, faces: Any, height: int, width: int
+) -> tuple[NDArray[np.float32], IntArray]:
+    """Inverse depth, 0 where nothing is seen, and number of the nearest among the triangles from first to last."""
+    inverse = np.zeros((height, width), dtype=np.float32)
+    nearest = np.zeros((height, width), dtype=np.int32)
+    for face in range(first, last):
+        a, b, c = placed[faces[face, 0]], placed[faces[face, 1]], placed[faces[face, 2]]
+        if not (a[2] > 0.0 and b[2] > 0.0 and c[2] > 0.0):
             continue
-        ax, ay, bx, by, cx, cy = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
+        ax, bx, cx = float(a[0]), float(b[0]), float(c[0])
+        left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
+        ay, by, cy = float(a[1]), float(b[1]), float(c[1])
+        top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
+        # Most triangles of a dense scan lie between pixel centres.
+        if not (left <= right and top <= bottom):
+            continue
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if not abs(area) > 0.0:
             continue
-        left, right = max(np.ceil(min(ax, bx, cx)), 0.0), min(np.floor(max(ax, bx, cx)), width - 1.0)
-        top, bottom = max(np.ceil(min(ay, by, cy)), 0.0), min(np.floor(max(ay, by, cy)), height - 1.0)
-        if not (left <= right and top <= bottom):
-            continue
+        share, da, db, dc = 1.0 / area, 1.0 / a[2], 1.0 / b[2], 1.0 / c[2]
         for row in range(int(top), int(bottom) + 1):
             for column in range(int(left), int(right) + 1):
-                wa = ((bx - column) * (cy - row) - (by - row) * (cx - column)) / area
-                wb = ((cx - column) * (ay - row) - (cy - row) * (ax - column)) / area
+                wa = ((bx - column) * (cy - row) - (by - row) * (cx - column)) * share
+                wb = ((cx - column) * (ay - row) - (cy - row) * (ax - column)) * share
                 wc = 1.0 - wa - wb
                 # Closed on all sides: a pixel on a shared edge is drawn twice, never left open.
                 if wa < -1e-9 or wb < -1e-9 or wc < -1e-9:
                     continue
-                wa, wb, wc = wa / depth[a], wb / depth[b], wc / depth[c]
-                z = 1.0 / (wa + wb + wc)
-                if nearest[row, column] <= z:
-                    continue
-                nearest[row, column] = z
-                front[row, column] = area < 0.0
-                for axis in range(3):
-                    normal[row, column, axis] = wa * normals[a, axis] + wb * normals[b, axis] + wc * normals[c, axis]
-    for row in range(height):
-        for column in range(width):
-            x, y, z = normal[row, column]
+                near = np.float32(wa * da + wb * db + wc * dc)
+                if near > inverse[row, column]:
+                    inverse[row, column] = near
+                    nearest[row, column] = face
+    return inverse, nearest
+
+
+@kernel
+def _normals(first: int, last: int, nearest: Any, placed: Any, normals: Any, faces: Any, seen: Any, front: Any) -> None:
+    """Normals of the rows from first to last, weighted as inverse depth is."""
+    for row in range(first, last):
+        for column in range(nearest.shape[1]):
+            face = nearest[row, column]
+            if face < 0:
+                continue
+            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+            ax, ay, bx, by = placed[a, 0] - column, placed[a, 1] - row, placed[b, 0] - column, placed[b, 1] - row
+            cx, cy = placed[c, 0] - column, placed[c, 1] - row
+            # Twice the areas of the parts opposite the corners, positive if clockwise in the picture: a back. Divided
+            # by depth they have the ratios of the parts of the triangle itself; their sum cancels in a unit vector.
+            wa, wb, wc = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+            front[row, column] = wa + wb + wc < 0.0
+            wa, wb, wc = -wa / placed[a, 2], -wb / placed[b, 2], -wc / placed[c, 2]
+            x, y, z = 0.0, 0.0, 0.0
+            for weight, corner in ((wa, a), (wb, b), (wc, c)):
+                nx, ny, nz = normals[corner, 0], normals[corner, 1], normals[corner, 2]
+                if not np.isnan(nx + ny + nz):
+                    x, y, z = x + weight * nx, y + weight * ny, z + weight * nz
             length = np.sqrt(x * x + y * y + z * z)
             if length > 0.0:
-                for axis in range(3):
-                    normal[row, column, axis] /= length
-    return nearest, normal, front
+                seen[row, column, 0], seen[row, column, 1], seen[row, column, 2] = x / length, y / length, z / length

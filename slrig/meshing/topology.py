@@ -45,7 +45,9 @@ def duplicate_face_count(faces: IntArray) -> int:
         return 0
     faces = np.ascontiguousarray(faces)
     bound = _vertex_bound(faces)
-    return sum(in_bands(_duplicates, bound, faces, *in_groups(faces.min(axis=1), bound)))
+    a, b, c = faces.T
+    lowest = np.minimum(np.minimum(a, b), c)  # a tenth of the time of a minimum over an axis of three
+    return sum(in_bands(_duplicates, bound, faces, *in_groups(lowest, bound)))
 
 
 def degenerate_faces(faces: IntArray) -> NDArray[np.bool_]:
@@ -108,32 +110,39 @@ def _vertex_bound(faces: IntArray) -> int:
     return int(faces.max()) + 1 if faces.size else 0
 
 
-@kernel_part(inline="always")
-def _far_end(faces: IntArray, half: int, vertex: int) -> int:
-    face, corner = half // 3, half % 3
-    return int(faces[face, corner] + faces[face, corner + 1 if corner < 2 else 0] - vertex)
-
-
 @kernel
 def _edge_counts(
     first: int, last: int, faces: IntArray, starts: IntArray, halves: IntArray, border: Any
 ) -> tuple[int, int, int, int]:
     """Edges; those of one triangle, marking their ends; those of more than two; directions run along more than once."""
     edges, boundary, nonmanifold, misoriented = 0, 0, 0, 0
+    most = 0
     for vertex in range(first, last):
-        for at in range(starts[vertex], starts[vertex + 1]):
-            other, known, uses, outward = _far_end(faces, halves[at], vertex), False, 0, 0
-            for each in range(starts[vertex], starts[vertex + 1]):
-                if _far_end(faces, halves[each], vertex) == other:
+        most = max(most, starts[vertex + 1] - starts[vertex])
+    # Of the half-edges at one vertex, read once: the other ends, and whether they run there from the vertex.
+    ends, away = np.zeros(most, dtype=np.int32), np.zeros(most, dtype=np.int32)
+    for vertex in range(first, last):
+        count = starts[vertex + 1] - starts[vertex]
+        for at in range(count):
+            half = halves[starts[vertex] + at]
+            face = half // 3
+            corner = half - 3 * face
+            origin, target = faces[face, corner], faces[face, corner + 1 if corner < 2 else 0]
+            ends[at] = origin + target - vertex
+            away[at] = origin == vertex
+        for at in range(count):
+            known, uses, outward = False, 0, 0
+            for each in range(count):
+                if ends[each] == ends[at]:
                     known |= each < at
                     uses += 1
-                    outward += faces[halves[each] // 3, halves[each] % 3] == vertex
+                    outward += away[each]
             if known:
                 continue
             edges += 1
             if uses == 1:
                 boundary += 1
-                border[vertex], border[other] = True, True
+                border[vertex], border[ends[at]] = True, True
             nonmanifold += uses > 2
             misoriented += (outward > 1) + (uses - outward > 1)
     return edges, boundary, nonmanifold, misoriented

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from slrig.errors import NothingToReconstructError, setting
 from slrig.meshing.rasteriser import rasterised
 from slrig.model import Mesh, Refusal, Size
-from slrig.reconstruction.optics import project
+from slrig.scan.placing import placed_vertices, resampled
 from slrig.scan.stream import CameraResult
 
 FAIR_SHARE = 0.6
@@ -31,11 +29,9 @@ def covered_share(mesh: Mesh, seen: CameraResult) -> float | None:
     decoded = decoded.reshape(rows, step, columns, step).mean(axis=(1, 3)) >= 0.5
     if not decoded.any():
         return None
-    device, points = seen.device, mesh.vertices_mm.astype(np.float64)
-    depth_mm = points @ device.rotation[2] + device.translation_mm[2]
-    pixels = (project(device, points) + 0.5) / step - 0.5
-    view = rasterised(pixels, depth_mm, mesh.normals, mesh.faces, Size(columns, rows))
-    return float((np.isfinite(view.depth_mm) & decoded).sum() / decoded.sum())
+    coarse = resampled(seen.device, 1 / step, Size(columns, rows))
+    view = rasterised(placed_vertices(mesh.vertices_mm, coarse), mesh.faces, coarse.size)
+    return float(((view.face >= 0) & decoded).sum() / decoded.sum())
 
 
 def coverage_notes(name: str, share: float | None) -> list[str]:

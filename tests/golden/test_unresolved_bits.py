@@ -20,7 +20,7 @@ from slrig.bundle import read_bundle
 from slrig.meshing.rasteriser import rasterised
 from slrig.model import Axis, FloatArray, Pinhole
 from slrig.reconstruction.frames import axis_frames
-from slrig.reconstruction.optics import project
+from slrig.scan.placing import placed_vertices
 from slrig.scan.plan import PatternPlan, ReconstructionPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.golden.test_light_axis import Device, rig_file, scanned
@@ -63,11 +63,8 @@ def covered(mesh: Path, device: Pinhole) -> NDArray[np.bool_]:
     """(H, W) bool: the pixels whose ray meets the mesh."""
     loaded: Any = trimesh.load(mesh, process=False)
     points: FloatArray = np.asarray(loaded.vertices, np.float64)
-    depth = points @ device.rotation[2] + device.translation_mm[2]
-    view = rasterised(
-        project(device, points), depth, np.zeros_like(points), np.asarray(loaded.faces, np.int32), device.size
-    )
-    return np.isfinite(view.depth_mm)
+    placed = placed_vertices(points, device)
+    return rasterised(placed, np.asarray(loaded.faces, np.int32), device.size).face >= 0
 
 
 @pytest.mark.slow

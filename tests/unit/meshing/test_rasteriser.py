@@ -4,36 +4,123 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba import config
+from numpy.typing import NDArray
 
-from slrig.meshing.rasteriser import rasterised
+from slrig.meshing import rasteriser
+from slrig.meshing.rasteriser import View, normals_seen, rasterised
 from slrig.model import FloatArray, IntArray, Size
 
+SIZE = Size(50, 40)
 
-def plain_depth(pixels: FloatArray, depth: FloatArray, faces: IntArray, size: Size) -> FloatArray:
-    """Nearest depth at each pixel centre, one triangle after the other over the whole picture."""
+
+def plain_weights(corners: FloatArray, size: Size) -> FloatArray:
+    """(3, H, W): barycentric coordinates of every pixel centre in a triangle, (3, 3) column, row, depth."""
     rows, columns = np.mgrid[: size.height_px, : size.width_px].astype(np.float64)
-    nearest = np.full(size.shape, np.inf)
-    for face in faces:
-        system = np.vstack((pixels[face].T, np.ones(3)))
-        weights = np.einsum("ij,jrc->irc", np.linalg.inv(system), np.stack((columns, rows, np.ones(size.shape))))
-        z = 1 / np.einsum("irc,i->rc", weights, 1 / depth[face])
-        nearest = np.where((weights >= 0).all(axis=0), np.minimum(nearest, z), nearest)
-    return np.where(np.isfinite(nearest), nearest, np.nan)
+    system = np.vstack((corners[:, :2].T, np.ones(3)))
+    return np.asarray(np.einsum("ij,jrc->irc", np.linalg.inv(system), np.stack((columns, rows, np.ones(size.shape)))))
 
 
-def test_depth_is_that_of_trying_every_triangle_at_every_pixel() -> None:
-    random = np.random.default_rng(4)
-    pixels = random.uniform(-10, 60, (60, 2))
-    depth = random.uniform(100, 300, 60)
-    faces = np.arange(60, dtype=np.int32).reshape(-1, 3)
-    size = Size(50, 40)
-    view = rasterised(pixels, depth, random.normal(size=(60, 3)), faces, size)
-    expected = plain_depth(pixels, depth, faces, size)
-    assert 0.2 < np.isfinite(expected).mean() < 1
-    assert view.depth_mm == pytest.approx(expected, nan_ok=True)
-    seen = np.isfinite(view.depth_mm)
-    assert np.linalg.norm(view.normals[seen], axis=1) == pytest.approx(np.ones(seen.sum()))
-    assert not view.normals[~seen].any()
+def plain_view(placed: NDArray[np.float32], faces: IntArray, size: Size) -> tuple[FloatArray, IntArray]:
+    """Nearest depth and which triangle at each pixel centre, one triangle after the other over the whole picture."""
+    nearest, which = np.full(size.shape, np.inf), np.full(size.shape, -1, dtype=np.int32)
+    for number, face in enumerate(faces):
+        corners = placed[face].astype(np.float64)
+        weights = plain_weights(corners, size)
+        z = 1 / np.einsum("irc,i->rc", weights, 1 / corners[:, 2])
+        nearer = (weights >= 0).all(axis=0) & (z < nearest)
+        nearest[nearer], which[nearer] = z[nearer], number
+    return np.where(np.isfinite(nearest), nearest, np.nan), which
+
+
+def placed_at(pixels: FloatArray, depth: FloatArray) -> NDArray[np.float32]:
+    return np.column_stack((pixels, depth)).astype(np.float32)
+
+
+def random_triangles(count: int = 20, seed: int = 4) -> tuple[NDArray[np.float32], IntArray, NDArray[np.float32]]:
+    """Placed vertices, faces and normals of triangles that pass through one another."""
+    random = np.random.default_rng(seed)
+    placed = placed_at(random.uniform(-10, 60, (3 * count, 2)), random.uniform(100, 300, 3 * count))
+    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+    return placed, faces, random.normal(size=(3 * count, 3)).astype(np.float32)
+
+
+def share_out(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    """Rasterise the smallest meshes in bands, on so many threads."""
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
+    monkeypatch.setattr(rasteriser, "_FACES_AT_LEAST", 1)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_view_is_that_of_trying_every_triangle_at_every_pixel(
+    monkeypatch: pytest.MonkeyPatch, threads: int
+) -> None:
+    share_out(monkeypatch, threads)
+    placed, faces, _ = random_triangles()
+    view = rasterised(placed, faces, SIZE)
+    depth, which = plain_view(placed, faces, SIZE)
+    assert 0.2 < (which >= 0).mean() < 1
+    assert view.depth_mm == pytest.approx(depth, nan_ok=True)
+    assert np.array_equal(view.face, which)
+
+
+def test_normals_are_those_of_the_triangle_that_is_seen_on_the_side_that_is_seen() -> None:
+    placed, faces, normals = random_triangles()
+    depth, which = plain_view(placed, faces, SIZE)
+    expected, front = np.zeros((*SIZE.shape, 3)), np.zeros(SIZE.shape, dtype=bool)
+    for number, face in enumerate(faces):
+        here = which == number
+        corners = placed[face].astype(np.float64)
+        # Over space a value is linear over the picture when it is divided by depth.
+        weights = plain_weights(corners, SIZE) / corners[:, 2, None, None] * depth
+        along, across = corners[1, :2] - corners[0, :2], corners[2, :2] - corners[0, :2]
+        front[here] = along[0] * across[1] - along[1] * across[0] < 0
+        expected[here] = np.einsum("irc,ik->rck", weights, normals[face].astype(np.float64))[here]
+    expected[~front] *= -1
+    length = np.linalg.norm(expected, axis=2, keepdims=True)
+    view = rasterised(placed, faces, SIZE)
+    found, found_front = normals_seen(view, placed, normals, faces)
+    assert 0.2 < front[which >= 0].mean() < 0.8
+    assert np.array_equal(found_front, front)
+    assert found == pytest.approx(expected / np.where(length > 0, length, 1), abs=1e-5)
+
+
+def test_a_normal_that_is_not_known_counts_for_nothing() -> None:
+    placed = placed_at(np.array([[1.0, 1.0], [1.0, 8.0], [8.0, 1.0]]), np.ones(3))
+    faces = np.array([[0, 1, 2]], dtype=np.int32)
+    normals = np.array([[0, 0, -1], [np.nan, np.nan, np.nan], [0, 0, -1]], dtype=np.float32)
+    found, front = normals_seen(rasterised(placed, faces, Size(10, 10)), placed, normals, faces)
+    assert front[2, 2]
+    assert tuple(found[2, 2]) == (0, 0, -1)
+    assert not found[1, 9].any()
+    nothing, _ = normals_seen(rasterised(placed, faces, Size(10, 10)), placed, np.full_like(normals, np.nan), faces)
+    assert not nothing.any()
+
+
+def test_views_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    placed, faces, normals = random_triangles(300, seed=1)
+
+    def view(threads: int) -> tuple[View, NDArray[np.float32], NDArray[np.bool_]]:
+        share_out(monkeypatch, threads)
+        found = rasterised(placed, faces, SIZE)
+        return found, *normals_seen(found, placed, normals, faces)
+
+    (alone, normal, front), *others = [view(threads) for threads in (1, 2, 3)]
+    for shared, its_normal, its_front in others:
+        assert np.array_equal(shared.depth_mm, alone.depth_mm, equal_nan=True)
+        assert np.array_equal(shared.face, alone.face)
+        assert np.array_equal(its_normal, normal)
+        assert np.array_equal(its_front, front)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_of_equally_near_triangles_the_first_is_seen(monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
+    share_out(monkeypatch, threads)
+    placed, faces, _ = random_triangles()
+    once = rasterised(placed, faces, SIZE)
+    # The same triangles again and again: some copies in the band of the first, some in others.
+    again = rasterised(placed, np.tile(faces, (5, 1)), SIZE)
+    assert np.array_equal(again.face, once.face)
 
 
 def test_interpolation_is_linear_in_space_not_in_the_picture() -> None:
@@ -41,7 +128,7 @@ def test_interpolation_is_linear_in_space_not_in_the_picture() -> None:
     corners = np.array([[-40, -30, 120], [40, -30, 280], [-40, 30, 120], [40, 30, 280]], dtype=np.float64)
     pixels = 100 * corners[:, :2] / corners[:, 2:] + (32, 24)
     faces = np.array([[0, 2, 1], [1, 2, 3]], dtype=np.int32)
-    view = rasterised(pixels, corners[:, 2], np.zeros((4, 3)), faces, Size(64, 48))
+    view = rasterised(placed_at(pixels, corners[:, 2]), faces, Size(64, 48))
     columns = np.arange(64)
     expected = 200 / (1 - 2 * (columns - 32) / 100)
     row = view.depth_mm[24]
@@ -52,13 +139,37 @@ def test_interpolation_is_linear_in_space_not_in_the_picture() -> None:
 
 def test_front_is_counter_clockwise_in_the_picture() -> None:
     pixels = np.array([[1, 1], [1, 8], [8, 1]], dtype=np.float64)  # down, then right: counter-clockwise to the eye
-    for face, front in (((0, 1, 2), True), ((0, 2, 1), False)):
-        view = rasterised(pixels, np.ones(3), np.zeros((3, 3)), np.array([face], dtype=np.int32), Size(10, 10))
-        assert view.front[2, 2] == front
+    placed, normals = placed_at(pixels, np.ones(3)), np.zeros((3, 3), dtype=np.float32)
+    for order, seen in (((0, 1, 2), True), ((0, 2, 1), False)):
+        faces = np.array([order], dtype=np.int32)
+        _, front = normals_seen(rasterised(placed, faces, Size(10, 10)), placed, normals, faces)
+        assert front[2, 2] == seen
+
+
+def test_a_sheet_of_small_triangles_has_no_holes() -> None:
+    side = np.linspace(-0.5, 30.5, 32)  # its edges pass between pixel centres; then through them
+    for shift in (0.0, 0.5):
+        x, y = (axis.ravel() + shift for axis in np.meshgrid(side, side))
+        index = np.arange(32 * 32, dtype=np.int32).reshape(32, 32)
+        a, b, c, d = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel()
+        faces = np.concatenate((np.stack((a, c, b), 1), np.stack((b, c, d), 1)))
+        view = rasterised(placed_at(np.stack((x, y), 1), np.full(len(x), 300.0)), faces, Size(34, 34))
+        seen = np.zeros((34, 34), dtype=bool)
+        seen[: 31 + round(2 * shift), : 31 + round(2 * shift)] = True
+        assert np.array_equal(view.face >= 0, seen)
 
 
 def test_a_triangle_with_a_vertex_behind_the_camera_or_unmeasured_is_left_out() -> None:
-    pixels = np.array([[1, 1], [8, 1], [1, 8], [np.nan, 8]], dtype=np.float64)
-    faces = np.array([[0, 1, 2], [0, 1, 3]], dtype=np.int32)
-    depth = np.array([1.0, 1.0, -1.0, np.nan])
-    assert np.isnan(rasterised(pixels, depth, np.zeros((4, 3)), faces, Size(10, 10)).depth_mm).all()
+    pixels = np.array([[1, 1], [8, 1], [1, 8], [np.nan, 8], [np.nan, np.nan]], dtype=np.float64)
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 4, 1], [4, 0, 1], [0, 1, 4]], dtype=np.int32)
+    depth = np.array([1.0, 1.0, -1.0, np.nan, 1.0])
+    view = rasterised(placed_at(pixels, depth), faces, Size(10, 10))
+    assert np.isnan(view.depth_mm).all()
+    assert (view.face == -1).all()
+
+
+def test_no_triangles_are_no_view() -> None:
+    placed, faces = np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32)
+    view = rasterised(placed, faces, Size(4, 3))
+    assert np.isnan(view.depth_mm).all()
+    assert not normals_seen(view, placed, placed, faces)[0].any()

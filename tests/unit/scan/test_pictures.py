@@ -7,10 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numba import config
 from numpy.typing import NDArray
 
 from slrig.errors import StorageError
+from slrig.meshing import rasteriser
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
+from slrig.scan import pictures
 from slrig.scan.pictures import _COLOURS, encode_png, preview, rejection_picture
 
 SIZE = Size(640, 480)
@@ -150,6 +153,31 @@ def test_stray_vertices_do_not_move_the_turned_view() -> None:
     assert other == pytest.approx(one, abs=2)
 
 
+def test_vertices_behind_the_camera_do_no_harm() -> None:
+    mesh = patch((0, 0, 500), 60)
+    behind = preview(joined(mesh, patch((0, 0, -20), 5)), camera(), white(), 255)
+    assert np.array_equal(panel(behind, 1), panel(preview(mesh, camera(), white(), 255), 1))
+    # Nor if all are: there is nothing to see, and no length that a bar could show.
+    nothing = preview(patch((0, 0, -500), 60), camera(), white(), 255)
+    assert (panel(nothing, 1) == BACKDROP).all()
+
+
+def test_triangles_without_an_area_are_no_reason_to_fail() -> None:
+    mesh = patch((0, 0, 500), 0)
+    assert not covered(panel(preview(mesh, camera(), white(), 255), 1)).any()
+
+
+@pytest.mark.parametrize("sampled", [100, 101])
+def test_a_sample_of_the_triangles_shows_the_same_view(monkeypatch: pytest.MonkeyPatch, sampled: int) -> None:
+    # 800 triangles in rows of 20: every eighth of them would always be one of the same few columns.
+    mesh = patch((60, 40, 500), 80, slope=0.3)
+    whole = preview(mesh, camera(), white(), 255)
+    monkeypatch.setattr(pictures, "_SAMPLED", sampled)
+    some = preview(mesh, camera(), white(), 255)
+    assert np.array_equal(panel(some, 1)[:-50], panel(whole, 1)[:-50])
+    assert bounds(covered(panel(some, 2))) == pytest.approx(bounds(covered(panel(whole, 2))), abs=8)
+
+
 def test_a_dark_white_image_is_brightened_and_a_deep_one_scaled() -> None:
     mesh = patch((0, 0, 500), 60)
     deep = np.full(SIZE.shape, 2048, dtype=np.uint16)
@@ -184,6 +212,17 @@ def test_odd_cameras_give_a_picture_too(size: Size) -> None:
 def test_the_same_scan_gives_the_same_picture() -> None:
     mesh = patch((0, 0, 500), 60, slope=0.3)
     assert np.array_equal(preview(mesh, camera(), white(), 255), preview(mesh, camera(), white(), 255))
+
+
+def test_pictures_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = joined(patch((0, 0, 500), 60, slope=0.3), patch((0, 0, 520), 60, slope=-0.3, turned=True))
+    monkeypatch.setattr(rasteriser, "_FACES_AT_LEAST", 1)
+
+    def drawn(threads: int) -> NDArray[np.uint8]:
+        monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
+        return preview(mesh, camera(), white(), 255)
+
+    assert np.array_equal(drawn(1), drawn(2))
 
 
 def test_every_cause_has_a_colour_of_its_own() -> None:
