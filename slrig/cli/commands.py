@@ -182,8 +182,12 @@ def scan(
 @grouped
 def reconstruct(
     *,
-    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="Folder with bundle.json and its frames.")],
-    output: Annotated[Path, typer.Option(help="Folder for mesh, points, report and pictures.")],
+    bundles: Annotated[
+        list[Path], typer.Argument(metavar="BUNDLE", help="Folders with bundle.json, or a folder of such.")
+    ],
+    output: Annotated[
+        Path, typer.Option(help="Folder for mesh, report and pictures; of several bundles, for folders.")
+    ],
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration to use in place of the bundle's calibration.json.")
     ] = None,
@@ -197,14 +201,14 @@ def reconstruct(
         typer.Option("--decode-only", help="Only decode: positions, causes, what to change. Needs no calibration."),
     ] = False,
 ) -> None:
-    """Make a mesh from a recorded scan. Needs no service and no rig."""
-    from slrig.cli.reconstruct import decode_and_tell, reconstruct_with_progress
+    """Make meshes from recorded scans. Needs no service and no rig."""
+    from slrig.cli.reconstruct import decode_and_tell, reconstruct_and_tell
 
     if decode_only:
-        decode_and_tell(bundle, output)
+        decode_and_tell(bundles, output)
         return
-    formats, options = mesh_format or (), given(**asdict(mesh))
-    reconstruct_with_progress(bundle, output, calibration=calibration, formats=formats, options=options)
+    options = given(**asdict(mesh))
+    reconstruct_and_tell(bundles, output, calibration=calibration, formats=mesh_format or (), options=options)
 
 
 @app.command()

@@ -77,6 +77,18 @@ class ProgressDisplay:
             if begun:
                 self._print()
 
+    def error(self, words: str) -> None:
+        """Print an error that does not end the work: it stays, above the bar where there is one."""
+        safe = "\n".join(map(printable, words.rstrip().split("\n")))
+        if self._bar is not None:
+            # The terminal breaks lines by itself, so that paths can be copied.
+            self._bar.console.print(Text.assemble(("error: ", "bold red"), safe), soft_wrap=True)
+            return
+        with self._telling:
+            print(f"error: {safe}", file=self._stream, flush=True)
+            # What comes next may begin with the stage that failed.
+            self._now = ("", *self._now[1:])
+
     def _repeat(self) -> None:
         wait_s = self._every_s
         while not self._ended.wait(wait_s):

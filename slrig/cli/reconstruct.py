@@ -1,4 +1,4 @@
-"""`slrig reconstruct`, a recorded bundle becomes a mesh in this process, and `slrig warm`, its kernels are compiled."""
+"""`slrig reconstruct`, recorded bundles become meshes in this process, and `slrig warm`, its kernels are compiled."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from rich.table import Column
 
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.description import read_description
-from slrig.cli.display import progress_shown
+from slrig.cli.bundles import Row, named_bundles, work_through
+from slrig.cli.display import counted, progress_shown
 from slrig.cli.scan import quality_lines
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
@@ -22,11 +24,30 @@ from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary
 
 
-def decode_and_tell(bundle: Path, output: Path) -> None:
-    """Decode a bundle without a calibration, and print what was found and what to change. Raises as decoding does."""
+def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
+    """Decode bundles without a calibration, and print what was found and what to change. Raises as decoding does, and
+    of several as `work_through` does.
+    """
     from slrig.scan.decoding_only import decode_bundle
 
     set_up_logs_for_a_person()
+    bundles, several = named_bundles(asked)
+    if several:
+
+        def decoded(bundle: Path, folder: Path, progress: Progress) -> list[Row]:
+            progress("decode", 0.0, "")
+            found, notes = decode_bundle(bundle, folder)
+            progress("done", 1.0, "")
+            return [
+                (f"{each.camera}, {each.axis.value}s", f"{each.lit:.0%}", f"{each.decoded:.0%}",
+                 "; ".join([*each.advice, *(notes if each is found[0] else ())]))
+                for each in found
+            ]  # fmt: skip
+
+        heads = [Column("camera"), *map(_figures, ("lit", "decoded"))]
+        work_through(bundles, output, decoded, heads=heads, places=[f"{'pictures':<10}{output / '*'}"])
+        return
+    (bundle,) = bundles
     with progress_shown() as display:
         display("decode", 0.0, str(bundle))
         found, notes = decode_bundle(bundle, output)
@@ -40,35 +61,67 @@ def decode_and_tell(bundle: Path, output: Path) -> None:
     typer.echo(f"{'pictures':<10}{output}")
 
 
-def reconstruct_with_progress(
-    bundle: Path, output: Path, *, calibration: Path | None, formats: Sequence[str] = (), options: Mapping[str, Any]
+def reconstruct_and_tell(
+    asked: Sequence[Path], output: Path, *, calibration: Path | None, formats: Sequence[str], options: Mapping[str, Any]
 ) -> None:
-    """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises.
+    """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises, and of several
+    bundles what `work_through` does.
 
     formats : further formats of the mesh, "stl" or "obj"; options : fields of `ReconstructionPlan` that were given.
     """
     set_up_logs_for_a_person()
     plan = ReconstructionPlan(**options)
+    bundles, several = named_bundles(asked)
     # What is wrong with the files is said at once, not after a minute in which kernels are compiled.
-    read_description(bundle)
+    if not several:
+        read_description(bundles[0])
     if calibration is not None:
         read_calibration(calibration)
-    with progress_shown() as display:
-        prepare_kernels(display)
+    further = [f"mesh.{name}" for name in dict.fromkeys(formats)]
+
+    def reconstructed(bundle: Path, folder: Path, progress: Progress) -> dict[str, Any]:
         from slrig.scan.reconstruct import reconstruct_bundle
 
         report = reconstruct_bundle(
-            bundle, output, plan=plan, calibration=calibration, progress=display, cancelled=lambda: False
+            bundle, folder, plan=plan, calibration=calibration, progress=progress, cancelled=lambda: False
         )
-        further = [f"mesh.{name}" for name in dict.fromkeys(formats)]
         for name in further:
-            display(f"writing {name}", 1.0, "")
-            write_converted(output, name)
+            progress(f"writing {name}", 1.0, "")
+            write_converted(folder, name)
+        return report_summary(report)
+
     told = [(Path(name).suffix[1:], name) for name in further]
-    for what, name in (("mesh", MESH), *told, ("preview", "preview.png"), ("report", "report.json")):
+    files = (("mesh", MESH), *told, ("preview", "preview.png"), ("report", "report.json"))
+    if several:
+        work_through(
+            bundles, output, lambda *each: [_row(reconstructed(*each))], prepare=prepare_kernels,
+            heads=[_figures(name) for name in ("triangles", "median σ", "covered")],
+            places=[f"{what:<10}{output / '*' / name}" for what, name in files],
+        )  # fmt: skip
+        return
+    with progress_shown() as display:
+        prepare_kernels(display)
+        summary = reconstructed(bundles[0], output, display)
+    for what, name in files:
         typer.echo(f"{what:<10}{output / name}")
-    for line in quality_lines(report_summary(report)):
+    for line in quality_lines(summary):
         typer.echo(line)
+
+
+def _figures(name: str) -> Column:
+    return Column(name, justify="right", no_wrap=True)
+
+
+def _row(summary: Mapping[str, Any]) -> Row:
+    """What a table says of a reconstruction: triangles, median of the stated deviations, share covered, a remark."""
+    mesh = summary["mesh"]
+    sigma_mm, covered, notes = mesh["sigma_mm"]["p50"], mesh["covers_of_decoded"], summary["notes"]
+    return (
+        f"{mesh['figures']['triangles']:,}",
+        "" if sigma_mm is None else f"{sigma_mm:.4f} mm",
+        "" if covered is None else f"{covered:.1%}",
+        f"{counted(len(notes), 'note')} in report.json" if notes else "",
+    )
 
 
 def warm() -> None:

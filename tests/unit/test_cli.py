@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -491,6 +492,25 @@ def test_a_stage_that_goes_on_without_a_word_is_told_again_off_a_terminal() -> N
     lines = stream.getvalue().splitlines()
     assert len(lines) >= 3
     assert all(line.endswith("41 of 56") for line in lines)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_an_error_beside_the_progress_stays_and_does_nothing_to_the_terminal(terminal: bool) -> None:
+    class Stream(io.StringIO):
+        def isatty(self) -> bool:
+            return terminal
+
+    stream = Stream()
+    display = ProgressDisplay(stream)
+    display.start()
+    display("decode", 0.5, "")
+    display.error("scan-[2]: a\x1b]0;title\x07\n  [b]again[/b]\n")
+    display("decode", 0.75, "")
+    display.stop()
+    told = re.sub(r"\x1b\[[0-9;]*m", "", stream.getvalue())
+    assert "error: scan-[2]: a\\u001b]0;title\\u0007\n  [b]again[/b]\n" in told
+    # Without a bar, a stage that begins anew after the error is told, though it has the same name.
+    assert terminal or told.count("decode") == 2
 
 
 def test_label_of_an_older_record_does_nothing_to_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,276 @@
+"""`slrig reconstruct` of several bundles: which are meant, what fails alone, and what is told at the end."""
+
+from __future__ import annotations
+
+import gc
+import json
+import shutil
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from slrig.bundle import write_bundle
+from slrig.cli.commands import INTERRUPTED, app
+from slrig.errors import NothingToReconstructError
+from slrig.scan.artefacts import staged_folder
+from slrig.scan.preparation import sample_scan
+
+
+class Report(dict[str, object]):
+    """A report that tells when it is gone."""
+
+
+class Reconstruction:
+    """Stands in for the reconstruction: writes a mesh, and does to some bundles what a test wants."""
+
+    def __init__(self) -> None:
+        self.prepared = 0
+        self.seen: list[str] = []
+        self.kept: list[int] = []
+        self.wanted: dict[str, Callable[[], None]] = {}
+        self._reports: list[weakref.ref[Report]] = []
+
+    def prepare(self, _display: object) -> int:
+        self.prepared += 1
+        return 0
+
+    def __call__(self, bundle: Path, output: Path, *, progress: Callable[..., None], **_: object) -> Report:
+        gc.collect()
+        self.kept.append(sum(each() is not None for each in self._reports))
+        self.seen.append(bundle.name)
+        with staged_folder(output) as staging:
+            (staging / "mesh.ply").write_text(bundle.name)
+            progress("decode", 0.5, "")
+            self.wanted.get(bundle.name, lambda: None)()
+            (staging / "report.json").write_text('{"format": "slrig-report"}')
+        progress("done", 1.0, "")
+        mesh = {
+            "figures": {"triangles": 1234, "vertices": 617},
+            "sigma_mm": {"p50": 0.0123},
+            "covers_of_decoded": 0.875,
+        }
+        report = Report(mesh=mesh, notes=["look"] if bundle.name == "scan-2" else [])
+        self._reports.append(weakref.ref(report))
+        return report
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> Reconstruction:
+    work = Reconstruction()
+    monkeypatch.setattr("slrig.scan.reconstruct.reconstruct_bundle", work)
+    monkeypatch.setattr("slrig.cli.reconstruct.prepare_kernels", work.prepare)
+    return work
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "bundle"
+    write_bundle(folder, *sample_scan())
+    return folder
+
+
+@pytest.fixture
+def scans(tmp_path: Path, recorded: Path) -> Path:
+    """scan-1, scan-2 and scan-10, and a folder that is no bundle."""
+    for name in ("scan-10", "scan-1", "scan-2"):
+        shutil.copytree(recorded, tmp_path / "scans" / name)
+    (tmp_path / "scans" / "notes").mkdir()
+    (tmp_path / "scans" / ".scan-3.part").mkdir()
+    return tmp_path / "scans"
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(app, ["reconstruct", *map(str, words)])
+
+
+def rows(result: Result) -> list[list[str]]:
+    """The words of the table's rows without its head."""
+    return [line.split() for line in result.stdout.partition("\n\n")[0].splitlines()[1:]]
+
+
+def within(folder: Path) -> list[str]:
+    return sorted(each.name for each in folder.iterdir())
+
+
+def test_several_bundles_are_reconstructed_as_each_alone(
+    scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slrig.cli.reconstruct.prepare_kernels", lambda _: 0)
+    alone, out = tmp_path / "alone", tmp_path / "out"
+    assert run(scans / "scan-1", "--output", alone).exit_code == 0
+    result = run(scans / "scan-1", scans / "scan-2", "--output", out, "--format", "stl")
+    assert result.exit_code == 0, result.output
+    triangles = json.loads((alone / "report.json").read_text())["mesh"]["figures"]["triangles"]
+    for name in ("scan-1", "scan-2"):
+        assert (out / name / "mesh.ply").read_bytes() == (alone / "mesh.ply").read_bytes()
+        assert within(out / name) == sorted([*within(alone), "mesh.stl"])
+    assert [row[:2] for row in rows(result)] == [["scan-1", f"{triangles:,}"], ["scan-2", f"{triangles:,}"]]
+
+
+def test_a_folder_of_bundles_is_worked_through_in_natural_order(
+    scans: Path, tmp_path: Path, work: Reconstruction
+) -> None:
+    out = tmp_path / "out"
+    result = run(scans, "--output", out)
+    assert result.exit_code == 0, result.output
+    assert (work.seen, work.prepared) == (["scan-1", "scan-2", "scan-10"], 1)
+    assert within(out) == ["scan-1", "scan-10", "scan-2"]
+    assert f"skipped   no bundle.json in notes of {scans}" in result.stderr
+    assert "2 of 3: scan-2" in result.stderr
+    assert rows(result)[1][:5] == ["scan-2", "1,234", "0.0123", "mm", "87.5%"]
+    assert rows(result)[1][6:] == ["1", "note", "in", "report.json"]
+    words = ["", "bundles   3 done", *(f"{what:<10}{out}/*/{name}" for what, name in (
+        ("mesh", "mesh.ply"), ("preview", "preview.png"), ("report", "report.json"),
+    ))]  # fmt: skip
+    assert result.stdout.splitlines()[4:] == words
+
+
+def test_a_pattern_that_no_shell_expanded_is_expanded(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    assert run(scans / "scan-1*", scans / "scan-1", "--output", tmp_path / "out").exit_code == 0
+    assert work.seen == ["scan-1", "scan-10"]
+    # One bundle is one, however it was named.
+    assert run(scans / "*-2", "--output", tmp_path / "one").exit_code == 0
+    assert (tmp_path / "one" / "mesh.ply").read_text() == "scan-2"
+
+
+def test_the_current_folder_has_a_name(
+    scans: Path, tmp_path: Path, work: Reconstruction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scans / "scan-1")
+    assert run(".", "../scan-2", "--output", tmp_path / "out").exit_code == 0
+    assert within(tmp_path / "out") == ["scan-1", "scan-2"]
+    assert work.seen[1] == "scan-2"
+
+
+def test_a_folder_without_bundles_is_refused_as_a_bundle_is(tmp_path: Path, work: Reconstruction) -> None:
+    (tmp_path / "empty" / "inner").mkdir(parents=True)
+    result = run(tmp_path / "empty", "--output", tmp_path / "out")
+    assert (result.exit_code, work.prepared) == (2, 0)
+    assert "found a folder without it; give the folder that holds it" in result.stderr
+
+
+def test_broken_bundles_do_not_stop_the_others(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    (scans / "scan-2" / "bundle.json").write_text("{}")
+    shutil.copytree(scans / "scan-10", scans / "scan-3")
+
+    def dark() -> None:
+        raise NothingToReconstructError("the lens cap is on")
+
+    work.wanted["scan-3"] = dark
+    out = tmp_path / "out"
+    result = run(scans, scans / "absent", "--output", out)
+    assert result.exit_code == 2, result.output
+    assert work.seen == ["scan-1", "scan-3", "scan-10"]
+    assert within(out) == ["scan-1", "scan-10"]
+    assert {row[0]: row[-2:] for row in rows(result) if "failed:" in row} == {
+        "scan-2": ["failed:", "bundle"],
+        "scan-3": ["failed:", "nothing-to-reconstruct"],
+        "absent": ["failed:", "bundle"],
+    }
+    assert [row[0] for row in rows(result)] == ["scan-1", "scan-2", "scan-3", "scan-10", "absent"]
+    assert "bundles   2 done, 3 failed" in result.stdout
+    # Files are looked at before anything is computed, and each error is told when it comes.
+    first_done = result.stderr.index("1 of 5: scan-1")
+    assert result.stderr.index(f"error: {scans / 'scan-2' / 'bundle.json'} is not a valid") < first_done
+    assert result.stderr.index(f"error: {scans / 'absent' / 'bundle.json'}: expected the description") < first_done
+    assert result.stderr.index(f"error: {scans / 'scan-3'}: the lens cap is on") > first_done
+    # The one that comes next begins with the stage that failed, and is told all the same.
+    assert result.stderr.count("decode ") == 3
+
+
+def test_a_defect_is_told_with_its_place_and_is_the_worst(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    (scans / "scan-1" / "bundle.json").write_text("{}")
+
+    def defect() -> None:
+        raise ZeroDivisionError("of nobody's doing")
+
+    work.wanted["scan-2"] = defect
+    result = run(scans, "--output", tmp_path / "out")
+    assert result.exit_code == 1
+    assert work.seen == ["scan-2", "scan-10"]
+    assert rows(result)[1] == ["scan-2", "failed:", "unexpected"]
+    assert "ZeroDivisionError: of nobody's doing" in result.stderr
+
+
+def test_nothing_is_prepared_for_bundles_that_are_all_broken(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    for each in scans.glob("scan-*"):
+        (each / "bundle.json").write_text("{}")
+    result = run(scans, "--output", tmp_path / "out")
+    assert (result.exit_code, work.prepared, work.seen) == (2, 0, [])
+    assert result.stdout.splitlines()[-1] == "bundles   3 failed"
+
+
+def test_equal_names_are_refused_before_anything_is_computed(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    shutil.copytree(scans / "scan-1", tmp_path / "other" / "Scan-1")
+    result = run(scans, tmp_path / "other" / "Scan-1", "--output", tmp_path / "out")
+    assert (result.exit_code, work.prepared, work.seen) == (2, 0, [])
+    assert f"the same name: {scans / 'scan-1'}, {tmp_path / 'other' / 'Scan-1'}. Rename" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "result"])
+def test_results_of_several_do_not_go_into_the_result_of_one(
+    scans: Path, tmp_path: Path, work: Reconstruction, kind: str
+) -> None:
+    out = tmp_path / "out"
+    if kind == "file":
+        out.write_text("")
+    else:
+        assert run(scans / "scan-1", "--output", out).exit_code == 0
+    work.seen.clear()
+    result = run(scans, "--output", out)
+    assert (result.exit_code, work.seen) == (2, [])
+    assert "name a new folder" in result.stderr
+
+
+def test_ctrl_c_ends_all_and_tells_what_is_done(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    work.wanted["scan-2"] = interrupted
+    result = run(scans, "--output", tmp_path / "out")
+    assert result.exit_code == INTERRUPTED
+    assert work.seen == ["scan-1", "scan-2"]
+    assert within(tmp_path / "out") == ["scan-1"]
+    assert [row[0] for row in rows(result)] == ["scan-1"]
+    assert "bundles   1 done, 2 not done" in result.stdout
+
+
+def test_nothing_of_a_bundle_is_kept_while_the_next_is_worked_on(
+    scans: Path, tmp_path: Path, work: Reconstruction
+) -> None:
+    large: list[weakref.ref[Any]] = []
+
+    class Held:
+        pass
+
+    def fails() -> None:
+        held = Held()
+        large.append(weakref.ref(held))
+        raise NothingToReconstructError(str(held))
+
+    work.wanted["scan-2"] = fails
+    assert run(scans, "--output", tmp_path / "out").exit_code == 2
+    assert work.kept == [0, 0, 0]
+    assert [each() for each in large] == [None]
+
+
+def test_several_are_decoded_alone_too(scans: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (scans / "scan-2" / "bundle.json").write_text("{}")
+    for each in scans.glob("scan-*"):
+        (each / "calibration.json").unlink()
+    result = run(scans, "--output", out, "--decode-only")
+    assert result.exit_code == 2, result.output
+    assert [row[:3] for row in rows(result)] == [
+        ["scan-1", "sample,", "columns"],
+        ["scan-2", "failed:", "bundle"],
+        ["scan-10", "sample,", "columns"],
+    ]
+    assert within(out) == ["scan-1", "scan-10"]
+    assert (out / "scan-10" / "position-sample-column.tiff").is_file()
+    assert result.stdout.splitlines()[-1] == f"pictures  {out}/*"
