@@ -32,7 +32,7 @@ from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.offered import rejected_picture
-from slrig.scan.pictures import Picture, encode_png, preview, rejection_picture
+from slrig.scan.pictures import encode_png, preview, rejection_picture
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
@@ -43,6 +43,7 @@ from slrig.scan.report import (
     redundancy_report,
     with_seconds,
 )
+from slrig.scan.shading import Picture
 from slrig.scan.stream import CameraResult, LiveScan
 from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
 

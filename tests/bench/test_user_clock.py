@@ -2,8 +2,8 @@
 
     pytest tests/bench/test_user_clock.py -s
 
-The frames of the bench scan (`test_pipeline_speed`) are played to a real service at 30 a second by the replay driver, so
-that nothing is rendered beside what is measured. Medians; processor seconds are those of the service and its worker.
+The frames of the bench scan (`test_pipeline_speed`) are played to a real service at 30 a second by the replay driver,
+so that nothing is rendered beside what is measured. Medians; processor seconds are those of the service and its worker.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -131,7 +131,7 @@ def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
         clocks = [Watched(client).clock() for _ in range(RUNS)]
         computed_s = (processor_s(service) - before_s) / RUNS
 
-    def median(of: Any) -> float:
+    def median(of: Callable[[Clock], float]) -> float:
         return statistics.median(of(each) for each in clocks)
 
     rows: dict[str, tuple[float, float | None]] = {
@@ -140,7 +140,8 @@ def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
     }
     for name in clocks[0].files_s:
         goal = TO_MESH_S if name == "mesh.ply" else None
-        rows[f"last frame to {name}"] = (median(lambda c, name=name: c.files_s[name] - c.captured_s), goal)
+        taken = [each.files_s[name] - each.captured_s for each in clocks]
+        rows[f"last frame to {name}"] = (statistics.median(taken), goal)
     rows["last frame to the end"] = (median(lambda c: c.over_s - c.captured_s), TO_ALL_S)
     rows["processor seconds, service and worker"] = (computed_s, None)
     told(rows, f"one scan at a time, medians of {RUNS}")
@@ -155,7 +156,7 @@ def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
             followed.append(Watched(client))
             followed[-1].until("computing")
         clocks = [each.clock() for each in followed]
-    cycle_s = statistics.median(b.posted_s - a.posted_s for a, b in zip(clocks, clocks[1:], strict=False))
+    cycle_s = statistics.median(b.posted_s - a.posted_s for a, b in pairwise(clocks))
     capture_s = statistics.median(each.captured_s - each.began_s for each in clocks)
     rows: dict[str, tuple[float, float | None]] = {
         "capture": (capture_s, None),

@@ -16,6 +16,7 @@ from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FrameSink
 from slrig.model import Black, Calibration, CameraFormat, Frame, PatternSequence, Shot, Size, White
 from slrig.model.header import CaptureHeader
+from slrig.scan.job import Recorded
 from slrig.scan.plan import ScanPlan
 
 WAIT_S = 20.0
@@ -166,7 +167,7 @@ class TameBench:
         progress: Callable[[str, float, str], None],
         cancelled: Callable[[], bool],
         frames: FrameSink,
-    ) -> TameRecording:
+    ) -> Recorded:
         rig.projector.show(0)
         frames.begin(OUTLINE, CALIBRATION)
         frames.take(SHOTS[0])
