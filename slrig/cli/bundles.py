@@ -26,6 +26,8 @@ from slrig.scan.plan import Progress
 
 Row = tuple[str, ...]
 """What the table says of a bundle, or of one of its cameras, beside name and seconds; the last cell is a remark."""
+BUNDLE = "bundle"
+"""The folder of a scan's frames in that of the scan: it is the scan that has a name."""
 _MOST_NAMED = 5
 """Names in one message."""
 
@@ -33,7 +35,7 @@ _MOST_NAMED = 5
 def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
     """The bundles that arguments name, each once, and whether each has a folder of its own for its results.
 
-    An argument is a bundle, a folder whose direct subfolders are bundles, or a pattern that no shell has expanded, as
+    An argument is a bundle, a folder whose direct subfolders are bundles or scans with theirs, or a pattern that no shell has expanded, as
     on Windows. Subfolders that are no bundles are told on stderr. Raises StorageError: a folder cannot be read.
     """
     found: dict[Path, Path] = {}
@@ -104,12 +106,16 @@ def _matching(asked: Path) -> list[Path]:
 
 
 def _bundles_inside(folder: Path) -> list[Path]:
-    """The bundles among the direct subfolders of a folder that is none itself, in natural order."""
+    """The bundles among the direct subfolders of a folder that is none itself, or those of scans among them, in natural
+    order.
+    """
     if not folder.is_dir() or (folder / DESCRIPTION).is_file():
         return []
     inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=_natural)
-    found = [each for each in inside if (each / DESCRIPTION).is_file()]
-    skipped = [each.name for each in inside if each not in found]
+    # A scan of the service has its bundle beside its results.
+    held = {each: [place for place in (each, each / BUNDLE) if (place / DESCRIPTION).is_file()][:1] for each in inside}
+    found = [place for places in held.values() for place in places]
+    skipped = [each.name for each, places in held.items() if not places]
     if found and skipped:
         typer.echo(f"{'skipped':<10}no {DESCRIPTION} in {_listed(skipped)} of {folder}", err=True)
     return found
@@ -122,8 +128,11 @@ def _natural(path: Path) -> list[str | int]:
 
 
 def _name(bundle: Path) -> str:
-    """Name of the bundle's folder; "." and ".." are folders that have one."""
-    return (bundle if bundle.name not in ("", "..") else bundle.resolve()).name or "bundle"
+    """Name of the bundle's folder, or of the scan that holds it; "." and ".." are folders that have one."""
+    place = bundle if bundle.name not in ("", "..") else bundle.resolve()
+    if place.name == BUNDLE:
+        place = place.absolute().parent
+    return place.name or BUNDLE
 
 
 def _listed(names: Sequence[object]) -> str:

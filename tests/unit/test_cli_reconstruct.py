@@ -129,6 +129,16 @@ def test_a_folder_of_bundles_is_worked_through_in_natural_order(
     assert result.stdout.splitlines()[4:] == words
 
 
+@pytest.mark.parametrize("named", ["folder", "bundles"])
+def test_bundles_of_a_service_go_by_their_scans(scans: Path, tmp_path: Path, work: Reconstruction, named: str) -> None:
+    for scan in ("scan-1", "scan-2"):
+        shutil.copytree(scans / scan, tmp_path / "data" / f"id-{scan}" / "bundle")
+    asked = [tmp_path / "data"] if named == "folder" else sorted((tmp_path / "data").glob("*/bundle"))
+    result = run(*asked, "--output", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert within(tmp_path / "out") == ["id-scan-1", "id-scan-2"]
+
+
 def test_a_pattern_that_no_shell_expanded_is_expanded(scans: Path, tmp_path: Path, work: Reconstruction) -> None:
     assert run(scans / "scan-1*", scans / "scan-1", "--output", tmp_path / "out").exit_code == 0
     assert work.seen == ["scan-1", "scan-10"]
