@@ -135,7 +135,7 @@ def test_bundles_of_a_service_go_by_their_scans(scans: Path, tmp_path: Path, wor
         shutil.copytree(scans / scan, tmp_path / "data" / f"id-{scan}" / "bundle")
     asked = [tmp_path / "data"] if named == "folder" else sorted((tmp_path / "data").glob("*/bundle"))
     result = run(*asked, "--output", tmp_path / "out")
-    assert result.exit_code == 0, result.output
+    assert (result.exit_code, work.prepared) == (0, 1), result.output
     assert within(tmp_path / "out") == ["id-scan-1", "id-scan-2"]
 
 
