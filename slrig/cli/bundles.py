@@ -36,7 +36,8 @@ def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
     """The bundles that arguments name, each once, and whether each has a folder of its own for its results.
 
     An argument is a bundle, a folder whose direct subfolders are bundles or scans with theirs, or a pattern that no
-    shell has expanded, as on Windows. Subfolders that are no bundles are told on stderr. Raises StorageError: a folder cannot be read.
+    shell has expanded, as on Windows. Subfolders that are no bundles are told on stderr. Raises StorageError: a folder
+    cannot be read.
     """
     found: dict[Path, Path] = {}
     several = False
