@@ -267,7 +267,7 @@ class ServiceSettings(BaseSettings):
     require_key: bool = True
     allowed_hosts: Annotated[tuple[str, ...], NoDecode] = ()
     queue_length: Annotated[int, Field(ge=0, le=1000)] = 8
-    backlog_length: Annotated[int, Field(ge=1, le=1000)] = 4
+    backlog_length: Annotated[int, Field(ge=1, le=1000)] = 16
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
     max_event_streams: Annotated[int, Field(ge=1)] = 32

@@ -65,6 +65,13 @@ def prepared() -> Prepared:
     return Prepared(sum(bool(each.overloads) for each in needed), len(needed))
 
 
+def all_kept() -> bool:
+    """Whether the disk has every kernel that every scan needs, of the modules that are imported, as their sources are
+    now: for one signature at least, so that nothing has to be compiled ahead.
+    """
+    return all(_is_kept(dispatcher) for dispatcher, in_every_scan in _entries if in_every_scan)
+
+
 @contextmanager
 def compilations_told(tell: Callable[[str], None]) -> Iterator[None]:
     """Call `tell` with the name of each kernel or part whose compilation begins, on the thread that compiles."""
@@ -104,6 +111,10 @@ def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     return compiled
 
 
+def _is_kept(compiled: Any) -> bool:
+    return bool(compiled.overloads) or compiled._cache.kept()  # noqa: SLF001 - see `_compiled`
+
+
 def _is_compiled(function: Any) -> bool:
     return isinstance(function, Dispatcher)
 
@@ -126,6 +137,11 @@ class _KernelCache(FunctionCache):  # type: ignore[misc] # numba is untyped
         super().__init__(function)
         state: dict[str, Any] = self.__dict__
         state["_cache_file"] = _KeyedFiles(function, state["_cache_file"])
+
+    def kept(self) -> bool:
+        """Whether something that was compiled of the present sources is on the disk."""
+        files: _KeyedFiles = self.__dict__["_cache_file"]
+        return files.kept()
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save what was compiled. A disk that refuses costs the next start its time, and fails nothing."""
@@ -161,14 +177,20 @@ class _KeyedFiles(IndexDataCacheFile):  # type: ignore[misc] # numba is untyped
         except (OSError, EOFError, pickle.UnpicklingError):
             return None
 
+    def kept(self) -> bool:
+        return any(Path(self._cache_path).glob(f"{glob.escape(self._base)}.{self._digest_of_sources()}.*.nbc"))
+
     def flush(self) -> None:
         for old in Path(self._cache_path).glob(f"{glob.escape(self._base)}.*.nbc"):
             old.unlink(missing_ok=True)
 
     def _name(self, key: Any) -> str:
+        return f"{self._base}.{self._digest_of_sources()}.{_digest(key)}.nbc"
+
+    def _digest_of_sources(self) -> str:
         if not self._sources:
             self._sources = _digest((self._version, config.BOUNDSCHECK, sorted(_sources(self._function, set()))))
-        return f"{self._base}.{self._sources}.{_digest(key)}.nbc"
+        return self._sources
 
 
 def _digest(value: object) -> str:

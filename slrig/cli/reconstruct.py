@@ -15,7 +15,7 @@ from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.description import read_description
 from slrig.cli.bundles import Row, named_bundles, work_through
 from slrig.cli.display import counted, progress_shown
-from slrig.cli.scan import quality_lines
+from slrig.cli.quality import quality_lines
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
 from slrig.logs import set_up_logs_for_a_person
@@ -134,17 +134,18 @@ def warm() -> None:
 
 
 def prepare_kernels(display: Progress) -> int:
-    """Compile or load the kernels of a usual scan in this process, under progress; return how many."""
+    """Compile the kernels of a usual scan that no earlier run has, under progress; return how many there are."""
     keep_kernels()
     display("loading", 0.0, "")
     # numba itself: a second.
-    from slrig.kernels import Prepared, prepared
+    from slrig.kernels import Prepared, all_kept, prepared
     from slrig.scan.reconstruct import warm_kernels
 
     def told(now: Prepared) -> None:
         display(PREPARING, 0.0, f"first time only: {now.done} of {now.total}")
 
-    warm_kernels(told)
+    if not all_kept():
+        warm_kernels(told)
     return prepared().total
 
 

@@ -12,6 +12,7 @@ import typer
 from slrig.bundle.storage import refusals_of
 from slrig.cli.client import ServiceClient
 from slrig.cli.display import progress_shown
+from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, not_offered, rejected_picture
 
@@ -97,23 +98,3 @@ def tell_result(scan: Mapping[str, Any], output: Path, *, files: tuple[str, ...]
             typer.echo(f"{names.get(name, name):<9} {output / name}")
     for line in quality_lines(scan.get("summary") or {}):
         typer.echo(line)
-
-
-def quality_lines(summary: Mapping[str, Any]) -> list[str]:
-    """What a report's summary says about the frames, the mesh and its error, one line each."""
-    lines = []
-    if summary.get("identity") is not None:
-        lines.append(f"{'frames':<10}{summary['identity']}")
-    mesh = summary.get("mesh") or {}
-    figures = mesh.get("figures") or {}
-    if figures.get("triangles") is not None:
-        lines.append(f"{'size':<10}{figures['vertices']:,} vertices, {figures['triangles']:,} triangles")
-    sigma = (mesh.get("sigma_mm") or {}).get("p50")
-    if sigma is not None:
-        lines.append(f"{'stated':<10}standard deviation of a point {sigma:.4f} mm (median)")
-    truth = summary.get("truth") or {}
-    if truth.get("rms_mm") is not None:
-        complete = truth.get("complete_0.3mm")
-        covered = "" if complete is None else f", {complete:.1%} of the visible surface within 0.3 mm"
-        lines.append(f"{'error':<10}rms {truth['rms_mm']:.4f} mm against the known truth{covered}")
-    return lines + [f"{'note':<10}{words}" for words in summary.get("notes") or []]

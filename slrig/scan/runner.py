@@ -82,7 +82,7 @@ class Runner:
         *,
         capture: CaptureFrames,
         queue_length: int = 8,
-        backlog_length: int = 4,
+        backlog_length: int = 16,
         spare_bytes: int = 0,
         give_up: Callable[[InvalidInputError], None] = lambda _: None,
     ) -> None:

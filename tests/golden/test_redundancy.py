@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from slrig.cli.scan import quality_lines
+from slrig.cli.quality import quality_lines
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import FloatArray

@@ -22,7 +22,8 @@ from slrig.cli.client import ServiceClient, read_key
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
-from slrig.cli.scan import quality_lines, scan_with, tell_result
+from slrig.cli.quality import quality_lines
+from slrig.cli.scan import scan_with, tell_result
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError, SlrigError
 from slrig.scan.offered import MEDIA_TYPES
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from slrig.cli.scan import quality_lines
+from slrig.cli.quality import quality_lines
 from slrig.scan.records import report_summary
 
 

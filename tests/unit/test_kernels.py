@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slrig.kernels import compilations_told, in_bands, kernel
+from slrig import kernels
+from slrig.kernels import all_kept, compilations_told, in_bands, kernel
 
 _ADDS = """
 from slrig.kernels import kernel, kernel_part
@@ -97,6 +98,20 @@ def test_a_compiled_kernel_is_kept_and_a_changed_one_is_compiled_anew(tmp_path: 
     changed = made(tmp_path, added=10)
     assert compiled_by(lambda: changed.sums(values)) == ["sums", "more"]
     assert changed.sums(values) == 23
+
+
+def test_nothing_is_prepared_ahead_once_every_kernel_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def kept(added: int) -> bool:
+        monkeypatch.setattr(kernels, "_entries", [(made(tmp_path, added=added).sums, True)])
+        return all_kept()
+
+    assert not kept(1)
+    made(tmp_path, added=1).sums(np.arange(3.0))
+    assert kept(1)
+    # Its source changed: what lies there is of another kernel.
+    assert not kept(2)
+    monkeypatch.setattr(kernels, "_entries", [(made(tmp_path, added=2).sums, False)])
+    assert all_kept()
 
 
 def test_a_kernel_is_compiled_anew_where_only_a_part_in_another_file_changed(tmp_path: Path) -> None:

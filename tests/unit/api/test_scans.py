@@ -255,7 +255,7 @@ def test_mesh_can_be_fetched_while_pictures_and_figures_are_made(client: TestCli
     assert (early.status_code, early.headers["ETag"]) == (200, f'"{scan_id}/mesh.ply"')
     # The rig is free of it, and says what it computes.
     rig = client.get("/rig").json()
-    assert (rig["holder"], rig["computing"], rig["backlog_length"]) == (None, [scan_id], 4)
+    assert (rig["holder"], rig["computing"], rig["backlog_length"]) == (None, [scan_id], 16)
     # What is made of the mesh, and what is not there yet, waits for the end.
     for name in ("mesh.stl", "report.json", "bundle.zip"):
         refused = client.get(f"/scan/{scan_id}/{name}")
