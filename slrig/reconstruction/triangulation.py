@@ -37,8 +37,9 @@ def camera_projector(
     """Intersect each point's ray with its light sheet.
 
     The sheet of a distorted column is curved, so the depth s along the ray solves column(project(o + s d)) = c by
-    Newton's method on the whole distorted projection. Points behind a device, or met where the projector has no pixel,
-    are left out. Also returns (n,) uint8, `Refusal`: for every point of the ensemble why it was left out, if it was.
+    Newton's method on the whole distorted projection. Points behind a device, or met where the projector has no pixel
+    or its lens has turned back, are left out. Also returns (n,) uint8, `Refusal`: for every point of the ensemble why
+    it was left out, if it was.
     """
     count = len(ensemble.points_px)
     points, deviation = np.zeros((count, 3)), np.zeros((count, 3))
@@ -170,6 +171,9 @@ def _sheet_kernel(
             _, v, zp, xn, yn, gx, gy = _position(p, out[i, 0], out[i, 1], out[i, 2], row)
             if zp <= 0:
                 cause[i] = _BEHIND_DEVICE
+                continue
+            _, _, a, b, c = distorted(p[5:10], xn, yn)
+            if not a * c - b * b > 0:
                 continue
             along[i] = v
             # On the same sheet, for a stripe found a little aside: position(o + s d) stays, so along with the ray's
