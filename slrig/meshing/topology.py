@@ -93,8 +93,15 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
 def used_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
     """(vertex_count,) bool: the vertices that a face uses."""
     used = np.zeros(vertex_count, dtype=np.bool_)
-    used[faces] = True
+    _mark(np.ascontiguousarray(faces), used)
     return used
+
+
+@kernel
+def _mark(faces: IntArray, used: Any) -> None:
+    for face in range(len(faces)):
+        for corner in range(3):
+            used[faces[face, corner]] = True
 
 
 def kept_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
