@@ -98,7 +98,7 @@ def longest_boundary_edge_mm(points_mm: FloatArray, faces: IntArray, /) -> Float
 
 def boundary_point_count(faces: IntArray, adjacency: IntArray, /) -> int:
     """Number of vertices on the boundary; adjacency as `neighbours` gives it."""
-    face, corner = np.nonzero(adjacency < 0)
+    face, corner = np.divmod(np.flatnonzero(adjacency < 0), 3)
     # Every boundary vertex has a half-edge that runs into it.
     return int(np.count_nonzero(np.bincount(faces[face, (corner + 2) % 3])))
 

@@ -95,15 +95,36 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
 def used_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
     """(vertex_count,) bool: the vertices that a face uses."""
     used = np.zeros(vertex_count, dtype=np.bool_)
-    used[faces] = True
+    _mark(np.ascontiguousarray(faces), used)
     return used
+
+
+@kernel
+def _mark(faces: IntArray, used: Any) -> None:
+    for face in range(len(faces)):
+        for corner in range(3):
+            used[faces[face, corner]] = True
 
 
 def kept_faces(faces: IntArray, adjacency: IntArray, kept: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
     """The faces that stay, (F,) bool, in their order, and their neighbours in the new numbering: (K, 3) int32 each."""
-    # Across a boundary lies face -1: the last number is its own.
-    numbers = np.append(np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1)), np.int32(-1))
-    return faces[kept], numbers[adjacency[kept]]
+    numbers = np.where(kept, np.cumsum(kept, dtype=np.int32) - np.int32(1), np.int32(-1))
+    rest = np.zeros((int(np.count_nonzero(kept)), 3), dtype=np.int32)
+    across = np.zeros_like(rest)
+    _keep(np.ascontiguousarray(faces), np.ascontiguousarray(adjacency), kept, numbers, rest, across)
+    return rest, across
+
+
+@kernel
+def _keep(faces: IntArray, adjacency: IntArray, kept: Any, numbers: IntArray, rest: Any, across: Any) -> None:
+    count = 0
+    for face in range(len(faces)):
+        if kept[face]:
+            for corner in range(3):
+                other = adjacency[face, corner]
+                rest[count, corner] = faces[face, corner]
+                across[count, corner] = numbers[other] if other >= 0 else -1
+            count += 1
 
 
 def _vertex_bound(faces: IntArray) -> int:

@@ -41,12 +41,12 @@ def compact_mesh(
     position_px : (c,) float64, projector column of each curve.
     """
     used = used_vertices(faces, len(points_mm))
-    numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    numbers, where = np.cumsum(used, dtype=np.int32) - np.int32(1), np.flatnonzero(used)
     return Mesh(
-        vertices_mm=points_mm[used].astype(np.float32),
+        vertices_mm=np.take(points_mm, where, axis=0).astype(np.float32),
         faces=numbers[faces],
-        normals=normals[used],
-        grey=grey[used],
-        sigma_mm=sigma_mm[used].astype(np.float32),
-        stripe=np.repeat(np.floor(position_px).astype(np.int32), np.diff(offsets))[used],
+        normals=np.take(normals, where, axis=0),
+        grey=np.take(grey, where),
+        sigma_mm=np.take(sigma_mm, where).astype(np.float32),
+        stripe=np.take(np.repeat(np.floor(position_px).astype(np.int32), np.diff(offsets)), where),
     )

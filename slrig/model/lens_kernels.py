@@ -12,7 +12,7 @@ import numpy as np
 from slrig.kernels import kernel_part
 from slrig.model import lens as model
 
-_STEPS = 30  # Newton's method doubles the digits with each: what needs more does not settle
+STEPS = 30  # Newton's method doubles the digits with each: what needs more does not settle
 
 distorted = kernel_part(inline="always")(model.distorted)
 by_terms = kernel_part(inline="always")(model.by_terms)
@@ -25,15 +25,24 @@ def undistorted(lens: Any, xd: float, yd: float, x: float, y: float, settled: fl
     lens : (5,) float64; settled : a step shorter than this is the last, and leaves about the square of it.
     NaN for a point that the lens cannot light: beyond the radius where its distortion turns back there is no direction.
     """
-    for _ in range(_STEPS):
-        gx, gy, a, b, c = distorted(lens, x, y)
-        det = a * c - b * b
-        if not det > 0:
-            break
-        scale = 1 / det
-        dx, dy = (c * (xd - gx) - b * (yd - gy)) * scale, (a * (yd - gy) - b * (xd - gx)) * scale
+    for _ in range(STEPS):
+        dx, dy = step_back(lens, xd, yd, x, y)
         x += dx
         y += dy
-        if dx * dx + dy * dy < settled * settled:
+        size = dx * dx + dy * dy
+        if size < settled * settled:
             return x, y
+        if np.isnan(size):
+            break
     return np.nan, np.nan
+
+
+@kernel_part(inline="always")
+def step_back(lens: Any, xd: float, yd: float, x: float, y: float) -> Any:
+    """A step of Newton's method from (x, y) towards the point that the lens sends to (xd, yd); NaN where the lens has
+    turned back.
+    """
+    gx, gy, a, b, c = distorted(lens, x, y)
+    det = a * c - b * b
+    scale = 1 / det if det > 0 else np.nan
+    return (c * (xd - gx) - b * (yd - gy)) * scale, (a * (yd - gy) - b * (xd - gx)) * scale

@@ -15,7 +15,7 @@ from slrig.model import FloatArray, Pinhole
 from slrig.model.lens_kernels import distorted, undistorted
 
 _POINTS = 1024  # that are worth calling a kernel for
-_SETTLED = 1e-7  # of normalised coordinates
+SETTLED = 1e-7  # a step shorter than this, in normalised coordinates, is the last of the way back through a lens
 
 
 def packed(device: Pinhole) -> FloatArray:
@@ -50,18 +50,18 @@ def to_depths(device: Pinhole, points_mm: FloatArray) -> FloatArray:
     return np.asarray(points_mm @ device.rotation[2] + device.translation_mm[2])
 
 
+@kernel_part(inline="always")
+def distorted_from_pixel(d: Any, u: float, v: float) -> Any:
+    """Normalised coordinates of a pixel, as the lens distorted them."""
+    yd = (v - d[4]) / d[3]
+    return (u - d[2] - d[1] * yd) / d[0], yd
+
+
 @kernel_part
 def normalised_from_pixel(d: Any, u: float, v: float) -> Any:
     """Undistorted normalised coordinates of a pixel, NaN for one that the lens cannot light."""
-    yd = (v - d[4]) / d[3]
-    return normalised_near(d, u, v, (u - d[2] - d[1] * yd) / d[0], yd)
-
-
-@kernel_part
-def normalised_near(d: Any, u: float, v: float, x: float, y: float) -> Any:
-    """As `normalised_from_pixel`, from a start: coordinates that are known to be near."""
-    yd = (v - d[4]) / d[3]
-    return undistorted(d[5:10], (u - d[2] - d[1] * yd) / d[0], yd, x, y, _SETTLED)
+    xd, yd = distorted_from_pixel(d, u, v)
+    return undistorted(d[5:10], xd, yd, xd, yd, SETTLED)
 
 
 @kernel_part

@@ -9,26 +9,14 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import Axis, Pinhole, Refusal, Source
-from slrig.model.lens_kernels import distorted
 from slrig.reconstruction.epipolar import runs_down
+from slrig.reconstruction.light_sheet import on_light_sheets
 from slrig.reconstruction.linking import StripeEnsemble
-from slrig.reconstruction.optics import (
-    normalised_from_pixel,
-    normalised_near,
-    packed,
-    project,
-    rays,
-    to_device,
-    world_ray,
-)
+from slrig.reconstruction.optics import packed, project, rays, world_ray
 from slrig.reconstruction.sheet_curves import SheetCurves, ordered_along_sheet, selected
 
-_NEWTON_STEPS = 25  # two to four, of sheets of strong lenses as well; more is a start that does not settle
-_CONVERGED_PX = 1e-5  # before the last step of Newton's method, which leaves about the square of it
 _PROBE_PX = 1e-3  # far above rounding, and a point moves straight over so little
 _BORDER_PX = 2.0  # beyond the projector's image; chosen, 0 and 4 give the same figures of a rendered vase
-_NEAR_PX = 3.0  # so near to the last point, its ray is moved on for a start of Newton's method
-_NONE, _BEHIND_DEVICE = int(Refusal.NONE), int(Refusal.BEHIND_DEVICE)
 
 
 def camera_projector(
@@ -36,18 +24,10 @@ def camera_projector(
 ) -> tuple[SheetCurves, NDArray[np.uint8]]:
     """Intersect each point's ray with its light sheet.
 
-    The sheet of a distorted column is curved, so the depth s along the ray solves column(project(o + s d)) = c by
-    Newton's method on the whole distorted projection. Points behind a device, or met where the projector has no pixel,
-    are left out. Also returns (n,) uint8, `Refusal`: for every point of the ensemble why it was left out, if it was.
+    Points behind a device, or met where the projector has no pixel or its lens has turned back, are left out. Also
+    returns (n,) uint8, `Refusal`: for every point of the ensemble why it was left out, if it was.
     """
-    count = len(ensemble.points_px)
-    points, deviation = np.zeros((count, 3)), np.zeros((count, 3))
-    along, cause = np.full(count, np.nan), np.full(count, Refusal.NO_INTERSECTION, dtype=np.uint8)
-    in_bands(
-        _sheet_kernel, len(ensemble.position_px), packed(camera), packed(projector), camera.centre_mm,
-        ensemble.points_px, ensemble.normals, ensemble.sigma_px, ensemble.offsets, ensemble.position_px,
-        axis is Axis.ROW, points, deviation, along, cause,
-    )  # fmt: skip
+    points, deviation, along, cause = on_light_sheets(ensemble, camera, projector, axis)
     other = Axis.ROW if axis is Axis.COLUMN else Axis.COLUMN
     outside = ~((along > -_BORDER_PX) & (along < projector.size.along(other) - 1 + _BORDER_PX))
     cause[outside & (cause == Refusal.NONE)] = Refusal.OFF_PROJECTOR
@@ -97,98 +77,6 @@ def camera_camera(first: StripeEnsemble, second: StripeEnsemble, camera: Pinhole
         source=np.full(len(points), Source.CAMERA_CAMERA, dtype=np.uint8),
     )
     return ordered_along_sheet(selected(made, good))
-
-
-@kernel_part(inline="always")
-def _position(p: Any, x: float, y: float, z: float, row: bool) -> Any:
-    """Projector position of a world point along the coded axis, and along the other one; z_p tells behind."""
-    xp, yp, zp = to_device(p, x, y, z)
-    xn, yn = xp / zp, yp / zp
-    xd, yd, a, b, c = distorted(p[5:10], xn, yn)
-    u, v = p[0] * xd + p[1] * yd + p[2], p[3] * yd + p[4]
-    if row:
-        return v, u, zp, xn, yn, p[3] * b, p[3] * c
-    return u, v, zp, xn, yn, p[0] * a + p[1] * b, p[0] * b + p[1] * c
-
-
-@kernel_part
-def _depth_on_sheet(p: Any, o: Any, d: Any, position: float, row: bool, s: float) -> float:
-    """The s with position(o + s d) = position, from a start; NaN when it does not settle."""
-    dx = p[10] * d[0] + p[11] * d[1] + p[12] * d[2]
-    dy = p[13] * d[0] + p[14] * d[1] + p[15] * d[2]
-    dz = p[16] * d[0] + p[17] * d[1] + p[18] * d[2]
-    for _ in range(_NEWTON_STEPS):
-        got, _v, zp, xn, yn, gx, gy = _position(p, o[0] + s * d[0], o[1] + s * d[1], o[2] + s * d[2], row)
-        slope = (gx * (dx - xn * dz) + gy * (dy - yn * dz)) / zp
-        if slope == 0 or not np.isfinite(slope):
-            return np.nan
-        step = (got - position) / slope
-        s -= step
-        if abs(got - position) < _CONVERGED_PX:
-            return s
-    return np.nan
-
-
-@kernel
-def _sheet_kernel(
-    first: int, last: int, camera: Any, projector: Any, centre: Any, points: Any, normals: Any, sigma: Any,
-    offsets: Any, positions: Any, row: bool, out: Any, deviation: Any, along: Any, cause: Any,
-) -> None:  # fmt: skip
-    p = projector
-    ox, oy, oz = to_device(p, centre[0], centre[1], centre[2])
-    for curve in range(first, last):
-        position = positions[curve]
-        d = np.zeros(3)
-        slope_d = np.zeros(3)
-        # Newton's method starts on the plane that touches the sheet at the projector's principal point.
-        n = normalised_from_pixel(p, p[2], position)[1] if row else normalised_from_pixel(p, position, p[4])[0]
-        base = 13 if row else 10
-        from_plane = n * oz - (oy if row else ox)
-        x = y = dxu = dxv = dyu = dyv = np.nan
-        for i in range(offsets[curve], offsets[curve + 1]):
-            du, dv = points[i, 0] - points[max(i - 1, 0), 0], points[i, 1] - points[max(i - 1, 0), 1]
-            if abs(du) < _NEAR_PX and abs(dv) < _NEAR_PX and x == x and dxu == dxu:
-                # One step from the point before is all but there.
-                x, y = normalised_near(
-                    camera, points[i, 0], points[i, 1], x + dxu * du + dxv * dv, y + dyu * du + dyv * dv
-                )
-            else:
-                x, y = normalised_from_pixel(camera, points[i, 0], points[i, 1])
-            for k in range(3):
-                d[k] = camera[10 + k] * x + camera[13 + k] * y + camera[16 + k]
-            towards = p[base] * d[0] + p[base + 1] * d[1] + p[base + 2] * d[2]
-            deep = p[16] * d[0] + p[17] * d[1] + p[18] * d[2]
-            if towards == n * deep:
-                continue
-            s = _depth_on_sheet(p, centre, d, position, row, from_plane / (towards - n * deep))
-            if not s > 0:
-                if s <= 0:
-                    cause[i] = _BEHIND_DEVICE
-                continue
-            for k in range(3):
-                out[i, k] = centre[k] + s * d[k]
-            _, v, zp, xn, yn, gx, gy = _position(p, out[i, 0], out[i, 1], out[i, 2], row)
-            if zp <= 0:
-                cause[i] = _BEHIND_DEVICE
-                continue
-            along[i] = v
-            # On the same sheet, for a stripe found a little aside: position(o + s d) stays, so along with the ray's
-            # direction its depth changes by ds = -s ∇position · dd / ∇position · d.
-            _, _, a, b, c = distorted(camera[5:10], x, y)
-            fx, fy = 1 / (camera[0] * (a * c - b * b)), 1 / (camera[3] * (a * c - b * b))
-            skew = camera[1] / camera[0]
-            dxu, dxv, dyu, dyv = c * fx, -(b + c * skew) * fy, -b * fx, (a + b * skew) * fy
-            dx, dy = dxu * normals[i, 0] + dxv * normals[i, 1], dyu * normals[i, 0] + dyv * normals[i, 1]
-            along_d = across_d = 0.0
-            for k in range(3):
-                slope_d[k] = camera[10 + k] * dx + camera[13 + k] * dy
-                gradient = gx * (p[10 + k] - xn * p[16 + k]) + gy * (p[13 + k] - yn * p[16 + k])
-                along_d += gradient * d[k]
-                across_d += gradient * slope_d[k]
-            for k in range(3):
-                deviation[i, k] = s * (slope_d[k] - across_d / along_d * d[k]) * sigma[i]
-            if np.isfinite(deviation[i, 0]):
-                cause[i] = _NONE
 
 
 @kernel_part

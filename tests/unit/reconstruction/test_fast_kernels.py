@@ -11,7 +11,6 @@ import pytest
 from slrig.kernels import in_bands
 from slrig.model import FloatArray
 from slrig.reconstruction.chaining import _order_kernel, chain_frames
-from slrig.reconstruction.optics import normalised_from_pixel, normalised_near, packed
 from slrig.reconstruction.sheet_curves import SheetCurves
 from slrig.reconstruction.steger import (
     _TAYLOR_BOX,
@@ -23,7 +22,6 @@ from slrig.reconstruction.steger import (
     taylor_step,
 )
 from slrig.reconstruction.stripes import gathered
-from tests.unit.reconstruction.builders import CAMERA
 
 KINDS = pytest.mark.parametrize("kind", [RIDGE, EDGE])
 
@@ -170,12 +168,3 @@ def test_gathering_is_indexing() -> None:
             wanted, got = getattr(curves, name)[index], getattr(taken, name)
             assert got.dtype == wanted.dtype
             np.testing.assert_array_equal(got, wanted)
-
-
-def test_a_start_nearby_leads_to_the_same_ray() -> None:
-    device = packed(CAMERA)
-    for u, v in ((10.0, 12.5), (120.3, 77.7)):
-        wanted = normalised_from_pixel(device, u, v)
-        for away in ((0.0, 0.0), (2e-3, -1e-3), (1e-8, 1e-8)):
-            got = normalised_near(device, u, v, wanted[0] + away[0], wanted[1] + away[1])
-            np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slrig.model import Axis, FloatArray, Pinhole, Refusal, Source
+from slrig.model import Axis, FloatArray, Pinhole, Refusal, Size, Source
 from slrig.reconstruction.linking import StripeEnsemble
 from slrig.reconstruction.triangulation import SheetCurves, camera_projector
 from tests.unit.reconstruction.builders import (
@@ -17,6 +17,7 @@ from tests.unit.reconstruction.builders import (
     Sphere,
     ensemble_of,
     lit_rows,
+    looking,
     opencv_pixels,
     opencv_rays,
 )
@@ -144,6 +145,23 @@ def test_points_behind_the_projector_are_left_out_and_say_so() -> None:
     curves, cause = camera_projector(ensemble, CAMERA, away, Axis.COLUMN)
     assert len(curves.points_mm) == 0
     assert set(cause.tolist()) == {Refusal.BEHIND_DEVICE}
+
+
+def test_nothing_is_met_where_the_projectors_lens_has_turned_back() -> None:
+    # x (1 - 0.5 r²) turns back at r = 0.82; points beyond have positions in the image all the same, but no light.
+    camera = looking((-90.0, 0.0, -500.0), (0.0, 150.0, 0.0), size=Size(640, 480), focal_px=(300.0, 300.0),
+                     distortion=(0.0, 0.0, 0.0, 0.0, 0.0))  # fmt: skip
+    barrel = looking((60.0, 0.0, -500.0), (60.0, 0.0, 0.0), size=Size(320, 240), focal_px=(200.0, 200.0),
+                     distortion=(-0.5, 0.0, 0.0, 0.0, 0.0))  # fmt: skip
+    for down, lit in ((np.linspace(0.2, 0.7, 9), True), (np.linspace(0.9, 1.2, 9), False)):
+        points = barrel.centre_mm + 500 * np.column_stack([np.full(9, 0.1), down, np.ones(9)])
+        at = opencv_pixels(barrel, points)
+        assert ((at > 0) & (at < [319, 239])).all()
+        order = np.argsort(at[:, 0])
+        ensemble = ensemble_of(list(opencv_pixels(camera, points)[order][:, None, :]), at[order, 0].tolist())
+        curves, cause = camera_projector(ensemble, camera, barrel, Axis.COLUMN)
+        assert set(cause.tolist()) == {Refusal.NONE if lit else Refusal.NO_INTERSECTION}
+        np.testing.assert_allclose(curves.points_mm, points[order][: 9 * lit], rtol=0, atol=1e-6)
 
 
 def test_a_ray_that_runs_along_its_light_sheet_meets_it_nowhere() -> None:
