@@ -10,7 +10,7 @@ from fastapi import APIRouter, Body, Response
 from slrig.api.artefacts import ready_files
 from slrig.api.idempotency import IdempotencyKey, started_once
 from slrig.api.openapi import problems
-from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, scan_body, scan_plan
+from slrig.api.schemas import ScanBody, ScanPage, ScanRequest, ScanSeries, scan_body, scan_plan
 from slrig.api.service import Cursor, PageLength, Service, Serving, paged
 from slrig.jobs.records import JobRecord
 from slrig.verify.verification import require_healthy
@@ -31,7 +31,10 @@ def start_scan(
     def start(key: str | None) -> UUID:
         health, _, _ = service.verifications.health()
         require_healthy(health, refuse_when_stale=service.refuse_when_stale)
-        return service.runner.submit(plan, label=request.label, wait=request.if_busy == "queue", key=key).id
+        return service.runner.submit(
+            plan, label=request.label, wait=request.if_busy == "queue", key=key,
+            repeat=request.repeat, every_s=request.every_s or 0.0,
+        ).id  # fmt: skip
 
     record = started_once(service.keys, service.store, idempotency_key, "/scan", request, start)
     response.headers["Location"] = f"/scan/{record.id}"
@@ -61,6 +64,18 @@ def look_at_scan(service: Serving, scan_id: UUID) -> ScanBody:
 def cancel_scan(service: Serving, scan_id: UUID) -> ScanBody:
     """Ask a scan to stop between two frames. May be repeated; a scan that has finished stays as it is."""
     return _body(service, service.runner.cancel(scan_id))
+
+
+@router.get("/series/{series_id}")
+def look_at_series(service: Serving, series_id: UUID) -> ScanSeries:
+    """Return the scans of a series. One that is not due yet is queued; `plan.series` says when it is."""
+    return ScanSeries(scans=[_body(service, record) for record in service.runner.series(series_id)])
+
+
+@router.post("/series/{series_id}/cancel", status_code=202)
+def cancel_series(service: Serving, series_id: UUID) -> ScanSeries:
+    """Ask all scans of a series to stop. May be repeated; those that have finished stay as they are."""
+    return ScanSeries(scans=[_body(service, record) for record in service.runner.cancel_series(series_id)])
 
 
 @router.put("/{scan_id}/pin")

@@ -20,6 +20,8 @@ from slrig.model import Axis, FlipRule, Size
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 
 MOST_EXPOSURE_S = 60.0
+MOST_REPEATS = 500
+"""Of one request: more are for a schedule, which outlives what happens to one series."""
 Body = TypeVar("Body", bound=BaseModel)
 
 
@@ -93,6 +95,23 @@ class ScanRequest(Strict):
         default="reject", description="what to do while the rig is held: answer 409, or wait in line"
     )
 
+    repeat: Annotated[int, Field(ge=1, le=MOST_REPEATS)] = Field(
+        default=1, description="a series of so many scans; the answer is the first one, `links.series` leads to all"
+    )
+    every_s: Annotated[float, Field(ge=0, le=86400)] | None = Field(
+        default=None,
+        description="of a series: a scan begins so long after the one before it began, or as soon as the rig is free, "
+        "if that is later. Default: as soon as the rig is free",
+    )
+
+    @field_validator("every_s")
+    @classmethod
+    def _of_a_series(cls, every_s: float | None, info: ValidationInfo) -> float | None:
+        if every_s is not None and info.data.get("repeat") == 1:
+            message = "expected repeat above 1 beside it, found none; say how many scans, or leave every_s out"
+            raise ValueError(message)
+        return every_s
+
     @field_validator("exposures_s")
     @classmethod
     def _alone(cls, exposures_s: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
@@ -158,6 +177,7 @@ class ScanLinks(BaseModel):
     self: str
     events: str
     cancel: str
+    series: str | None = Field(description="all scans of the series that this one belongs to; null for one alone")
     files: dict[str, str]
 
 
@@ -195,6 +215,12 @@ class ScanBody(BaseModel):
     links: ScanLinks
 
 
+class ScanSeries(BaseModel):
+    """The scans of a series that are on record, in their order."""
+
+    scans: list[ScanBody]
+
+
 class ScanPage(BaseModel):
     """Scans from new to old. `next` asks for the page after this one, null on the last."""
 
@@ -205,7 +231,8 @@ class ScanPage(BaseModel):
 def scan_body(record: JobRecord, files: Mapping[str, str]) -> ScanBody:
     """A record as an answer; `files` maps the names of those that are ready to their paths."""
     here = f"/scan/{record.id}"
-    links = ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=dict(files))
+    series = None if record.parent is None else f"/scan/series/{record.parent}"
+    links = ScanLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", series=series, files=dict(files))
     return filled(ScanBody, record, error=record.fault, links=links)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -32,7 +33,8 @@ class Job:
     free for the next job; None where there is none. clear_up : does what remains, on the same thread as the part that
     was done last; after `work` the rig is not free yet. concluded : takes note, on any thread, how it ended; a lock is
     held: it returns at once. ended : called once, when the rig is free. These three are given what was raised, None
-    where nothing was. stop : set when it is to end early.
+    where nothing was. due_s : by `time.monotonic`, before which it does not begin and others may pass it. stop : set
+    when it is to end early.
     """
 
     id: UUID
@@ -43,6 +45,7 @@ class Job:
     compute: Callable[[Job], None] | None = None
     clear_up: Callable[[Exception | None], None] = lambda _: None
     concluded: Callable[[Exception | None], None] = lambda _: None
+    due_s: float = -math.inf
     stop: threading.Event = field(default_factory=threading.Event)
     _error: Exception | None = None
     _noted: bool = False

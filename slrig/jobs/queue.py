@@ -89,8 +89,8 @@ class JobQueue:
         if call is not None:
             raise DeviceError(call.hangs())
 
-    def submit(self, make: Callable[[], Job], *, wait: bool) -> None:
-        """Put the job that `make` returns in line; `wait` lets it stand behind others.
+    def submit(self, make: Callable[[], Sequence[Job]], *, wait: bool) -> None:
+        """Put the jobs that `make` returns in line; `wait` lets the first stand behind others.
 
         Raises
         ------
@@ -104,14 +104,14 @@ class JobQueue:
         with self._changed:
             if self._ending:
                 raise interruption()
-            ahead = self._active or (self._waiting[0] if self._waiting else None)
+            waiting = self._due()
+            ahead = self._active or (waiting[0] if waiting else None)
             if ahead is not None and not wait:
                 raise busy(ahead)
-            if len(self._waiting) >= self.queue_length and ahead is not None:
-                message = f"The rig is held and {len(self._waiting)} are waiting, as many as may. Try again later."
+            if len(waiting) >= self.queue_length and ahead is not None:
+                message = f"The rig is held and {len(waiting)} are waiting, as many as may. Try again later."
                 raise QueueFullError(message)
-            job = make()
-            self._waiting.append(job)
+            self._waiting.extend(make())
             self._changed.notify_all()
         self._previews.interrupt()
 
@@ -172,7 +172,7 @@ class JobQueue:
             active = self._active
             holder, since = (None, None) if active is None else (active.holder, active.since)
             computing = tuple(job.holder for job in self._computing)
-            return QueueStatus(holder, since, len(self._waiting), computing, self._ending)
+            return QueueStatus(holder, since, len(self._due()), computing, self._ending)
 
     @property
     def ending(self) -> bool:
@@ -257,18 +257,31 @@ class JobQueue:
     def _next(self) -> Job | None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._wanted() or self._previews.wanted)
+                self._changed.wait_for(lambda: self._wanted() or self._previews.wanted, self._until_due_s())
                 if self._ending:
                     return None
                 if self._wanted():
-                    self._active = self._waiting.popleft()
+                    self._active = self._due()[0]
+                    self._waiting.remove(self._active)
                     return self._active
-            self._show()
+                looks = self._previews.wanted
+            if looks:
+                self._show()
 
     def _wanted(self) -> bool:
         """Whether the service ends, or a job waits that may begin: in their order, while few enough compute."""
-        full = len(self._computing) >= self.backlog_length
-        return self._ending or bool(self._waiting and not (full and self._waiting[0].compute is not None))
+        full, waiting = len(self._computing) >= self.backlog_length, self._due()
+        return self._ending or bool(waiting and not (full and waiting[0].compute is not None))
+
+    def _due(self) -> list[Job]:
+        """The jobs that wait for nothing but the rig, in their order; with the lock held."""
+        now_s = time.monotonic()
+        return [job for job in self._waiting if job.due_s <= now_s]
+
+    def _until_due_s(self) -> float | None:
+        """How long no further job becomes due; None where none waits for its time."""
+        now_s = time.monotonic()
+        return min((job.due_s - now_s for job in self._waiting if job.due_s > now_s), default=None)
 
     def _wake(self) -> None:
         with self._changed:

@@ -58,15 +58,27 @@ class JobStore:
         store's, its first by default.
         """
         row = _new_row(job_id or uuid4(), kind or self.kinds[0], plan, rig=rig, label=label, parent=parent)
-        row.state, row.created_at, row.stage, row.pinned = JobState.QUEUED, self._now(), "waiting", False
+        return self._queued([row], key)[0]
+
+    def create_series(
+        self, plans: Sequence[Mapping[str, Any]], *, rig: str, label: str | None, parent: UUID, key: str | None = None
+    ) -> list[JobRecord]:
+        """Record jobs of one parent as queued, all of them or none; the key is that of the first."""
+        kind = self.kinds[0]
+        rows = [_new_row(uuid4(), kind, plan, rig=rig, label=label, parent=parent) for plan in plans]
+        return self._queued(rows, key)
+
+    def _queued(self, rows: Sequence[JobRow], key: str | None) -> list[JobRecord]:
         with self.database.changing() as session:
-            session.add(row)
-            session.flush()
+            for row in rows:
+                row.state, row.created_at, row.stage, row.pinned = JobState.QUEUED, self._now(), "waiting", False
+                session.add(row)
+                session.flush()
+                _append(session, row, "state", {"state": row.state, "time": row.created_at})
             if key is not None and (held := session.get(KeyRow, key)) is not None:
-                held.job_id = row.id
-            _append(session, row, "state", {"state": row.state, "time": row.created_at})
-            made = _record(row)
-        if parent is not None:
+                held.job_id = rows[0].id
+            made = [_record(row) for row in rows]
+        for parent in {record.parent for record in made if record.parent is not None}:
             self._wake(parent)
         return made
 

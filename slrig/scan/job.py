@@ -4,6 +4,7 @@ whatever happens.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from slrig.jobs.endings import Ending, Endings, ending_by
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
-from slrig.jobs.records import JobRecord, JobState
+from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.jobs.worker_process import Task
@@ -104,9 +105,13 @@ def scan_job(record: JobRecord, tools: ScanTools) -> Job:
     holder = Holder(str(record.id), f"scan {record.id}", f"/scan/{record.id}")
     # Where the service was killed while it reconstructed, all that is needed lies there.
     work = None if record.state is JobState.COMPUTING else scan.capture
-    return Job(
+    job = Job(
         record.id, holder, record.created_at, work, scan.ended, scan.reconstruct, scan.clear_up, scan.concluded
     )  # fmt: skip
+    series = scan.plan.series
+    if series is not None:
+        job.due_s = time.monotonic() + (series.due_at - utc_now()).total_seconds()
+    return job
 
 
 class _Scan:
@@ -115,7 +120,7 @@ class _Scan:
     def __init__(self, record: JobRecord, tools: ScanTools) -> None:
         self._record = record
         self._id = record.id
-        self._plan = plan_from_json(record.plan)
+        self.plan = plan_from_json(record.plan)
         self._tools = tools
         self._job: Job | None = None
         self._feed: FrameFeed | None = None
@@ -176,7 +181,7 @@ class _Scan:
         rig = held.open()
         held.refuse_misfit()
         if held.facts is not None:
-            frame_bytes = check_plan(self._plan, held.facts, rig.calibration)
+            frame_bytes = check_plan(self.plan, held.facts, rig.calibration)
             tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
         tools.folder.stage(self._id)
         feed = self._feed = tools.worker.feed()
@@ -184,7 +189,7 @@ class _Scan:
         try:
             with driver_errors(held.name):
                 self._recording = tools.capture(
-                    rig, self._plan, tools.folder.recording(self._id),
+                    rig, self.plan, tools.folder.recording(self._id),
                     progress=progress, cancelled=job.stop.is_set, frames=feed,
                 )  # fmt: skip
         except Exception as error:
@@ -206,7 +211,7 @@ class _Scan:
         self._captured = on_record
         staged = tools.folder.clear_results(self._id)
         bundle, result = staged / "bundle", tools.folder.stage_result(self._id)
-        call = reconstruction(tools.worker.module, bundle, result, self._plan.reconstruction)
+        call = reconstruction(tools.worker.module, bundle, result, self.plan.reconstruction)
         progress = self._progress(CAPTURE_SHARE, 1.0)
         feed, self._feed = self._feed, None
         report: Mapping[str, Any] = tools.worker.run(
@@ -217,7 +222,7 @@ class _Scan:
         write_record(
             staged,
             KeptRecord(
-                self._id, record.rig, record.label, self._plan, record.created_at, job.since, record.requested_by
+                self._id, record.rig, record.label, self.plan, record.created_at, job.since, record.requested_by
             ),
         )
         tools.folder.commit(self._id)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
 from typing import Protocol
+from uuid import UUID
 
 from slrig.errors import ConfigError
 from slrig.model import Axis, FlipRule, bracket_fault
@@ -89,13 +91,26 @@ class ReconstructionPlan:
 
 
 @dataclass(frozen=True, slots=True)
+class SeriesPlace:
+    """A scan's place in a series. id : names the series; number : 1 for the first of `count`; due_at : with a time
+    zone, before which it does not begin.
+    """
+
+    id: UUID
+    number: int
+    count: int
+    due_at: datetime
+
+
+@dataclass(frozen=True, slots=True)
 class ScanPlan:
     """One scan: patterns, exposure, reconstruction. `exposure_s` None keeps what the rig file says per camera.
 
     exposures_s : a bracket, for an object that is dark here and shines there: the sequence is played once for each of
     these exposure times, and the frames are fused. They are times and not multiples of what each camera has, like
     `exposure_s`: so every one can be a whole number of a projector's refreshes (of 1/60 s, say), and is checked against
-    what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order.
+    what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order. series : None for a
+    scan alone.
 
     Raises
     ------
@@ -107,6 +122,7 @@ class ScanPlan:
     reconstruction: ReconstructionPlan = field(default_factory=ReconstructionPlan)
     exposure_s: float | None = None
     exposures_s: tuple[float, ...] | None = None
+    series: SeriesPlace | None = None
 
     def __post_init__(self) -> None:
         if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
@@ -128,3 +144,18 @@ class ScanPlan:
         if self.exposures_s is not None:
             return tuple(sorted(self.exposures_s))
         return () if self.exposure_s is None else (self.exposure_s,)
+
+
+def series_of(plan: ScanPlan, series: UUID, *, count: int, every_s: float, begins_at: datetime) -> tuple[ScanPlan, ...]:
+    """The plans of a series: one scan every `every_s`, or as fast as the rig can where it needs longer.
+
+    >>> from datetime import UTC
+    >>> begins_at = datetime(2026, 11, 25, tzinfo=UTC)
+    >>> _, second = series_of(ScanPlan(), UUID(int=7), count=2, every_s=90, begins_at=begins_at)
+    >>> second.series.number, str(second.series.due_at)
+    (2, '2026-11-25 00:01:30+00:00')
+    """
+    return tuple(
+        replace(plan, series=SeriesPlace(series, 1 + index, count, begins_at + timedelta(seconds=index * every_s)))
+        for index in range(count)
+    )

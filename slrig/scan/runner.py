@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Protocol
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import structlog
 
 from slrig.devices import Rig
-from slrig.errors import InvalidInputError, ScanInterruptedError, ScanStateError
+from slrig.errors import InvalidInputError, JobNotFoundError, ScanInterruptedError, ScanStateError
 from slrig.failure import UNEXPECTED, failure_of
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.endings import Endings
@@ -25,7 +25,7 @@ from slrig.jobs.worker import Worker
 from slrig.rig.preview import Light, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_errors
 from slrig.scan.job import CaptureFrames, ScanTools, WatchesHealth, scan_job
-from slrig.scan.plan import ScanPlan
+from slrig.scan.plan import ScanPlan, series_of
 from slrig.scan.plan_check import check_plan
 from slrig.scan.records import plan_json
 
@@ -105,8 +105,18 @@ class Runner:
         """Put scans in line that a kill of the service left unfinished, see `slrig.scan.sweep`; before `start`."""
         self._queue.take_up([scan_job(self._store.get(scan), self._tools) for scan in scans])
 
-    def submit(self, plan: ScanPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
-        """Record a scan and have it done; `wait` lets it queue behind others.
+    def submit(
+        self,
+        plan: ScanPlan,
+        *,
+        label: str | None,
+        wait: bool,
+        key: str | None = None,
+        repeat: int = 1,
+        every_s: float = 0.0,
+    ) -> JobRecord:
+        """Record a scan and have it done; `wait` lets it queue behind others. repeat : so many scans, one every
+        `every_s`; the first one's record is returned.
 
         Raises
         ------
@@ -130,17 +140,34 @@ class Runner:
         rig.refuse_misfit()
         # Frames once as captured, and as much again for meshes and the zipped bundle of a careful client.
         self._folder.require_space(2 * frame_bytes + self._tools.spare_bytes)
-        record: JobRecord | None = None
+        records: list[JobRecord] = []
 
-        def make() -> Job:
-            nonlocal record
-            record = self._store.create(plan_json(plan), rig=rig.name, label=label, key=key)
-            return scan_job(record, self._tools)
+        def make() -> list[Job]:
+            if repeat == 1:
+                records.append(self._store.create(plan_json(plan), rig=rig.name, label=label, key=key))
+            else:
+                series = uuid4()
+                plans = series_of(plan, series, count=repeat, every_s=every_s, begins_at=utc_now())
+                documents = [plan_json(each) for each in plans]
+                records.extend(self._store.create_series(documents, rig=rig.name, label=label, parent=series, key=key))
+            return [scan_job(record, self._tools) for record in records]
 
         self._queue.submit(make, wait=wait)
-        if record is None:
-            raise TypeError(record)
-        return record
+        return records[0]
+
+    def cancel_series(self, series: UUID) -> list[JobRecord]:
+        """Ask all scans of a series to stop, as `cancel` does. Raises JobNotFoundError: there is none of that id."""
+        scans = self.series(series)
+        # The last first: no other one begins meanwhile.
+        return [self.cancel(scan.id) for scan in reversed(scans)][::-1]
+
+    def series(self, series: UUID) -> list[JobRecord]:
+        """Return the scans of a series that are on record, in their order. Raises JobNotFoundError: there are none."""
+        scans = self._store.of(series).get(series)
+        if not scans:
+            message = f"No series {series} is on record here. GET /scan lists scans, and the series of each."
+            raise JobNotFoundError(message)
+        return scans
 
     def submit_work(
         self,
@@ -178,9 +205,9 @@ class Runner:
                         _log.exception("work with the rig failed", work=holder.words)
                 raise
 
-        def make() -> Job:
+        def make() -> list[Job]:
             begun()
-            return Job(work_id, holder, utc_now(), with_rig, ended)
+            return [Job(work_id, holder, utc_now(), with_rig, ended)]
 
         self._queue.submit(make, wait=wait)
 

@@ -173,6 +173,38 @@ def test_queue_takes_what_it_may_and_no_more(client: TestClient, served: ServedB
     assert ended(client, queued.json()["id"])["state"] == "succeeded"
 
 
+def test_a_series_is_one_request_and_many_scans(client: TestClient) -> None:
+    first = client.post("/scan", json={"repeat": 3, "label": "row"}).json()
+    series = first["links"]["series"]
+    scans = [ended(client, each["id"]) for each in client.get(series).json()["scans"]]
+    assert [(each["state"], each["label"], each["plan"]["series"]["number"]) for each in scans] == [
+        ("succeeded", "row", number) for number in (1, 2, 3)
+    ]
+    assert scans[0]["id"] == first["id"]
+    assert ended(client, client.post("/scan").json()["id"])["links"]["series"] is None
+
+
+def test_a_series_that_waits_for_its_time_is_cancelled_as_one(client: TestClient) -> None:
+    headers = {"Idempotency-Key": "a series"}
+    request = {"repeat": 3, "every_s": 3600}
+    first = client.post("/scan", json=request, headers=headers).json()
+    assert client.post("/scan", json=request, headers=headers).json()["id"] == first["id"]
+    ended(client, first["id"])
+    series = first["links"]["series"]
+    assert len(client.get(series).json()["scans"]) == 3
+    cancelled = client.post(f"{series}/cancel")
+    assert cancelled.status_code == 202
+    assert [each["state"] for each in cancelled.json()["scans"]] == ["succeeded", "cancelled", "cancelled"]
+    assert client.get(f"/scan/series/{uuid4()}").status_code == 404
+
+
+@pytest.mark.parametrize("request_", [{"every_s": 5}, {"repeat": 0}, {"repeat": 501}, {"repeat": 2, "every_s": -1}])
+def test_a_series_that_is_none_is_refused(client: TestClient, request_: dict[str, float]) -> None:
+    refused = client.post("/scan", json=request_)
+    assert refused.status_code == 422
+    assert {"repeat", "every_s"} & set(refused.text.replace('"', " ").replace(".", " ").split())
+
+
 def test_cancel_may_be_repeated(client: TestClient, served: ServedBench) -> None:
     scan = served.held(client)
     assert client.post(scan["links"]["cancel"]).status_code == 202
