@@ -24,7 +24,6 @@ from slrig.bundle.storage import json_bytes, refusals_of, staging_name, sync_fol
 from slrig.errors import BundleError, CalibrationError, StorageError
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Pixels, Shot, Size
 
-
 _PNG = (cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP, cv2.IMWRITE_PNG_COMPRESSION, 1,
         cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)  # fmt: skip
 """Stripes run down the image: by differences to the row above, files are a quarter smaller than by OpenCV's usual
