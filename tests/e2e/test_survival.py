@@ -101,6 +101,38 @@ def test_killed_reconstruction_fails_its_scan_and_the_next_one_succeeds(start: S
         assert ended(client, client.start({}))["state"] == "succeeded"
 
 
+def test_a_kill_costs_the_scan_that_is_shot_and_none_that_is_reconstructed(start: Start, tmp_path: Path) -> None:
+    rig = write_rig(tmp_path / "rig", head=SLOW)
+    first = start(rig)
+    with first.client() as client:
+        assert ended(client, client.start({}))["state"] == "succeeded"
+        worker = first.worker_id()
+        os.kill(worker, signal.SIGSTOP)
+        computed = [client.start({"label": "first"})]
+        followed_to(client, computed[0], "computing")
+        # Not in line: the rig is free.
+        computed.append(client.start({"label": "second"}))
+        followed_to(client, computed[1], "computing")
+        assert client.get("/rig")["computing"] == [each["id"] for each in computed]
+        shot = client.start({"label": "third"})
+        for event in client.follow(shot):
+            # Long enough for the frames of the second to be a bundle.
+            if event["kind"] == "progress" and event["fraction"] > 0.25:
+                break
+        first.kill()
+        os.kill(worker, signal.SIGKILL)
+    second = start(rig)
+    with second.client() as client:
+        assert client.get(shot["links"]["self"])["state"] == "interrupted"
+        for scan in computed:
+            record = ended(client, scan)
+            assert record["state"] == "succeeded", record
+            assert (second.data / "scans" / scan["id"] / "mesh.ply").stat().st_size > 1000
+        assert list((second.data / ".incoming").iterdir()) == []
+        assert ended(client, client.start({}))["state"] == "succeeded"
+    assert second.stop() == 0
+
+
 def test_cancelled_scan_leaves_the_rig_ready(start: Start, tmp_path: Path) -> None:
     service = start(write_rig(tmp_path / "rig", head=SLOW))
     with service.client() as client:
