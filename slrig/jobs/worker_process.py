@@ -200,12 +200,16 @@ def _be_ended_first() -> None:
 
 def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | Failed:
     stopped = False
+    # A task may tell of its progress from several threads.
+    telling = threading.Lock()
 
     def progress(stage: str, fraction: float, detail: str) -> None:
-        pipe.send(Progressed(run.number, stage, fraction, detail))
+        with telling:
+            pipe.send(Progressed(run.number, stage, fraction, detail))
 
     def made(name: str) -> None:
-        pipe.send(FileMade(run.number, name))
+        with telling:
+            pipe.send(FileMade(run.number, name))
 
     def cancelled() -> bool:
         nonlocal stopped

@@ -6,7 +6,8 @@ again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -43,7 +44,6 @@ from slrig.scan.report import (
     redundancy_report,
     with_seconds,
 )
-from slrig.scan.shading import Picture
 from slrig.scan.stream import CameraResult, LiveScan
 from slrig.scan.triangulated import Triangulated, steps, widest_gap_px
 
@@ -144,7 +144,7 @@ def reconstruct_into(
         write_file(folder / name, data, durable=False)
         made(name)
 
-    with compilations_told(compiling):
+    with compilations_told(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
         walked, found = measured(bundle, calibration, live, entered, axis=plan.axis)
         meshed = _meshed(bundle, found, walked, plan, entered)
@@ -152,15 +152,17 @@ def reconstruct_into(
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
         # One at a time: each is as large as the mesh.
         place(MESH, encode_mesh_ply(mesh, sigma_calibration_mm=meshed.mesh_share_mm))
+        # The mesh is what somebody waits for; what is left is shared by two threads.
+        pictures = beside.submit(_encoded_pictures, mesh, cameras)
         place("mesh.glb", encode_mesh_glb(mesh))
         place("points.ply", encode_points_ply(meshed.curves, sigma_calibration_mm=meshed.share_mm))
-        entered("pictures", 0.85, "")
-        for name, picture in _pictures(mesh, cameras):
-            place(name, encode_png(picture))
         covered = covered_share(mesh, cameras[0])
+        figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
+        entered("pictures", 0.85, "")
+        for name, picture in pictures.result().items():
+            place(name, picture)
         known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
         entered("write report", 0.98, "")
-        figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         seconds = watch.finished()
         report = {
             **walked.sections,
@@ -277,12 +279,14 @@ def _calibration_share(
     return calibration_sigma(modes, points.points_mm, normals, points.source, found.joined.camera, tangents)
 
 
-def _pictures(mesh: Mesh, cameras: list[CameraResult]) -> Iterator[tuple[str, Picture]]:
-    """The name of each picture, and the picture."""
+def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, bytes]:
+    """PNG of each picture by its name."""
     first = cameras[0]
-    yield "preview.png", preview(mesh, first.device, first.white, int(first.full_scale))
+    encoded = {"preview.png": encode_png(preview(mesh, first.device, first.white, int(first.full_scale)))}
     for seen in cameras:
-        yield rejected_picture(seen.name), rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
+        picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
+        encoded[rejected_picture(seen.name)] = encode_png(picture)
+    return encoded
 
 
 def _compared_with_truth(
