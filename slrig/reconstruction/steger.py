@@ -76,9 +76,12 @@ def _taylor_kernel(
     down = np.zeros((3, columns + 2 * radius), dtype=np.float32)
     along = np.zeros((6, columns), dtype=np.float32)
     for y in range(first, last):
-        _filter_down(image, y, radius, g0, g1, g2, down)
-        _filter_along(down, radius, g0, g1, g2, along)
-        for x in range(columns):
+        begin, end = _lit_part(lit[y])
+        if begin == end:
+            continue
+        _filter_down(image, y, radius, max(begin - radius, 0), min(end + radius, columns), g0, g1, g2, down)
+        _filter_along(down, radius, begin, end, g0, g1, g2, along)
+        for x in range(begin, end):
             if not lit[y, x]:
                 continue
             r, rx, ry, rxx, rxy, ryy = (
@@ -105,24 +108,45 @@ def _taylor_kernel(
 
 
 @kernel_part
-def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
+def _lit_part(lit: Any) -> Any:
+    """The first lit pixel of a row, and one more than the last; twice the same where none is."""
+    begin, end = 0, len(lit)
+    while begin < end and not lit[begin]:
+        begin += 1
+    while begin < end and not lit[end - 1]:
+        end -= 1
+    return begin, end
+
+
+@kernel_part
+def _filter_down(
+    image: Any, y: int, radius: int, begin: int, end: int, g0: Any, g1: Any, g2: Any, out: Any
+) -> None:  # fmt: skip
     """Fill (3, columns + 2 radius) with the image's rows round y, smoothed and differentiated once and twice.
 
-    Beyond its borders the image is reflected about its outermost pixels.
+    Only the columns from begin to end are filled in, and what lies beyond the image's borders, where it is reflected
+    about its outermost pixels.
     """
     rows, columns = image.shape
-    smooth, first, second = out[0, radius:], out[1, radius:], out[2, radius:]
-    middle = image[y]
-    for x in range(columns):
-        smooth[x] = g0[0] * middle[x]
-    for x in range(columns):
-        second[x] = g2[0] * middle[x]
-    first[:] = 0
-    for t in range(1, radius + 1):
-        above, below = image[_reflected(y - t, rows)], image[_reflected(y + t, rows)]
-        _add(smooth, columns, g0[t], below, above)
-        _subtract(first, columns, g1[t], below, above)
-        _add(second, columns, g2[t], below, above)
+    count = end - begin
+    smooth, first, second = (
+        out[0, radius + begin :], out[1, radius + begin :], out[2, radius + begin :]
+    )  # fmt: skip
+    middle = image[y, begin:]
+    _scale(smooth, count, g0[0], middle)
+    _scale(second, count, g2[0], middle)
+    first[:count] = 0
+    for t in range(1, radius, 2):
+        above, below = image[_reflected(y - t, rows), begin:], image[_reflected(y + t, rows), begin:]
+        top, bottom = image[_reflected(y - t - 1, rows), begin:], image[_reflected(y + t + 1, rows), begin:]
+        _add_two(smooth, count, g0[t], below, above, g0[t + 1], bottom, top)
+        _subtract_two(first, count, g1[t], below, above, g1[t + 1], bottom, top)
+        _add_two(second, count, g2[t], below, above, g2[t + 1], bottom, top)
+    if radius % 2:
+        above, below = image[_reflected(y - radius, rows), begin:], image[_reflected(y + radius, rows), begin:]
+        _add(smooth, count, g0[radius], below, above)
+        _subtract(first, count, g1[radius], below, above)
+        _add(second, count, g2[radius], below, above)
     for k in range(3):
         for t in range(1, radius + 1):
             out[k, radius - t] = out[k, radius + _reflected(-t, columns)]
@@ -130,31 +154,49 @@ def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out
 
 
 @kernel_part
-def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
-    """Fill (6, columns) with r, rx, ry, rxx, rxy, ryy of one row."""
-    columns = out.shape[1]
-    smooth, first, second = down[0], down[1], down[2]
-    for x in range(columns):
-        out[0, x] = g0[0] * smooth[x + radius]
-    for x in range(columns):
-        out[2, x] = g0[0] * first[x + radius]
-    for x in range(columns):
-        out[3, x] = g2[0] * smooth[x + radius]
-    for x in range(columns):
-        out[5, x] = g0[0] * second[x + radius]
-    out[1] = 0
-    out[4] = 0
-    for t in range(1, radius + 1):
+def _filter_along(down: Any, radius: int, begin: int, end: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
+    """Fill (6, columns) from begin to end with r, rx, ry, rxx, rxy, ryy of one row."""
+    smooth, first, second = down[0, begin:], down[1, begin:], down[2, begin:]
+    _even(out[0, begin:end], radius, g0, smooth)
+    _odd(out[1, begin:end], radius, g1, smooth)
+    _even(out[2, begin:end], radius, g0, first)
+    _even(out[3, begin:end], radius, g2, smooth)
+    _odd(out[4, begin:end], radius, g1, first)
+    _even(out[5, begin:end], radius, g0, second)
+
+
+@kernel_part
+def _even(out: Any, radius: int, weights: Any, row: Any) -> None:
+    count = len(out)
+    _scale(out, count, weights[0], row[radius:])
+    for t in range(1, radius, 2):
         left, right = radius - t, radius + t
-        _add(out[0], columns, g0[t], smooth[right:], smooth[left:])
-        _subtract(out[1], columns, g1[t], smooth[right:], smooth[left:])
-        _add(out[2], columns, g0[t], first[right:], first[left:])
-        _add(out[3], columns, g2[t], smooth[right:], smooth[left:])
-        _subtract(out[4], columns, g1[t], first[right:], first[left:])
-        _add(out[5], columns, g0[t], second[right:], second[left:])
+        _add_two(out, count, weights[t], row[right:], row[left:], weights[t + 1], row[right + 1 :], row[left - 1 :])
+    if radius % 2:
+        _add(out, count, weights[radius], row[2 * radius :], row)
 
 
-# Loops of three arrays each: with more, the compiler gives up proving that they do not overlap, and uses no vectors.
+@kernel_part
+def _odd(out: Any, radius: int, weights: Any, row: Any) -> None:
+    count = len(out)
+    out[:] = 0
+    for t in range(1, radius, 2):
+        left, right = radius - t, radius + t
+        _subtract_two(
+            out, count, weights[t], row[right:], row[left:], weights[t + 1], row[right + 1 :], row[left - 1 :]
+        )  # fmt: skip
+    if radius % 2:
+        _subtract(out, count, weights[radius], row[2 * radius :], row)
+
+
+# Loops of five arrays at most, of which one is written: with more, the compiler gives up proving that they do not
+# overlap, and uses no vectors.
+@kernel_part
+def _scale(out: Any, count: int, weight: Any, row: Any) -> None:
+    for x in range(count):
+        out[x] = weight * row[x]
+
+
 @kernel_part
 def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
@@ -165,6 +207,22 @@ def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
 def _subtract(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
         out[x] += weight * (right[x] - left[x])
+
+
+@kernel_part
+def _add_two(
+    out: Any, count: int, weight: Any, right: Any, left: Any, other: Any, far_right: Any, far_left: Any
+) -> None:  # fmt: skip
+    for x in range(count):
+        out[x] = out[x] + weight * (right[x] + left[x]) + other * (far_right[x] + far_left[x])
+
+
+@kernel_part
+def _subtract_two(
+    out: Any, count: int, weight: Any, right: Any, left: Any, other: Any, far_right: Any, far_left: Any
+) -> None:  # fmt: skip
+    for x in range(count):
+        out[x] = out[x] + weight * (right[x] - left[x]) + other * (far_right[x] - far_left[x])
 
 
 @kernel_part(inline="always")
