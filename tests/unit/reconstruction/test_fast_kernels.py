@@ -185,6 +185,19 @@ def test_frames_are_chained_each_by_itself() -> None:
     assert set(frame.tolist()) == {0, 2}
 
 
+@pytest.mark.parametrize("strengths", [(1.0, 2.0), (2.0, 1.0), (2.0, 2.0)])
+def test_of_two_points_in_one_pixel_the_stronger_is_chained(strengths: tuple[float, float]) -> None:
+    line = np.stack([np.full(9, 20.0), np.arange(30.0, 39.0)], axis=1)
+    points = np.concatenate([line[:5], [[20.1, 34.2]], line[5:]])
+    strength = np.full(10, 3.0)
+    strength[4:6] = strengths
+    normals, strong = np.tile([1.0, 0.0], (10, 1)), np.ones(10, dtype=np.bool_)
+    order, offsets, _ = chain_frames(points, normals, strength, strong, np.array([0, 10]), (41, 43))
+    left_out = 4 if strengths[1] > strengths[0] else 5
+    assert sorted(order.tolist()) == [i for i in range(10) if i != left_out]
+    assert offsets.tolist() == [0, 9]
+
+
 def test_gathering_is_indexing() -> None:
     rng = np.random.default_rng(2)
     points, normals, sigma = rng.normal(0, 1, (90, 2)), rng.normal(0, 1, (90, 2)), rng.normal(0, 1, 90)
