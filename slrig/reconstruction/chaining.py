@@ -50,7 +50,7 @@ def chain_frames(
     frames = len(borders) - 1
     order, ends = np.zeros(len(placed), dtype=np.int32), np.zeros(len(placed), dtype=np.int32)
     filled, chains = np.zeros(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
-    in_bands(_chain_kernel, frames, placed, strong, by_strength, borders, shape, order, ends, filled, chains)
+    in_bands(_chain_kernel, frames, placed, keys, strong, by_strength, borders, shape, order, ends, filled, chains)
     none = np.zeros(0, dtype=np.int32)
     parts = list(zip(borders, filled, chains, strict=False))
     lengths = np.concatenate([none, *(np.diff(ends[a : a + count], prepend=0) for a, _, count in parts)])
@@ -88,35 +88,46 @@ def _order_kernel(begin: int, end: int, keys: Any, borders: Any, order: Any) -> 
 
 @kernel
 def _chain_kernel(
-    begin: int, end: int, placed: Any, strong: Any, by_strength: Any, borders: Any, shape: Any,
+    begin: int, end: int, placed: Any, keys: Any, strong: Any, by_strength: Any, borders: Any, shape: Any,
     order: Any, ends: Any, filled: Any, chains: Any,
 ) -> None:  # fmt: skip
     """Chain each frame into its own part of the results.
 
-    placed : (n, 4) x, y and normal of each point. Fills in order, the ends of the chains within each frame's part, and
-    how much of either each frame has filled.
+    placed : (n, 4) x, y and normal of each point; keys : (n,) uint32, rising from the strongest. Fills in order, the
+    ends of the chains within each frame's part, and how much of either each frame has filled.
     """
+    height, width = shape
+    most = np.int64(0)
+    for frame in range(begin, end):
+        most = max(most, borders[frame + 1] - borders[frame])
+    # at : one more than the point that a pixel holds and no chain has used; 0 for none. In tiles, see `_place`.
+    at = np.zeros(-(-height // 4) * -(-width // 4) * 16, dtype=np.int32)
+    # Whether a chain may begin at a point: to ask that takes less memory, and so less time, than to look at its pixel.
+    may_start = np.zeros(most, dtype=np.bool_)
+    ahead = np.zeros(most, dtype=np.int32)
+    behind = np.zeros(most, dtype=np.int32)
     for frame in range(begin, end):
         first, last = borders[frame], borders[frame + 1]
-        # at : one more than the point that a pixel holds and no chain has used; 0 for none.
-        at = np.zeros(shape, dtype=np.int32)
-        for k in range(first, last):
-            i = first + by_strength[k]
-            row, column = _pixel(placed, i, shape)
-            # Where two points fall into one pixel the stronger is kept.
-            if at[row, column] == 0:
-                at[row, column] = i + 1
-        ahead = np.zeros(last - first, dtype=np.int32)
-        behind = np.zeros(last - first, dtype=np.int32)
+        for i in range(first, last):
+            may_start[i - first] = False
+            row, column = _pixel(placed, i, height, width)
+            here = _place(row, column, width)
+            # Where two points fall into one pixel the stronger is kept, the first of equals.
+            other = at[here] - 1
+            if other < 0 or keys[i] < keys[other]:
+                at[here] = i + 1
+                may_start[i - first] = strong[i]
+                if other >= 0:
+                    may_start[other - first] = False
         place = first
         for k in range(first, last):
-            start = first + by_strength[k]
-            row, column = _pixel(placed, start, shape)
-            if not strong[start] or at[row, column] != start + 1:
+            if not may_start[by_strength[k]]:
                 continue
-            at[row, column] = 0
-            forward = _trace(start, 1.0, at, placed, ahead)
-            backward = _trace(start, -1.0, at, placed, behind)
+            start = first + by_strength[k]
+            row, column = _pixel(placed, start, height, width)
+            at[_place(row, column, width)] = 0
+            forward = _trace(start, 1.0, at, height, width, placed, first, may_start, ahead)
+            backward = _trace(start, -1.0, at, height, width, placed, first, may_start, behind)
             if forward + backward == 0:
                 continue
             for j in range(backward - 1, -1, -1):
@@ -130,36 +141,55 @@ def _chain_kernel(
             ends[first + chains[frame]] = place - first
             chains[frame] += 1
         filled[frame] = place - first
+        for i in range(first, last):
+            row, column = _pixel(placed, i, height, width)
+            at[_place(row, column, width)] = 0
 
 
 @kernel_part(inline="always")
-def _pixel(placed: Any, i: int, shape: Any) -> Any:
-    column = min(max(int(np.rint(placed[i, 0])), 0), shape[1] - 1)
-    row = min(max(int(np.rint(placed[i, 1])), 0), shape[0] - 1)
+def _pixel(placed: Any, i: int, height: int, width: int) -> Any:
+    column = min(max(int(np.rint(placed[i, 0])), 0), width - 1)
+    row = min(max(int(np.rint(placed[i, 1])), 0), height - 1)
     return row, column
 
 
+@kernel_part(inline="always")
+def _place(row: int, column: int, width: int) -> Any:
+    """The index of a pixel in tiles of 4 x 4, each a line of the cache: neighbours are near, whichever way one goes."""
+    tile = (row >> 2) * ((width + 3) >> 2) + (column >> 2)
+    return np.uintp((tile << 4) + ((row & 3) << 2) + (column & 3))
+
+
 @kernel_part
-def _trace(start: int, sign: float, at: Any, placed: Any, out: Any) -> int:
-    height, width = at.shape
+def _trace(
+    start: int, sign: float, at: Any, height: int, width: int, placed: Any, first: int, may_start: Any, out: Any
+) -> int:  # fmt: skip
     current = start
+    row, column = _pixel(placed, current, height, width)
     heading_x, heading_y = -sign * placed[start, 3], sign * placed[start, 2]
     count = 0
     while True:
         octant = _octant(heading_x, heading_y)
-        row, column = _pixel(placed, current, at.shape)
         for side in (2, -2):
-            k = (octant + side) % 8
-            _use_double(current, row + _STEP_Y[k], column + _STEP_X[k], at, placed)
-        best = -1
-        best_cost = np.nan
-        best_distance = 0.0
-        for turn in (0, -1, 1):
-            k = (octant + turn) % 8
+            k = (octant + side) & 7
             y, x = row + _STEP_Y[k], column + _STEP_X[k]
             if y < 0 or x < 0 or y >= height or x >= width:
                 continue
-            other = at[y, x] - 1
+            here = _place(y, x, width)
+            double = at[here] - 1
+            if double >= 0 and _is_double(current, double, placed):
+                at[here] = 0
+                may_start[double - first] = False
+        best = -1
+        best_cost = np.nan
+        best_distance = 0.0
+        best_row, best_column = row, column
+        for turn in (0, -1, 1):
+            k = (octant + turn) & 7
+            y, x = row + _STEP_Y[k], column + _STEP_X[k]
+            if y < 0 or x < 0 or y >= height or x >= width:
+                continue
+            other = at[_place(y, x, width)] - 1
             if other < 0:
                 continue
             dx, dy = placed[other, 0] - placed[current, 0], placed[other, 1] - placed[current, 1]
@@ -168,18 +198,19 @@ def _trace(start: int, sign: float, at: Any, placed: Any, out: Any) -> int:
             if distance > _LONGEST_STEP_PX or aligned < _SHARPEST_ALIGNED or dx * heading_x + dy * heading_y <= 0:
                 continue
             if best < 0:
-                best, best_distance = other, distance
+                best, best_distance, best_row, best_column = other, distance, y, x
                 continue
             # Two ways to go on: now the angles themselves are needed.
             if np.isnan(best_cost):
                 best_cost = best_distance + np.arccos(_alignment(placed, current, best))
             cost = distance + np.arccos(aligned)
             if cost < best_cost:
-                best, best_cost = other, cost
+                best, best_cost, best_row, best_column = other, cost, y, x
         if best < 0:
             return count
-        row, column = _pixel(placed, best, at.shape)
-        at[row, column] = 0
+        row, column = best_row, best_column
+        at[_place(row, column, width)] = 0
+        may_start[best - first] = False
         out[count] = best
         count += 1
         tangent_x, tangent_y = -placed[best, 3], placed[best, 2]
@@ -201,17 +232,12 @@ def _octant(x: float, y: float) -> int:
     return 3 if y > 0 else 5
 
 
-@kernel_part
-def _use_double(current: int, row: int, column: int, at: Any, placed: Any) -> None:
-    if row < 0 or column < 0 or row >= at.shape[0] or column >= at.shape[1]:
-        return
-    other = at[row, column] - 1
-    if other < 0:
-        return
+@kernel_part(inline="always")
+def _is_double(current: int, other: int, placed: Any) -> bool:
+    """Whether a point beside another one answers to the same line."""
     dx, dy = placed[other, 0] - placed[current, 0], placed[other, 1] - placed[current, 1]
     across = abs(dx * placed[current, 2] + dy * placed[current, 3])
-    if across < _SAME_LINE_PX and _alignment(placed, current, other) > _SAME_LINE_ALIGNED:
-        at[row, column] = 0
+    return bool(across < _SAME_LINE_PX and _alignment(placed, current, other) > _SAME_LINE_ALIGNED)
 
 
 @kernel_part(inline="always")

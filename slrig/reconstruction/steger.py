@@ -19,6 +19,7 @@ EDGE = 1
 _SUPPORT = 3.6  # kernel radius in sigmas
 _TAYLOR_BOX = 0.6  # a point this far from the pixel centre still belongs to it; the chain drops double responses
 _NEWTON_BOX = 1.1  # half a pixel beyond the first step's
+_VECTOR = 4  # of double precision
 _ROWS, _POINTS = 32, 1024  # that are worth calling a kernel for
 
 
@@ -75,9 +76,12 @@ def _taylor_kernel(
     down = np.zeros((3, columns + 2 * radius), dtype=np.float32)
     along = np.zeros((6, columns), dtype=np.float32)
     for y in range(first, last):
-        _filter_down(image, y, radius, g0, g1, g2, down)
-        _filter_along(down, radius, g0, g1, g2, along)
-        for x in range(columns):
+        begin, end = _lit_part(lit[y])
+        if begin == end:
+            continue
+        _filter_down(image, y, radius, max(begin - radius, 0), min(end + radius, columns), g0, g1, g2, down)
+        _filter_along(down, radius, begin, end, g0, g1, g2, along)
+        for x in range(begin, end):
             if not lit[y, x]:
                 continue
             r, rx, ry, rxx, rxy, ryy = (
@@ -104,24 +108,45 @@ def _taylor_kernel(
 
 
 @kernel_part
-def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
+def _lit_part(lit: Any) -> Any:
+    """The first lit pixel of a row, and one more than the last; twice the same where none is."""
+    begin, end = 0, len(lit)
+    while begin < end and not lit[begin]:
+        begin += 1
+    while begin < end and not lit[end - 1]:
+        end -= 1
+    return begin, end
+
+
+@kernel_part
+def _filter_down(
+    image: Any, y: int, radius: int, begin: int, end: int, g0: Any, g1: Any, g2: Any, out: Any
+) -> None:  # fmt: skip
     """Fill (3, columns + 2 radius) with the image's rows round y, smoothed and differentiated once and twice.
 
-    Beyond its borders the image is reflected about its outermost pixels.
+    Only the columns from begin to end are filled in, and what lies beyond the image's borders, where it is reflected
+    about its outermost pixels.
     """
     rows, columns = image.shape
-    smooth, first, second = out[0, radius:], out[1, radius:], out[2, radius:]
-    middle = image[y]
-    for x in range(columns):
-        smooth[x] = g0[0] * middle[x]
-    for x in range(columns):
-        second[x] = g2[0] * middle[x]
-    first[:] = 0
-    for t in range(1, radius + 1):
-        above, below = image[_reflected(y - t, rows)], image[_reflected(y + t, rows)]
-        _add(smooth, columns, g0[t], below, above)
-        _subtract(first, columns, g1[t], below, above)
-        _add(second, columns, g2[t], below, above)
+    count = end - begin
+    smooth, first, second = (
+        out[0, radius + begin :], out[1, radius + begin :], out[2, radius + begin :]
+    )  # fmt: skip
+    middle = image[y, begin:]
+    _scale(smooth, count, g0[0], middle)
+    _scale(second, count, g2[0], middle)
+    first[:count] = 0
+    for t in range(1, radius, 2):
+        above, below = image[_reflected(y - t, rows), begin:], image[_reflected(y + t, rows), begin:]
+        top, bottom = image[_reflected(y - t - 1, rows), begin:], image[_reflected(y + t + 1, rows), begin:]
+        _add_two(smooth, count, g0[t], below, above, g0[t + 1], bottom, top)
+        _subtract_two(first, count, g1[t], below, above, g1[t + 1], bottom, top)
+        _add_two(second, count, g2[t], below, above, g2[t + 1], bottom, top)
+    if radius % 2:
+        above, below = image[_reflected(y - radius, rows), begin:], image[_reflected(y + radius, rows), begin:]
+        _add(smooth, count, g0[radius], below, above)
+        _subtract(first, count, g1[radius], below, above)
+        _add(second, count, g2[radius], below, above)
     for k in range(3):
         for t in range(1, radius + 1):
             out[k, radius - t] = out[k, radius + _reflected(-t, columns)]
@@ -129,31 +154,49 @@ def _filter_down(image: Any, y: int, radius: int, g0: Any, g1: Any, g2: Any, out
 
 
 @kernel_part
-def _filter_along(down: Any, radius: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
-    """Fill (6, columns) with r, rx, ry, rxx, rxy, ryy of one row."""
-    columns = out.shape[1]
-    smooth, first, second = down[0], down[1], down[2]
-    for x in range(columns):
-        out[0, x] = g0[0] * smooth[x + radius]
-    for x in range(columns):
-        out[2, x] = g0[0] * first[x + radius]
-    for x in range(columns):
-        out[3, x] = g2[0] * smooth[x + radius]
-    for x in range(columns):
-        out[5, x] = g0[0] * second[x + radius]
-    out[1] = 0
-    out[4] = 0
-    for t in range(1, radius + 1):
+def _filter_along(down: Any, radius: int, begin: int, end: int, g0: Any, g1: Any, g2: Any, out: Any) -> None:
+    """Fill (6, columns) from begin to end with r, rx, ry, rxx, rxy, ryy of one row."""
+    smooth, first, second = down[0, begin:], down[1, begin:], down[2, begin:]
+    _even(out[0, begin:end], radius, g0, smooth)
+    _odd(out[1, begin:end], radius, g1, smooth)
+    _even(out[2, begin:end], radius, g0, first)
+    _even(out[3, begin:end], radius, g2, smooth)
+    _odd(out[4, begin:end], radius, g1, first)
+    _even(out[5, begin:end], radius, g0, second)
+
+
+@kernel_part
+def _even(out: Any, radius: int, weights: Any, row: Any) -> None:
+    count = len(out)
+    _scale(out, count, weights[0], row[radius:])
+    for t in range(1, radius, 2):
         left, right = radius - t, radius + t
-        _add(out[0], columns, g0[t], smooth[right:], smooth[left:])
-        _subtract(out[1], columns, g1[t], smooth[right:], smooth[left:])
-        _add(out[2], columns, g0[t], first[right:], first[left:])
-        _add(out[3], columns, g2[t], smooth[right:], smooth[left:])
-        _subtract(out[4], columns, g1[t], first[right:], first[left:])
-        _add(out[5], columns, g0[t], second[right:], second[left:])
+        _add_two(out, count, weights[t], row[right:], row[left:], weights[t + 1], row[right + 1 :], row[left - 1 :])
+    if radius % 2:
+        _add(out, count, weights[radius], row[2 * radius :], row)
 
 
-# Loops of three arrays each: with more, the compiler gives up proving that they do not overlap, and uses no vectors.
+@kernel_part
+def _odd(out: Any, radius: int, weights: Any, row: Any) -> None:
+    count = len(out)
+    out[:] = 0
+    for t in range(1, radius, 2):
+        left, right = radius - t, radius + t
+        _subtract_two(
+            out, count, weights[t], row[right:], row[left:], weights[t + 1], row[right + 1 :], row[left - 1 :]
+        )  # fmt: skip
+    if radius % 2:
+        _subtract(out, count, weights[radius], row[2 * radius :], row)
+
+
+# Loops of five arrays at most, of which one is written: with more, the compiler gives up proving that they do not
+# overlap, and uses no vectors.
+@kernel_part
+def _scale(out: Any, count: int, weight: Any, row: Any) -> None:
+    for x in range(count):
+        out[x] = weight * row[x]
+
+
 @kernel_part
 def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
@@ -164,6 +207,22 @@ def _add(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
 def _subtract(out: Any, count: int, weight: Any, right: Any, left: Any) -> None:
     for x in range(count):
         out[x] += weight * (right[x] - left[x])
+
+
+@kernel_part
+def _add_two(
+    out: Any, count: int, weight: Any, right: Any, left: Any, other: Any, far_right: Any, far_left: Any
+) -> None:  # fmt: skip
+    for x in range(count):
+        out[x] = out[x] + weight * (right[x] + left[x]) + other * (far_right[x] + far_left[x])
+
+
+@kernel_part
+def _subtract_two(
+    out: Any, count: int, weight: Any, right: Any, left: Any, other: Any, far_right: Any, far_left: Any
+) -> None:  # fmt: skip
+    for x in range(count):
+        out[x] = out[x] + weight * (right[x] - left[x]) + other * (far_right[x] - far_left[x])
 
 
 @kernel_part(inline="always")
@@ -220,6 +279,11 @@ def _newton_kernel(
     whole = np.exp(-((np.arange(size) - radius) ** 2) / (2 * sigma * sigma))
     wx = np.zeros((3, size))
     wy = np.zeros((3, size))
+    flat = image.reshape(-1)
+    # Whole vectors of columns: those beyond the window are summed, too, and nobody looks at them.
+    lanes = min(-(-size // _VECTOR) * _VECTOR, width)
+    furthest = len(flat) - (size - 1) * width - lanes
+    smooth, once, twice = np.zeros(lanes), np.zeros(lanes), np.zeros(lanes)
     for i in range(first, last):
         column, row = columns[i], rows[i]
         if column < radius or row < radius or column >= width - radius or row >= height - radius:
@@ -227,21 +291,18 @@ def _newton_kernel(
         fx, fy = float(offset[row, column, 0]), float(offset[row, column, 1])
         _centred_weights(wx, fx, sigma, whole)
         _centred_weights(wy, fy, sigma, whole)
+        corner = (row - radius) * width + column - radius
+        begun = min(corner, furthest)
+        _weighted_down(flat, begun, width, wy, smooth, once, twice)
         r = rx = ry = rxx = rxy = ryy = 0.0
-        for j in range(size):
-            line = image[row - radius + j, column - radius :]
-            s0 = s1 = s2 = 0.0
-            for k in range(size):
-                value = float(line[k])
-                s0 += value * wx[0, k]
-                s1 += value * wx[1, k]
-                s2 += value * wx[2, k]
-            r += s0 * wy[0, j]
-            rx += s1 * wy[0, j]
-            rxx += s2 * wy[0, j]
-            ry += s0 * wy[1, j]
-            rxy += s1 * wy[1, j]
-            ryy += s0 * wy[2, j]
+        for k in range(size):
+            s0, s1, s2 = smooth[corner - begun + k], once[corner - begun + k], twice[corner - begun + k]
+            r += s0 * wx[0, k]
+            rx += s0 * wx[1, k]
+            rxx += s0 * wx[2, k]
+            ry += s1 * wx[0, k]
+            rxy += s1 * wx[1, k]
+            ryy += s2 * wx[0, k]
         if kind == RIDGE:
             nx, ny, curvature = _ridge_normal(rxx, rxy, ryy)
             if curvature >= 0:
@@ -264,28 +325,61 @@ def _newton_kernel(
 
 
 @kernel_part
+def _weighted_down(flat: Any, corner: int, width: int, weights: Any, smooth: Any, first: Any, second: Any) -> None:
+    """Fill (lanes,) each with sums down the columns of a window, weighted with each row of weights, (3, size).
+
+    flat, corner, width : the image's pixels, the window's first among them, and the pixels of a row. The sums of
+    neighbouring columns are made side by side, in vector registers; two rows at a time after the first, for each turn
+    waits for the sums of the one before.
+    """
+    lanes = len(smooth)
+    line = flat[corner:]
+    w0, w1, w2 = weights[0, 0], weights[1, 0], weights[2, 0]
+    for k in range(lanes):
+        value = float(line[k])
+        smooth[k] = value * w0
+        first[k] = value * w1
+        second[k] = value * w2
+    for j in range(1, weights.shape[1], 2):
+        line, following = flat[corner + j * width :], flat[corner + (j + 1) * width :]
+        w0, w1, w2 = weights[0, j], weights[1, j], weights[2, j]
+        u0, u1, u2 = weights[0, j + 1], weights[1, j + 1], weights[2, j + 1]
+        for k in range(lanes):
+            value, below = float(line[k]), float(following[k])
+            smooth[k] += value * w0 + below * u0
+            first[k] += value * w1 + below * u1
+            second[k] += value * w2 + below * u2
+
+
+@kernel_part
 def _centred_weights(out: Any, centre: float, sigma: float, whole: Any) -> None:
     """Fill (3, size) with Gaussian, first and second derivative weights for samples at -radius … radius.
 
     whole : (size,) the Gaussian's values when its centre is 0. About another centre f each changes by
     exp(f k / σ²) and by a factor that all share.
     """
-    size = out.shape[1]
+    zero, one, two = out[0], out[1], out[2]
+    size = len(zero)
     radius = size // 2
-    s2 = sigma * sigma
-    step = np.exp(centre / s2)
+    variance = sigma * sigma
+    step = np.exp(centre / variance)
     back = 1 / step
-    total = out[0, radius] = whole[radius]
+    total = zero[radius] = whole[radius]
     up = down = 1.0
     for k in range(1, radius + 1):
         up *= step
         down *= back
-        out[0, radius + k] = whole[radius + k] * up
-        out[0, radius - k] = whole[radius - k] * down
-        total += out[0, radius + k] + out[0, radius - k]
+        right, left = whole[radius + k] * up, whole[radius - k] * down
+        zero[radius + k] = right
+        zero[radius - k] = left
+        total += right + left
+    # Dividing takes several times as long as multiplying.
+    share = 1 / total
+    of_one = share / variance
+    of_two = of_one / variance
     for k in range(size):
         at = k - radius - centre
-        g = out[0, k] / total
-        out[0, k] = g
-        out[1, k] = at / s2 * g
-        out[2, k] = (at * at / s2 - 1) / s2 * g
+        value = zero[k]
+        zero[k] = value * share
+        one[k] = at * (value * of_one)
+        two[k] = (at * at - variance) * (value * of_two)

@@ -27,6 +27,9 @@ _X, _Y, _NOISE, _MISFIT, _VALUE = 6, 7, 8, 9, 10
 _VARIANCE = _VALUE + _PIXELS
 _ROWS = _VARIANCE + _PIXELS
 
+# Rows of what is worked out in double precision: where each point is, the gradient there, and the value wanted.
+_AT_X, _AT_Y, _ALONG_X, _ALONG_Y, _WANTED = 0, 1, 2, 3, 4
+
 
 def stencils() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], float]:
     """Weighted least squares of a quadratic surface on 5 x 5 pixels, row by row, padded to whole vectors.
@@ -73,6 +76,7 @@ def fit_kernel(
     gains = np.zeros((6, _LANES), dtype=np.float32)
     # Points whose neighbours are all usable, side by side, so that they are worked off in vector registers.
     work = np.zeros(_ROWS * _LANES, dtype=np.float32)
+    precise = np.zeros(5 * _LANES)
     which = np.zeros(_LANES, dtype=np.int64)
     waiting = np.int64(0)  # and no literal, for which the parts would be compiled once more
     for i in range(first, last):
@@ -91,12 +95,15 @@ def fit_kernel(
                     pixel = 5 * dy + dx
                     work[(_VALUE + pixel) * _LANES + waiting] = flat_position[at] - origin
                     work[(_VARIANCE + pixel) * _LANES + waiting] = flat_sigma[at] * flat_sigma[at]
+            precise[_AT_X * _LANES + waiting] = starts[i, 0] - ix
+            precise[_AT_Y * _LANES + waiting] = starts[i, 1] - iy
+            precise[_WANTED * _LANES + waiting] = targets[i] - origin
             which[waiting] = i
             waiting += 1
             if waiting == _LANES:
                 _fit_side_by_side(
-                    work, waiting, which, stencils, basis, whole_freedom,
-                    position, starts, targets, points, normals, deviation, found, by_noise,
+                    work, precise, waiting, which, stencils, basis, whole_freedom,
+                    starts, points, normals, deviation, found, by_noise,
                 )  # fmt: skip
                 waiting = np.int64(0)
             continue
@@ -122,41 +129,34 @@ def fit_kernel(
         freedom = _plane_freedom(member, members, gains, basis)
         _put(i, ix, iy, x, y, gx, gy, noise, misfit, freedom, starts, points, normals, deviation, found, by_noise)
     _fit_side_by_side(
-        work, waiting, which, stencils, basis, whole_freedom,
-        position, starts, targets, points, normals, deviation, found, by_noise,
+        work, precise, waiting, which, stencils, basis, whole_freedom,
+        starts, points, normals, deviation, found, by_noise,
     )  # fmt: skip
 
 
 @kernel_part
 def _fit_side_by_side(
-    work: Any, count: int, which: Any, stencils: Any, basis: Any, freedom: float,
-    position: Any, starts: Any, targets: Any, points: Any, normals: Any, deviation: Any, found: Any, by_noise: Any,
+    work: Any, precise: Any, count: int, which: Any, stencils: Any, basis: Any, freedom: float,
+    starts: Any, points: Any, normals: Any, deviation: Any, found: Any, by_noise: Any,
 ) -> None:  # fmt: skip
     """Fit a quadratic surface to each of the first `count` columns of `work`: the points `which`.
 
-    Row r of `work` is work[r * _LANES :]. Lanes beyond `count` hold anything, and nobody looks at them.
+    Row r of `work` is work[r * _LANES :], and so with `precise`. Lanes beyond `count` hold anything, and nobody looks
+    at them.
     """
     _surface_of(work, stencils)
-    for lane in range(count):
-        i = which[lane]
-        ix, iy = int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1]))
-        x, y, gx, gy = _solved(
-            work[lane], work[_LANES + lane], work[2 * _LANES + lane],
-            work[3 * _LANES + lane], work[4 * _LANES + lane], work[5 * _LANES + lane],
-            starts[i, 0] - ix, starts[i, 1] - iy, targets[i] - position[iy, ix],
-        )  # fmt: skip
-        points[i, 0], points[i, 1] = x, y
-        normals[i, 0], normals[i, 1] = gx, gy
-        work[_X * _LANES + lane], work[_Y * _LANES + lane] = x, y
+    _solve_side_by_side(work, precise)
+    for lane in range(_LANES):
+        work[_X * _LANES + lane] = precise[_AT_X * _LANES + lane]
+        work[_Y * _LANES + lane] = precise[_AT_Y * _LANES + lane]
     _scatter_of(work, stencils, basis)
     for lane in range(count):
         i = which[lane]
-        ix, iy = int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1]))
-        x, y, gx, gy = points[i, 0], points[i, 1], normals[i, 0], normals[i, 1]
-        points[i, 0], points[i, 1] = starts[i, 0], starts[i, 1]
-        normals[i, 0] = normals[i, 1] = 0.0
         _put(
-            i, ix, iy, x, y, gx, gy, work[_NOISE * _LANES + lane], work[_MISFIT * _LANES + lane], freedom,
+            i, int(np.rint(starts[i, 0])), int(np.rint(starts[i, 1])),
+            precise[_AT_X * _LANES + lane], precise[_AT_Y * _LANES + lane],
+            precise[_ALONG_X * _LANES + lane], precise[_ALONG_Y * _LANES + lane],
+            work[_NOISE * _LANES + lane], work[_MISFIT * _LANES + lane], freedom,
             starts, points, normals, deviation, found, by_noise,
         )  # fmt: skip
 
@@ -166,18 +166,19 @@ def _fit_side_by_side(
 def _surface_of(work: Any, stencils: Any) -> None:
     """Rows 0 to 5: the coefficients of 1, x, y, x², xy, y²."""
     work[: 6 * _LANES] = 0
-    for j in range(_PIXELS):
-        w0, w1, w2 = stencils[0, j], stencils[1, j], stencils[2, j]
-        w3, w4, w5 = stencils[3, j], stencils[4, j], stencils[5, j]
-        row = (_VALUE + j) * _LANES
-        for lane in range(_LANES):
-            value = work[row + lane]
-            work[lane] += w0 * value
-            work[_LANES + lane] += w1 * value
-            work[2 * _LANES + lane] += w2 * value
-            work[3 * _LANES + lane] += w3 * value
-            work[4 * _LANES + lane] += w4 * value
-            work[5 * _LANES + lane] += w5 * value
+    for k in range(6):
+        sums = work[k * _LANES : (k + 1) * _LANES]
+        # Five pixels, a row, at a time: the sums are then fetched and put back a fifth as often.
+        for j in range(0, _PIXELS, 5):
+            w0, w1, w2, w3, w4 = (
+                stencils[k, j], stencils[k, j + 1], stencils[k, j + 2], stencils[k, j + 3], stencils[k, j + 4]
+            )  # fmt: skip
+            values = work[(_VALUE + j) * _LANES :]
+            for lane in range(_LANES):
+                sums[lane] = (
+                    sums[lane] + w0 * values[lane] + w1 * values[_LANES + lane] + w2 * values[2 * _LANES + lane]
+                    + w3 * values[3 * _LANES + lane] + w4 * values[4 * _LANES + lane]
+                )  # fmt: skip
 
 
 @kernel_part
@@ -202,6 +203,30 @@ def _scatter_of(work: Any, stencils: Any, basis: Any) -> None:
             )  # fmt: skip
             residual = work[values + lane] - fitted
             work[_MISFIT * _LANES + lane] += residual * residual / work[variances + lane]
+
+
+@kernel_part
+def _solve_side_by_side(work: Any, precise: Any) -> None:
+    """`_solved` of every lane, without a jump: what has come to its end is kept from there on."""
+    for lane in range(_LANES):
+        f0, f1, f2 = float(work[lane]), float(work[_LANES + lane]), float(work[2 * _LANES + lane])
+        f3, f4, f5 = float(work[3 * _LANES + lane]), float(work[4 * _LANES + lane]), float(work[5 * _LANES + lane])
+        x, y = precise[_AT_X * _LANES + lane], precise[_AT_Y * _LANES + lane]
+        target = precise[_WANTED * _LANES + lane]
+        gx = gy = 0.0
+        moves = True
+        for _ in range(3):
+            slope_x = f1 + 2.0 * f3 * x + f4 * y
+            slope_y = f2 + f4 * x + 2.0 * f5 * y
+            gx, gy = slope_x if moves else gx, slope_y if moves else gy
+            squared = gx * gx + gy * gy
+            moves = moves & (not squared < LEAST_GRADIENT * LEAST_GRADIENT)
+            miss = (f0 + f1 * x + f2 * y + f3 * x * x + f4 * x * y + f5 * y * y - target) / squared
+            next_x, next_y = x - miss * gx, y - miss * gy
+            x, y = next_x if moves else x, next_y if moves else y
+            moves = moves & (not ((abs(x) > 2) | (abs(y) > 2)))
+        precise[_AT_X * _LANES + lane], precise[_AT_Y * _LANES + lane] = x, y
+        precise[_ALONG_X * _LANES + lane], precise[_ALONG_Y * _LANES + lane] = gx, gy
 
 
 @kernel_part(inline="always")

@@ -66,6 +66,42 @@ def test_first_step_is_taken_from_six_separable_filters(kind: int, sigma_px: flo
     assert kept > 10
 
 
+@KINDS
+@pytest.mark.parametrize("shape", [(20, 60), (20, 7)])
+def test_unlit_margins_change_nothing_between_them(kind: int, shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(6)
+    image, noise = rng.normal(0, 1, shape).astype(np.float32), np.full(shape, 0.1, dtype=np.float32)
+    everywhere = taylor_step(image, noise, np.ones(shape, dtype=np.bool_), np.float32(0.5), *kernels(1.2), kind)
+    for begin, end in ((0, 3), (2, 4), (shape[1] - 1, shape[1]), (shape[1] // 2, shape[1] - 1)):
+        lit = np.zeros(shape, dtype=np.bool_)
+        lit[3:-1, begin:end] = rng.uniform(0, 1, (16, end - begin)) > 0.3
+        offset, response = taylor_step(image, noise, lit, np.float32(0.5), *kernels(1.2), kind)
+        np.testing.assert_array_equal(response, np.where(lit, everywhere[1], 0))
+        np.testing.assert_array_equal(offset, np.where(lit[..., None], everywhere[0], 0))
+
+
+@KINDS
+@pytest.mark.parametrize("beyond", [(0, 0), (0, 3), (4, 0), (2, 2)])
+def test_second_step_ends_with_the_image(kind: int, beyond: tuple[int, int]) -> None:
+    # Its window, 11 pixels wide, ends with the image's last pixel: no others may count, nor be read.
+    rng = np.random.default_rng(9)
+    wide = cv2.GaussianBlur(rng.normal(0, 1, (40, 40)).astype(np.float32), (0, 0), 2.0)
+    rows, columns = np.arange(10, 30, dtype=np.int32), rng.integers(10, 30, 20).astype(np.int32)
+    offset = np.zeros((40, 40, 2), dtype=np.float32)
+    wanted = newton_step(wide, offset, columns, rows, 1.3, kind)
+    assert wanted[4].any()
+    for i in range(len(rows)):
+        top, left = rows[i] - 5 - beyond[0], columns[i] - 5 - beyond[1]
+        cut = np.ascontiguousarray(wide[top : rows[i] + 6, left : columns[i] + 6])
+        at = np.array([5 + beyond[1]], dtype=np.int32), np.array([5 + beyond[0]], dtype=np.int32)
+        x, y, normals, response, kept = newton_step(cut, offset[: len(cut), : cut.shape[1]].copy(), *at, 1.3, kind)
+        assert kept[0] == wanted[4][i]
+        if kept[0]:
+            np.testing.assert_allclose([x[0] + left, y[0] + top], [wanted[0][i], wanted[1][i]], atol=1e-10)
+            np.testing.assert_allclose(normals[0], wanted[2][i], atol=1e-10)
+            assert response[0] == pytest.approx(wanted[3][i], rel=1e-10)
+
+
 @pytest.mark.parametrize("centre", [-0.6, 0.0, 0.37])
 @pytest.mark.parametrize("sigma_px", [1.0, 2.5])
 def test_weights_about_a_point_between_pixels(centre: float, sigma_px: float) -> None:
@@ -147,6 +183,19 @@ def test_frames_are_chained_each_by_itself() -> None:
     assert np.diff(offsets).tolist() == lengths
     assert frame.tolist() == [k for k, (_, each) in enumerate(alone) for _ in range(len(each) - 1)]
     assert set(frame.tolist()) == {0, 2}
+
+
+@pytest.mark.parametrize("strengths", [(1.0, 2.0), (2.0, 1.0), (2.0, 2.0)])
+def test_of_two_points_in_one_pixel_the_stronger_is_chained(strengths: tuple[float, float]) -> None:
+    line = np.stack([np.full(9, 20.0), np.arange(30.0, 39.0)], axis=1)
+    points = np.concatenate([line[:5], [[20.1, 34.2]], line[5:]])
+    strength = np.full(10, 3.0)
+    strength[4:6] = strengths
+    normals, strong = np.tile([1.0, 0.0], (10, 1)), np.ones(10, dtype=np.bool_)
+    order, offsets, _ = chain_frames(points, normals, strength, strong, np.array([0, 10]), (41, 43))
+    left_out = 4 if strengths[1] > strengths[0] else 5
+    assert sorted(order.tolist()) == [i for i in range(10) if i != left_out]
+    assert offsets.tolist() == [0, 9]
 
 
 def test_gathering_is_indexing() -> None:
