@@ -90,8 +90,8 @@ def test_every_rig_of_the_repository_is_read(path: Path) -> None:
 
 def test_scan_defaults_are_the_fields_of_a_plan() -> None:
     plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
-    # A pose may be shot without codes, a scan may not.
-    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes"}
+    # A pose may be shot without codes, a scan may not; a request makes a series, no rig file.
+    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes", "series"}
 
 
 @pytest.mark.parametrize(
