@@ -53,9 +53,9 @@ class Job:
     _told: bool = False
 
     @property
-    def concluded_early(self) -> bool:
-        """Whether its end was noted while it was still under way."""
-        return self._noted
+    def ended_by(self) -> Exception | None:
+        """What has ended it, perhaps while it still was under way; None before that, or where nothing has."""
+        return self._error
 
     def conclude(self, error: Exception | None) -> None:
         """Take note of its end, with the lock held under which the rig is given and taken."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -68,7 +67,8 @@ class JobQueue:
         self.rig = rig
         self._give_up = give_up
         self._changed = threading.Condition()
-        self._waiting: deque[Job] = deque()
+        # Replaced, never changed: previews look at it without the lock.
+        self._waiting: tuple[Job, ...] = ()
         self._active: Job | None = None
         self._computing: list[Job] = []
         self._previews = Previews(self._wake)
@@ -111,13 +111,13 @@ class JobQueue:
             if len(waiting) >= self.queue_length and ahead is not None:
                 message = f"The rig is held and {len(waiting)} are waiting, as many as may. Try again later."
                 raise QueueFullError(message)
-            self._waiting.extend(make())
+            self._waiting += tuple(make())
             self._changed.notify_all()
         self._previews.interrupt()
 
     def take_up(self, jobs: Sequence[Job]) -> None:
         """Put jobs of an earlier run in line, or have them computed, however many; before `start`."""
-        self._waiting.extend(job for job in jobs if job.work is not None)
+        self._waiting += tuple(job for job in jobs if job.work is not None)
         self._computing.extend(job for job in jobs if job.work is None)
 
     def cancel(self, job_id: UUID) -> bool:
@@ -125,7 +125,7 @@ class JobQueue:
         with self._changed:
             queued = next((job for job in self._waiting if job.id == job_id), None)
             if queued is not None:
-                self._waiting.remove(queued)
+                self._waiting = _without(self._waiting, queued)
                 message = f"{_begun(queued.holder.words)} was cancelled while it waited for the rig."
                 queued.conclude(ScanCancelledError(message))
             for job in self._under_way():
@@ -194,8 +194,7 @@ class JobQueue:
         """Take nothing in any more, and have what is under way end early. `join` has to follow."""
         with self._changed:
             self._ending = True
-            cut_off = list(self._waiting)
-            self._waiting.clear()
+            cut_off, self._waiting = self._waiting, ()
             for job in self._under_way():
                 job.stop.set()
             for job in cut_off:
@@ -262,7 +261,7 @@ class JobQueue:
                     return None
                 if self._wanted():
                     self._active = self._due()[0]
-                    self._waiting.remove(self._active)
+                    self._waiting = _without(self._waiting, self._active)
                     return self._active
                 looks = self._previews.wanted
             if looks:
@@ -274,7 +273,7 @@ class JobQueue:
         return self._ending or bool(waiting and not (full and waiting[0].compute is not None))
 
     def _due(self) -> list[Job]:
-        """The jobs that wait for nothing but the rig, in their order; with the lock held."""
+        """The jobs that wait for nothing but the rig, in their order."""
         now_s = time.monotonic()
         return [job for job in self._waiting if job.due_s <= now_s]
 
@@ -303,7 +302,7 @@ class JobQueue:
                 self.rig.darken()
             goes_on = error is None and self._begun_computing(job)
             if not goes_on:
-                job.clear_up(error)
+                job.clear_up(error or job.ended_by)
         finally:
             if not goes_on:
                 # The rig is free before anyone can read that the work is over: a client may start its next one at once.
@@ -320,7 +319,7 @@ class JobQueue:
         although the driver has returned.
         """
         with self._changed:
-            if job.compute is None or job.concluded_early:
+            if job.compute is None or job.ended_by is not None:
                 return False
             self._active = None
             self._computing.append(job)
@@ -370,6 +369,10 @@ class JobQueue:
             _log.warning("the rig cannot be opened; the next scan tries again", rig=self.rig.name, cause=str(error))
         elif error is not None:
             _log.error("the rig's driver failed with an error of its own", rig=self.rig.name, exc_info=error)
+
+
+def _without(jobs: tuple[Job, ...], job: Job) -> tuple[Job, ...]:
+    return tuple(each for each in jobs if each is not job)
 
 
 def _begun(words: str) -> str:

@@ -8,6 +8,7 @@ import pytest
 
 from slrig.errors import DeviceGoneError, RigBusyError, StorageError
 from slrig.jobs.records import JobRecord, JobState
+from slrig.rig.watchdog import Call
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
@@ -104,6 +105,19 @@ def test_frames_are_a_bundle_only_when_they_are_all_on_the_disk(bench: Bench) ->
     bench.folder.recording(scan.id).mkdir()
     assert sweep(bench.store, bench.folder).interrupted == (scan.id,)
     assert not bench.folder.staging(scan.id).exists()
+
+
+def test_a_capture_that_was_given_up_and_ends_well_after_all_leaves_nothing(bench: Bench) -> None:
+    scan = bench.held()
+    call = Call("camera 'cam0'", "read", 10.0, 0.0)
+    bench.runner._queue._give_up_on(call)
+    assert failure_code(bench.until(scan.id)) == "device"
+    bench.gate.set()
+    # The rig is given on when the driver is back.
+    assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
+    assert bench.recording.discarded == 1
+    assert not bench.folder.staging(scan.id).exists()
+    assert bench.store.get(scan.id).state is JobState.FAILED
 
 
 def test_closing_leaves_all_that_are_reconstructed_to_the_next_start(bench: Bench) -> None:
