@@ -14,14 +14,15 @@ from slrig.jobs.records import JobProgress
 from slrig.jobs.store import JobStore
 
 _LEAST_STEP = 0.01
+_LEAST_S = 0.1  # each is brought to disk, on the thread that captures; nobody sees more than ten a second
 _DETAIL_S = 2.0  # a person who looks on wants a sign every few seconds
 
 _log = structlog.get_logger(__name__)
 
 
 class ProgressRecorder:
-    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, or another
-    detail of a stage that goes on.
+    """Takes progress from the work and records the steps worth telling: a new stage, a hundredth of the way, ten times
+    a second at most, the end, or another detail of a stage that goes on.
     """
 
     def __init__(
@@ -52,8 +53,10 @@ class ProgressRecorder:
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
         """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""
         overall = self._start + (self._end - self._start) * min(max(fraction, 0.0), 1.0)
-        goes_on = detail != self._told.detail and self._now_s() - self._told_s >= _DETAIL_S
-        if goes_on or stage != self._told.stage or overall - self._told.fraction >= _LEAST_STEP:
+        since_s = self._now_s() - self._told_s
+        goes_on = detail != self._told.detail and since_s >= _DETAIL_S
+        further = overall - self._told.fraction >= _LEAST_STEP and (since_s >= _LEAST_S or fraction >= 1)
+        if goes_on or stage != self._told.stage or further:
             self._told = JobProgress(stage, overall, detail.replace(self._hidden, ""))
             self._told_s = self._now_s()
             try:

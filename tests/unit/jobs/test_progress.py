@@ -21,7 +21,9 @@ def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(t
         (2.5, "preparing kernels", 0.0, "9 of 56"),
         (9.0, "preparing kernels", 0.0, "9 of 56"),  # nothing new
         (9.1, "decode", 0.001, "secret/a"),
-        (9.2, "decode", 0.5, ""),
+        (9.15, "decode", 0.2, "too soon after the last"),
+        (9.3, "decode", 0.5, ""),
+        (9.31, "decode", 1.0, "the end"),
     ):
         now_s[0] = at_s
         record(stage, fraction, detail)
@@ -31,5 +33,6 @@ def test_progress_is_recorded_by_stage_by_hundredths_and_while_a_stage_goes_on(t
         ("preparing kernels", "9 of 56"),
         ("decode", "a"),
         ("decode", ""),
+        ("decode", "the end"),
     ]
     store.database.close()
