@@ -108,8 +108,9 @@ def _answers(events: str, nothing: str) -> dict[int | str, dict[str, Any]]:
 
 
 _JOB = _answers(
-    "`progress` events with stage, fraction and detail; `file` events with the name of a file of a scan that can be "
-    "fetched from then on; `state` events with the new state. The stream ends after the event of a final state.",
+    "`progress` events with stage, fraction and detail; `captured` when the rig is free of a scan, whose "
+    "frames are brought to disk and reconstructed then; `file` events with the name of a file that can be fetched from "
+    "then on; `state` events with the new state. The stream ends after the event of a final state.",
     "nothing has happened since the event that was named, and nothing more will",
 )
 _CALIBRATION = _answers(

@@ -183,9 +183,16 @@ class JobStore:
 
     def file_made(self, job_id: UUID, name: str) -> None:
         """Record that a file of a running job can be fetched. Refused as `progress` is."""
+        self._tell(job_id, "file", {"name": name})
+
+    def captured(self, job_id: UUID) -> None:
+        """Record that a running job needs the rig no longer. Refused as `progress` is."""
+        self._tell(job_id, "captured", {"time": self._now()})
+
+    def _tell(self, job_id: UUID, kind: str, data: dict[str, Any]) -> None:
         with self.database.changing(patience_s=_PROGRESS_PATIENCE_S) as session:
             row = self._find(session, job_id)
-            _append(session, row, "file", {"name": name, "state": row.state})
+            _append(session, row, kind, {**data, "state": row.state})
         self._wake(job_id, row.parent)
 
     def finish(

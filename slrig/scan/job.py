@@ -206,9 +206,9 @@ class _Scan:
     def reconstruct(self, job: Job) -> None:
         """Make the mesh of the bundle in staging, and put the scan in its place. See `Job.compute`."""
         self._job, tools = job, self._tools
-        on_record = self._on_record_as_computing()
+        self._tell_that_the_rig_is_free()
         self._keep_recording()
-        self._captured = on_record
+        self._captured = self._on_record_as_computing()
         staged = tools.folder.clear_results(self._id)
         bundle, result = staged / "bundle", tools.folder.stage_result(self._id)
         call = reconstruction(tools.worker.module, bundle, result, self.plan.reconstruction)
@@ -233,8 +233,16 @@ class _Scan:
                 _log.exception("what a scan says of its calibration could not be noted")
         self._summary = report_summary(report)
 
+    def _tell_that_the_rig_is_free(self) -> None:
+        if self._recording is None:
+            return
+        try:
+            self._tools.store.captured(self._id)
+        except StorageError as error:
+            _log.warning("that a scan is captured could not be told", scan=str(self._id), cause=str(error))
+
     def _on_record_as_computing(self) -> bool:
-        """Record that the rig is free of the scan, and return whether that could be done."""
+        """Record that all is there to compute with, whatever ends the service; return whether that could be done."""
         try:
             self._tools.store.advance(self._id, JobState.COMPUTING)
         except StorageError as error:

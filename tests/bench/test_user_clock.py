@@ -86,9 +86,10 @@ class Watched:
                 self._files[event["name"]] = now
             elif event["kind"] == "progress" and event["stage"] == "capture":
                 self._times["captured"] = now
-            elif event["kind"] == "state":
-                self._times[event["state"]] = now
-                if event["state"] == state:
+            elif event["kind"] in {"state", "captured"}:
+                reached = event["state"] if event["kind"] == "state" else "free"
+                self._times[reached] = now
+                if reached == state:
                     return
         message = f"the scan did not come to {state}: {self._times}"
         raise AssertionError(message)
@@ -97,7 +98,7 @@ class Watched:
         self.until("succeeded")
         seen = self._times
         return Clock(
-            self.posted_s, seen["capturing"], seen["captured"], seen["computing"], self._files, seen["succeeded"]
+            self.posted_s, seen["capturing"], seen["captured"], seen["free"], self._files, seen["succeeded"]
         )  # fmt: skip
 
 
@@ -154,7 +155,7 @@ def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
         followed = []
         for _ in range(ROW):
             followed.append(Watched(client))
-            followed[-1].until("computing")
+            followed[-1].until("free")
         clocks = [each.clock() for each in followed]
     cycle_s = statistics.median(b.posted_s - a.posted_s for a, b in pairwise(clocks))
     capture_s = statistics.median(each.captured_s - each.began_s for each in clocks)

@@ -308,7 +308,7 @@ class DiskHook:
         else:
             step = "write" if "x" in str(given[1] or "") else "sync"
         # Folders are opened to be removed, too, and no disk refuses that.
-        if not incoming or (step == "sync" and below.split("/")[1:2] != ["bundle"]):
+        if not incoming or (step == "sync" and below.split("/")[1:2] != ["recording"]):
             return
         self._asking.now = True
         try:
