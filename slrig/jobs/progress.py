@@ -44,11 +44,12 @@ class ProgressRecorder:
         self._told = JobProgress("", -1.0, "")
 
     def file_made(self, name: str) -> None:
-        """Take note of a file that can be fetched before the job is over; refused as the rest."""
-        try:
-            self._store.file_made(self._job_id, name)
-        except StorageError as error:
-            _log.warning("a file of a job could not be announced", job=str(self._job_id), file=name, cause=str(error))
+        """Take note of a file that can be fetched before the job is over; a refusal fails no work, either."""
+        self._recorded("a file of a job could not be announced", lambda: self._store.file_made(self._job_id, name))
+
+    def captured(self) -> None:
+        """Take note that the job needs the rig no longer; a refusal fails no work, either."""
+        self._recorded("that the rig is free of a job could not be told", lambda: self._store.captured(self._job_id))
 
     def __call__(self, stage: str, fraction: float, detail: str) -> None:
         """Take note, as `slrig.scan.plan.Progress` asks. A record that is refused fails no work: see the log."""
@@ -59,7 +60,12 @@ class ProgressRecorder:
         if goes_on or stage != self._told.stage or further:
             self._told = JobProgress(stage, overall, detail.replace(self._hidden, ""))
             self._told_s = self._now_s()
-            try:
-                self._store.progress(self._job_id, self._told)
-            except StorageError as error:
-                _log.warning("how far a job is could not be recorded", job=str(self._job_id), cause=str(error))
+            self._recorded(
+                "how far a job is could not be recorded", lambda: self._store.progress(self._job_id, self._told)
+            )
+
+    def _recorded(self, refused: str, record: Callable[[], None]) -> None:
+        try:
+            record()
+        except StorageError as error:
+            _log.warning(refused, job=str(self._job_id), cause=str(error))

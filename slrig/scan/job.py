@@ -206,7 +206,8 @@ class _Scan:
     def reconstruct(self, job: Job) -> None:
         """Make the mesh of the bundle in staging, and put the scan in its place. See `Job.compute`."""
         self._job, tools = job, self._tools
-        self._tell_that_the_rig_is_free()
+        if self._recording is not None:
+            self._progress(CAPTURE_SHARE, 1.0).captured()
         self._keep_recording()
         self._captured = self._on_record_as_computing()
         staged = tools.folder.clear_results(self._id)
@@ -232,14 +233,6 @@ class _Scan:
             except Exception:  # noqa: BLE001 - the scan stands, whatever becomes of that
                 _log.exception("what a scan says of its calibration could not be noted")
         self._summary = report_summary(report)
-
-    def _tell_that_the_rig_is_free(self) -> None:
-        if self._recording is None:
-            return
-        try:
-            self._tools.store.captured(self._id)
-        except StorageError as error:
-            _log.warning("that a scan is captured could not be told", scan=str(self._id), cause=str(error))
 
     def _on_record_as_computing(self) -> bool:
         """Record that all is there to compute with, whatever ends the service; return whether that could be done."""
