@@ -20,11 +20,10 @@ import numpy as np
 import tifffile
 
 from slrig.bundle.frame_headers import BMP_SIGNATURE, JPEG_SIGNATURE, TIFF_SIGNATURES, Bitmap, Jpeg, tiff_page_count
+from slrig.bundle.png import COLOUR, FILTERS, GREY, SIGNATURE, png_file, rows_above_added
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Pixels
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_GREY, PNG_COLOUR, PNG_FILTERS = 0, 2, 4
 TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
 TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
 MOST_FILE_BYTES = 2**31
@@ -50,7 +49,7 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     Raises BundleError: the file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
     """
     data = _read_bytes(path)
-    readers = {PNG_SIGNATURE: _png, BMP_SIGNATURE: _bitmap, JPEG_SIGNATURE: _jpeg}
+    readers = {SIGNATURE: _png, BMP_SIGNATURE: _bitmap, JPEG_SIGNATURE: _jpeg}
     read = next((each for signature, each in readers.items() if data.startswith(signature)), None)
     if data.startswith(TIFF_SIGNATURES):
         _check_tiff(path, data, pages, camera)
@@ -105,13 +104,13 @@ def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
     width, height, bits, colour, _, _, interlaced = struct.unpack(">IIBBBBB", data[16:29])
-    if colour not in (PNG_GREY, PNG_COLOUR):
+    if colour not in (GREY, COLOUR):
         kind = "a palette" if colour == 3 else "an alpha channel"
         _refuse(path, "a grey or colour PNG", f"one with {kind}", "save the frame as grey")
     if interlaced:
         _refuse(path, "a PNG line by line", "an interlaced one", "save the frame without interlacing")
     _check_header(path, width, height, bits, camera)
-    place = len(PNG_SIGNATURE)
+    place = len(SIGNATURE)
     packed = bytearray()
     while True:
         length, kind_of_chunk = struct.unpack(">I4s", data[place : place + 8].ljust(8, b"\xff"))
@@ -127,14 +126,15 @@ def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
         if kind_of_chunk == b"IEND":
             break
         place = end
-    row_bytes = 1 + width * bits // 8 * (3 if colour == PNG_COLOUR else 1)
+    row_bytes = 1 + width * bits // 8 * (3 if colour == COLOUR else 1)
     rows = _inflated(packed, row_bytes * height)
-    if rows is None or len(rows) != row_bytes * height or max(rows[::row_bytes]) > PNG_FILTERS:
+    if rows is None or len(rows) != row_bytes * height or max(rows[::row_bytes]) > FILTERS:
         return None
+    image = rows_above_added(rows, height, bits) if colour == GREY else None
+    if image is not None:
+        return image
     # The decoder gets a file of these rows alone: nothing that a stranger packed, and no chunk that the walk passed.
-    parts = (b"IHDR" + data[16:29], b"IDAT" + zlib.compress(rows, 0), b"IEND")
-    plain = b"".join(struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in parts)
-    return _decoded(PNG_SIGNATURE + plain)
+    return _decoded(png_file(data[16:29], zlib.compress(rows, 0)))
 
 
 def _inflated(packed: bytearray | memoryview, most_bytes: int) -> bytes | None:
