@@ -83,16 +83,19 @@ def compilations_told(tell: Callable[[str], None]) -> Iterator[None]:
         event.unregister("numba:compile", listener)
 
 
-def in_bands(compiled: Callable[..., Any], count: int, /, *given: Any, rows_at_least: int = 1) -> list[Any]:
+def in_bands(
+    compiled: Callable[..., Any], count: int, /, *given: Any, rows_at_least: int = 1, rows_at_most: int | None = None
+) -> list[Any]:
     """Call compiled(first, last, *given) for bands that make up range(count), on all cores; their answers, in order.
 
-    rows_at_least : bands are not made smaller than this, where calling costs more than there is to do. Bands may write
-    to different rows of one array only.
+    rows_at_least : bands are not made smaller than this, where calling costs more than there is to do. rows_at_most :
+    nor larger than this, where each takes memory by its rows. Bands may write to different rows of one array only.
     """
-    share = max(rows_at_least, -(-count // (_BANDS_PER_CORE * config.NUMBA_NUM_THREADS)), 1)
+    share = -(-count // (_BANDS_PER_CORE * config.NUMBA_NUM_THREADS)) if config.NUMBA_NUM_THREADS > 1 else count
+    share = max(rows_at_least, min(share, rows_at_most or count), 1)
     borders = [*range(0, count, share), count]
     if len(borders) <= 2 or config.NUMBA_NUM_THREADS == 1:
-        return [compiled(0, count, *given)]
+        return [compiled(first, last, *given) for first, last in pairwise(borders)] or [compiled(0, count, *given)]
     bands = [_pool().submit(compiled, first, last, *given) for first, last in pairwise(borders)]
     wait(bands)
     return [band.result() for band in bands]

@@ -94,12 +94,12 @@ class _Runs:
 
 def _free(taken: NDArray[np.bool_], first: int, last: int) -> tuple[int, int]:
     """The first part of first … last whose steps are not taken."""
-    while first < last and taken[first]:
-        first += 1
-    end = first
-    while end < last and not taken[end]:
-        end += 1
-    return first, end
+    free = np.flatnonzero(~taken[first:last])
+    if len(free) == 0:
+        return last, last
+    first += int(free[0])
+    after = np.flatnonzero(taken[first:last])
+    return first, last if len(after) == 0 else first + int(after[0])
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ from slrig.reconstruction.stripes import (
 
 _FINEST_SCALE_PX = 1.0  # at 0.7 px, stripes of 0.7 px are found to 0.027 px rms, at 1.0 px to 0.008
 _COARSEST_SCALE_PX = 2.5  # chosen; half and double give the same figures of a rendered vase, refined by phase
+_REACH_PX = 16  # of the widest filter, 9 px, and of what a point may lie beside its pixel
 _LEAST_SMOOTHED_PX = 1.4  # stripe and filter together: see `_matched_scale_px`
 
 
@@ -269,7 +270,7 @@ def _curves(
     if lost is not None and tables.edges_of is not None:
         entered("locate stripes")
         coded, code = _with_fewer_bits(coded, code, lost, tables, limits)
-        edges = code_edge_points(coded, limits.stripes, scales.filter_px, within=lost)
+        edges = _edges_within(coded, lost, limits.stripes, scales.filter_px)
         beside = limits.edges.for_filters(scales.blur_px)
         middles = position_map(frames, noise, code, tables.cell_position, by_phase=False)
         shadow, step = near_edges(middles, coded.unlit, cell_width_px(coded), beside)
@@ -306,14 +307,34 @@ def _with_fewer_bits(
     frames, noise = coded.frames, coded.noise
     bits = unresolved_bits(frames, lit_pixels(frames, noise, limits.decoding))
     bits[~lost] = 0
-    cells = len(tables.cell_position)
-    fewer = decode(frames, noise, tables.index_of_word, cells, limits.decoding, unresolved=bits)
-    code = CodeMap(
-        np.where(lost, fewer.lowest, code.lowest),
-        np.where(lost, fewer.highest, code.highest),
-        np.where(lost, fewer.refusal, code.refusal),
+    rows, cells = _rows_about(lost, 0), len(tables.cell_position)
+    inside = lost[rows]
+    fewer = decode(
+        frames.rows(rows), noise.rows(rows), tables.index_of_word, cells, limits.decoding, unresolved=bits[rows]
     )
-    return replace(coded, code=fewer, unresolved=bits), code
+
+    def changed(before: CodeMap) -> CodeMap:
+        lowest, highest, refusal = before.lowest.copy(), before.highest.copy(), before.refusal.copy()
+        lowest[rows][inside] = fewer.lowest[inside]
+        highest[rows][inside] = fewer.highest[inside]
+        refusal[rows][inside] = fewer.refusal[inside]
+        return CodeMap(lowest, highest, refusal)
+
+    # Elsewhere all bits are read, as before.
+    return replace(coded, code=changed(coded.code), unresolved=bits), changed(code)
+
+
+def _edges_within(coded: Coded, lost: NDArray[np.bool_], limits: StripeLimits, scale_px: float) -> list[LinePoints]:
+    """Points of code edges where lines are lost, looked for in the rows about it."""
+    rows = _rows_about(lost, _REACH_PX)
+    found = code_edge_points(coded.rows(rows), limits, scale_px, within=lost[rows])
+    return [each._replace(points_px=each.points_px + np.array([0.0, rows.start])) for each in found]
+
+
+def _rows_about(mask: NDArray[np.bool_], reach: int) -> slice:
+    """From the first row in which the mask is set to the last, and so many more on either side."""
+    inside = np.flatnonzero(mask.any(axis=1))
+    return slice(max(int(inside[0]) - reach, 0), min(int(inside[-1]) + reach + 1, len(mask)))
 
 
 def _outside(points: LinePoints, lost: NDArray[np.bool_]) -> LinePoints:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, Images, band_rows, rows_of
 from slrig.reconstruction.noise import NoiseModel
 
 
@@ -72,19 +72,26 @@ def edge_crossings(
     round with the crossing's place between the pixels.
     """
     paired = frames.inverses is not None
-    against = frames.inverses if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
+    against = frames.inverses if frames.inverses is not None else [(frames.white + frames.black) / 2]
     read, slope = noise.read_variance, noise.slope
-    given = frames.bits, against, code.lowest, code.highest, asked & (code.refusal == 0)
+    images: list[Images] = [frames.bits, against, (code.lowest,), (code.highest,), (asked & (code.refusal == 0),)]
     if down:
-        # Columns of a transposed copy lie behind one another in memory; strided ones would be far slower to walk.
-        given = tuple(np.ascontiguousarray(np.swapaxes(each, -1, -2)) for each in given)  # type: ignore[assignment]
-    shape = given[0].shape[1:]
+        images = [[image.T for image in each] for each in images]
+    shape = images[0][0].shape
     fraction, sigma = (np.full(shape, np.nan, dtype=np.float32) for _ in range(2))
     position = np.full(shape, np.nan)
-    in_bands(
-        _crossing_kernel, shape[0], *given, paired, np.float32(read), np.float32(slope),
-        np.asarray(edge_position, np.float64), least_sigma, fraction, sigma, position,
-    )  # fmt: skip
+
+    def band(first: int, last: int) -> None:
+        rows = slice(first, last)
+        # Columns of a transposed copy lie behind one another in memory; strided ones would be far slower to walk.
+        shown, other = (rows_of(each, rows) for each in images[:2])
+        low, high, wanted = (np.ascontiguousarray(each[0][rows]) for each in images[2:])
+        _crossing_kernel(
+            0, last - first, shown, other, low, high, wanted, paired, np.float32(read), np.float32(slope),
+            np.asarray(edge_position, np.float64), least_sigma, fraction[rows], sigma[rows], position[rows],
+        )  # fmt: skip
+
+    in_bands(band, shape[0], rows_at_most=band_rows(frames.bits, 2 * shape[1]))
     along, across = np.nonzero(np.isfinite(position))
     row, column = (across, along) if down else (along, across)
     return EdgeCrossings(

@@ -7,14 +7,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.kernels import in_bands
 from slrig.model import Refusal
 from slrig.reconstruction.compression import loss_variance
 from slrig.reconstruction.correlation import PixelSum, shared_noise
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, Images, at_rows, band_rows, rows_of
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.response import gain
-from slrig.reconstruction.stripes import LinePoints, StripeLimits, edge_points, normalised, normalised_line
+from slrig.reconstruction.stripes import (
+    LinePoints,
+    StripeLimits,
+    edge_points,
+    normalised,
+    normalised_kernel,
+    normalised_line,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +46,28 @@ class Coded:
     shared: float = 1.0
     gamma: float = 1.0
 
+    def rows(self, rows: slice) -> Coded:
+        """Some rows of all of it."""
+        return replace(
+            self,
+            frames=self.frames.rows(rows),
+            noise=self.noise.rows(rows),
+            code=self.code.rows(rows),
+            near_shadow=self.near_shadow[rows],
+            contrast_deviation=self.contrast_deviation[rows],
+            unresolved=at_rows(self.unresolved, rows),
+        )
+
     @property
     def position_noise(self) -> NoiseModel:
         """Noise as positions have it."""
         return self.noise.times(self.shared).with_more(self.loss_variance)
 
-    def summed(self, images: NDArray[np.float32], pixels: PixelSum) -> Coded:
-        """The same with what noise and compression of these images, (n, H, W), do to positions that sum pixels so."""
+    def summed(self, images: Images, pixels: PixelSum) -> Coded:
+        """The same with what noise and compression of these images do to positions that sum pixels so."""
         loss = loss_variance(self.frames, self.noise, self.code, images, pixels)
         if loss:
-            loss *= gain(images[:, ~self.unlit], self.gamma, self.frames.full_scale)
+            loss *= gain((image[~self.unlit] for image in images), self.gamma, self.frames.full_scale)
         return replace(self, loss_variance=loss, shared=shared_noise(self.frames, self.noise, ~self.unlit, pixels))
 
     @property
@@ -64,7 +84,8 @@ def cell_width_px(coded: Coded) -> float | NDArray[np.float32]:
 
 def line_image(coded: Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Line frame `index` relative to white, and its noise."""
-    frames, noise, line = coded.frames, coded.position_noise, coded.frames.lines[index]
+    frames, noise = coded.frames, coded.position_noise
+    line = frames.lines[index].astype(np.float32, copy=False)
     if noise.read_share is None:
         return normalised_line(
             line, frames.white, frames.black, noise.read_variance, noise.slope, frames.ends_repeats
@@ -81,22 +102,43 @@ def code_edge_points(
     coded: Coded, limits: StripeLimits, scale_px: float, *, within: NDArray[np.bool_] | None = None
 ) -> list[LinePoints]:
     """Points of each code bit's edges, where the bit resolves. within : (H, W) bool, to look for them nowhere else."""
-    frames, noise = coded.frames, coded.position_noise
-    contrast, lit = frames.contrast, ~coded.unlit
-    none = np.zeros_like(contrast)
-    ends_variance = (noise.variance(frames.white) + noise.variance(frames.black)) / frames.ends_repeats
+    frames, lit = coded.frames, ~coded.unlit
     parts = []
-    for index, bit in enumerate(frames.bits):
+    for index in range(len(frames.bits)):
+        read = lit if coded.unresolved is None else lit & (index < len(frames.bits) - coded.unresolved)
+        if within is not None:
+            read &= within
+        parts.append(edge_points(*_swing(coded, index), read, limits, sigma_px=scale_px))
+    return parts
+
+
+def _swing(coded: Coded, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Bit `index` less its inverse relative to white less black, and its noise, (H, W) each."""
+    whole = replace(
+        coded.frames,
+        bits=coded.frames.bits[index : index + 1],
+        inverses=None if coded.frames.inverses is None else coded.frames.inverses[index : index + 1],
+        lines=(),
+    )
+    light, deviation = np.zeros_like(whole.white), np.zeros_like(whole.white)
+
+    def band(first: int, last: int) -> None:
+        rows = slice(first, last)
+        frames, noise = whole.rows(rows), coded.position_noise.rows(rows)
+        bit = rows_of(frames.bits)[0]
         if frames.inverses is not None:
-            inverse = frames.inverses[index]
+            inverse = rows_of(frames.inverses)[0]
             swing = bit - inverse
             variance = noise.variance(bit) + noise.variance(inverse)
         else:
             swing = 2 * bit - frames.white - frames.black
-            variance = 4 * noise.variance(bit) + ends_variance
-        image, deviation = normalised(swing, none, contrast, np.sqrt(variance))
-        read = lit if coded.unresolved is None else lit & (index < len(frames.bits) - coded.unresolved)
-        if within is not None:
-            read &= within
-        parts.append(edge_points(image, deviation, read, limits, sigma_px=scale_px))
-    return parts
+            ends = (noise.variance(frames.white) + noise.variance(frames.black)) / frames.ends_repeats
+            variance = 4 * noise.variance(bit) + ends
+        normalised_kernel(
+            0, last - first, swing, np.zeros_like(swing), frames.contrast, np.sqrt(variance), light[rows],
+            deviation[rows],
+        )  # fmt: skip
+
+    rows, columns = light.shape
+    in_bands(band, rows, rows_at_most=band_rows(whole.white, columns))
+    return light, deviation

@@ -17,7 +17,6 @@ decoded show no steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -27,10 +26,8 @@ from numpy.typing import NDArray
 from slrig.model import FloatArray, IntArray, Refusal
 from slrig.reconstruction.correlation import PixelSum
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, Images
 from slrig.reconstruction.noise import NoiseModel
-
-Images = Sequence[NDArray[Any]] | NDArray[Any]
 
 _SIDE = 8
 _FULL_SCALE = 255  # of what JPEG is used for

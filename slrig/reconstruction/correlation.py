@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Refusal
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, Images
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.surface_fit import stencils
 
@@ -80,14 +80,14 @@ def shared_noise(frames: AxisFrames, noise: NoiseModel, where: NDArray[np.bool_]
     if len(corner[0]) < _LEAST_WINDOWS:
         return 1.0
     direct, inverse = _seen_in(bits, corner, summed), _seen_in(inverses, corner, summed)
-    contrast = _seen_in(frames.contrast[np.newaxis], corner, summed)
+    contrast = _seen_in([frames.contrast], corner, summed)
     clear = np.abs(direct - inverse) > _CLEAR_SHARE * contrast
     # Where the dark one of both is cut off at zero, pixels and sums lose alike.
     clear &= np.maximum(direct, inverse) < frames.clipped_at
     kept = clear.all(axis=(0, 2))
     if np.count_nonzero(kept) < _LEAST_WINDOWS:
         return 1.0
-    ends = _seen_in((noise.variance(frames.white) + noise.variance(frames.black))[np.newaxis], corner, summed)[0, kept]
+    ends = _seen_in([noise.variance(frames.white) + noise.variance(frames.black)], corner, summed)[0, kept]
     direct, inverse = direct[:, kept], inverse[:, kept]
     swings = _ratio(np.abs(direct - inverse), ends, summed)
     ratio = swings if summed.of_swings else max(swings, _ratio(direct + inverse, ends, summed))
@@ -123,9 +123,9 @@ def _windows(where: NDArray[np.bool_], side: int) -> tuple[NDArray[np.intp], NDA
 
 
 def _seen_in(
-    images: NDArray[np.float32], corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum
+    images: Images, corner: tuple[NDArray[np.intp], NDArray[np.intp]], summed: PixelSum
 ) -> NDArray[np.float32]:
-    """(images, windows, k²): the pixels of each window."""
-    side = len(summed.weights)
-    views = np.lib.stride_tricks.sliding_window_view(images, (side, side), axis=(1, 2))
-    return np.asarray(views[:, corner[0], corner[1]].reshape(len(images), len(corner[0]), -1))
+    """(images, windows, k²) float32: the pixels of each window."""
+    sides = (len(summed.weights),) * 2
+    views = (np.lib.stride_tricks.sliding_window_view(image, sides) for image in images)
+    return np.array([view[corner].reshape(len(corner[0]), -1) for view in views], dtype=np.float32)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel
 from slrig.model import IntArray, Refusal
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, band_rows, rows_of
 from slrig.reconstruction.noise import NoiseModel
 
 _NOT_LIT = int(Refusal.NOT_LIT)
@@ -54,6 +54,10 @@ class CodeMap(NamedTuple):
     highest: IntArray
     refusal: NDArray[np.uint8]
 
+    def rows(self, rows: slice) -> CodeMap:
+        """Some rows of the map, to look at or to fill in."""
+        return CodeMap(self.lowest[rows], self.highest[rows], self.refusal[rows])
+
     def centre(self) -> NDArray[np.float64]:
         """(H, W) float64: the middle of the interval in cells, NaN where refused."""
         middle = (self.lowest + self.highest) / 2
@@ -82,24 +86,33 @@ def decode(
     index_of_word : (2^bits,) int32, the cell index of each Gray word; cell_count : cells that the projector shows.
     unresolved : (H, W) uint8, how many of the finest bits are not read at each pixel; all are read without it.
     """
-    contrast = frames.contrast
-    shown = frames.bits
-    against = frames.inverses if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
-    spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
-    lit = lit_pixels(frames, noise, limits)
-    unread = np.zeros(contrast.shape, dtype=np.uint8) if unresolved is None else unresolved
-    lowest = np.full(contrast.shape, -1, dtype=np.int32)
-    highest = np.full(contrast.shape, -1, dtype=np.int32)
-    refusal = np.zeros(contrast.shape, dtype=np.uint8)
+    shape = frames.white.shape
+    code = CodeMap(np.full(shape, -1, np.int32), np.full(shape, -1, np.int32), np.zeros(shape, np.uint8))
+    unread = np.zeros(shape, dtype=np.uint8) if unresolved is None else unresolved
+    words = index_of_word.astype(np.int32)
+
+    def band(first: int, last: int) -> None:
+        rows = slice(first, last)
+        _decode_rows(frames.rows(rows), noise.rows(rows), words, cell_count, limits, unread[rows], code.rows(rows))
+
+    in_bands(band, shape[0], rows_at_most=band_rows(frames.bits, 2 * shape[1]))
+    return code
+
+
+def _decode_rows(
+    frames: AxisFrames, noise: NoiseModel, words: IntArray, cell_count: int, limits: DecodingLimits,
+    unread: NDArray[np.uint8], code: CodeMap,
+) -> None:  # fmt: skip
+    """Fill in the code of some rows."""
     paired = frames.inverses is not None
+    against = rows_of(frames.inverses) if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
+    spread = np.sqrt(noise.variance(frames.white) + noise.variance(frames.black))
     # Against the middle of white and black a bit swings half as far as against its inverse.
-    margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * contrast) * (1.0 if paired else 0.5)
-    in_bands(
-        _decode_kernel, len(lit), shown, against, paired, frames.white, lit, unread, margin.astype(np.float32),
-        np.float32(frames.clipped_at),
-        index_of_word.astype(np.int32), cell_count, limits.widest_interval, lowest, highest, refusal,
+    margin = np.maximum(limits.bit_sigma * spread, limits.bit_fraction * frames.contrast) * (1.0 if paired else 0.5)
+    _decode_kernel(
+        0, len(unread), rows_of(frames.bits), against, paired, frames.white, lit_pixels(frames, noise, limits), unread,
+        margin.astype(np.float32), np.float32(frames.clipped_at), words, cell_count, limits.widest_interval, *code,
     )  # fmt: skip
-    return CodeMap(lowest, highest, refusal)
 
 
 @kernel

@@ -1,6 +1,9 @@
 """The frames of one camera and one axis, sorted by what they show, ready for decoding.
 
 Repeats of a pattern at one exposure are averaged. Several exposures are a bracket: see `slrig.reconstruction.fusion`.
+
+Images stay as they came, of whole numbers: as float32 those of a large sensor would take four times the memory. What is
+computed takes them so a few rows at a time.
 """
 
 from __future__ import annotations
@@ -8,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -17,14 +21,42 @@ from slrig.errors import PatternError
 from slrig.model import Axis, Black, Capture, Gray, LineShift, Pattern, Shot, White, exposure_groups
 
 Image = NDArray[np.float32]
+Images = Sequence[NDArray[Any]] | NDArray[np.float32]
+"""(H, W) each, of one extent, of whole numbers or float32."""
+
+_BAND_BYTES = 2**22
+"""Of what is made of images at a time: it stays in a core's cache."""
+
+
+def rows_of(images: Images, rows: slice = slice(None)) -> NDArray[np.float32]:
+    """(n, rows, W) float32: some rows of all images."""
+    found = np.zeros((len(images), *images[0][rows].shape), dtype=np.float32)
+    for image, out in zip(images, found, strict=True):
+        out[:] = image[rows]
+    return found
+
+
+def sampled(images: Images, row_step: int, column_step: int) -> NDArray[np.float32]:
+    """(n, rows, columns) float32: every so many pixels of all images."""
+    return np.array([image[::row_step, ::column_step] for image in images], dtype=np.float32)
+
+
+def band_rows(images: Images, columns: int) -> int:
+    """How many rows of all images, of so many columns, are worked on at a time."""
+    return max(16, _BAND_BYTES // (4 * columns * max(len(images), 1)))
+
+
+def at_rows(values: Any, rows: slice) -> Any:
+    """Some rows of (H, W) values; what is not an array holds for all."""
+    return values[rows] if isinstance(values, np.ndarray) else values
 
 
 @dataclass(frozen=True, slots=True)
 class AxisFrames:
-    """What one camera saw of the patterns of one axis. Images are (H, W) float32 in camera units.
+    """What one camera saw of the patterns of one axis. Images are (H, W) in camera units, white and black float32.
 
-    bits : (B, H, W) float32, most significant first; inverses : the same, or None where none were shown.
-    lines : (L, H, W) float32, one per shift; line_patterns says which.
+    bits : B images, most significant first; inverses : the same, or None where none were shown.
+    lines : L images, one per shift; line_patterns says which.
     full_scale : the value of a saturated sample of one exposure.
     ends_repeats : white and black are means of so many times more frames than the others.
     exposure_ratio : the light of a bracket's longest exposure over that of its shortest; 1 without a bracket.
@@ -33,10 +65,10 @@ class AxisFrames:
     axis: Axis
     white: Image
     black: Image
-    bits: NDArray[np.float32]
-    inverses: NDArray[np.float32] | None
+    bits: Images
+    inverses: Images | None
     gray: Gray
-    lines: NDArray[np.float32]
+    lines: Images
     line_patterns: tuple[LineShift, ...]
     full_scale: float
     exposure_ratio: float = 1.0
@@ -51,6 +83,17 @@ class AxisFrames:
     def contrast(self) -> Image:
         """(H, W) float32: white minus black, the light that the projector adds."""
         return self.white - self.black
+
+    def rows(self, rows: slice) -> AxisFrames:
+        """Some rows of all images."""
+        return replace(
+            self,
+            white=self.white[rows],
+            black=self.black[rows],
+            bits=[image[rows] for image in self.bits],
+            inverses=None if self.inverses is None else [image[rows] for image in self.inverses],
+            lines=[image[rows] for image in self.lines],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,9 +206,10 @@ class FrameStacks:
         self.patterns = patterns
         self._scales = {"full_scale": full_scale, "exposure_ratio": exposure_ratio, "ends_repeats": ends_repeats}
         bits = patterns.gray.bits
-        self._bits = np.zeros((bits, *shape), dtype=np.float32)
-        self._inverses = np.zeros((bits if patterns.inverted else 0, *shape), dtype=np.float32)
-        self._lines = np.zeros((len(patterns.lines), *shape), dtype=np.float32)
+        dark = np.broadcast_to(np.zeros(1, dtype=np.uint8), shape)
+        self._bits: list[NDArray[Any]] = [dark] * bits
+        self._inverses: list[NDArray[Any]] = [dark] * (bits if patterns.inverted else 0)
+        self._lines: list[NDArray[Any]] = [dark] * len(patterns.lines)
         self._ends: dict[Pattern, Image] = {}
         self._missing = set(patterns.needed)
         self._gamma = 1.0
@@ -182,14 +226,16 @@ class FrameStacks:
             (0, 0), full_scale=frames.full_scale, exposure_ratio=frames.exposure_ratio,
             ends_repeats=frames.ends_repeats,
         )  # fmt: skip
-        stacks._bits, stacks._lines = frames.bits, frames.lines
-        stacks._inverses = stacks._inverses if frames.inverses is None else frames.inverses
+        stacks._bits, stacks._lines = list(frames.bits), list(frames.lines)
+        stacks._inverses = [] if frames.inverses is None else list(frames.inverses)
         stacks._ends = {White(): frames.white, Black(): frames.black}
         stacks._missing = set()
         return stacks
 
     def put(self, pattern: Pattern, image: NDArray[Any]) -> None:
-        """Take the (H, W) image of a pattern; of one that this axis does not need, nothing is kept."""
+        """Take the (H, W) image of a pattern, which nobody may change; of one that this axis does not need, nothing is
+        kept.
+        """
         if pattern not in self._missing:
             return
         if self._gamma != 1:
@@ -208,10 +254,8 @@ class FrameStacks:
         gamma : of a camera whose values are light to the power of 1/gamma.
         """
         self._gamma = gamma
-        # Into new arrays: the old ones may be somebody else's.
-        self._bits, self._inverses, self._lines = (
-            self._straight(each) for each in (self._bits, self._inverses, self._lines)
-        )
+        for images in (self._bits, self._inverses, self._lines):
+            images[:] = [self._straight(each) for each in images]
         self._ends = {pattern: self._straight(image) for pattern, image in self._ends.items()}
 
     def _straight(self, image: NDArray[Any]) -> NDArray[np.float32]:
@@ -237,10 +281,11 @@ class FrameStacks:
         patterns = self.patterns
         pairs = sorted(patterns.direct & patterns.inverted)
         white, black = self._ends.get(White()), self._ends.get(Black())
+        both = [each for bit in pairs for each in (self._bits[bit], self._inverses[bit])]
         if white is None:
-            white = np.maximum(self._bits[pairs], self._inverses[pairs]).max(axis=0)
+            white = reduce(np.maximum, both).astype(np.float32)
         if black is None:
-            black = np.minimum(self._bits[pairs], self._inverses[pairs]).min(axis=0)
+            black = reduce(np.minimum, both).astype(np.float32)
         for bit in patterns.inverted - patterns.direct:
             self._bits[bit] = white + black - self._inverses[bit]
         return AxisFrames(

@@ -84,11 +84,13 @@ def with_refused_points(
     float32, that of `phase.position_map`, NaN where a line frame is clipped.
     """
     refusal = code.refusal.copy()
-    clipped_at = np.float32(frames.clipped_at)
+    clipped = np.zeros(refusal.shape, dtype=np.bool_)
+    for image in frames.lines:
+        clipped |= image >= frames.clipped_at
     for index, points in enumerate(found):
         cause = np.zeros(len(points.points_px), dtype=np.uint8)
         in_bands(
-            _cause_kernel, len(cause), points.points_px, position_of[index], code, frames.lines, clipped_at, position,
+            _cause_kernel, len(cause), points.points_px, position_of[index], code, clipped, position,
             near_shadow, near_step, cause,
         )  # fmt: skip
         # One after another: the last of the points that share a pixel stands.
@@ -100,8 +102,8 @@ def with_refused_points(
 
 @kernel
 def _cause_kernel(
-    first: int, last: int, points: Any, position_of: Any, code: Any, lines: Any, clipped_at: float,
-    position: Any, near_shadow: Any, near_step: Any, cause: Any,
+    first: int, last: int, points: Any, position_of: Any, code: Any, clipped: Any, position: Any,
+    near_shadow: Any, near_step: Any, cause: Any,
 ) -> None:  # fmt: skip
     """Fill in why each point of a frame is refused, 0 where it is not."""
     for i in range(first, last):
@@ -110,10 +112,8 @@ def _cause_kernel(
             continue
         low, high = position_of[code.lowest[y, x]], position_of[code.highest[y, x]]
         cause[i] = _cause(low, high, near_shadow[y, x], near_step[y, x])
-        if not cause[i] and np.isnan(position[y, x]):
-            for k in range(len(lines)):
-                if lines[k, y, x] >= clipped_at:
-                    cause[i] = _SATURATED
+        if not cause[i] and np.isnan(position[y, x]) and clipped[y, x]:
+            cause[i] = _SATURATED
 
 
 @kernel_part(inline="always")

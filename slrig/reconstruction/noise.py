@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, Images, at_rows, sampled
 
 _QUANTISATION_VARIANCE = 1.0 / 12.0  # of rounding to whole camera units: no camera has less
 _MOST_SAMPLES = 200_000  # some 8000 for each of the bins
@@ -47,9 +47,17 @@ class NoiseModel:
     def variance(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """(H, W) float32: the variance expected of each sample of `image`."""
         if self.read_share is None or self.shot_share is None:
-            return np.asarray(self.read_variance + self.slope * np.maximum(image, 0), dtype=np.float32)
+            # In one array: pages of fresh memory cost more than the sums.
+            variance = np.maximum(image, 0)
+            variance *= np.float32(self.slope)
+            variance += np.float32(self.read_variance)
+            return np.asarray(variance)
         read, shot = np.float32(self.read_variance) * self.read_share, np.float32(self.slope) * self.shot_share
         return np.asarray(read + shot * np.maximum(image, 0), dtype=np.float32)
+
+    def rows(self, rows: slice) -> NoiseModel:
+        """The noise of some rows."""
+        return replace(self, read_share=at_rows(self.read_share, rows), shot_share=at_rows(self.shot_share, rows))
 
     def times(self, factor: float) -> NoiseModel:
         """The same with the variance of every sample multiplied."""
@@ -103,11 +111,11 @@ def _tells_slope(level: NDArray[np.float32], variance: NDArray[np.float32]) -> b
 
 
 def _scatter_of_sums(
-    bits: NDArray[np.float32], inverses: NDArray[np.float32], clipped_at: float, where: NDArray[np.bool_] | None
+    bits: Images, inverses: Images, clipped_at: float, where: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Levels and variances of single samples, half those of the sums."""
     step = math.ceil(math.sqrt(bits[0].size / _MOST_SAMPLES))
-    direct, inverse = bits[:, ::step, ::step], inverses[:, ::step, ::step]
+    direct, inverse = sampled(bits, step, step), sampled(inverses, step, step)
     sums = direct + inverse
     unclipped = (np.maximum(direct, inverse).max(axis=0) < clipped_at) & (np.minimum(direct, inverse).min(axis=0) > 0)
     if where is not None:

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
-from slrig.model import FloatArray
+from slrig.model import FloatArray, LineShift
 from slrig.reconstruction.decoding import CodeMap
-from slrig.reconstruction.frames import AxisFrames
+from slrig.reconstruction.frames import AxisFrames, band_rows, rows_of
 from slrig.reconstruction.noise import NoiseModel
 from slrig.reconstruction.surface_fit import stencils
 
@@ -51,27 +51,46 @@ def position_map(
     phase = by_phase and has_phase(frames)
     # An interval of more than half a period may hold the phase twice, and does not tell which.
     widest_px = 0.5 * patterns[0].period_px if phase else np.inf
-    middle = np.full(code.lowest.shape, np.nan, dtype=np.float32)
-    in_bands(_middle_kernel, len(middle), code, cell_position, widest_px, middle)
+    shape = code.lowest.shape
+    position, sigma = (np.full(shape, np.nan, dtype=np.float32) for _ in range(2))
     if not phase:
-        return PositionMap(middle, np.full_like(middle, np.nan))
+        in_bands(_middle_kernel, shape[0], code, cell_position, widest_px, position)
+        return PositionMap(position, sigma)
+
+    def band(first: int, last: int) -> None:
+        rows = slice(first, last)
+        middle = np.full((last - first, shape[1]), np.nan, dtype=np.float32)
+        _middle_kernel(0, last - first, code.rows(rows), cell_position, widest_px, middle)
+        lines = rows_of(frames.lines, rows)
+        position[rows], sigma[rows] = _phases(lines, patterns, noise.rows(rows), middle, np.float32(frames.clipped_at))
+
+    in_bands(band, shape[0], rows_at_most=band_rows(frames.lines, shape[1]))
+    return PositionMap(position, sigma)
+
+
+def _phases(
+    lines: NDArray[np.float32], patterns: tuple[LineShift, ...], noise: NoiseModel, middle: NDArray[np.float32],
+    clipped_at: np.float32,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+    """Position and its deviation, (rows, W) float32 each, NaN where unknown.
+
+    lines : (n, rows, W) float32; middle : (rows, W) float32, of the code's intervals, px.
+    """
     period = patterns[0].period_px
     angle = 2 * np.pi / period * np.array([p.centre_px for p in patterns])
-    given = frames.lines, np.cos(angle), np.sin(angle), float(period), middle
-    clipped_at = np.float32(frames.clipped_at)
+    given = lines, np.cos(angle), np.sin(angle), float(period), middle
+
+    def phases(read: float, slope: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        position, sigma = (np.full_like(middle, np.nan) for _ in range(2))
+        _phase_kernel(0, len(middle), *given, read, slope, clipped_at, position, sigma)
+        return position, sigma
+
     if noise.read_share is None or noise.shot_share is None:
-        return PositionMap(*_phases(*given, noise.read_variance, noise.slope, clipped_at))
+        return phases(noise.read_variance, noise.slope)
     # The variance is a sum of one part by read noise and one by shot noise, each with its own share at each pixel.
-    position, by_read = _phases(*given, noise.read_variance, 0.0, clipped_at)
-    _, by_shot = _phases(*given, 0.0, noise.slope, clipped_at)
-    return PositionMap(position, np.sqrt(noise.read_share * by_read**2 + noise.shot_share * by_shot**2))
-
-
-def _phases(lines: NDArray[np.float32], *given: Any) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Position and its deviation, (H, W) float32 each, NaN where unknown."""
-    position, sigma = (np.full(lines.shape[1:], np.nan, dtype=np.float32) for _ in range(2))
-    in_bands(_phase_kernel, len(position), lines, *given, position, sigma)
-    return position, sigma
+    position, by_read = phases(noise.read_variance, 0.0)
+    _, by_shot = phases(0.0, noise.slope)
+    return position, np.sqrt(noise.read_share * by_read**2 + noise.shot_share * by_shot**2)
 
 
 @kernel

@@ -44,11 +44,12 @@ def unresolved_bits(frames: AxisFrames, lit: NDArray[np.bool_], /) -> NDArray[np
     not seen, as in light from elsewhere, and 0 stands.
     """
     lit = lit & (frames.white < frames.clipped_at)
-    against = frames.inverses if frames.inverses is not None else ((frames.white + frames.black) / 2)[None]
     bits = len(frames.bits)
+    against = frames.inverses if frames.inverses is not None else [(frames.white + frames.black) / 2] * bits
     word = np.zeros(lit.shape, dtype=np.int32)
-    for bit in range(bits):
-        word |= (frames.bits[bit] > against[bit if len(against) > 1 else 0]).astype(np.int32) << (bits - 1 - bit)
+    for shown, other in zip(frames.bits, against, strict=True):
+        word <<= 1
+        word |= shown > other
     blocks = tuple(-(-extent // BLOCK_PX) for extent in lit.shape)
     unresolved = np.zeros(blocks, dtype=np.uint8)
     # Columns of a transposed copy lie behind one another in memory.

@@ -13,14 +13,16 @@ light at edges, which looks like γ < 1, and nothing is made straight then.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.reconstruction.compression import frames_loss
 from slrig.reconstruction.decoding import DecodingLimits, lit_pixels
-from slrig.reconstruction.frames import AxisFrames, FrameStacks
+from slrig.reconstruction.frames import AxisFrames, FrameStacks, sampled
 from slrig.reconstruction.noise import NoiseModel, estimate_noise
 
 _LEAST = 1.2  # chosen: cameras bend by 1.8 and more if at all, and edges of eight scenes by straight ones told 1.00
@@ -39,7 +41,7 @@ def found_gamma(frames: AxisFrames) -> float:
     full = frames.full_scale
     # Rows enough: an edge of the code crosses most of them.
     step = max(1, frames.white.size // _MOST_PIXELS)
-    bits, inverses = frames.bits[:, ::step], frames.inverses[:, ::step]
+    bits, inverses = sampled(frames.bits, step, 1), sampled(frames.inverses, step, 1)
     # At most bits a pixel is clear of edges. White does not tell: projectors may dim a picture that is all white.
     white, black = (np.median(each(bits, inverses), axis=0) for each in (np.maximum, np.minimum))
     clear = (white - black > _CLEAR_LEVELS / 255 * full) & (white < frames.clipped_at)
@@ -77,10 +79,13 @@ def in_light(stacks: FrameStacks, limits: DecodingLimits) -> tuple[AxisFrames, N
     return frames, replace(estimate_noise(frames), loss=loss), gamma
 
 
-def gain(light: NDArray[np.float32], gamma: float, full_scale: float) -> float:
+def gain(light: Iterable[NDArray[Any]], gamma: float, full_scale: float) -> float:
     """By what an error's variance grew on average where values were made straight: the mean square slope, 1 for γ = 1.
 
-    light : straight values of one full scale. Light v^γ has the slope γ v^(γ - 1) over the value v.
+    light : straight values of one full scale, as many of each image. Light v^γ has the slope γ v^(γ - 1) over the
+    value v.
     """
-    share = np.maximum(light, 0) / np.float32(full_scale)
-    return float(np.mean((gamma * share ** np.float32(1 - 1 / gamma)) ** 2, dtype=np.float64))
+    if gamma == 1:
+        return 1.0
+    shares = (np.maximum(each, 0) / np.float32(full_scale) for each in light)
+    return float(np.mean([np.mean((gamma * s ** np.float32(1 - 1 / gamma)) ** 2, dtype=np.float64) for s in shares]))

@@ -100,14 +100,15 @@ def normalised(
     noise : (H, W) float32, standard deviation of I - black, camera units.
     """
     light, deviation = np.zeros_like(image), np.zeros_like(image)
-    in_bands(_normalised_kernel, len(image), image, black, contrast, noise, light, deviation)
+    in_bands(normalised_kernel, len(image), image, black, contrast, noise, light, deviation)
     return light, deviation
 
 
 @kernel(in_every_scan=False)
-def _normalised_kernel(
+def normalised_kernel(
     first: int, last: int, image: Any, black: Any, contrast: Any, noise: Any, light: Any, deviation: Any
 ) -> None:
+    """Fill in light and deviation: see `normalised`."""
     for y in range(first, last):
         for x in range(image.shape[1]):
             weight = _weight(contrast[y, x], noise[y, x])

@@ -20,7 +20,7 @@ from slrig.model import (
     Size,
     White,
 )
-from slrig.reconstruction.frames import axis_frames
+from slrig.reconstruction.frames import Images, axis_frames, rows_of, sampled
 
 CAMERA = CameraFormat(Size(3, 2), 8)
 BITS = [Gray(Axis.COLUMN, bit, 2) for bit in range(2)]
@@ -56,30 +56,47 @@ def exposed(exposure_s: float | None, *patterns: Pattern) -> list[Seen]:
 ENDS: list[Seen] = [(White(), 200, None), (Black(), 10, None)]
 
 
+def first_pixels(images: Images) -> list[float]:
+    return [float(image[0, 0]) for image in images]
+
+
 def test_frames_are_sorted_by_what_they_show() -> None:
     seen: list[Seen] = [(LINES[2], 72, None), (BITS[1], 21, None), (LINES[0], 70, None), (INVERSES[0], 30, None)]
     seen += [*ENDS, (INVERSES[1], 31, None), (BITS[0], 20, None)]
     frames = axis_frames(capture_of(*seen), "eye", Axis.COLUMN)
-    assert frames.bits[:, 0, 0].tolist() == [20, 21]
+    assert first_pixels(frames.bits) == [20, 21]
     assert frames.inverses is not None
-    assert frames.inverses[:, 0, 0].tolist() == [30, 31]
-    assert frames.lines[:, 0, 0].tolist() == [70, 72]
+    assert first_pixels(frames.inverses) == [30, 31]
+    assert first_pixels(frames.lines) == [70, 72]
     assert frames.line_patterns == (LINES[0], LINES[2])
     assert (frames.contrast == 190).all()
     assert frames.full_scale == 255
     assert (frames.gray.bits, frames.gray.cell_px, frames.gray.offset_px) == (2, 1, 0)
-    for image in (frames.white, frames.black, frames.bits, frames.inverses, frames.lines):
+    for image in (frames.white, frames.black):
         assert image.dtype == np.float32
+    for image in (*frames.bits, *frames.inverses, *frames.lines):
+        assert image.dtype == np.uint8
+
+
+def test_rows_of_frames_are_those_of_all_images() -> None:
+    frames = axis_frames(capture_of(*ENDS, *plain(*BITS), *plain(*INVERSES), *plain(*LINES)), "eye", Axis.COLUMN)
+    some = frames.rows(slice(1, 2))
+    assert some.inverses is not None
+    for images in (some.bits, some.inverses, some.lines):
+        assert {image.shape for image in images} == {(1, frames.white.shape[1])}
+    assert rows_of(frames.lines, slice(1, 2)).dtype == np.float32
+    assert first_pixels(some.bits) == first_pixels(frames.bits)
+    assert sampled(frames.bits, 2, 3).shape == (2, -(-frames.white.shape[0] // 2), -(-frames.white.shape[1] // 3))
 
 
 def test_only_the_axis_and_the_camera_asked_for_are_taken() -> None:
     row = Gray(Axis.ROW, 0, 1)
     both = capture_of(*ENDS, *plain(*BITS), *plain(row, LineShift(Axis.ROW, 0, 4), value=77))
-    assert axis_frames(both, "eye", Axis.ROW).bits[:, 0, 0].tolist() == [77]
+    assert first_pixels(axis_frames(both, "eye", Axis.ROW).bits) == [77]
     assert len(axis_frames(both, "eye", Axis.COLUMN).lines) == 0
     other = capture_of(*ENDS, *plain(*BITS, value=99), name="other")
     together = Capture(both.projector, both.patterns, {**both.cameras, **other.cameras}, both.shots + other.shots)
-    assert axis_frames(together, "eye", Axis.COLUMN).bits.max() == 50
+    assert np.max(axis_frames(together, "eye", Axis.COLUMN).bits) == 50
 
 
 def test_repeats_at_one_exposure_are_averaged() -> None:
@@ -87,7 +104,7 @@ def test_repeats_at_one_exposure_are_averaged() -> None:
     frames = axis_frames(capture_of(*ENDS, *opening, *plain(*BITS)), "eye", Axis.COLUMN)
     assert (frames.white == np.float32(204)).all()
     twice = axis_frames(capture_of(*ENDS, *plain(*BITS), *plain(*BITS, value=60), *ENDS), "eye", Axis.COLUMN)
-    assert (twice.bits == np.float32(55)).all()
+    assert (np.array(twice.bits) == np.float32(55)).all()
     assert (frames.ends_repeats, twice.ends_repeats) == (1.0, 1.0)
 
 
@@ -124,7 +141,7 @@ def test_missing_inverses_are_said_to_be_missing() -> None:
 
 def test_a_bit_shown_only_inverted_is_turned_back() -> None:
     frames = axis_frames(capture_of(*ENDS, *plain(BITS[0]), (INVERSES[1], 60, None)), "eye", Axis.COLUMN)
-    assert frames.bits[:, 0, 0].tolist() == [50, 200 + 10 - 60]
+    assert first_pixels(frames.bits) == [50, 200 + 10 - 60]
 
 
 def test_without_white_and_black_the_pairs_stand_in() -> None:

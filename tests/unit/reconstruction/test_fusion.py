@@ -169,9 +169,10 @@ def frame_by_frame(capture: Capture) -> AxisFrames:
         axis_frames(without(capture, lambda shot, time_s=time_s: shot.exposure_s == time_s), "eye", COLUMN)  # type: ignore[misc]
         for time_s in EXPOSURES_S
     )
-    lines = shortest.lines * np.float32(16)
+    lines = np.array(shortest.lines, dtype=np.float32) * np.float32(16)
     for frames, scale in zip(longer, (4, 1), strict=True):
-        lines = np.where(frames.lines < 250, frames.lines * np.float32(scale), lines)
+        shown = np.array(frames.lines, dtype=np.float32)
+        lines = np.where(shown < 250, shown * np.float32(scale), lines)
     return replace(shortest, lines=lines, exposure_ratio=16.0)
 
 

@@ -123,6 +123,6 @@ def test_images_that_come_later_are_made_straight_as_they_come() -> None:
         each.put(Black(), bent.black)
     early.straighten(2.2)
     one, other = early.frames(), late.frames()
-    assert (one.bits == other.bits).all()
+    np.testing.assert_array_equal(one.bits, other.bits)
     assert (one.white == other.white).all()
     assert (one.black == FULL * (bent.black / FULL) ** np.float32(2.2)).mean() > 0.99
