@@ -56,13 +56,15 @@ class EvidenceSummary:
 class Evidence:
     """The evidence of one sequence: feed it every frame, in any order; white and black first is cheapest.
 
-    patterns : the whole sequence. cameras : every camera by name.
+    patterns : the whole sequence. cameras : every camera by name. refused : what is on record as refused already.
     """
 
-    def __init__(self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat]) -> None:
+    def __init__(
+        self, patterns: Sequence[Pattern], cameras: Mapping[str, CameraFormat], refused: Sequence[Refused] = ()
+    ) -> None:
         self._patterns = tuple(patterns)
         self._cameras = dict(cameras)
-        self._refused: list[Refused] = []
+        self._refused = [replace(each, shot=None) for each in refused if each.pattern < len(self._patterns)]
         self._verifiers: dict[str, FrameVerifier] = {}
         self.forget()
 
@@ -109,27 +111,25 @@ def check_capture(capture: Capture, refused: Sequence[Refused] = ()) -> Evidence
     Of a pattern that was exposed for different times, the exposure that most patterns share is judged. `refused` is
     what was shot again while it was captured.
     """
-    evidence = Evidence(capture.patterns, capture.cameras)
-    for each in refused:
-        if each.pattern < len(capture.patterns):
-            evidence.note(each)
-    for shot in _one_exposure(capture):
-        evidence.contradictions(shot)
+    evidence = Evidence(capture.patterns, capture.cameras, refused)
+    for index in judged_frames(capture):
+        evidence.contradictions(capture.shots[index])
     return evidence.summary()
 
 
-def _one_exposure(capture: Capture) -> list[Shot]:
-    chosen: list[Shot] = []
+def judged_frames(capture: Capture) -> list[int]:
+    """Of the frames of a capture those that `check_capture` judges, by their indices, in the order in which it does."""
+    chosen: list[int] = []
     for camera in capture.cameras:
-        shots = [shot for shot in capture.shots if shot.camera == camera]
-        exposures = [shot.exposure_s for shot in shots]
+        indices = [index for index, shot in enumerate(capture.shots) if shot.camera == camera]
+        exposures = [capture.shots[index].exposure_s for index in indices]
         most = max(exposures, key=exposures.count, default=None)
-        by_pattern: dict[int, Shot] = {}
-        for shot in shots:
-            if shot.exposure_s == most:
-                by_pattern.setdefault(shot.pattern, shot)
+        by_pattern: dict[int, int] = {}
+        for index, exposure_s in zip(indices, exposures, strict=True):
+            if exposure_s == most:
+                by_pattern.setdefault(capture.shots[index].pattern, index)
         # One white and one black first: every other test refers to them.
         opening = [next((i for i in by_pattern if capture.patterns[i] == p), -1) for p in (White(), Black())]
         chosen += [by_pattern[i] for i in opening if i in by_pattern]
-        chosen += [shot for i, shot in by_pattern.items() if i not in opening]
+        chosen += [index for i, index in by_pattern.items() if i not in opening]
     return chosen

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.meshing.boundary import Shrunk, Smoothed, boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
+from slrig.meshing.boundary import boundary_point_count, longest_boundary_edge_mm, shrunk, smoothed
 from slrig.meshing.initial import InitialMesh, initial_mesh
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import Optimised, optimised
@@ -43,19 +43,16 @@ class Stage:
 @dataclass(frozen=True, slots=True)
 class FinishedMesh:
     """faces : (F, 3) int32 into the curves' points, counter-clockwise seen from the eye; normals : (n, 3) float32,
-    unit, NaN for points in no triangle; stages in order, and what the single steps did.
+    unit, NaN for points in no triangle; stages in order.
 
-    The triangles of `smoothed` are those of `boundary_optimised`, which was done on them.
+    steps : what the single steps did, in figures: their own meshes would take several times the memory of the last one.
+    `initial`, `optimisation` (paper, Fig. 10, turn by turn), and `boundary` where that was smoothed.
     """
 
     faces: IntArray
     normals: NDArray[np.float32]
     stages: tuple[Stage, ...]
-    initial: InitialMesh
-    optimised: Optimised
-    shrunk: Shrunk | None
-    smoothed: Smoothed | None
-    boundary_optimised: Optimised | None
+    steps: Mapping[str, Mapping[str, object]]
 
 
 def finished_mesh(
@@ -76,6 +73,7 @@ def finished_mesh(
     Arrays as for `initial_mesh`. `entered` is told the name of each stage as it begins; `Stage.name` repeats it.
     """
     stages: list[Stage] = []
+    steps: dict[str, Mapping[str, object]] = {}
 
     def done(name: str, faces: IntArray, adjacency: IntArray | None) -> None:
         # Flips leave the boundary as it is: without an adjacency it is that of the stage before.
@@ -88,38 +86,62 @@ def finished_mesh(
         widest_step_px=limits.widest_step_px, depth_edge_ratio=limits.depth_edge_ratio, keep_holes=limits.keep_holes,
         runs=runs,
     )  # fmt: skip
-    done(FIRST_STAGE, initial.faces, initial.adjacency)
+    faces, adjacency = initial.faces, initial.adjacency
+    done(FIRST_STAGE, faces, adjacency)
+    steps["initial"] = _of_initial(initial)
+    del initial
     entered("global optimisation")
-    best = optimised(points_mm, initial.faces, rule=limits.flip_rule, adjacency=initial.adjacency)
-    done("global optimisation", best.faces, None)
-    faces, less, smooth, mended = best.faces, None, None, None
+    best = optimised(points_mm, faces, rule=limits.flip_rule, adjacency=adjacency)
+    faces, adjacency = best.faces, best.adjacency
+    done("global optimisation", faces, None)
+    steps["optimisation"] = _of_flips(best)
+    del best
     if limits.smooth_boundary and len(faces):
         entered("shrinking boundary")
-        less = shrunk(points_mm, faces, longest_boundary_edge_mm(points_mm, faces), adjacency=best.adjacency)
-        done("shrinking boundary", less.faces, less.adjacency)
+        less = shrunk(points_mm, faces, longest_boundary_edge_mm(points_mm, faces), adjacency=adjacency)
+        faces, adjacency = less.faces, less.adjacency
+        done("shrinking boundary", faces, adjacency)
         entered("smoothing boundary")
         allowed_mm = limits.depth_edge_ratio * sampling_mm
         if limits.keep_holes:
             # Nothing is filled in at a bridge: what was left open there is to stay open.
             ends = np.flatnonzero(bridge_after)
             allowed_mm[np.concatenate([ends, ends + 1])] = -np.inf
-        smooth = smoothed(points_mm, less.faces, allowed_mm, adjacency=less.adjacency)
-        done("smoothing boundary", smooth.faces, smooth.adjacency)
+        smooth = smoothed(points_mm, faces, allowed_mm, adjacency=adjacency)
+        faces, adjacency = smooth.faces, smooth.adjacency
+        done("smoothing boundary", faces, adjacency)
         entered("optimising boundary")
-        mended = optimised(
-            points_mm, smooth.faces, rule=limits.flip_rule, among=smooth.added, adjacency=smooth.adjacency,
-            # Nothing is flipped unless triangles were added, and then the arrays are the smoothing's own.
-        )  # fmt: skip
-        done("optimising boundary", mended.faces, None)
+        # Nothing is flipped unless triangles were added, and then the arrays are the smoothing's own.
+        mended = optimised(points_mm, faces, rule=limits.flip_rule, among=smooth.added, adjacency=adjacency)
         faces = mended.faces
+        done("optimising boundary", faces, None)
+        steps["boundary"] = {
+            "shrunk_triangles": less.removed_triangles,
+            "added_triangles": int(np.count_nonzero(smooth.added)),
+            "removed_triangles": smooth.removed_triangles,
+            "rounds": smooth.rounds,
+            "optimisation": _of_flips(mended),
+        }
     entered("vertex normals")
-    return FinishedMesh(
-        faces=faces,
-        normals=vertex_normals(points_mm, faces),
-        stages=tuple(stages),
-        initial=initial,
-        optimised=best,
-        shrunk=less,
-        smoothed=smooth,
-        boundary_optimised=mended,
-    )
+    return FinishedMesh(faces, vertex_normals(points_mm, faces), tuple(stages), steps)
+
+
+def _of_initial(made: InitialMesh) -> dict[str, object]:
+    return {
+        "strips": made.strip_pairs,
+        "strip_triangles": made.strip_triangles,
+        "dropped_at_depth_edges": made.dropped_at_depth_edges,
+        "dropped_at_bridges": made.dropped_at_bridges,
+        "dropped_as_dust": made.dropped_as_dust,
+        "dropped_triangles": made.dropped_triangles,
+        "triangles": len(made.faces),
+    }
+
+
+def _of_flips(made: Optimised) -> dict[str, object]:
+    return {
+        "harmonic_index_before": made.harmonic_index_before,
+        "turns": [asdict(turn) for turn in made.turns],
+        "flipped_edges": sum(turn.flipped_edges for turn in made.turns),
+        "ended_by": made.ended_by,
+    }

@@ -228,19 +228,25 @@ class _Scales:
     blur_px: float
 
 
-def _curves(
-    coded: Coded,
-    found: list[LinePoints],
-    scales: _Scales,
-    tables: CodeTables,
-    limits: Limits,
-    entered: Callable[[str], None],
-) -> CameraCurves:
-    """What is left when all points are found: refine, number and link them."""
-    frames, noise, code = coded.frames, coded.position_noise, coded.code
-    points, disagreement_px, steady = found, np.zeros(0), False
-    entered("refine stripes")
-    seen = position_map(frames, noise, code, tables.cell_position)
+@dataclass(frozen=True, slots=True)
+class _Placed:
+    """Points of each line frame, or of each bit, at their best places, and the code with the causes of those left out.
+
+    near_shadow, near_step : (H, W) bool, where no point counts; refined, disagreement_px : as of `CameraCurves`.
+    """
+
+    points: list[LinePoints]
+    code: CodeMap
+    near_shadow: NDArray[np.bool_]
+    near_step: NDArray[np.bool_]
+    refined: bool
+    disagreement_px: FloatArray
+
+
+def _placed(coded: Coded, found: list[LinePoints], scales: _Scales, tables: CodeTables, limits: Limits) -> _Placed:
+    """Put the points that were found where the light of all frames puts them, if it was the same in all."""
+    frames, code, disagreement_px = coded.frames, coded.code, np.zeros(0)
+    seen = position_map(frames, coded.position_noise, code, tables.cell_position)
     resolution_px = cell_width_px(coded)
     if has_phase(frames):
         resolution_px = 0.0
@@ -252,27 +258,44 @@ def _curves(
         usable = np.isfinite(seen.position) & ~near_shadow & ~near_step
         refinement = refined(found, seen, usable, code, tables.position_of)
         disagreement_px = refinement.disagreement_px
-        steady = bool(np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px)
-        if steady:
-            points = refinement.points
+        if np.nanmax(np.abs(disagreement_px), initial=0.0) <= limits.largest_disagreement_px:
             code = with_refused_points(code, found, frames, seen.position, tables.position_of, near_shadow, near_step)
-    if not steady:
-        # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
-        near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))
+            return _Placed(refinement.points, code, near_shadow, near_step, True, disagreement_px)
+    # A fit to pixels leaves out those of mixed light; a filter's window has to be clear of them.
+    near_shadow, near_step = near_edges(seen, coded.unlit, resolution_px, limits.edges.for_filters(scales.blur_px))
+    return _Placed(list(found), code, near_shadow, near_step, False, disagreement_px)
+
+
+def _curves(
+    coded: Coded,
+    found: list[LinePoints],
+    scales: _Scales,
+    tables: CodeTables,
+    limits: Limits,
+    entered: Callable[[str], None],
+) -> CameraCurves:
+    """What is left when all points are found: refine, number and link them. Empties `found`, which takes memory."""
+    frames = coded.frames
+    entered("refine stripes")
+    placed = _placed(coded, found, scales, tables, limits)
+    line_count = len(found)
+    found.clear()
+    points, code, near_shadow, near_step = placed.points, placed.code, placed.near_shadow, placed.near_step
     entered("identify stripes")
     shortest = limits.stripes.shortest_points
     stripes = chained(points, code.refusal.shape)
     numbered, refusal = identify(stripes, code, tables.position_of, near_shadow, near_step, shortest_points=shortest)
     lost = None
     if tables.edges_of is not None:
-        per_cell = len(found) * frames.gray.cell_px / frames.line_patterns[0].period_px
+        per_cell = line_count * frames.gray.cell_px / frames.line_patterns[0].period_px
         lost = lost_lines(numbered.stripes.points_px, coded.code, ~(near_shadow | near_step), per_cell)
     if lost is not None and tables.edges_of is not None:
+        del stripes, numbered
         entered("locate stripes")
         coded, code = _with_fewer_bits(coded, code, lost, tables, limits)
         edges = _edges_within(coded, lost, limits.stripes, scales.filter_px)
         beside = limits.edges.for_filters(scales.blur_px)
-        middles = position_map(frames, noise, code, tables.cell_position, by_phase=False)
+        middles = position_map(frames, coded.position_noise, code, tables.cell_position, by_phase=False)
         shadow, step = near_edges(middles, coded.unlit, cell_width_px(coded), beside)
         near_shadow, near_step = np.where(lost, shadow, near_shadow), np.where(lost, step, near_step)
         entered("identify stripes")
@@ -290,8 +313,8 @@ def _curves(
         decoded_pixels=int((coded.code.refusal == Refusal.NONE).sum()),
         stripe_points=len(stripes.points_px),
         stripe_count=len(numbered.stripes),
-        refined=steady,
-        disagreement_px=disagreement_px,
+        refined=placed.refined,
+        disagreement_px=placed.disagreement_px,
         unresolved=coded.unresolved,
         lost_lines=lost,
         compression_dn=float(np.sqrt(coded.loss_variance)),

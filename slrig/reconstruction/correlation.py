@@ -27,6 +27,7 @@ _LEAST_WINDOWS = 200
 _CLEAR_SHARE = 0.8  # of the contrast: less is an edge of the code, where a camera that bends its values breaks the sum
 _LEAST_RATIO = 1.1  # the model is no better than that; of independent noise the windows tell 0.98 to 1.08
 _FEWEST_BITS = 3  # as for `noise.estimate_noise`
+_MOST_RISES = 200_000  # whose median is known to a few thousandths
 _STEP_PX = 8  # over which stripes are counted: cells of the code are steps
 
 
@@ -52,8 +53,15 @@ class PixelSum(NamedTuple):
 
 def phase_sum(frames: AxisFrames, code: CodeMap, cell_position: FloatArray) -> PixelSum:
     """As the fit to the phase of line frames sums pixels. cell_position : (cells,) float64, px."""
-    position = np.where(code.refusal == Refusal.NONE, cell_position[code.lowest], np.nan)
-    rises = position[:, _STEP_PX:] - position[:, :-_STEP_PX], position[_STEP_PX:] - position[:-_STEP_PX]
+    rows, columns = code.refusal.shape
+    every = max(1, rows * columns // _MOST_RISES)
+
+    def position(first: int) -> FloatArray:
+        drawn = code.rows(slice(first, None if first else -_STEP_PX, every))
+        return np.where(drawn.refusal == Refusal.NONE, cell_position[drawn.lowest], np.nan)
+
+    here = position(0)
+    rises = here[:, _STEP_PX:] - here[:, :-_STEP_PX], position(_STEP_PX) - here
     per_cycle = _STEP_PX * frames.line_patterns[0].period_px
     across, down = (float(np.nanmedian(np.abs(rise))) / per_cycle if np.isfinite(rise).any() else 0.0 for rise in rises)
     return PixelSum(stencils()[0][0, :25].reshape(5, 5).astype(np.float64), (across, down))

@@ -77,11 +77,27 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
 
     shape : (rows, columns) of the image.
     """
-    borders = np.cumsum([0, *(len(each.points_px) for each in frames)], dtype=np.int64)
-    none = LinePoints(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.bool_), np.zeros(0))
-    points, normals, strength, strong, sigma_px = map(np.concatenate, zip(none, *frames, strict=True))
-    order, offsets, frame = chain_frames(points, normals, strength, strong, borders, shape)
-    return Stripes(offsets, frame, *gathered(order, points, normals, sigma_px))
+
+    def chain(first: int, last: int) -> list[Stripes]:
+        # Frame by frame: what chaining makes on the way is large.
+        found = []
+        for index in range(first, last):
+            points, normals, strength, strong, sigma_px = frames[index]
+            borders = np.array([0, len(points)], dtype=np.int64)
+            order, offsets, frame = chain_frames(points, normals, strength, strong, borders, shape)
+            found.append(Stripes(offsets, frame + np.int32(index), *gathered(order, points, normals, sigma_px)))
+        return found
+
+    none = Stripes(np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    parts = [none, *(each for band in in_bands(chain, len(frames)) for each in band)]
+    lengths = np.concatenate([np.diff(each.offsets) for each in parts])
+    return Stripes(
+        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
+        np.concatenate([each.frame for each in parts]),
+        np.concatenate([each.points_px for each in parts]),
+        np.concatenate([each.normals for each in parts]),
+        np.concatenate([each.sigma_px for each in parts]),
+    )
 
 
 def gathered(

@@ -7,21 +7,23 @@ first axis is weak both are tried, and the one that decodes more pixels to a sma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from slrig.bundle import read_bundle, read_calibration
+from slrig.bundle import read_calibration
 from slrig.bundle.calibration_file import check_rays
 from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION
+from slrig.bundle.reading import CALIBRATION, BundleFiles, open_bundle
 from slrig.bundle.refused import read_refused
+from slrig.capture.evidence import Evidence, EvidenceSummary, judged_frames
 from slrig.capture.exposure import check_exposures
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
-from slrig.model import LEAST_SHARE, Axis, Calibration, Refusal, without_missing_bits
+from slrig.model import LEAST_SHARE, Axis, Calibration, Refusal, Shot, without_missing_bits
 from slrig.model.header import CaptureHeader
+from slrig.reconstruction.frames import exposure_count
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
@@ -164,18 +166,20 @@ def _walked(
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
     cut_short: tuple[str, ...] = ()
-    last = ""
+    last, share = "", 0.0
 
     def stage_entered(stage: str, name: str) -> None:
-        nonlocal last
+        nonlocal last, share
         if last != stage + name:
             last = stage + name
-            share = (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names)
+            if stage in _STAGES:
+                share = (names.index(name) + _STAGES.index(stage) / len(_STAGES)) / len(names)
             entered(stage, 0.1 + 0.5 * share, f"camera '{name}'")
 
     if (
         live is not None
         and live.evidence is not None
+        and live.one_exposure
         and axis in (None, live.axis)
         and _is_of(live, folder, calibration_file)
     ):
@@ -185,31 +189,58 @@ def _walked(
         _require_calibration(folder, names, devices)
         seen = live.finished(stage_entered)
     else:
-        recorded = read_bundle(folder, calibration_file=calibration_file)
-        capture, cut_short = without_missing_bits(recorded.capture)
-        names += capture.cameras
-        devices = _require_calibration(folder, names, recorded.calibration)
+        files = open_bundle(folder, calibration_file=calibration_file)
+        names += files.outline.cameras
+        devices = _require_calibration(folder, names, files.calibration)
         try:
-            stream = ScanStream(CaptureHeader.of(capture), devices, entered=stage_entered, axis=axis)
-            for name in names:
-                for shot in capture.shots:
-                    if shot.camera == name:
-                        stream.take(shot)
+            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis)
             seen = stream.finish()
         except PatternError as cause:
             message = f"{folder}: {cause}"
             raise PatternError(message) from cause
-        entered("check frames", 0.58, "")
-        evidence = check_exposures(capture, read_refused(folder))
-    sections = capture_report(stream.capture, stream.axis, evidence)
+    sections = capture_report(stream.header, stream.axis, evidence)
     step, cell = (each(stream.header.shown, stream.axis) for each in (step_px, cell_px))
     notes = [
         *cut_short,
-        *capture_notes(stream.capture, stream.axis, evidence),
+        *capture_notes(stream.header, stream.axis, evidence),
         *camera_notes(seen),
         *unresolved_notes(seen, step, cell),
     ]
     return Walked(devices, stream.axis, stream.header.axes, seen, step, cell, sections, notes)
+
+
+def _streamed(
+    files: BundleFiles, devices: Calibration, entered: Callable[[str, str], None], axis: Axis | None
+) -> tuple[ScanStream, EvidenceSummary, tuple[str, ...]]:
+    """The frames of a bundle in a stream, what they prove, and words for each code that was cut short.
+
+    Frames are read one after another, so that memory holds only those that are needed. Brackets, and frames that a
+    missing bit gives other patterns, are read first.
+    """
+    refused = read_refused(files.folder)
+    capture, cut_short = without_missing_bits(files.outline)
+    exposures = [{shot.exposure_s for shot in capture.shots if shot.camera == name} for name in capture.cameras]
+    one_exposure = all(exposure_count(each) <= 1 for each in exposures)
+    judged = judged_frames(capture)
+    others = sorted(set(range(len(capture.shots))) - set(judged))
+    order = [i for name in capture.cameras for i in (*judged, *others) if capture.shots[i].camera == name]
+    if cut_short or not one_exposure:
+        every = tuple(files.shots(range(len(files.outline.shots))))
+        capture, _ = without_missing_bits(replace(files.outline, shots=every))
+        shots: Iterable[Shot] = [capture.shots[index] for index in order]
+    else:
+        shots = files.shots(order)
+    stream = ScanStream(
+        CaptureHeader.of(capture), devices, entered=entered, axis=axis, one_exposure=one_exposure
+    )  # fmt: skip
+    evidence = Evidence(capture.patterns, capture.cameras, refused)
+    for index, shot in zip(order, shots, strict=True):
+        stream.take(shot)
+        if one_exposure and index in judged:
+            entered("check frames", shot.camera)
+            evidence.contradictions(shot)
+        entered("read bundle", shot.camera)
+    return stream, evidence.summary() if one_exposure else check_exposures(capture, refused), cut_short
 
 
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
@@ -220,8 +251,4 @@ def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:
         tuple((frame.pattern, frame.camera) for frame in description.frames),
     )  # fmt: skip
     path = folder / CALIBRATION if calibration_file is None else calibration_file
-    return (
-        CaptureHeader.of(live.capture) == listed
-        and path.exists()
-        and read_calibration(path).digest == live.calibration.digest
-    )
+    return live.taken == listed and path.exists() and read_calibration(path).digest == live.calibration.digest

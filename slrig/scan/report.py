@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from slrig.bundle.description import read_description
 from slrig.capture.evidence import EvidenceSummary
-from slrig.meshing.optimisation import Optimised
 from slrig.meshing.surface import FinishedMesh, Stage
-from slrig.model import Axis, Calibration, Capture, FloatArray, LineShift, Mesh, PointCurves, Refusal, Solved, Source
+from slrig.model import Axis, Calibration, FloatArray, LineShift, Mesh, PointCurves, Refusal, Solved, Source
+from slrig.model.header import CaptureHeader
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.fusion import ExposureUse
 from slrig.reconstruction.merging import MergedCurves
@@ -142,39 +142,11 @@ def _pair_report(pair: PairRedundancy) -> dict[str, object]:
 def mesh_report(surface: FinishedMesh, mesh: Mesh, curves: PointCurves) -> dict[str, object]:
     """What each step did to the mesh, and its stated error."""
     sigma = np.percentile(mesh.sigma_mm, (5, 50, 95))
-    initial, shrunk, smoothed = surface.initial, surface.shrunk, surface.smoothed
-    report: dict[str, object] = {
+    return {
         "points": len(curves.points_mm),
         "curves": len(curves.column_px),
-        "initial": {
-            "strips": initial.strip_pairs,
-            "strip_triangles": initial.strip_triangles,
-            "dropped_at_depth_edges": initial.dropped_at_depth_edges,
-            "dropped_at_bridges": initial.dropped_at_bridges,
-            "dropped_as_dust": initial.dropped_as_dust,
-            "dropped_triangles": initial.dropped_triangles,
-            "triangles": len(initial.faces),
-        },
-        "optimisation": _optimisation_report(surface.optimised),
-    }
-    if shrunk is not None and smoothed is not None and surface.boundary_optimised is not None:
-        report["boundary"] = {
-            "shrunk_triangles": shrunk.removed_triangles,
-            "added_triangles": int(np.count_nonzero(smoothed.added)),
-            "removed_triangles": smoothed.removed_triangles,
-            "rounds": smoothed.rounds,
-            "optimisation": _optimisation_report(surface.boundary_optimised),
-        }
-    return {**report, "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])}}
-
-
-def _optimisation_report(optimised: Optimised) -> dict[str, object]:
-    """The paper's Fig. 10, turn by turn."""
-    return {
-        "harmonic_index_before": optimised.harmonic_index_before,
-        "turns": [asdict(turn) for turn in optimised.turns],
-        "flipped_edges": sum(turn.flipped_edges for turn in optimised.turns),
-        "ended_by": optimised.ended_by,
+        **surface.steps,
+        "sigma_mm": {"p5": float(sigma[0]), "p50": float(sigma[1]), "p95": float(sigma[2])},
     }
 
 
@@ -183,7 +155,7 @@ def with_seconds(stages: Sequence[Stage], seconds: Mapping[str, float]) -> list[
     return [{**asdict(stage), "seconds": seconds.get(stage.name)} for stage in stages]
 
 
-def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> dict[str, object]:
+def capture_report(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary) -> dict[str, object]:
     """What was shown and taken, and what the frames prove of themselves."""
     return {
         "format": REPORT_FORMAT,
@@ -193,7 +165,7 @@ def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> d
         "axis": axis.value,
         "frames": {
             "patterns": len(capture.patterns),
-            "shots": len(capture.shots),
+            "shots": len(capture.frames),
             "projector_px": [capture.projector.width_px, capture.projector.height_px],
             "cameras_px": {n: [c.size.width_px, c.size.height_px] for n, c in capture.cameras.items()},
         },
@@ -207,12 +179,11 @@ def capture_report(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> d
     }
 
 
-def _has_lines(capture: Capture, axis: Axis) -> bool:
-    shown = (capture.patterns[shot.pattern] for shot in capture.shots)
-    return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in shown)
+def _has_lines(capture: CaptureHeader, axis: Axis) -> bool:
+    return any(isinstance(pattern, LineShift) and pattern.axis is axis for pattern in capture.shown)
 
 
-def capture_notes(capture: Capture, axis: Axis, evidence: EvidenceSummary) -> list[str]:
+def capture_notes(capture: CaptureHeader, axis: Axis, evidence: EvidenceSummary) -> list[str]:
     """What a person should know of the frames, one sentence each."""
     notes = []
     if not _has_lines(capture, axis):

@@ -6,9 +6,9 @@ of its list, so a scan that was watched while it was captured and the same scan 
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,9 @@ class CameraResult:
 class ScanStream:
     """Reconstructs the curves of every camera while frames come, along `axis` or the one that `chosen_axis` chooses.
 
+    Frames that are not needed are let go. one_exposure : every camera takes all frames with one; otherwise all wait for
+    the end.
+
     Raises
     ------
     PatternError
@@ -68,25 +71,25 @@ class ScanStream:
     """
 
     def __init__(
-        self, header: CaptureHeader, calibration: Calibration, *, entered: Entered, axis: Axis | None = None
+        self,
+        header: CaptureHeader,
+        calibration: Calibration,
+        *,
+        entered: Entered,
+        axis: Axis | None = None,
+        one_exposure: bool = True,
     ) -> None:
         self.header = header
         devices = [calibration.cameras[name] for name in header.cameras]
         self.axis = axis or chosen_axis(header.axes, devices, calibration.projector)
         self.calibration = calibration
-        self._shots: list[Shot] = []
-        self._cameras = {name: _CameraFrames(name, header, self.axis, entered) for name in header.cameras}
+        self._cameras = {
+            name: _CameraFrames(name, header, self.axis, entered, one_exposure=one_exposure) for name in header.cameras
+        }
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
-        self._shots.append(shot)
         self._cameras[shot.camera].take(shot)
-
-    @property
-    def capture(self) -> Capture:
-        """The frames taken so far."""
-        header = self.header
-        return Capture(header.projector, header.patterns, header.cameras, tuple(self._shots))
 
     def finish(self) -> list[CameraResult]:
         """The curves of every camera, once all frames are in.
@@ -96,10 +99,10 @@ class ScanStream:
         PatternError
             The frames cannot be decoded.
         """
-        capture, seen = self.capture, []
+        seen = []
         for name in list(self._cameras):
             # What it held of its frames is not needed any more, and the memory is.
-            curves, frames, fused = self._cameras.pop(name).finish(capture)
+            curves, frames, fused = self._cameras.pop(name).finish()
             used = curves.refusal == Refusal.NONE
             seen.append(
                 CameraResult(
@@ -122,13 +125,14 @@ class _CameraFrames:
     before all of them are in, so they wait for `finish`.
     """
 
-    def __init__(self, name: str, header: CaptureHeader, axis: Axis, entered: Entered) -> None:
+    def __init__(self, name: str, header: CaptureHeader, axis: Axis, entered: Entered, *, one_exposure: bool) -> None:
         self._name = name
         self._axis = axis
+        self._header = header
         self._patterns = header.patterns
         self._projector = header.projector
         self._entered = lambda stage: entered(stage, name)
-        self._exposures_s: set[float | None] = set()
+        self._kept: list[Shot] = []
         self._repeats: dict[Pattern, list[Pixels]] = {}
         listed = [index for index, camera in header.frames if camera == name]
         shown = [header.patterns[index] for index in listed]
@@ -138,7 +142,7 @@ class _CameraFrames:
         self._wanted = Counter(used)
         self._stream: CameraStream | None = None
         patterns = axis_patterns(self._wanted, name, axis)
-        if all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
+        if one_exposure and all(self._wanted[each] == 1 for each in used if isinstance(each, Gray | LineShift)):
             form = header.cameras[name]
             stacks = FrameStacks(
                 patterns,
@@ -149,10 +153,17 @@ class _CameraFrames:
             tables = _tables(patterns.gray, patterns.lines, header.projector)
             self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered)
 
+    @property
+    def waits(self) -> bool:
+        """Whether its frames wait for `finish`."""
+        return self._stream is None
+
     def take(self, shot: Shot) -> None:
         """Take one frame of this camera."""
-        self._exposures_s.add(shot.exposure_s)
-        if self._stream is None or self._waiting[shot.pattern] == 0:
+        if self._stream is None:
+            self._kept.append(shot)
+            return
+        if self._waiting[shot.pattern] == 0:
             return
         self._waiting[shot.pattern] -= 1
         pattern = self._patterns[shot.pattern]
@@ -161,14 +172,15 @@ class _CameraFrames:
         if len(repeats) == self._wanted[pattern]:
             self._stream.take(pattern, mean_image(self._repeats.pop(pattern)))
 
-    def finish(self, capture: Capture) -> tuple[CameraCurves, AxisFrames, FusedFrames | None]:
+    def finish(self) -> tuple[CameraCurves, AxisFrames, FusedFrames | None]:
         """The curves, and the frames that they were found in; and how these were fused, if they are a bracket's."""
-        fused = None
-        if exposure_count(self._exposures_s) > 1:
+        if self._stream is not None:
+            return *self._stream.finish(), None
+        header, fused = self._header, None
+        capture = Capture(header.projector, header.patterns, header.cameras, tuple(self._kept))
+        if exposure_count([shot.exposure_s for shot in self._kept]) > 1:
             fused = fused_frames(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
-        elif self._stream is not None:
-            return *self._stream.finish(), None
         else:
             frames, noise = axis_frames(capture, self._name, self._axis), None
         tables = _tables(frames.gray, frames.line_patterns, self._projector)
@@ -181,14 +193,29 @@ class LiveScan(ScanStream):
     def __init__(self, header: CaptureHeader, calibration: Calibration) -> None:
         self.evidence: EvidenceSummary | None = None
         self.watch = Stopwatch()
+        self._frames: list[tuple[int, str]] = []
+        self._exposures_s: defaultdict[str, set[float | None]] = defaultdict(set)
         self._told: Entered = lambda stage, _camera: self.watch.enter(stage)
         super().__init__(header, calibration, entered=lambda stage, camera: self._told(stage, camera))
         self.watch.enter(WAITING)
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
+        self._frames.append((shot.pattern, shot.camera))
+        self._exposures_s[shot.camera].add(shot.exposure_s)
         super().take(shot)
         self.watch.enter(WAITING)
+
+    @property
+    def taken(self) -> CaptureHeader:
+        """The header of the frames that were taken."""
+        return replace(self.header, frames=tuple(self._frames))
+
+    @property
+    def one_exposure(self) -> bool:
+        """Whether every camera took all frames with one, or all frames waited for the end."""
+        waits = all(each.waits for each in self._cameras.values())
+        return waits or all(exposure_count(each) <= 1 for each in self._exposures_s.values())
 
     def end(self, evidence: EvidenceSummary) -> None:
         """Take note that all frames have come, and what they have proven."""

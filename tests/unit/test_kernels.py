@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba import config
 
 from slrig import kernels
 from slrig.kernels import all_kept, compilations_told, in_bands, kernel
@@ -68,6 +69,16 @@ def test_bands_cover_every_row_once(count: int, rows_at_least: int) -> None:
     answers = in_bands(_square, count, values, out, rows_at_least=rows_at_least)
     assert sum(answers) == count
     assert all(rows >= min(rows_at_least, count) for rows in answers[:-1])
+    np.testing.assert_array_equal(out, values**2)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_bands_are_no_larger_than_asked(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(config, "NUMBA_NUM_THREADS", threads)
+    values, out = np.arange(1000, dtype=np.float64), np.full(1000, np.nan)
+    answers = in_bands(_square, 1000, values, out, rows_at_most=60)
+    assert sum(answers) == 1000
+    assert max(answers) <= 60
     np.testing.assert_array_equal(out, values**2)
 
 

@@ -98,9 +98,10 @@ def test_a_model_that_is_too_small_is_made_up_for_and_one_too_large_is_not() -> 
 def test_edges_of_the_code_do_not_count_where_they_break_the_sum() -> None:
     frames = noisy(np.array([[1.0]]))
     assert frames.inverses is not None
-    broken = frames.bits.copy()
+    bits = np.array(frames.bits)
+    broken = bits.copy()
     # A camera that bends its values has the middle of an edge too bright.
-    at_edges = np.abs(np.diff(frames.bits, axis=2, append=frames.bits[:, :, -1:])) > 60
+    at_edges = np.abs(np.diff(bits, axis=2, append=bits[:, :, -1:])) > 60
     broken[at_edges] = 110
     inverses = np.where(at_edges, 110, frames.inverses).astype(np.float32)
     found = shared_noise(replace(frames, bits=broken, inverses=inverses), NoiseModel(4.0, 0.0), EVERYWHERE, PHASES)

@@ -172,8 +172,8 @@ def test_crossings_are_those_of_plain_numpy(down: bool) -> None:
     if down:
         assert frames.inverses is not None
         frames = replace(
-            frames, white=frames.white.T, black=frames.black.T, bits=frames.bits.swapaxes(1, 2),
-            inverses=frames.inverses.swapaxes(1, 2),
+            frames, white=frames.white.T, black=frames.black.T, bits=[image.T for image in frames.bits],
+            inverses=[image.T for image in frames.inverses],
         )  # fmt: skip
         code, asked = CodeMap(code.lowest.T, code.highest.T, code.refusal.T), asked.T
     found = edge_crossings(frames, NOISE, code, edges, asked, down=down, least_sigma=8.0)
@@ -267,7 +267,8 @@ def test_the_finest_bits_drop_out_where_they_are_lost() -> None:
 
 def test_an_unlit_or_unasked_surface_has_no_correspondences() -> None:
     frames = Wall().frames(noise=NOISE)
-    dark = replace(frames, white=frames.black, bits=frames.bits * 0 + BLACK, inverses=frames.bits * 0 + BLACK)
+    unlit = [np.full_like(image, BLACK) for image in frames.bits]
+    dark = replace(frames, white=frames.black, bits=unlit, inverses=unlit)
     for given, asked in ((dark, INSIDE), (frames, np.zeros_like(INSIDE))):
         seen = projector_positions(given, tables(given), asked, CorrespondenceLimits(), camera_blur_px=0.8, noise=NOISE)
         assert seen.pixels_px.shape == (0, 2)

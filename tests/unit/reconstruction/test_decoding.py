@@ -72,11 +72,11 @@ def expected(frames: AxisFrames, noise: NoiseModel, cells: int, limits: Decoding
         choices: list[tuple[int, ...]] = []
         clipped = frames.inverses is None and white >= frames.full_scale
         for b in range(BITS):
-            seen = float(frames.bits[b, y, x])
+            seen = float(frames.bits[b][y, x])
             if frames.inverses is None:
                 difference = 2 * (seen - (white + black) / 2)
             else:
-                other = float(frames.inverses[b, y, x])
+                other = float(frames.inverses[b][y, x])
                 difference = seen - other
                 clipped |= min(seen, other) >= frames.full_scale
             margin = max(limits.bit_sigma * spread, limits.bit_fraction * (white - black))
@@ -218,7 +218,7 @@ def test_words_are_numbered_along_the_projector() -> None:
 
 def test_frames_are_left_alone() -> None:
     frames = random_frames(1, paired=True)
-    before = [frames.bits.copy(), frames.white.copy(), frames.black.copy(), WORDS.copy()]
+    before = [np.array(frames.bits), frames.white.copy(), frames.black.copy(), WORDS.copy()]
     decode(frames, QUIET, WORDS, 50, LIMITS)
     for array, earlier in zip([frames.bits, frames.white, frames.black, WORDS], before, strict=True):
         np.testing.assert_array_equal(array, earlier)

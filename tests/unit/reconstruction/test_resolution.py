@@ -68,7 +68,7 @@ def test_a_bit_lost_in_noise_is_not_resolved_however_wide_its_cells() -> None:
     assert seen.inverses is not None
     rng = np.random.default_rng(0)
     for images in (seen.bits, seen.inverses):
-        images[-1] = 85 + rng.normal(0, 2, LIT.shape)
+        images[-1][:] = 85 + rng.normal(0, 2, LIT.shape)
     assert (unresolved_bits(seen, LIT) == 1).all()
 
 
@@ -81,8 +81,8 @@ def test_light_from_elsewhere_leaves_out_nothing() -> None:
     seen = frames(ramp(0.5))
     assert seen.inverses is not None
     rng = np.random.default_rng(0)
-    for images in (seen.bits, seen.inverses):
-        images[:] = 85 + rng.normal(0, 2, images.shape)
+    for image in (*seen.bits, *seen.inverses):
+        image[:] = 85 + rng.normal(0, 2, image.shape)
     assert not unresolved_bits(seen, LIT).any()
 
 

@@ -128,7 +128,9 @@ def test_the_report_says_what_was_verified_and_what_was_shot_again(tmp_path: Pat
     stream = ScanStream(
         CaptureHeader.of(bundle.capture), replace(sample_calibration(), projector=None), entered=lambda *_: None
     )
-    report = capture_report(bundle.capture, stream.axis, check_capture(bundle.capture, read_refused(bundle.folder)))
+    report = capture_report(
+        CaptureHeader.of(bundle.capture), stream.axis, check_capture(bundle.capture, read_refused(bundle.folder))
+    )
     assert report["identity"] == "22/22 patterns verified, 1 frame shot again"
     evidence = report["evidence"]
     assert isinstance(evidence, dict)

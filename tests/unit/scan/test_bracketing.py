@@ -212,8 +212,8 @@ def test_an_exposure_that_is_too_long_or_too_short_is_left_out_and_the_report_sa
     capture, refused = read_bundle(tmp_path / "bundle").capture, read_refused(tmp_path / "bundle")
     summary = check_exposures(capture, refused)
     assert summary == sink.evidence
-    report = capture_report(capture, Axis.COLUMN, summary)
-    notes = capture_notes(capture, Axis.COLUMN, summary)
+    report = capture_report(CaptureHeader.of(capture), Axis.COLUMN, summary)
+    notes = capture_notes(CaptureHeader.of(capture), Axis.COLUMN, summary)
     for name in ("left", "right"):
         assert any(n.startswith(f"an exposure was left out: 0.0001 s is too dark for camera '{name}': ") for n in notes)
         assert any(n.startswith(f"an exposure was left out: 0.08 s is too bright for camera '{name}': ") for n in notes)

@@ -277,12 +277,13 @@ def test_some_of_the_line_shifts_make_a_coarser_mesh(truthful: Path, tmp_path: P
     assert truth["complete_0.3mm"] > 0.90  # type: ignore[index]
 
 
-def seen_live(bundle: Path, *, upside_down: bool = False) -> LiveScan:
+def seen_live(bundle: Path, *, upside_down: bool = False, last_exposure_s: float | None = None) -> LiveScan:
     """What a reconstruction holds that was fed while this bundle was captured."""
     recorded = read_bundle(bundle)
     assert recorded.calibration is not None
     live = LiveScan(CaptureHeader.of(recorded.capture), recorded.calibration)
-    for shot in recorded.capture.shots:
+    *others, last = recorded.capture.shots
+    for shot in (*others, replace(last, exposure_s=last_exposure_s or last.exposure_s)):
         live.take(replace(shot, image=shot.image[::-1]) if upside_down else shot)
     live.end(check_capture(recorded.capture))
     return live
@@ -337,7 +338,7 @@ def test_two_cameras_taken_live_give_the_bytes_that_the_bundle_gives(tmp_path: P
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["another calibration", "other frames", "an end that never came"])
+@pytest.mark.parametrize("what", ["another calibration", "other frames", "two exposures", "an end that never came"])
 def test_frames_taken_live_that_are_not_those_of_the_bundle_are_passed_over(
     recorded: Path, tmp_path: Path, what: str
 ) -> None:
@@ -352,6 +353,8 @@ def test_frames_taken_live_that_are_not_those_of_the_bundle_are_passed_over(
         path.write_text(json.dumps(described))
     elif what == "other frames":
         live.take(read_bundle(recorded).capture.shots[0])
+    elif what == "two exposures":
+        live = seen_live(recorded, upside_down=True, last_exposure_s=0.5)
     else:
         live.evidence = None
     report = reconstruct_bundle(
