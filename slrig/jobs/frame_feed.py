@@ -7,6 +7,7 @@ reads the bundle instead.
 
 from __future__ import annotations
 
+import os
 import queue
 import threading
 from collections.abc import Callable
@@ -19,10 +20,21 @@ from slrig.capture.evidence import EvidenceSummary
 from slrig.model import Calibration, Shot
 from slrig.model.header import CaptureHeader
 
-MOST_WAITING_BYTES = 128 * 2**20
-"""How much of frames may wait for the reconstruction: a whole scan of a common camera."""
+LEAST_WAITING_BYTES, MOST_WAITING_BYTES = 128 * 2**20, 512 * 2**20
+"""How much of frames may wait for the reconstruction: a whole scan of a common camera where there is little memory, and
+where there is more, 40 frames of 12 megapixels: a line frame of those takes the reconstruction longer than the camera.
+"""
+_SHARE_OF_MEMORY = 1 / 16
 
 _log = structlog.get_logger(__name__)
+
+
+def most_waiting_bytes() -> int:
+    """The bytes of frames that may wait on this machine."""
+    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
+        return LEAST_WAITING_BYTES
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min(max(int(memory * _SHARE_OF_MEMORY), LEAST_WAITING_BYTES), MOST_WAITING_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +79,12 @@ class FrameFeed:
         *,
         number: int = 0,
         receiver: object = None,
-        most_bytes: int = MOST_WAITING_BYTES,
+        most_bytes: int | None = None,
     ) -> None:
         self.number = number
         self.receiver = receiver
         self._send = send
-        self._most_bytes = most_bytes
+        self._most_bytes = most_waiting_bytes() if most_bytes is None else most_bytes
         self._waiting: queue.Queue[Begin | Shot | EvidenceSummary | Abandon] = queue.Queue()
         self._taken: set[tuple[int, str, float | None]] = set()
         self._given_up = threading.Event()

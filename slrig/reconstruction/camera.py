@@ -152,9 +152,9 @@ class CameraStream:
         """Do what the frames so far allow."""
         if self._coded is None and self._stacks.coded:
             self._coded = self._decoded()
-        if self._coded is not None:
+        if self._coded is not None and self._curves is None:
             self._coded = self._locate(self._coded)
-            if self._curves is None and self._scales is not None and not self._stacks.missing:
+            if self._scales is not None and not self._stacks.missing:
                 self._curves = _curves(
                     self._coded, self._points, self._scales, self._tables, self._limits, self._entered
                 )

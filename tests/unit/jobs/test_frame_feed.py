@@ -15,7 +15,14 @@ import pytest
 from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs import worker_wait
-from slrig.jobs.frame_feed import Abandon, Begin, FrameFeed
+from slrig.jobs.frame_feed import (
+    LEAST_WAITING_BYTES,
+    MOST_WAITING_BYTES,
+    Abandon,
+    Begin,
+    FrameFeed,
+    most_waiting_bytes,
+)
 from slrig.jobs.records import JobState
 from slrig.jobs.worker import Worker
 from slrig.model import Shot
@@ -85,6 +92,17 @@ def test_capture_is_not_held_up_by_a_reconstruction_that_falls_behind() -> None:
     assert feed.settled(WAIT_S)
     assert not feed.whole
     assert far.kinds() in ([Begin, Abandon], [Abandon])
+
+
+@pytest.mark.parametrize(("memory_gib", "share"), [(1, None), (4, 1 / 16), (64, None)])
+def test_frames_that_wait_take_a_share_of_the_memory(
+    memory_gib: int, share: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = 4096
+    asked = {"SC_PAGE_SIZE": page, "SC_PHYS_PAGES": memory_gib * 2**30 // page}
+    monkeypatch.setattr(os, "sysconf", asked.__getitem__)
+    bounds = LEAST_WAITING_BYTES if memory_gib == 1 else MOST_WAITING_BYTES
+    assert most_waiting_bytes() == (bounds if share is None else memory_gib * 2**30 * share)
 
 
 def test_frames_that_have_been_sent_wait_no_more() -> None:
