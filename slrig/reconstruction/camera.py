@@ -133,7 +133,7 @@ class CameraStream:
         self._go_on()
 
     def finish(self) -> tuple[CameraCurves, AxisFrames]:
-        """The curves, and the frames that they were found in, but white and black as the camera gave them.
+        """The curves, and of the frames that they were found in white and black, as the camera gave them.
 
         Raises
         ------
@@ -156,8 +156,9 @@ class CameraStream:
             self._coded = self._locate(self._coded)
             if self._scales is not None and not self._stacks.missing:
                 self._curves = _curves(
-                    self._coded, self._points, self._scales, self._tables, self._limits, self._entered
-                )
+                    self._coded, self._points, self._scales, self._tables, self._limits, self._entered,
+                    self._stacks.let_go,
+                )  # fmt: skip
         return self._coded
 
     def _decoded(self) -> Coded:
@@ -273,8 +274,12 @@ def _curves(
     tables: CodeTables,
     limits: Limits,
     entered: Callable[[str], None],
+    let_go: Callable[[], None],
 ) -> CameraCurves:
-    """What is left when all points are found: refine, number and link them. Empties `found`, which takes memory."""
+    """What is left when all points are found: refine, number and link them.
+
+    What takes memory goes as soon as it is not needed: `found` is emptied, and `let_go` drops the frames.
+    """
     frames = coded.frames
     entered("refine stripes")
     placed = _placed(coded, found, scales, tables, limits)
@@ -298,12 +303,14 @@ def _curves(
         middles = position_map(frames, coded.position_noise, code, tables.cell_position, by_phase=False)
         shadow, step = near_edges(middles, coded.unlit, cell_width_px(coded), beside)
         near_shadow, near_step = np.where(lost, shadow, near_shadow), np.where(lost, step, near_step)
+        let_go()
         entered("identify stripes")
         stripes = chained([*(_outside(each, lost) for each in points), *edges], code.refusal.shape)
         numbered, refusal = identify(
             stripes, code, np.vstack([tables.position_of, tables.edges_of]), near_shadow, near_step,
             shortest_points=shortest,
         )  # fmt: skip
+    let_go()
     entered("link stripes")
     return CameraCurves(
         ensemble=link(numbered),

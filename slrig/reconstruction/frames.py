@@ -248,6 +248,11 @@ class FrameStacks:
             self._ends[pattern] = image.astype(np.float32)
         self._missing.discard(pattern)
 
+    def let_go(self) -> None:
+        """Drop the images of code and lines, of the frames that were given out, too."""
+        for images in (self._bits, self._inverses, self._lines):
+            images.clear()
+
     def straighten(self, gamma: float) -> None:
         """Make all values proportional to light, of the images that are in and of those that come.
 
@@ -277,7 +282,7 @@ class FrameStacks:
         return all(isinstance(pattern, LineShift) for pattern in self._missing)
 
     def frames(self) -> AxisFrames:
-        """The frames, once `coded`; line frames that are not in are black."""
+        """The frames, once `coded`; line frames that are not in are black until they are."""
         patterns = self.patterns
         pairs = sorted(patterns.direct & patterns.inverted)
         white, black = self._ends.get(White()), self._ends.get(Black())

@@ -184,6 +184,8 @@ def refined(
     missed = no_points(len(frame))
     in_bands(fit_kernel, len(frame), *given, *crossings, missed, rows_at_least=POINTS)
     in_bands(_new_kernel, len(frame), frame, coarsest_px, landed, missed)
+    # What follows takes as much again.
+    del started, landed, targets, away, crossings
     new_borders = np.searchsorted(frame, np.arange(len(found) + 1))
     new_parts = [slice(a, b) for a, b in pairwise(new_borders)]
     pairs = zip(found, parts, new_parts, strict=True)
