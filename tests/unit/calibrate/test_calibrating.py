@@ -376,9 +376,9 @@ def test_scan_uses_the_active_calibration(bench: CalibrationBench) -> None:
     seen = []
     capture = bench.runner._tools.capture
 
-    def watched(rig: object, *given: object, **options: object) -> None:
+    def watched(rig: object, *given: object, **options: object) -> object:
         seen.append(getattr(rig, "calibration"))  # noqa: B009 - any rig
-        capture(rig, *given, **options)  # type: ignore[arg-type] # as it came
+        return capture(rig, *given, **options)  # type: ignore[arg-type] # as it came
 
     object.__setattr__(bench.runner._tools, "capture", watched)
     bench.until(bench.scan().id)

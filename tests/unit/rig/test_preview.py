@@ -116,7 +116,7 @@ def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     with simulated(tmp_path).head() as head:
         # The cameras of the rendered rig; the tame capture asks nothing of them, and lights the tame projector.
-        bench.runner._queue.rig = RigSession("bench", lambda: replace(rig_of(head), projector=TameProjector()))
+        bench.runner.queue.rig = RigSession("bench", lambda: replace(rig_of(head), projector=TameProjector()))
         bench.runner.start()
         try:
             scan = bench.scan()
