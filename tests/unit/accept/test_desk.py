@@ -42,7 +42,7 @@ from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.accept.test_plan import VOLUME
-from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, scan_of
+from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, nothing_captured, scan_of
 from tests.unit.jobs.tame_queue import PowerCut, TameQueue
 from tests.unit.scan.fakes import WAIT_S, TameProjector
 
@@ -80,7 +80,7 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> 
     """Makes the desk of a service, and of one after it over the same folder."""
     folder = DataFolder(tmp_path)
     database = Database(folder.database)
-    monkeypatch.setattr(acceptance, "capture_bundle", lambda _rig, _plan, folder, **_: folder.mkdir())
+    monkeypatch.setattr(acceptance, "capture_frames", nothing_captured)
 
     def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
         name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
