@@ -200,7 +200,8 @@ class PoseDesk:
 
         def compute(*_: object) -> Outcome:
             with self._reading:
-                return self._read(session_id, pose, self.folder.staging(pose.id), last_frame_s)
+                # A run of the service that ended in the middle of this may have left some of it.
+                return self._read(session_id, pose, self.folder.clear_results(pose.id), last_frame_s)
 
         def failed(_: Exception) -> None:
             """Remove a pose that came to nothing, and end the script with it."""

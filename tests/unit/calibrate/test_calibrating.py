@@ -474,6 +474,8 @@ def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_rea
     bundle = bench.folder.stage(whole.id) / "bundle"
     bundle.mkdir()
     (bundle / "bundle.json").write_text("{}")
+    # It was ended between its answer and its place.
+    (bench.folder.staging(whole.id) / "answer.json").write_text("{}")
     bench.jobs.advance(answered.id, JobState.COMPUTING)
     place = bench.calibrations.store.pose(session_id, 4)
     shutil.copytree(bench.calibrations.store.pose(session_id, 1), place)
