@@ -150,7 +150,7 @@ class Service:
         """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until
         `hurry`.
         """
-        self.runner.drain(self.settings.drain_s, self.hurry)
+        self.runner.queue.drain(self.settings.drain_s, self.hurry)
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""

@@ -18,7 +18,6 @@ from slrig.jobs.records import JobRecord, utc_now
 from slrig.jobs.rig_jobs import RigJobs
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
-from slrig.rig.preview import Light, Watch
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
 from slrig.scan.job import CaptureFrames, ScanTools, WatchesHealth, scan_job
 from slrig.scan.plan import ScanPlan, series_of
@@ -175,10 +174,6 @@ class Runner:
             raise fault
         rig.active = active
 
-    def watch(self, camera: str, light: Light) -> Watch:
-        """Look through a camera: see `JobQueue.watch`."""
-        return self.queue.watch(camera, light)
-
     def cancel(self, scan_id: UUID) -> JobRecord:
         """Ask a scan to stop. Returns at once; a scan that has finished stays as it is. Raises JobNotFoundError."""
         self._work.cancel(scan_id)
@@ -229,10 +224,6 @@ class Runner:
             preparing=self._worker.loading,
             ending=held.ending,
         )
-
-    def drain(self, timeout_s: float, hurry: threading.Event) -> None:
-        """Let what is under way come to its end: see `JobQueue.drain`."""
-        self.queue.drain(timeout_s, hurry)
 
     def close(self, *, timeout_s: float = 3.0) -> None:
         """Stop scanning, darken and close the rig, and record what was cut off as interrupted. Idempotent.
