@@ -150,8 +150,8 @@ class _Work:
 
     def _capture(self, capture: Capture, held: RigSession, job: Job) -> None:
         self._endings.settle()
-        job.since = self._jobs.advance(self._id, JobState.CAPTURING)
         self._resumable = False
+        job.since = self._jobs.advance(self._id, JobState.CAPTURING)
         self._folder.stage(self._id)
         try:
             with driver_errors(held.name):
@@ -159,6 +159,9 @@ class _Work:
         except Exception as error:
             held.doubt(error)
             raise
+        if job.stop.is_set():
+            message = "It was cancelled when all of its frames had come."
+            raise ScanCancelledError(message)
 
     def _compute(self, job: Job) -> None:
         progress = self._progress(self._parts.capture_share, 1.0)

@@ -14,7 +14,7 @@ import structlog
 
 from slrig.bundle.health import write_health
 from slrig.devices import Rig
-from slrig.errors import ScanCancelledError, StorageError
+from slrig.errors import StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import BUNDLE, DataFolder, missing_files
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
@@ -137,16 +137,11 @@ class _Scan:
         if held.facts is not None:
             frame_bytes = check_plan(self.plan, held.facts, rig.calibration)
             tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
+        stamp = None if tools.health is None else tools.health.stamp()
         self._feed, folder = tools.worker.feed(), tools.folder.recording(self._id)
         recording = tools.capture(
             rig, self.plan, folder, progress=progress, cancelled=job.stop.is_set, frames=self._feed
         )
-        held.darken()
-        stamp = None if tools.health is None else tools.health.stamp()
-        if job.stop.is_set():
-            recording.discard()
-            message = "The scan was cancelled."
-            raise ScanCancelledError(message)
         return recording if stamp is None else _Stamped(recording, folder, stamp)
 
     def failed(self, _: Exception) -> None:

@@ -184,6 +184,14 @@ def test_whatever_happens_the_job_has_one_end_with_its_cause(
     assert list(bench.folder.incoming.iterdir()) == []
 
 
+def test_job_that_is_cancelled_with_its_last_frame_is_cancelled(bench: JobBench) -> None:
+    bench.queue.cancelled = lambda: True
+    work = Work()
+    assert bench.done(work).state is JobState.CANCELLED
+    assert (work.done, work.recording.discarded) == (["capture", "failed by ScanCancelledError"], 1)
+    assert list(bench.folder.incoming.iterdir()) == []
+
+
 def test_refused_job_is_on_no_record(bench: JobBench) -> None:
     bench.queue.full = True
     recorded: list[object] = []
