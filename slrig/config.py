@@ -248,11 +248,11 @@ class ServiceSettings(BaseSettings):
     are removed with their poses, but for the one in use and those that a scan or an acceptance test names. Scans are
     kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes` sets a limit: beyond it the oldest are
     removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `backlog_length`
-    is how many scans may be reconstructed, or wait for that, while the rig shoots the next one. `drain_s` is how long,
-    after SIGTERM, the job that has the rig and scans that are reconstructed may take to come to their end before they
-    are interrupted; what waits or computes goes on at the next start. Nobody but the service's own user may read the
-    data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, and JSON lines
-    elsewhere.
+    is how many scans may be reconstructed, or wait for that, while the rig shoots the next one; what else computes
+    counts, too. `drain_s` is how long, after SIGTERM, the job that has the rig and those that compute may take to come
+    to their end before they are interrupted; what waits, and what has its frames, goes on at the next start. Nobody but
+    the service's own user may read the data, and the users of `data_group`, if it is set. `log_format` auto is text on
+    a terminal, and JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(

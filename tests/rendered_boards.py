@@ -10,7 +10,7 @@ from typing import Any
 
 from simulated_rig.device import SimulatedHead, simulated_head
 from slrig.devices import CameraSettings, Rig
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 
 BOARDS: Mapping[str, str] = {
@@ -144,6 +144,6 @@ def rendered_poses(
             rig.positioner.move(index)
             bundle = folder / f"pose_{number:02d}"
             plan = ScanPlan(patterns=PatternPlan(rows=True))
-            capture_bundle(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False)
+            capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
             bundles.append(bundle)
     return bundles

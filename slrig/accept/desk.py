@@ -26,13 +26,14 @@ from slrig.errors import (
     ScanStateError,
 )
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.job import Holder
+from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import Clock, JobRecord, utc_now
-from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
+from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
-from slrig.scan.runner import RigAccess
+from slrig.rig.session import RigSession
 
 
 class AcceptanceDesk:
@@ -43,7 +44,7 @@ class AcceptanceDesk:
     def __init__(
         self,
         folder: DataFolder,
-        queue: RigAccess,
+        queue: JobQueue,
         jobs: JobStore,
         *,
         evaluate: Evaluate,
@@ -86,17 +87,17 @@ class AcceptanceDesk:
         if the plan cannot be done; StorageError.
         """
         with self._lock:
-            status = self._queue.status()
-            if status.facts is None:
+            rig = self._queue.rig
+            if rig.facts is None:
                 message = "The rig is being opened. Ask again in a moment."
                 raise DeviceBusyError(message)
-            calibration = status.facts.calibration if status.active is None else status.active.calibration
+            calibration = rig.facts.calibration if rig.active is None else rig.active.calibration
             if calibration is None:
-                message = f"rig '{status.rig}' has no calibration, and nothing can be measured; calibrate it first"
+                message = f"rig '{rig.name}' has no calibration, and nothing can be measured; calibrate it first"
                 raise CalibrationError(message)
             number = 1 + max((each.number for each in self._tests.values()), default=0)
             plan = plan_of(calibration, self._wanted_mm)
-            record = AcceptanceRecord(number, uuid4(), self._clock(), status.rig, calibration.solve_id, plan)
+            record = AcceptanceRecord(number, uuid4(), self._clock(), rig.name, calibration.solve_id, plan)
             self._store.save(record)
             self._tests[record.id] = record
         return record
@@ -179,21 +180,22 @@ class AcceptanceDesk:
         """Captures and evaluates, with the rig; then the report, where all is measured."""
         calibration: Calibration | None = None
 
-        def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
+        def capture(held: RigSession, job: Job, progress: ProgressRecorder) -> None:
             nonlocal calibration
+            rig = held.open()
             calibration = _same_calibration(self._found(test_id), rig)
-            self._measure(test_id, rig, progress, cancelled, scripted=scripted)
+            self._measure(test_id, rig, progress, job.stop.is_set, scripted=scripted)
 
-        def compute(_: ProgressRecorder) -> Outcome:
+        def compute(*_: object) -> Outcome:
             record = self._found(test_id)
             if record.next_take is None and calibration is not None:
                 self._conclude(record, calibration)
             return Outcome({"captures_done": len(record.readings)})
 
-        return Parts(capture=capture, compute=compute)
+        return Parts(compute, capture)
 
     def _measure(
-        self, test_id: UUID, rig: Rig, progress: ProgressRecorder, cancelled: Cancelled, *, scripted: bool
+        self, test_id: UUID, rig: Rig, progress: ProgressRecorder, cancelled: Callable[[], bool], *, scripted: bool
     ) -> None:
         """On the rig's thread: measure one position, or all that are left."""
         record = self._change(test_id, readings=self._found(test_id).from_first_take().readings)

@@ -28,7 +28,7 @@ from slrig.errors import (
 )
 from slrig.jobs.records import utc_now
 from slrig.model import Calibration
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import Progress, ReconstructionPlan, ScanPlan
 
@@ -165,7 +165,7 @@ def _captured(
         # The test must not use what a rendered rig knows of its scene; and the noise of a point, which is told beside
         # its form, is to hold nothing of the calibration's own error, which is what form is to show.
         blind = replace(rig, head=None, calibration=replace(calibration, solved=None))
-        capture_bundle(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled)
+        capture_frames(blind, scan, work / _BUNDLE, progress=progress, cancelled=cancelled).finish()
         return evaluate(work, folder, plan, step, take, progress=progress, cancelled=cancelled)
     finally:
         shutil.rmtree(work, ignore_errors=True)

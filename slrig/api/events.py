@@ -108,15 +108,16 @@ def _answers(events: str, nothing: str) -> dict[int | str, dict[str, Any]]:
 
 
 _JOB = _answers(
-    "`progress` events with stage, fraction and detail; `captured` when the rig is free of a scan, whose "
-    "frames are brought to disk and reconstructed then; `file` events with the name of a file that can be fetched from "
+    "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
+    "frames are brought to disk and computed with then; `file` events with the name of a file that can be fetched from "
     "then on; `state` events with the new state. The stream ends after the event of a final state.",
     "nothing has happened since the event that was named, and nothing more will",
 )
 _CALIBRATION = _answers(
     "`pose` events with the number and the new state of a pose; `progress` events with stage, fraction and detail, and "
-    "the number of the pose; `state` events when a solve begins (`solving`) and ends (`solved`, `failed`). The stream "
-    "ends when nothing is under way any more. Event numbers rise, with gaps.",
+    "the number of the pose; `captured` when the rig is free of a pose, and the board may be moved; `state` events "
+    "when a solve begins (`solving`) and ends (`solved`, `failed`). The stream ends when nothing is under way any "
+    "more. Event numbers rise, with gaps.",
     "nothing has happened since the event that was named, and nothing is under way",
 )
 
@@ -195,7 +196,7 @@ def _look_at_calibration(
 
 def _of_calibration(event: JobEvent, pose: int | None) -> JobEvent:
     """An event of a pose, or of a solve where `pose` is None, as one of the calibration."""
-    if event.kind == "progress":
+    if event.kind in {"progress", "captured"}:
         return replace(event, data={**event.data, "pose": pose})
     if pose is not None:
         return replace(event, kind="pose", data={**event.data, "pose": pose})

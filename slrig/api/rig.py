@@ -102,7 +102,7 @@ async def look_through_camera(
 ) -> Response:
     """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
     place.take()
-    watch = await run_in_threadpool(service.runner.watch, camera, light)
+    watch = await run_in_threadpool(service.runner.queue.watch, camera, light)
     return StreamingResponse(
         _parts(watch),
         media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}",

@@ -297,7 +297,8 @@ class RigBody(BaseModel):
     waiting: int
     queue_length: int
     computing: list[str] = Field(
-        description="ids of scans that are reconstructed, or wait for that, in their order: the rig is free of them"
+        description="scans that are reconstructed, and other work that computes, or wait for that, in their order and "
+        "named as the holder is: the rig is free of them"
     )
     backlog_length: int = Field(description="while as many are computed, the next scan waits before it begins")
     scan_defaults: dict[str, Any] = Field(description="what the rig file says; a request may say otherwise")

@@ -91,7 +91,7 @@ class Service:
         self.notices = Notices(settings.webhook_url, rig=rig_name)
         self.verifications = VerificationDesk(
             folder,
-            runner,
+            runner.queue,
             NoticedHealth(database, self.notices),
             JobStore(database, JobKind.VERIFICATION),
             tools=verification_tools(worker),
@@ -100,7 +100,7 @@ class Service:
         runner.watch_health(self.verifications)
         self.acceptance = AcceptanceDesk(
             folder,
-            runner,
+            runner.queue,
             JobStore(database, JobKind.POSITION),
             evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
@@ -121,14 +121,15 @@ class Service:
         )
         limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
         self.scan_retention = ScanRetention(store, folder, limits, runner.delete)
-        runner.after_each(self.scan_retention.look)
         self.schedules = ScheduleStore(database)
-        self.tasks = Tasks(runner, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
+        self.tasks = Tasks(runner.queue, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True, notice=self.notices.run)
 
     def _ended(self, jobs: JobStore, record: JobRecord) -> None:
-        """Measure a job that is over."""
+        """Measure a job that is over, and make room after a scan."""
+        if jobs is self.store:
+            self.scan_retention.look()
         try:
             events = jobs.events(record.id, after=0)
             self.durations.ended(record, events)
@@ -149,7 +150,7 @@ class Service:
         """Begin nothing new, and let what has the rig come to its end, as long as the settings allow, or until
         `hurry`.
         """
-        self.runner.drain(self.settings.drain_s, self.hurry)
+        self.runner.queue.drain(self.settings.drain_s, self.hurry)
 
     def end_work(self) -> None:
         """Stop scanning and calibrating, and record what was cut off. Idempotent."""

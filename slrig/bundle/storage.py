@@ -74,9 +74,10 @@ def json_bytes(data: object) -> bytes:
     return (json.dumps(data, indent=1, allow_nan=False) + "\n").encode()
 
 
-def sync_tree(folder: Path) -> None:
-    """Make every file below `folder`, and every folder, durable."""
-    for place, _, files in os.walk(folder):
+def sync_tree(folder: Path, *, but: str = "") -> None:
+    """Make every file below `folder`, and every folder, durable. but : a folder in it that is so already, by name."""
+    for place, folders, files in os.walk(folder):
+        folders[:] = [name for name in folders if Path(place, name) != folder / but]
         for file in (Path(place, name) for name in files):
             # What a link leads to is not ours.
             if not file.is_symlink():

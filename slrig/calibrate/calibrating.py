@@ -64,16 +64,16 @@ class Calibrations:
         self._data = folder
         self.store = CalibrationStore(folder)
         self.register = CalibrationRegister(self.store, jobs)
-        self._work = RigJobs(jobs, runner, folder)
+        self._work = RigJobs(jobs, runner.queue, folder)
         self._runner = runner
         self._rig_name = rig_name
         self._tools = tools
-        self.poses = PoseDesk(self.register, folder, runner, self._work, tools, spare_bytes)
+        self.poses = PoseDesk(self.register, folder, self._work, tools, spare_bytes)
         self.solves = SolveDesk(self.register, self._work, tools, wanted_mm, self._of_the_rig)
         runner.use_calibration(self.store.active_calibration())
 
     def _of_the_rig(self) -> Calibration | None:
-        facts = self._runner.status().facts
+        facts = self._runner.queue.rig.facts
         return None if facts is None else facts.calibration
 
     def take_up(self) -> None:

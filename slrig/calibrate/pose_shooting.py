@@ -9,7 +9,7 @@ import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from uuid import UUID, uuid4
@@ -20,21 +20,20 @@ from slrig.bundle.storage import write_durably
 from slrig.calibrate.records import PoseRecord, SessionRecord, SessionState, pose_of
 from slrig.calibrate.register import CalibrationRegister
 from slrig.calibrate.solving import ReadPose
-from slrig.calibrate.store import ANSWER, BUNDLE, READING, picture_name, reading_bytes
+from slrig.calibrate.store import ANSWER, READING, picture_name, reading_bytes
 from slrig.calibrate.tools import CalibrationTools, Judgement, setting_of
 from slrig.devices import Rig
 from slrig.errors import CalibrationError, CalibrationStateError, PoseRefusedError, SlrigError, UnsupportedByDeviceError
 from slrig.failure import JobFailure, disk_errors
-from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.job import Holder
+from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as, actor, utc_now
-from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
+from slrig.jobs.rig_jobs import Outcome, Parts, Recorded, RigJobs
 from slrig.model import Size
-from slrig.rig.session import RigFacts
+from slrig.rig.session import RigFacts, RigSession
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
-from slrig.scan.runner import RigAccess
 
 _log = structlog.get_logger(__name__)
 
@@ -55,10 +54,11 @@ class PoseDesk:
 
     register: CalibrationRegister
     folder: DataFolder
-    queue: RigAccess
     work: RigJobs
     tools: CalibrationTools
     spare_bytes: int
+    _reading: threading.Lock = field(default_factory=threading.Lock)
+    """One at a time: each is judged by those before it."""
 
     def warm(self) -> None:
         """Load, on a thread of its own, what reading a pose needs."""
@@ -101,19 +101,19 @@ class PoseDesk:
             if record.state is SessionState.SOLVING:
                 message = f"Calibration {record.id} is being solved. Shoot the next pose when that is over."
                 raise CalibrationStateError(message)
-            status = self.queue.status()
-            place, name = _position(request.position, status.facts)
+            rig = self.work.queue.rig
+            place, name = _position(request.position, rig.facts)
             scan = ScanPlan(patterns=record.patterns, exposure_s=request.exposure_s)
-            if status.facts is not None:
-                _require_same_rig(record, status.facts)
-                self.folder.require_space(2 * check_plan(scan, status.facts) + self.spare_bytes)
+            if rig.facts is not None:
+                _require_same_rig(record, rig.facts)
+                self.folder.require_space(2 * check_plan(scan, rig.facts) + self.spare_bytes)
             number = record.latest_pose + 1
             pose = PoseRecord(number, uuid4(), JobState.QUEUED, utc_now(), place, name, request.exposure_s)
 
             def begun() -> None:
                 self.register.change(session_id, latest_pose=number)
                 self.register.jobs.create(
-                    pose.plan, rig=status.rig, label=None, key=key, job_id=pose.id, kind=JobKind.POSE, parent=session_id
+                    pose.plan, rig=rig.name, label=None, key=key, job_id=pose.id, kind=JobKind.POSE, parent=session_id
                 )
 
             parts = self._parts(session_id, pose, scan, asked_by=actor())
@@ -145,7 +145,7 @@ class PoseDesk:
         does not. Raises as `shoot` does.
         """
         with self.register.lock:
-            facts = self.queue.status().facts
+            facts = self.work.queue.rig.facts
             # Of a rig without positions, the first is asked for, and refused.
             asked = positions or range(max(len(facts.positions) if facts is not None else 0, 1))
             first, *others = [place for each in asked if (place := _position(each, facts)[0]) is not None]
@@ -178,37 +178,37 @@ class PoseDesk:
 
     def _parts(self, session_id: UUID, pose: PoseRecord, scan: ScanPlan, *, asked_by: str | None) -> Parts:
         """The two parts of a pose. asked_by : who asks for the next one of its script, too."""
-        staged = self.folder.staging(pose.id)
         last_frame_s = time.monotonic()
 
-        def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
+        def capture(held: RigSession, job: Job, progress: ProgressRecorder) -> Recorded:
             """Move the board if asked, and record a bundle."""
             nonlocal last_frame_s
+            rig = held.open()
             self._meet(session_id, rig)
             if pose.position is not None and rig.positioner is not None:
                 progress("move", 0.0, pose.position_name or "")
                 rig.positioner.move(pose.position)
             # Neither an earlier calibration nor what a rendered rig knows of its scene is any business of this one's.
-            bare = replace(rig, calibration=None, head=None)
-            self.tools.capture(bare, scan, staged / BUNDLE, progress=progress, cancelled=cancelled)
+            bare, folder = replace(rig, calibration=None, head=None), self.folder.recording(pose.id)
+            recording = self.tools.capture(bare, scan, folder, progress=progress, cancelled=job.stop.is_set)
             last_frame_s = time.monotonic()
+            return recording
 
         def captured() -> None:
             with acting_as(asked_by):
                 self._go_on(session_id, pose.exposure_s)
 
-        def ended(state: JobState, fault: JobFailure | None) -> None:
-            """Remove a pose that came to nothing, and end the script with it."""
-            if state is not JobState.SUCCEEDED and (fault is None or fault.code != PoseRefusedError.code):
-                self._set_script(session_id)
-                self.register.store.discard_pose(session_id, pose.number)
+        def compute(*_: object) -> Outcome:
+            with self._reading:
+                # A run of the service that ended in the middle of this may have left some of it.
+                return self._read(session_id, pose, self.folder.clear_results(pose.id), last_frame_s)
 
-        return Parts(
-            capture=capture,
-            captured=captured,
-            compute=lambda _: self._read(session_id, pose, staged, last_frame_s),
-            ended=ended,
-        )
+        def failed(_: Exception) -> None:
+            """Remove a pose that came to nothing, and end the script with it."""
+            self._set_script(session_id)
+            self.register.store.discard_pose(session_id, pose.number)
+
+        return Parts(compute, capture, captured=captured, failed=failed)
 
     def _meet(self, session_id: UUID, rig: Rig) -> None:
         """Take the rig's devices down with the first pose, and hold the others against them."""

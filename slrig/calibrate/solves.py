@@ -12,11 +12,12 @@ import structlog
 from slrig.bundle.calibration_file import check_calibration, write_calibration
 from slrig.calibrate.records import SessionRecord, SessionState
 from slrig.calibrate.register import CalibrationRegister
-from slrig.calibrate.store import BUNDLE, CALIBRATION, REPORT
+from slrig.calibrate.store import CALIBRATION, REPORT
 from slrig.calibrate.tools import CalibrationTools, setting_of
 from slrig.calibration.board import BoardShape
 from slrig.errors import CalibrationError, CalibrationStateError, SolveRefusedError
-from slrig.failure import JobFailure
+from slrig.jobs.data_folder import BUNDLE
+from slrig.jobs.job import Holder
 from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobKind, JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
@@ -73,7 +74,7 @@ class SolveDesk:
                 raise SolveRefusedError(message)
             plan = {"number": record.solve + 1, "board_shape": str(board_shape)}
             job = self.register.jobs.create(plan, rig=record.rig, label=None, kind=JobKind.SOLVE, parent=session_id)
-            self.work.compute(job.id, self._parts(session_id, job))
+            self.work.take_up(job, self._parts(session_id, job), holder=_holder(session_id, job))
             return self.register.get(session_id)
 
     def take_up(self, session_id: UUID, job: JobRecord) -> None:
@@ -81,14 +82,14 @@ class SolveDesk:
         if self.register.get(session_id).solve >= job.plan["number"]:
             self.register.jobs.finish(job.id, JobState.SUCCEEDED)
         else:
-            self.work.interrupt(job.id, self._parts(session_id, job))
+            self.work.take_up(job, self._parts(session_id, job), holder=_holder(session_id, job))
 
     def _parts(self, session_id: UUID, job: JobRecord) -> Parts:
-        def ended(state: JobState, _: JobFailure | None) -> None:
-            if state is not JobState.SUCCEEDED:
-                self.register.change(session_id, must_last=False, state=SessionState.FAILED)
-
-        return Parts(compute=lambda progress: self._solve(session_id, job.plan, progress), ended=ended)
+        return Parts(
+            lambda _, progress: self._solve(session_id, job.plan, progress),
+            failed=lambda _: self.register.change(session_id, must_last=False, state=SessionState.FAILED),
+            capture_share=0.0,
+        )
 
     def _solve(self, session_id: UUID, plan: Mapping[str, Any], progress: ProgressRecorder) -> Outcome:
         record, store = self.register.get(session_id), self.register.store
@@ -131,6 +132,11 @@ class SolveDesk:
         except CalibrationError:
             return None
         return used
+
+
+def _holder(session_id: UUID, job: JobRecord) -> Holder:
+    words = f"calibration {session_id}, solve {job.plan['number']}"
+    return Holder(words, words, f"/calibration/{session_id}")
 
 
 def solve_name(session_id: UUID, number: int) -> str:

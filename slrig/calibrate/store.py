@@ -31,7 +31,7 @@ from slrig.calibrate.solving import ReadPose
 from slrig.calibration.observations import BoardView, Correspondences, PoseObservation, ViewFigures
 from slrig.errors import CalibrationError, StorageError
 from slrig.failure import disk_errors
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.model import Calibration
 from slrig.rig.session import ActiveCalibration
 
@@ -40,7 +40,6 @@ CALIBRATION = "calibration.json"
 REPORT = "report.html"
 ANSWER = "answer.json"
 READING = "reading.npz"
-BUNDLE = "bundle"
 
 _ACTIVE_FORMAT = "slrig-active-calibration"
 
@@ -115,7 +114,7 @@ class CalibrationStore:
         self._remove(self.folder(session_id))
 
     def commit_pose(self, session_id: UUID, number: int, staged: Path) -> None:
-        """Move a pose into place, whole and durable."""
+        """Move a pose into place, whole and durable. Its bundle is durable already."""
         self._commit(staged, self.pose(session_id, number))
 
     def discard_pose(self, session_id: UUID, number: int) -> None:
@@ -213,7 +212,7 @@ class CalibrationStore:
 
     def _commit(self, staged: Path, place: Path) -> None:
         with disk_errors(staged):
-            sync_tree(staged)
+            sync_tree(staged, but=BUNDLE)
             staged.rename(place)
             sync_folder(place.parent)
 

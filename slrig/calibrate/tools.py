@@ -18,9 +18,10 @@ from slrig.calibration.judging.comparison import Comparison
 from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError
+from slrig.jobs.rig_jobs import Recorded
 from slrig.jobs.worker import Worker
 from slrig.model import Calibration, Size
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import Progress, ScanPlan
 
 
@@ -66,12 +67,12 @@ class Judgement:
 
 
 class CapturePose(Protocol):
-    """`slrig.scan.acquisition.capture_bundle`."""
+    """`slrig.scan.acquisition.capture_frames`."""
 
     def __call__(
         self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
-    ) -> None:
-        """Play the patterns and write a complete bundle into `folder`."""
+    ) -> Recorded:
+        """Play the patterns, and record a bundle for `folder`."""
         ...
 
 
@@ -100,7 +101,7 @@ def calibration_tools(worker: Worker) -> CalibrationTools:
     """The real ones: the shot is taken here, the mathematics is the worker's."""
     room = "slrig.calibrate"
     return CalibrationTools(
-        capture=capture_bundle,
+        capture=capture_frames,
         read=worker.task(f"{room}.pose_reading:read_pose", "reading of the pose"),
         judge=worker.task(f"{room}.pose_judging:judgement", "judgement of the pose"),
         survey=worker.task(f"{room}.pose_judging:standing", "survey of the poses"),

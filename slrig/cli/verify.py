@@ -20,7 +20,7 @@ from slrig.discovery import open_rig
 from slrig.errors import CalibrationError
 from slrig.logs import set_up_logs_for_a_person
 from slrig.model import Calibration
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import Progress, ScanPlan
 from slrig.verify.verification import verify_bundle
 
@@ -91,7 +91,9 @@ def _shot(
             rig.positioner.move(position)
         bare = replace(rig, calibration=None, head=None)
         place = Path(folder) / "verification"
-        capture_bundle(bare, ScanPlan(patterns=USUAL_PATTERNS), place, progress=display, cancelled=lambda: False)
+        capture_frames(
+            bare, ScanPlan(patterns=USUAL_PATTERNS), place, progress=display, cancelled=lambda: False
+        ).finish()
         return verify_bundle(place, board, calibration)
 
 

@@ -26,7 +26,7 @@ from slrig.bundle.storage import sync_folder, sync_tree
 from slrig.errors import DataFolderGoneError, StorageError
 from slrig.failure import disk_errors
 
-DATABASE, SCANS, ORPHANS = "slrig.sqlite", "scans", ".orphans"
+DATABASE, SCANS, ORPHANS, BUNDLE = "slrig.sqlite", "scans", ".orphans", "bundle"
 
 _HOLDER, _RESULT = "holder", "result"
 
@@ -188,7 +188,7 @@ class DataFolder:
         staged = self.staging(scan_id)
         with disk_errors(staged):
             sync_tree(self.recording(scan_id))
-            self.recording(scan_id).rename(staged / "bundle")
+            self.recording(scan_id).rename(staged / BUNDLE)
             sync_folder(staged)
 
     def result(self, scan_id: UUID) -> Path:
@@ -214,9 +214,8 @@ class DataFolder:
         return folder
 
     def commit(self, scan_id: UUID) -> None:
-        """Move a staged scan to its place, whole and durable: fsync everything, then one rename.
-
-        The reconstruction's own folder is dissolved, so that its files lie beside the bundle.
+        """Move a staged scan to its place, whole and durable: fsync all but the bundle, which is so already, then one
+        rename. The reconstruction's own folder is dissolved, so that its files lie beside the bundle.
         """
         staged = self.staging(scan_id)
         with disk_errors(staged):
@@ -225,7 +224,7 @@ class DataFolder:
                 for file in sorted(result.iterdir()):
                     file.rename(staged / file.name)
                 result.rmdir()
-            sync_tree(staged)
+            sync_tree(staged, but=BUNDLE)
             staged.rename(self.scan(scan_id))
             sync_folder(self.scans)
             sync_folder(self.incoming)
@@ -236,7 +235,7 @@ class DataFolder:
         """
         if self.recording(scan_id).is_dir():
             self.keep_recording(scan_id)
-        if not (self.staging(scan_id) / "bundle").is_dir():
+        if not (self.staging(scan_id) / BUNDLE).is_dir():
             return
         self.clear_results(scan_id)
         self.commit(scan_id)
@@ -245,7 +244,7 @@ class DataFolder:
         """Remove all that is staged for a scan but its bundle, and return the staging folder."""
         staged = self.staging(scan_id)
         for other in staged.iterdir():
-            if other.name != "bundle":
+            if other.name != BUNDLE:
                 remove(other)
         return staged
 

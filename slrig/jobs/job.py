@@ -40,7 +40,7 @@ class Job:
     id: UUID
     holder: Holder
     since: datetime
-    work: Callable[[RigSession, Job], None] | None
+    work: Callable[[RigSession, Job], object] | None
     ended: Callable[[Exception | None], None]
     compute: Callable[[Job], None] | None = None
     clear_up: Callable[[Exception | None], None] = lambda _: None

@@ -83,12 +83,6 @@ class JobQueue:
         for job in list(self._computing):
             self._begin_computing(job)
 
-    def refuse_while_stuck(self) -> None:
-        """Raise DeviceError while a driver hangs."""
-        call = self.rig.calls.stuck
-        if call is not None:
-            raise DeviceError(call.hangs())
-
     def submit(self, make: Callable[[], Sequence[Job]], *, wait: bool) -> None:
         """Put the jobs that `make` returns in line; `wait` lets the first stand behind others.
 
@@ -100,7 +94,10 @@ class JobQueue:
             As many wait as may.
         ScanInterruptedError
             The service ends.
+        DeviceError
+            A driver hangs.
         """
+        self._refuse_while_stuck()
         with self._changed:
             if self._ending:
                 raise interruption()
@@ -115,10 +112,16 @@ class JobQueue:
             self._changed.notify_all()
         self._previews.interrupt()
 
-    def take_up(self, jobs: Sequence[Job]) -> None:
-        """Put jobs of an earlier run in line, or have them computed, however many; before `start`."""
-        self._waiting += tuple(job for job in jobs if job.work is not None)
-        self._computing.extend(job for job in jobs if job.work is None)
+    def add(self, jobs: Sequence[Job]) -> None:
+        """Put jobs in line, however many wait, and have those computed that do not need the rig."""
+        computing = [job for job in jobs if job.work is None]
+        with self._changed:
+            self._waiting += tuple(job for job in jobs if job.work is not None)
+            self._computing.extend(computing)
+            self._changed.notify_all()
+        if self._owner.is_alive():
+            for job in computing:
+                self._begin_computing(job)
 
     def cancel(self, job_id: UUID) -> bool:
         """Have a job end early. Returns whether it is under way and was told; one that waited has ended."""
@@ -148,7 +151,7 @@ class JobQueue:
         DeviceError
             The rig is not open, or not yet.
         """
-        self.refuse_while_stuck()
+        self._refuse_while_stuck()
         facts = self.rig.facts
         if self.rig.fault is not None:
             message = f"The rig cannot be opened: {self.rig.fault.message}"
@@ -218,6 +221,11 @@ class JobQueue:
         with self._changed:
             self._changed.wait_for(lambda: not self._computing, max(give_up - time.monotonic(), 0.0))
         self._cut_off(interruption(), self._under_way)
+
+    def _refuse_while_stuck(self) -> None:
+        call = self.rig.calls.stuck
+        if call is not None:
+            raise DeviceError(call.hangs())
 
     def _give_up_on(self, call: Call) -> None:
         """End, on the watchdog's thread, what waits for a call that hangs."""

@@ -1,49 +1,38 @@
-"""Jobs of two parts: one that holds the rig, and one that computes when the rig is free."""
+"""Jobs on record, done in two parts: one holds the rig, one computes when the rig is free; each job has one end."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 from uuid import UUID
 
 import structlog
 
-from slrig.devices import Rig
-from slrig.errors import ScanInterruptedError, SlrigError, StorageError
-from slrig.failure import JobFailure, interruption
+from slrig.errors import ScanCancelledError, ScanInterruptedError, StorageError
+from slrig.failure import JobFailure, failure_of, interruption
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.endings import Ending, Endings, ending_by
-from slrig.jobs.job import Holder
+from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
-from slrig.jobs.records import JobRecord, JobState
+from slrig.jobs.queue import JobQueue
+from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.jobs.store import JobStore
-
-Cancelled = Callable[[], bool]
-"""Whether a job is to end early."""
+from slrig.rig.session import RigSession, driver_errors
 
 _log = structlog.get_logger(__name__)
 
 
-class RigQueue(Protocol):
-    """`slrig.scan.runner.Runner`, as far as work that is no scan needs it."""
+class Recorded(Protocol):
+    """`slrig.scan.acquisition.Recording`, or what a test puts in its place."""
 
-    def submit_work(
-        self,
-        work: Callable[[Rig, Cancelled], None],
-        *,
-        work_id: UUID,
-        holder: Holder,
-        wait: bool,
-        ended: Callable[[Exception | None], None],
-        begun: Callable[[], object],
-    ) -> None:
-        """Have work done with the rig."""
+    def finish(self) -> None:
+        """Bring the bundle to its place."""
         ...
 
-    def cancel_work(self, work_id: UUID) -> None:
-        """Ask it to end early."""
+    def discard(self) -> None:
+        """Let it go."""
         ...
 
 
@@ -55,34 +44,44 @@ class Outcome:
     fault: JobFailure | None = None
 
 
+Capture = Callable[[RigSession, Job, ProgressRecorder], Recorded | None]
+"""A job's first part. What it returns is on its way to `DataFolder.recording`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Parts:
     """What one job does.
 
-    compute : its second part, on a thread of its own. capture : its first, on the rig's thread, for a job that needs
-    the rig. captured : called between the two, on the rig's thread, when the rig is free; it returns soon. ended :
-    called when the job is over, before that is on record.
+    compute : its second part, on a thread of its own when the rig is free. capture : its first, on the rig's thread;
+    None where it was done before, or is not needed. What it recorded is the staged bundle when the second part begins.
+    captured : called between the two, when the rig is free. failed : called once, on any thread, when an error has
+    ended the job. salvage : keeps what it can of one that was not cancelled, before its files are removed.
+    capture_share : the part of its progress that is capture.
     """
 
-    compute: Callable[[ProgressRecorder], Outcome]
-    capture: Callable[[Rig, ProgressRecorder, Cancelled], None] = lambda *_: None
+    compute: Callable[[Job, ProgressRecorder], Outcome]
+    capture: Capture | None = None
     captured: Callable[[], None] = lambda: None
-    ended: Callable[[JobState, JobFailure | None], None] = lambda *_: None
+    failed: Callable[[Exception], None] = lambda _: None
+    salvage: Callable[[UUID], None] = lambda _: None
+    capture_share: float = 1.0
 
 
 class RigJobs:
     """Has jobs of one store done, and each put on record with one end. Any thread may call; `close` at the end.
 
-    A job's files are made in the staging folder of its id, which is removed at its end. Second parts are done one at a
-    time, in their order.
+    A job's files are made in the staging folder of its id, which is removed at its end.
     """
 
-    def __init__(self, jobs: JobStore, queue: RigQueue, folder: DataFolder) -> None:
+    def __init__(self, jobs: JobStore, queue: JobQueue, folder: DataFolder) -> None:
         self.jobs = jobs
-        self._queue = queue
-        self._folder = folder
-        self._endings = Endings(jobs)
-        self._computing = threading.Lock()
+        self.queue = queue
+        self.folder = folder
+        self.endings = Endings(jobs)
+
+    def job(self, job_id: UUID, parts: Parts, holder: Holder) -> Job:
+        """What the queue does for a job that is on record, or will be when it begins."""
+        return _Work(job_id, parts, self, holder).job
 
     def submit(
         self, job_id: UUID, parts: Parts, *, holder: Holder, wait: bool, record: Callable[[], object] = lambda: None
@@ -96,94 +95,141 @@ class RigJobs:
         RigBusyError, QueueFullError, DeviceError
             As a scan.
         """
-        self._queue.submit_work(
-            lambda rig, cancelled: self._capture(job_id, parts, rig, cancelled),
-            work_id=job_id,
-            holder=holder,
-            wait=wait,
-            ended=lambda error: self._captured(job_id, parts, error),
-            begun=record,
-        )
 
-    def compute(self, job_id: UUID, parts: Parts) -> None:
-        """Have the second part of a job done that is on record. Returns at once."""
-        try:
-            self.jobs.advance(job_id, JobState.COMPUTING)
-        except StorageError as refused:
-            # That record is for whoever looks on.
-            _log.warning("that a job computes could not be recorded", job=str(job_id), cause=str(refused))
-        # A daemon, so that it never holds up the end of the service.
-        threading.Thread(target=self._compute, args=(job_id, parts), name="slrig-job", daemon=True).start()
+        def make() -> Sequence[Job]:
+            record()
+            return [self.job(job_id, parts, holder)]
 
-    def cancel(self, job_id: UUID) -> None:
-        """Ask a job to end early. Returns at once; what the rig is not needed for any more goes on to its end."""
-        self._queue.cancel_work(job_id)
+        self.queue.submit(make, wait=wait)
 
     def take_up(self, record: JobRecord, parts: Parts, *, holder: Holder, resumes: bool = False) -> None:
-        """Go on with a job of an earlier run of the service: submit it again if it waited, else end it as interrupted.
-        resumes : whether its second part can be done from what is staged; it is, once.
+        """Have a job done that is on record and waits; end one that an earlier run of the service had begun as
+        interrupted. resumes : whether its second part can be done from what is staged; it is, once.
         """
         if record.state is JobState.QUEUED:
-            try:
-                self.submit(record.id, parts, holder=holder, wait=True)
-            except SlrigError as error:
-                self._end(record.id, parts, error)
+            self.queue.add([self.job(record.id, parts, holder)])
         elif resumes and record.state is JobState.COMPUTING and self.jobs.attempts(record.id) == 1:
-            self.compute(record.id, parts)
+            self.queue.add([self.job(record.id, replace(parts, capture=None), holder)])
         else:
-            self.interrupt(record.id, parts)
+            work, error = _Work(record.id, parts, self, holder, resumable=False), interruption()
+            work.clear_up(error)
+            work.job.conclude(error)
+            work.job.settle()
 
-    def interrupt(self, job_id: UUID, parts: Parts) -> None:
-        """End a job that the end of the service cut off."""
-        self._end(job_id, parts, interruption())
+    def cancel(self, job_id: UUID) -> None:
+        """Ask a job to end early. Returns at once; one that is over stays so. Raises JobNotFoundError."""
+        if self.queue.cancel(job_id):
+            return
+        self.endings.settle()
+        if job_id not in self.endings:
+            # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
+            fault = failure_of(ScanInterruptedError("Nothing works on this any more. Start it again."))
+            self.jobs.finish(job_id, JobState.INTERRUPTED, fault=fault)
 
     def close(self) -> None:
-        """Put on record what the disk refused before. Idempotent."""
-        self._endings.close()
+        """Put on record what the disk refused before. Idempotent; after the queue has come to its end."""
+        self.endings.close()
 
-    def _recorder(self, job_id: UUID) -> ProgressRecorder:
-        return ProgressRecorder(self.jobs, job_id, hidden=self._folder.hidden(job_id))
 
-    def _capture(self, job_id: UUID, parts: Parts, rig: Rig, cancelled: Cancelled) -> None:
-        self.jobs.advance(job_id, JobState.CAPTURING)
-        self._folder.stage(job_id)
-        parts.capture(rig, self._recorder(job_id), cancelled)
+class _Work:
+    """One job that waits or is under way. resumable : whether the next start of the service goes on with it."""
 
-    def _captured(self, job_id: UUID, parts: Parts, error: Exception | None) -> None:
-        if error is not None:
-            self._interrupted(job_id, parts, error)
-            return
-        try:
-            parts.captured()
-        finally:
-            self.compute(job_id, parts)
+    def __init__(self, job_id: UUID, parts: Parts, of: RigJobs, holder: Holder, *, resumable: bool = True) -> None:
+        self._id = job_id
+        self._parts = parts
+        self._jobs, self._folder, self._endings = of.jobs, of.folder, of.endings
+        self._hidden = of.folder.hidden(job_id)
+        self._recording: Recorded | None = None
+        self._resumable = resumable
+        self._worked = self._failed = False
+        self._found = Outcome(None)
+        capture = None if parts.capture is None else partial(self._capture, parts.capture)
+        self.job = Job(
+            job_id, holder, utc_now(), capture, self._ended, self._compute, self.clear_up, self._concluded
+        )  # fmt: skip
 
-    def _compute(self, job_id: UUID, parts: Parts) -> None:
-        try:
-            with self._computing, structlog.contextvars.bound_contextvars(job=str(job_id)):
-                found = parts.compute(self._recorder(job_id))
-        except Exception as error:  # noqa: BLE001 - whatever goes wrong, the job gets its end
-            self._interrupted(job_id, parts, error)
-        else:
-            state = JobState.SUCCEEDED if found.fault is None else JobState.FAILED
-            self._settle(Ending(job_id, state, found.fault, found.summary), parts)
-
-    def _interrupted(self, job_id: UUID, parts: Parts, error: Exception) -> None:
-        """End a job by an error, but leave one that the end of the service caught in line, or computing, to the next
-        start, which goes on with it or tells that it cannot.
-        """
-        if isinstance(error, ScanInterruptedError) and self.jobs.get(job_id).state is not JobState.CAPTURING:
-            return
-        self._end(job_id, parts, error)
-
-    def _end(self, job_id: UUID, parts: Parts, error: Exception) -> None:
-        self._settle(ending_by(error, job_id, hidden=self._folder.hidden(job_id)), parts)
-
-    def _settle(self, ending: Ending, parts: Parts) -> None:
-        self._folder.discard(ending.id)
-        try:
-            parts.ended(ending.state, ending.fault)
-        except Exception:  # noqa: BLE001 - whoever waits for the job has to be told all the same
-            _log.exception("the end of a job went wrong", job=str(ending.id))
-        self._endings.add(ending)
+    def _capture(self, capture: Capture, held: RigSession, job: Job) -> None:
         self._endings.settle()
+        self._resumable = False
+        job.since = self._jobs.advance(self._id, JobState.CAPTURING)
+        self._folder.stage(self._id)
+        try:
+            with driver_errors(held.name):
+                self._recording = capture(held, job, self._progress(0.0, self._parts.capture_share))
+        except Exception as error:
+            held.doubt(error)
+            raise
+        if job.stop.is_set():
+            message = "It was cancelled when all of its frames had come."
+            raise ScanCancelledError(message)
+
+    def _compute(self, job: Job) -> None:
+        progress = self._progress(self._parts.capture_share, 1.0)
+        recording, self._recording = self._recording, None
+        if recording is not None:
+            progress.captured()
+        if self._parts.capture is not None:
+            self._tell(self._parts.captured)
+        if recording is not None:
+            recording.finish()
+            self._folder.keep_recording(self._id)
+        self._resumable = self._on_record_as_computing()
+        self._found = self._parts.compute(job, progress)
+
+    def clear_up(self, error: Exception | None) -> None:
+        """See `Job`."""
+        self._worked = True
+        if error is not None and self._goes_on(error):
+            return
+        if error is not None:
+            self._fail(error)
+            if self._recording is not None:
+                self._tell(self._recording.discard)
+            elif not isinstance(error, ScanCancelledError):
+                self._tell(lambda: self._parts.salvage(self._id))
+        self._folder.discard(self._id)
+
+    def _concluded(self, error: Exception | None) -> None:
+        if error is None:
+            state = JobState.SUCCEEDED if self._found.fault is None else JobState.FAILED
+            self._endings.add(Ending(self._id, state, self._found.fault, self._found.summary))
+        elif self._goes_on(error):
+            _log.info("a job is left to the next start of the service", job=str(self._id))
+        else:
+            ending = ending_by(error, self._id, hidden=self._hidden)
+            if ending.state is JobState.FAILED and not self._worked and self.job.stop.is_set():
+                # It was to end, and its driver hangs.
+                ending = replace(ending, state=JobState.CANCELLED)
+            self._endings.add(ending)
+
+    def _ended(self, error: Exception | None) -> None:
+        if error is not None and not self._goes_on(error):
+            self._fail(error)
+        self._endings.settle()
+
+    def _goes_on(self, error: Exception) -> bool:
+        return self._resumable and isinstance(error, ScanInterruptedError)
+
+    def _fail(self, error: Exception) -> None:
+        if not self._failed:
+            self._failed = True
+            self._tell(lambda: self._parts.failed(error))
+
+    def _tell(self, what: Callable[[], object]) -> None:
+        """Do what must not change how the job itself ends."""
+        try:
+            what()
+        except Exception:  # noqa: BLE001 - see above
+            _log.exception("what goes with a job went wrong", job=str(self._id))
+
+    def _on_record_as_computing(self) -> bool:
+        """Record that all is there to compute with, whatever ends the service; return whether that could be done."""
+        try:
+            self._jobs.advance(self._id, JobState.COMPUTING)
+        except StorageError as error:
+            _log.warning("that a job computes could not be recorded", job=str(self._id), cause=str(error))
+            return False
+        return True
+
+    def _progress(self, start: float, end: float) -> ProgressRecorder:
+        return ProgressRecorder(self._jobs, self._id, hidden=self._hidden, span=(start, end))

@@ -175,11 +175,7 @@ class JobStore:
 
     def progress(self, job_id: UUID, progress: JobProgress) -> None:
         """Record how far a running job is. Where that cannot be had at once it is refused: the next will be told."""
-        with self.database.changing(patience_s=_PROGRESS_PATIENCE_S) as session:
-            row = self._find(session, job_id)
-            row.stage, row.fraction, row.detail = progress.stage, progress.fraction, progress.detail
-            _append(session, row, "progress", {**progress.as_json(), "state": row.state})
-        self._wake(job_id, row.parent)
+        self._tell(job_id, "progress", progress.as_json(), progress)
 
     def file_made(self, job_id: UUID, name: str) -> None:
         """Record that a file of a running job can be fetched. Refused as `progress` is."""
@@ -189,9 +185,11 @@ class JobStore:
         """Record that a running job needs the rig no longer. Refused as `progress` is."""
         self._tell(job_id, "captured", {"time": self._now()})
 
-    def _tell(self, job_id: UUID, kind: str, data: dict[str, Any]) -> None:
+    def _tell(self, job_id: UUID, kind: str, data: dict[str, Any], at: JobProgress | None = None) -> None:
         with self.database.changing(patience_s=_PROGRESS_PATIENCE_S) as session:
             row = self._find(session, job_id)
+            if at is not None:
+                row.stage, row.fraction, row.detail = at.stage, at.fraction, at.detail
             _append(session, row, kind, {**data, "state": row.state})
         self._wake(job_id, row.parent)
 

@@ -138,19 +138,6 @@ class Recorder:
                 self._error, self._stopped = error, True
 
 
-def capture_bundle(
-    rig: Rig,
-    plan: ScanPlan,
-    folder: Path,
-    *,
-    progress: Progress,
-    cancelled: Callable[[], bool],
-    frames: FrameSink | None = None,
-) -> None:
-    """Play the plan's patterns on the rig and record a bundle in `folder`. Raises as `capture_frames` does."""
-    capture_frames(rig, plan, folder, progress=progress, cancelled=cancelled, frames=frames).finish()
-
-
 def capture_frames(
     rig: Rig,
     plan: ScanPlan,

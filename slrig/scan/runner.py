@@ -6,24 +6,19 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Protocol
 from uuid import UUID, uuid4
 
 import structlog
 
-from slrig.devices import Rig
-from slrig.errors import InvalidInputError, JobNotFoundError, ScanInterruptedError, ScanStateError
-from slrig.failure import UNEXPECTED, failure_of
+from slrig.errors import InvalidInputError, JobNotFoundError, ScanStateError
 from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.endings import Endings
-from slrig.jobs.job import Holder, Job
+from slrig.jobs.job import Job
 from slrig.jobs.queue import JobQueue
-from slrig.jobs.records import JobRecord, JobState, utc_now
-from slrig.jobs.rig_jobs import RigQueue
+from slrig.jobs.records import JobRecord, utc_now
+from slrig.jobs.rig_jobs import RigJobs
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
-from slrig.rig.preview import Light, Watch
-from slrig.rig.session import ActiveCalibration, RigFacts, RigSession, driver_errors
+from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
 from slrig.scan.job import CaptureFrames, ScanTools, WatchesHealth, scan_job
 from slrig.scan.plan import ScanPlan, series_of
 from slrig.scan.plan_check import check_plan
@@ -34,8 +29,8 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RunnerStatus:
-    """What the runner is at: the rig as far as it is known, who holds it and since when, how many wait, and which scans
-    are reconstructed, or wait for that, while the rig is free of them.
+    """What the runner is at: the rig as far as it is known, who holds it and since when, how many wait, and whose
+    frames are computed with, or wait for that, while the rig is free of them.
 
     `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` and
     those of `computing` are `Holder.name`. `opening` is what the rig's driver told last, while it is opened.
@@ -59,16 +54,8 @@ class RunnerStatus:
     ending: bool
 
 
-class RigAccess(RigQueue, Protocol):
-    """`Runner`, as far as work that is no scan needs it."""
-
-    def status(self) -> RunnerStatus:
-        """What the rig is."""
-        ...
-
-
 class Runner:
-    """Takes scans, works them off in order, and leaves each in a final state; lets other work have the rig.
+    """Takes scans, works them off in order, and leaves each in a final state. `queue` takes other work, too.
 
     Every public method may be called from any thread.
     """
@@ -92,18 +79,18 @@ class Runner:
         self._worker = worker
         self._closing = threading.Lock()
         self._closed = False
-        self._queue = JobQueue(rig, queue_length=queue_length, backlog_length=backlog_length, give_up=give_up)
-        self._endings = Endings(store)
-        self._tools = ScanTools(store, folder, worker, capture, self._endings, spare_bytes)
+        self.queue = JobQueue(rig, queue_length=queue_length, backlog_length=backlog_length, give_up=give_up)
+        self._work = RigJobs(store, self.queue, folder)
+        self._tools = ScanTools(folder, worker, capture, spare_bytes)
 
     def start(self) -> None:
         """Start the owner thread, which opens the rig, and the worker, which loads its kernels."""
-        self._queue.start()
+        self.queue.start()
         self._worker.start()
 
     def take_up(self, scans: Iterable[UUID]) -> None:
         """Put scans in line that a kill of the service left unfinished, see `slrig.scan.sweep`; before `start`."""
-        self._queue.take_up([scan_job(self._store.get(scan), self._tools) for scan in scans])
+        self.queue.add([scan_job(self._store.get(scan), self._tools, self._work) for scan in scans])
 
     def submit(
         self,
@@ -133,8 +120,7 @@ class Runner:
         DeviceError
             A driver hangs.
         """
-        self._queue.refuse_while_stuck()
-        rig = self._queue.rig
+        rig = self.queue.rig
         # Before the rig was first open nothing is known about it; the scan then fails with the same errors.
         frame_bytes = 0 if rig.facts is None else check_plan(plan, rig.facts, rig.calibration)
         rig.refuse_misfit()
@@ -150,9 +136,9 @@ class Runner:
                 plans = series_of(plan, series, count=repeat, every_s=every_s, begins_at=utc_now())
                 documents = [plan_json(each) for each in plans]
                 records.extend(self._store.create_series(documents, rig=rig.name, label=label, parent=series, key=key))
-            return [scan_job(record, self._tools) for record in records]
+            return [scan_job(record, self._tools, self._work) for record in records]
 
-        self._queue.submit(make, wait=wait)
+        self.queue.submit(make, wait=wait)
         return records[0]
 
     def cancel_series(self, series: UUID) -> list[JobRecord]:
@@ -169,59 +155,9 @@ class Runner:
             raise JobNotFoundError(message)
         return scans
 
-    def submit_work(
-        self,
-        work: Callable[[Rig, Callable[[], bool]], None],
-        *,
-        work_id: UUID,
-        holder: Holder,
-        wait: bool,
-        ended: Callable[[Exception | None], None],
-        begun: Callable[[], object] = lambda: None,
-    ) -> None:
-        """Have `work` done with the rig, in line with the scans.
-
-        work : called on the owner thread with the open rig and `cancelled`; it raises ScanCancelledError when that
-        turned true. ended : called once, when the rig is free again, with what was raised, None where nothing was.
-        begun : called once a place in the line is certain, before the work can begin.
-
-        Raises
-        ------
-        RigBusyError, QueueFullError, DeviceError
-            As `submit` does.
-        """
-        self._queue.refuse_while_stuck()
-
-        def with_rig(held: RigSession, job: Job) -> None:
-            job.since = utc_now()
-            try:
-                rig = held.open()
-                with driver_errors(held.name):
-                    work(rig, job.stop.is_set)
-            except Exception as error:
-                if not self._queue.ending:
-                    held.doubt(error)
-                    if failure_of(error).code == UNEXPECTED:
-                        _log.exception("work with the rig failed", work=holder.words)
-                raise
-
-        def make() -> list[Job]:
-            begun()
-            return [Job(work_id, holder, utc_now(), with_rig, ended)]
-
-        self._queue.submit(make, wait=wait)
-
-    def cancel_work(self, work_id: UUID) -> None:
-        """Ask work that has the rig, or waits for it, to end early. Returns at once; one that is over stays so."""
-        self._queue.cancel(work_id)
-
     def watch_health(self, health: WatchesHealth) -> None:
         """Have scans that begin from now on carry the health of their calibration, and tell what they find of it."""
         self._tools.health = health
-
-    def after_each(self, told: Callable[[], None]) -> None:
-        """Have `told` called, on any thread, after each scan."""
-        self._tools.after = told
 
     def use_calibration(self, active: ActiveCalibration | None) -> None:
         """Have what is begun from now on use a calibration; None has it use the rig's own.
@@ -231,27 +167,16 @@ class Runner:
         CalibrationError
             It is for other devices than those of the open rig.
         """
-        rig = self._queue.rig
+        rig = self.queue.rig
         fault = None if active is None else rig.misfit(active)
         # Before the rig is open nobody knows; a scan is then refused with the same words.
         if fault is not None:
             raise fault
         rig.active = active
 
-    def watch(self, camera: str, light: Light) -> Watch:
-        """Look through a camera: see `JobQueue.watch`."""
-        return self._queue.watch(camera, light)
-
     def cancel(self, scan_id: UUID) -> JobRecord:
         """Ask a scan to stop. Returns at once; a scan that has finished stays as it is. Raises JobNotFoundError."""
-        record = self._store.get(scan_id)
-        if self._queue.cancel(scan_id):
-            return record
-        self._endings.settle()
-        if scan_id not in self._endings:
-            # Nobody works on it, and nobody knows how it ended: the least that can be done is to let it go.
-            message = "Nothing works on this scan any more. Scan again."
-            self._store.finish(scan_id, JobState.INTERRUPTED, fault=failure_of(ScanInterruptedError(message)))
+        self._work.cancel(scan_id)
         return self._store.get(scan_id)
 
     def delete(self, scan_id: UUID) -> None:
@@ -264,7 +189,7 @@ class Runner:
         ScanStateError
             It is not finished.
         """
-        self._endings.settle()
+        self._work.endings.settle()
         record = self._store.get(scan_id)
         if not record.state.final:
             message = (
@@ -279,7 +204,7 @@ class Runner:
 
     def status(self) -> RunnerStatus:
         """Return what the runner is at. Touches no device."""
-        rig, held = self._queue.rig, self._queue.status()
+        rig, held = self.queue.rig, self.queue.status()
         active = rig.active
         misfit = None if active is None else rig.misfit(active)
         return RunnerStatus(
@@ -291,18 +216,14 @@ class Runner:
             holder=None if held.holder is None else held.holder.name,
             since=held.since,
             waiting=held.waiting,
-            queue_length=self._queue.queue_length,
+            queue_length=self.queue.queue_length,
             computing=tuple(each.name for each in held.computing),
-            backlog_length=self._queue.backlog_length,
+            backlog_length=self.queue.backlog_length,
             opening=rig.calls.doing,
             reconstruction=self._worker.condition,
             preparing=self._worker.loading,
             ending=held.ending,
         )
-
-    def drain(self, timeout_s: float, hurry: threading.Event) -> None:
-        """Let what is under way come to its end: see `JobQueue.drain`."""
-        self._queue.drain(timeout_s, hurry)
 
     def close(self, *, timeout_s: float = 3.0) -> None:
         """Stop scanning, darken and close the rig, and record what was cut off as interrupted. Idempotent.
@@ -313,8 +234,8 @@ class Runner:
         with self._closing:
             if not self._closed:
                 self._closed = True
-                self._queue.end()
+                self.queue.end()
                 # What computes waits for it.
                 self._worker.close()
-                self._queue.join(timeout_s)
-                self._endings.close()
+                self.queue.join(timeout_s)
+                self._work.close()

@@ -29,8 +29,8 @@ from slrig.errors import (
 )
 from slrig.failure import JobFailure, errors_by_code, failure_of
 from slrig.jobs.job import Holder
+from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobState
-from slrig.scan.runner import RigAccess
 from slrig.schedule.task_options import CalibrationOptions, VerificationOptions, require_positions
 from slrig.verify.job import VerificationDesk
 
@@ -74,7 +74,7 @@ class VerificationTask:
 
     options = VerificationOptions
 
-    def __init__(self, queue: RigAccess, calibrations: Calibrations, desk: VerificationDesk) -> None:
+    def __init__(self, queue: JobQueue, calibrations: Calibrations, desk: VerificationDesk) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._desk = desk
@@ -83,7 +83,7 @@ class VerificationTask:
         """See `Task`. A calibration may be made before the first run; a board to look at is named now or never."""
         self._board(asked)
         if asked.position is not None:
-            require_positions(self._queue.status().facts, [asked.position])
+            require_positions(self._queue.rig.facts, [asked.position])
 
     def do(self, holder: Holder, asked: VerificationOptions, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. A rig that is found stale is a verification that succeeded."""
@@ -122,7 +122,7 @@ class CalibrationTask:
 
     options = CalibrationOptions
 
-    def __init__(self, queue: RigAccess, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
+    def __init__(self, queue: JobQueue, calibrations: Calibrations, tidy: Callable[[], object]) -> None:
         self._queue = queue
         self._calibrations = calibrations
         self._tidy = tidy
@@ -130,11 +130,11 @@ class CalibrationTask:
     def check(self, asked: CalibrationOptions, /) -> None:
         """See `Task`."""
         asked.board.board()
-        require_positions(self._queue.status().facts, asked.positions)
+        require_positions(self._queue.rig.facts, asked.positions)
 
     def do(self, holder: Holder, asked: CalibrationOptions, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. Poses that are refused are left out; one that fails ends the run."""
-        facts = self._queue.status().facts
+        facts = self._queue.rig.facts
         require_positions(facts, asked.positions)
         first, *others = asked.positions or range(0 if facts is None else len(facts.positions))
         session = self._calibrations.open(asked.board.board(), label=holder.words).id
@@ -209,13 +209,13 @@ class AcceptanceTask:
 
     options = AcceptanceRequest
 
-    def __init__(self, queue: RigAccess, desk: AcceptanceDesk) -> None:
+    def __init__(self, queue: JobQueue, desk: AcceptanceDesk) -> None:
         self._queue = queue
         self._desk = desk
 
     def check(self, _asked: AcceptanceRequest, /) -> None:
         """See `Task`."""
-        require_positions(self._queue.status().facts, ())
+        require_positions(self._queue.rig.facts, ())
 
     def do(self, holder: Holder, asked: AcceptanceRequest, /, *, cancelled: Callable[[], bool]) -> Mapping[str, Any]:
         """See `Task`. A rig that fails the test is a run that succeeded."""

@@ -11,8 +11,9 @@ from slrig.accept.desk import AcceptanceDesk
 from slrig.bundle.faults import Strict
 from slrig.calibrate.calibrating import Calibrations
 from slrig.errors import CalibrationError, ScanStateError, ScheduleError
-from slrig.jobs.job import Holder
-from slrig.scan.runner import RigAccess
+from slrig.jobs.job import Holder, Job
+from slrig.jobs.queue import JobQueue
+from slrig.jobs.records import utc_now
 from slrig.schedule.records import Order, Run, Schedule, TaskKind
 from slrig.schedule.rig_tasks import AcceptanceTask, CalibrationTask, VerificationTask, until
 from slrig.schedule.task_options import checked
@@ -50,7 +51,7 @@ class Tasks:
 
     def __init__(
         self,
-        queue: RigAccess,
+        queue: JobQueue,
         calibrations: Calibrations,
         verifications: VerificationDesk,
         acceptance: AcceptanceDesk,
@@ -103,14 +104,12 @@ class Tasks:
 
     def _open_rig(self, holder: Holder, cancelled: Callable[[], bool]) -> None:
         """Have a rig opened that was not open yet: what it can do is known only then. Raises as a scan does."""
-        if self._queue.status().facts is not None:
+        if self._queue.rig.facts is not None:
             return
         errors: list[Exception | None] = []
-        work_id = uuid4()
-        self._queue.submit_work(
-            lambda *_: None, work_id=work_id, holder=holder, wait=False, ended=errors.append, begun=lambda: None
-        )
-        until(lambda: bool(errors), cancelled, cancel=lambda: self._queue.cancel_work(work_id))
+        job = Job(uuid4(), holder, utc_now(), lambda rig, _: rig.open(), errors.append)
+        self._queue.submit(lambda: [job], wait=False)
+        until(lambda: bool(errors), cancelled, cancel=lambda: self._queue.cancel(job.id))
         if errors[0] is not None:
             raise errors[0]
 

@@ -14,19 +14,18 @@ from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import Health, HealthState
 from slrig.calibration.health.verification import health_of_scan
-from slrig.devices import Rig
 from slrig.errors import CalibrationError, CalibrationStateError, UnsupportedByDeviceError
-from slrig.failure import disk_errors
-from slrig.jobs.data_folder import DataFolder
-from slrig.jobs.job import Holder
+from slrig.jobs.data_folder import BUNDLE, DataFolder
+from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import Clock, JobRecord, utc_now
-from slrig.jobs.rig_jobs import Cancelled, Outcome, Parts, RigJobs
+from slrig.jobs.rig_jobs import Outcome, Parts, Recorded, RigJobs
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
+from slrig.rig.session import RigSession
 from slrig.scan.plan import ScanPlan
 from slrig.scan.plan_check import check_plan
-from slrig.scan.runner import RigAccess
 from slrig.verify.store import HealthStore, VerificationRecord
 from slrig.verify.verification import VerificationTools, health_stamp, verify_bundle
 
@@ -65,7 +64,7 @@ class VerificationDesk:
     def __init__(
         self,
         folder: DataFolder,
-        queue: RigAccess,
+        queue: JobQueue,
         store: HealthStore,
         jobs: JobStore,
         *,
@@ -106,18 +105,17 @@ class VerificationDesk:
         Raises CalibrationStateError if the rig has no calibration; UnsupportedByDeviceError if it has no positioner, or
         not that position; StorageError, RigBusyError, QueueFullError, DeviceError as a scan.
         """
-        status = self._queue.status()
-        plan = VerificationPlan(board, position, exposure_s)
-        if status.facts is not None:
-            if status.active is None and status.facts.calibration is None:
+        rig, plan = self._queue.rig, VerificationPlan(board, position, exposure_s)
+        if rig.facts is not None:
+            if rig.active is None and rig.facts.calibration is None:
                 raise CalibrationStateError(_UNCALIBRATED)
-            if position is not None and not 0 <= position < len(status.facts.positions):
-                message = f"position: found {position}, this rig has {len(status.facts.positions)} of them"
+            if position is not None and not 0 <= position < len(rig.facts.positions):
+                message = f"position: found {position}, this rig has {len(rig.facts.positions)} of them"
                 raise UnsupportedByDeviceError(message)
-            self._folder.require_space(check_plan(plan.scan, status.facts) + self._spare_bytes)
+            self._folder.require_space(check_plan(plan.scan, rig.facts) + self._spare_bytes)
         job_id = uuid4()
         document = _plan_adapter.dump_python(plan, mode="json")
-        record = partial(self.jobs.create, document, rig=status.rig, label=None, key=key, job_id=job_id)
+        record = partial(self.jobs.create, document, rig=rig.name, label=None, key=key, job_id=job_id)
         parts = self._parts(job_id, plan)
         self._work.submit(job_id, parts, holder=holder or _holder(job_id), wait=wait, record=record)
         self.jobs.prune(_KEPT)
@@ -125,15 +123,13 @@ class VerificationDesk:
 
     def cancel(self, job_id: UUID) -> JobRecord:
         """Ask a verification to end early. Returns at once; one that is over stays so. Raises JobNotFoundError."""
-        self.jobs.get(job_id)
         self._work.cancel(job_id)
         return self.jobs.get(job_id)
 
     def health(self) -> tuple[Health, VerificationRecord | None, Calibration | None]:
         """The health of the calibration in use, the verification that it rests on, and that calibration."""
-        status = self._queue.status()
-        active = status.active.calibration if status.active is not None else None
-        calibration = active or (None if status.facts is None else status.facts.calibration)
+        active, facts = self._queue.rig.active, self._queue.rig.facts
+        calibration = active.calibration if active is not None else None if facts is None else facts.calibration
         if calibration is None:
             unknown = Health(HealthState.UNKNOWN, ("the rig has no calibration, or is not open yet",), "calibrate it")
             return unknown, None, None
@@ -158,30 +154,30 @@ class VerificationDesk:
 
     def _parts(self, job_id: UUID, plan: VerificationPlan) -> Parts:
         """The two parts of a verification."""
-        bundle = self._folder.staging(job_id) / "bundle"
         calibration: Calibration | None = None
 
-        def capture(rig: Rig, progress: ProgressRecorder, cancelled: Cancelled) -> None:
+        def capture(held: RigSession, job: Job, progress: ProgressRecorder) -> Recorded:
             """Move the board if asked, and record a bundle."""
             nonlocal calibration
+            rig = held.open()
             if rig.calibration is None:
                 raise CalibrationStateError(_UNCALIBRATED)
             calibration = rig.calibration
             if plan.position is not None and rig.positioner is not None:
                 rig.positioner.move(plan.position)
             # A verification must not use what a rendered rig knows of its scene.
-            bare = replace(rig, calibration=None, head=None)
-            with disk_errors(bundle):
-                self._tools.capture(bare, plan.scan, bundle, progress=progress, cancelled=cancelled)
+            bare, folder = replace(rig, calibration=None, head=None), self._folder.recording(job_id)
+            return self._tools.capture(bare, plan.scan, folder, progress=progress, cancelled=job.stop.is_set)
 
-        def compute(_: ProgressRecorder) -> Outcome:
+        def compute(*_: object) -> Outcome:
             """Read the board, and judge the calibration by it."""
             if calibration is None:
                 raise CalibrationError(_UNCALIBRATED)
+            bundle = self._folder.staging(job_id) / BUNDLE
             found = verify_bundle(bundle, plan.board, calibration, tools=self._tools)
             return Outcome(self.store.add(found, calibration=calibration.solve_id, at=self._clock()).document())
 
-        return Parts(capture=capture, compute=compute)
+        return Parts(compute, capture)
 
 
 def _holder(job_id: UUID) -> Holder:

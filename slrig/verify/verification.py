@@ -15,7 +15,7 @@ from slrig.calibration.health.verification import Verification
 from slrig.errors import CalibrationStateError, PoseRefusedError
 from slrig.jobs.worker import Worker
 from slrig.model import Calibration
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.verify.store import VerificationRecord
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _READ, _JUDGE = "slrig.calibrate.pose_reading:read_pose", "slrig.calibration.hea
 class VerificationTools:
     """The shot, the reading and the judgement. The mathematics is loaded when it is first used."""
 
-    capture: CapturePose = capture_bundle
+    capture: CapturePose = capture_frames
     read: Callable[[Path, Board, str], ReadPose] = field(default_factory=lambda: _later(_READ))
     judge: Callable[[Sequence[Any], Board, Calibration], Verification] = field(default_factory=lambda: _later(_JUDGE))
 

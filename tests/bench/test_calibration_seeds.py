@@ -30,7 +30,7 @@ from slrig.calibration.solution import Solution
 from slrig.calibration.solving.solve import solve
 from slrig.errors import PoseRefusedError, ScanEvidenceError
 from slrig.model import Calibration
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.rendered_boards import board_head, board_options, board_rig, board_scene
 from tests.unit.calibration.solving.against_truth import in_deviations, in_first_camera
@@ -75,7 +75,7 @@ def solved(options: dict[str, Any], folder: Path) -> tuple[Solution, Calibration
             rig.positioner.move(index)
             bundle = folder / name
             try:
-                capture_bundle(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False)
+                capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
                 seen.append(read_pose(bundle, BOARD, name).observation)
             except (PoseRefusedError, ScanEvidenceError) as error:
                 refused.append(f"{name}: {type(error).__name__}: {error}")

@@ -23,7 +23,7 @@ from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Projector, ProjectorInfo, Rig, Shown
 from slrig.model import Calibration, PatternSequence, Shot
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.contract.benches import simulated
 from tests.contract.live_devices import LivePlayer, Webcam
@@ -120,14 +120,14 @@ def test_a_scan_takes_little_longer_than_its_light(tmp_path: Path, cameras: int,
         ratios = []
         for number in range(3):
             watched = Watched(rig.projector)
-            capture_bundle(
+            capture_frames(
                 replace(rig, projector=watched),
                 ScanPlan(),
                 tmp_path / f"bundle{number}",
                 progress=lambda *_: None,
                 cancelled=lambda: False,
                 frames=Sink(),
-            )
+            ).finish()
             capture = read_bundle(tmp_path / f"bundle{number}").capture
             patterns = len(capture.patterns)
             assert (len(capture.shots), watched.shows) == (patterns * cameras, patterns)

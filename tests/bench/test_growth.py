@@ -22,7 +22,7 @@ from slrig.bundle import Bundle, read_bundle, write_bundle
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Capture, LineShift, Pattern
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.peers.ours import FILE_STAGES
@@ -77,9 +77,9 @@ def _toml(value: Any) -> str:
 def recorded(folder: Path, *, camera_scale: int) -> Bundle:
     """Render a scan and read it back."""
     with open_rig(read_rig(rig_file(folder, camera_scale=camera_scale))) as rig:
-        capture_bundle(
+        capture_frames(
             rig, ScanPlan(), folder / f"rendered-{camera_scale}", progress=lambda *_: None, cancelled=lambda: False
-        )
+        ).finish()
     return read_bundle(folder / f"rendered-{camera_scale}")
 
 

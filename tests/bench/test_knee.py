@@ -20,7 +20,7 @@ from slrig.discovery import open_rig
 from slrig.reconstruction.decoding import DecodingLimits
 from slrig.reconstruction.edges import EdgeLimits
 from slrig.reconstruction.refinement import refined
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.plots import FIGURES, Curve, Panel, require_matplotlib, write_figure
@@ -90,7 +90,7 @@ def bundles(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     require_matplotlib()
     demo = tmp_path_factory.mktemp("demo") / "bundle"
     with open_rig(read_rig(RIGS / "demo.toml")) as rig:
-        capture_bundle(rig, ScanPlan(), demo, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), demo, progress=lambda *_: None, cancelled=lambda: False).finish()
     return {name: shared / "bundles" / name for name in GOALS_MM} | {"demo": demo}
 
 

@@ -22,7 +22,7 @@ import pytest
 from slrig.bundle import read_bundle, read_truth
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.bench.peers.catalogue import METHODS, OURS
@@ -105,7 +105,7 @@ def test_peers_on_a_rendered_scan(tmp_path: Path, capsys: pytest.CaptureFixture[
     # A code of single columns, as OpenCV's module has it; ours would ask for four frames less.
     plan = ScanPlan(patterns=PatternPlan(gray_cell_px=1))
     with open_rig(read_rig(RIGS / "demo.toml")) as rig:
-        capture_bundle(rig, plan, tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     rows = compared(tmp_path / "bundle", tmp_path)
     shown(rows, "demo", capsys)
     check(rows)

@@ -26,7 +26,7 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, LineShift, Mesh
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.measured import Walked
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import _meshed
@@ -75,7 +75,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     folder = tmp_path_factory.mktemp("speed")
     (folder / "rig.toml").write_text(RIG)
     with open_rig(read_rig(folder / "rig.toml")) as rig:
-        capture_bundle(rig, ScanPlan(), folder / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     return read_bundle(folder / "bundle")
 
 

@@ -23,7 +23,7 @@ import pytest
 from slrig.cli.client import ServiceClient
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.bench.test_pipeline_speed import RIG
 from tests.e2e.conftest import ServiceProcess, Start, start
@@ -41,7 +41,9 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("clock")
     (folder / "rendered.toml").write_text(RIG)
     with open_rig(read_rig(folder / "rendered.toml")) as rig:
-        capture_bundle(rig, ScanPlan(), folder / "recording", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(
+            rig, ScanPlan(), folder / "recording", progress=lambda *_: None, cancelled=lambda: False
+        ).finish()
     for truth in (folder / "recording").glob("truth*"):
         truth.unlink()
     description = folder / "recording" / "bundle.json"

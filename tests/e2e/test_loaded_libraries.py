@@ -9,7 +9,7 @@ import pytest
 from slrig.calibrate.records import USUAL_PATTERNS
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.e2e.conftest import ServiceProcess, Start
 from tests.e2e.test_calibration_walk import BOARD, Caller, scanned, write_rig
@@ -28,9 +28,9 @@ def recorded(folder: Path) -> Path:
     with open_rig(read_rig(write_rig(folder / "rendered", head="", carries="true"))) as rig:
         assert rig.positioner is not None
         rig.positioner.move(1)
-        capture_bundle(
+        capture_frames(
             rig, ScanPlan(patterns=USUAL_PATTERNS), folder / "pose", progress=lambda *_: None, cancelled=lambda: False
-        )
+        ).finish()
     rig_file = folder / "replayed.toml"
     rig_file.write_text('name = "replayed"\n[head]\ndriver = "replay"\nbundle = "pose"\n')
     return rig_file

@@ -12,7 +12,7 @@ from drivers.replay import open_head
 from slrig.bundle import read_capture
 from slrig.devices import CameraSettings, Rig
 from slrig.model import Capture
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.e2e.conftest import Start, write_rig
@@ -90,5 +90,5 @@ def test_a_scan_of_somebody_elses_recording_gives_its_mesh(shared: Path, tmp_pat
     plan = ScanPlan()
     again = tmp_path / "again"
     with Rig("replayed", head.cameras, head.projector, settings, head.calibration, head) as rig:
-        capture_bundle(rig, plan, again, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, again, progress=lambda *_: None, cancelled=lambda: False).finish()
     require_equal_meshes(reconstructed(again, tmp_path / "new"), reconstructed(bundle, tmp_path / "old"))

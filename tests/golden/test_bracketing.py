@@ -19,7 +19,7 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, Shot
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.stream import LiveScan
@@ -69,9 +69,9 @@ class Watching:
 
 def captured(rig: Path, plan: ScanPlan, bundle: Path, watching: Watching | None = None) -> Path:
     with open_rig(read_rig(rig)) as opened:
-        capture_bundle(
+        capture_frames(
             opened, plan, bundle, progress=lambda *_: None, cancelled=lambda: False, frames=watching
-        )  # fmt: skip
+        ).finish()  # fmt: skip
     return bundle
 
 

@@ -38,7 +38,7 @@ from slrig.calibration.solving.solve import solve
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Calibration, FloatArray, Pinhole, Solved
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.unit.calibration.perturbed import aligned, met_with_projector, pixels
@@ -139,7 +139,7 @@ def captured(folder: Path, scene: str, seed: int, bundle: Path) -> Calibration:
     (folder / "scene.toml").write_text(scene)
     (folder / "rig.toml").write_text(RIG.format(seed=seed, poses=""))
     with open_rig(read_rig(folder / "rig.toml")) as rig:
-        capture_bundle(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
         assert rig.calibration is not None
         return rig.calibration
 
@@ -156,7 +156,7 @@ def observed(folder: Path, seed: int) -> Observations:
         for index, name in enumerate(rig.positioner.poses):
             rig.positioner.move(index)
             bundle = folder / f"pose_{index:02d}"
-            capture_bundle(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False)
+            capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
             seen.append(read_pose(bundle, BOARD, name).observation)
         sizes = {name: camera.info.format.size for name, camera in rig.cameras.items()}
         return Observations(BOARD, sizes, rig.projector.info.size, tuple(seen))

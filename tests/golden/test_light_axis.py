@@ -21,7 +21,7 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import NothingToReconstructError
 from slrig.model import Calibration
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.golden.test_bundles import reconstructed
 
@@ -100,10 +100,10 @@ def scanned(rig: Path, *, plan: PatternPlan | None = None, projector_known: bool
     with open_rig(read_rig(rig)) as opened:
         assert opened.calibration is not None
         known = opened.calibration if projector_known else Calibration(opened.calibration.cameras, None)
-        capture_bundle(
+        capture_frames(
             replace(opened, calibration=known), ScanPlan(patterns=plan or PatternPlan()), bundle,
             progress=lambda *_: None, cancelled=lambda: False,
-        )  # fmt: skip
+        ).finish()  # fmt: skip
     report: Mapping[str, Any] = reconstructed(bundle, rig.parent / "out")
     return report
 

@@ -10,7 +10,7 @@ import pytest
 from slrig.bundle import Bundle, read_bundle
 from slrig.capture.evidence import check_capture
 from slrig.model import Axis, Capture, LineShift
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.bench.test_calibration_seeds import rig_options
 from tests.rendered_boards import board_head, board_rig, board_scene
@@ -31,7 +31,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
         assert rig.positioner is not None
         rig.positioner.move(POSE)
         plan = ScanPlan(patterns=PatternPlan(rows=True))
-        capture_bundle(rig, plan, folder / "pose", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, folder / "pose", progress=lambda *_: None, cancelled=lambda: False).finish()
     return read_bundle(folder / "pose")
 
 

@@ -16,7 +16,7 @@ from slrig.cli.quality import quality_lines
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import FloatArray
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.records import report_summary
@@ -30,7 +30,7 @@ CalibrationChange = Callable[[dict[str, Any]], None]
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "bundle"
     with open_rig(read_rig(RIG)) as rig:
-        capture_bundle(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False).finish()
     return folder
 
 

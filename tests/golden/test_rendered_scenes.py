@@ -8,7 +8,7 @@ import pytest
 
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.golden.test_bundles import reconstructed
 
@@ -24,7 +24,7 @@ FIRST = "two_cameras"
 )
 def test_a_rendered_scene_meets_its_figures(rig_file: Path, tmp_path: Path) -> None:
     with open_rig(read_rig(rig_file)) as rig:
-        capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     report = reconstructed(tmp_path / "bundle", tmp_path / "out")
     truth = report["truth"]
     assert truth["rms_mm"] <= 0.016

@@ -19,7 +19,7 @@ from slrig.discovery import open_rig
 from slrig.meshing.quality import TruthScore, score
 from slrig.meshing.search_tree import SearchTree
 from slrig.model import FloatArray, Mesh, Truth
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from tests.e2e.conftest import Start, write_rig
@@ -66,7 +66,7 @@ def scanned_here(rig: Rig, folder: Path) -> Scanned:
     """Scan in this process."""
     bundle, results = folder / "bundle", folder / "results"
     with rig:
-        capture_bundle(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
     reconstruct_bundle(bundle, results, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False)
     return Scanned(mesh_in(results), results, bundle)
 

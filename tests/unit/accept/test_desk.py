@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from uuid import UUID, uuid4
 
@@ -38,61 +37,22 @@ from slrig.errors import (
 from slrig.failure import failure_of, interruption
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.job import Holder
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.accept.test_plan import VOLUME
-from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, scan_of
-from tests.unit.scan.fakes import WAIT_S
+from tests.unit.accept.test_running import RIG, SHORT, TamePositioner, nothing_captured, scan_of
+from tests.unit.jobs.tame_queue import PowerCut, TameQueue
+from tests.unit.scan.fakes import WAIT_S, TameProjector
 
 PLAN = replace(SHORT, rendered=False)
-
-
-class TameQueue:
-    """Does work with a rig on the caller's own thread; `holder` is who holds it meanwhile."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.rig = rig
-        self.facts: object = SimpleNamespace(calibration=rig.calibration)
-        self.busy = False
-        self.cancelled: Callable[[], bool] = lambda: False
-        self.holders: list[str] = []
-
-    def submit_work(
-        self,
-        work: Callable[[Rig, Callable[[], bool]], None],
-        *,
-        work_id: UUID,  # noqa: ARG002 - as the real one
-        holder: Holder,
-        wait: bool,
-        ended: Callable[[Exception | None], None],
-        begun: Callable[[], object],
-    ) -> None:
-        if self.busy and not wait:
-            message = "The rig is held by scan 1."
-            raise RigBusyError(message, holder="1", since="")
-        begun()
-        self.holders.append(holder.name)
-        try:
-            work(self.rig, self.cancelled)
-        except Exception as error:  # noqa: BLE001 - as the real one
-            ended(error)
-        else:
-            ended(None)
-
-    def cancel_work(self, work_id: UUID) -> None:
-        """Nothing is under way between two calls."""
-
-    def status(self) -> Any:
-        return SimpleNamespace(rig="tame", facts=self.facts, active=None)
 
 
 @pytest.fixture
 def queue() -> TameQueue:
     positioner = TamePositioner(tuple(step.name for step in PLAN.steps))
-    return TameQueue(Rig("tame", {}, None, {}, RIG, positioner=positioner))  # type: ignore[arg-type]
+    return TameQueue(Rig("tame", {}, TameProjector(), {}, RIG, positioner=positioner))
 
 
 class Desk(AcceptanceDesk):
@@ -120,7 +80,7 @@ def desks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, queue: TameQueue) -> 
     """Makes the desk of a service, and of one after it over the same folder."""
     folder = DataFolder(tmp_path)
     database = Database(folder.database)
-    monkeypatch.setattr(acceptance, "capture_bundle", lambda _rig, _plan, folder, **_: folder.mkdir())
+    monkeypatch.setattr(acceptance, "capture_frames", nothing_captured)
 
     def reconstruct(bundle: Path, output: Path, /, **_: object) -> Mapping[str, Any]:
         name = bundle.parent.name.lstrip(".").rsplit("-", 1)[0]
@@ -176,7 +136,7 @@ def test_by_hand_one_position_is_measured_at_a_time_with_its_repeats(desk: Desk,
         done.append(following[0].name)
         desk.measure(test.id, wait=False, scripted=False)
     assert done == ["sphere-1", "sphere-2", "bar-1", "plane-1"]
-    assert queue.rig.positioner.moves == []  # type: ignore[union-attr]
+    assert queue.bare.positioner.moves == []  # type: ignore[union-attr]
     assert desk.get(test.id).decision is Decision.PASSES
     assert desk.get(test.id).state is AcceptanceState.FINISHED
     assert desk.file(test.id, "report.html").is_file()
@@ -190,7 +150,7 @@ def test_a_script_measures_all_that_are_left_in_one_loan(desk: Desk, queue: Tame
     desk.measure(test.id, wait=False, scripted=True)
     assert desk.get(test.id).state is AcceptanceState.FINISHED
     assert len(queue.holders) == 1
-    assert queue.rig.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
     assert desk.latest() == (desk.get(test.id),)
 
 
@@ -228,7 +188,7 @@ def test_a_cancelled_test_is_over(desk: Desk, queue: TameQueue) -> None:
 
 def test_a_held_rig_is_refused_and_the_test_stays_open(desk: Desk, queue: TameQueue) -> None:
     test = desk.open(the_plan)
-    queue.busy = True
+    queue.busy = "1"
     with pytest.raises(RigBusyError):
         desk.measure(test.id, wait=False, scripted=False)
     assert desk.get(test.id).state is AcceptanceState.OPEN
@@ -240,14 +200,16 @@ def test_what_cannot_be_tested_is_refused(desk: Desk, queue: TameQueue) -> None:
     exact = desk.open(lambda *_: replace(PLAN, rendered=True))
     desk.measure(exact.id, wait=False, scripted=True)
     assert failure_code(desk, exact.id) == InvalidInputError.code
-    queue.rig.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
+    queue.bare.positioner.poses = ("sphere-1",)  # type: ignore[union-attr, misc]
     test = desk.open(the_plan)
     desk.measure(test.id, wait=False, scripted=True)
     assert failure_code(desk, test.id) == UnsupportedByDeviceError.code
-    queue.facts = SimpleNamespace(calibration=None)
+    facts = queue.rig.facts
+    assert facts is not None
+    queue.rig.facts = replace(facts, calibration=None)
     with pytest.raises(CalibrationError, match="has no calibration"):
         desk.open(the_plan)
-    queue.facts = None
+    queue.rig.facts = None
     with pytest.raises(DeviceBusyError, match="being opened"):
         desk.open(the_plan)
 
@@ -276,9 +238,6 @@ def test_a_finished_test_and_its_report_outlive_the_service(desks: Desks) -> Non
 def cut_off(desk: Desk, test_id: UUID, queue: TameQueue, *, after_captures: int) -> None:
     """Have the service end, as it were, in the middle of a capture: nothing is told of how it ended."""
 
-    class PowerCut(BaseException):
-        """Nobody catches it."""
-
     def cancelled() -> bool:
         if len(desk.get(test_id).readings) == after_captures:
             raise PowerCut
@@ -304,10 +263,10 @@ def test_a_test_that_was_cut_off_is_told_as_interrupted_and_goes_on(desks: Desks
     with pytest.raises(ArtefactNotReadyError, match="is interrupted"):
         after.file(test.id, "report.json")
     assert desks().get(test.id).state is AcceptanceState.INTERRUPTED
-    queue.rig.positioner.moves.clear()  # type: ignore[union-attr]
+    queue.bare.positioner.moves.clear()  # type: ignore[union-attr]
     after.measure(test.id, wait=False, scripted=True)
     # Between repeats nothing may be moved: the first position begins anew.
-    assert queue.rig.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
+    assert queue.bare.positioner.moves == [0, 1, 2, 3]  # type: ignore[union-attr]
     assert after.get(test.id).state is AcceptanceState.FINISHED
     assert [each.take for each in after.get(test.id).readings if each.step == "sphere-1"] == [0, 1]
 
@@ -367,7 +326,8 @@ def test_positions_of_one_test_are_measured_with_one_calibration(desk: Desk, que
     desk.measure(test.id, wait=False, scripted=False)
     camera = RIG.cameras["left"]
     other = replace(camera, translation_mm=camera.translation_mm + 1)
-    queue.rig = replace(queue.rig, calibration=Calibration({"left": other}, RIG.projector))
+    queue.bare = replace(queue.bare, calibration=Calibration({"left": other}, RIG.projector))
+    queue.rig.let_go()
     desk.measure(test.id, wait=False, scripted=False)
     assert failure_code(desk, test.id) == CalibrationStateError.code
     assert len(desk.get(test.id).readings) == PLAN.repeats

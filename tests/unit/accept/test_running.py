@@ -31,6 +31,7 @@ from slrig.errors import (
 from slrig.model import Calibration, FloatArray, Mesh
 from slrig.scan.artefacts import encode_mesh_ply
 from tests.unit.accept.test_plan import GOOD, VOLUME, device
+from tests.unit.scan.fakes import TameRecording
 
 CAMERA = device()
 RIG = Calibration({"left": CAMERA}, CAMERA)
@@ -192,18 +193,20 @@ class TamePositioner:
         """Nothing to close."""
 
 
+def nothing_captured(rig: Rig, _plan: object, folder: Path, **_: object) -> TameRecording:
+    """In place of a capture."""
+    assert rig.truth() is None
+    folder.mkdir()
+    return TameRecording()
+
+
 Scan = Callable[[Step], Mesh]
 
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., AcceptanceResult]:
     """Run a test with a rig whose scans are made by `scan`."""
-
-    def capture(rig: Rig, _plan: object, folder: Path, **_: object) -> None:
-        assert rig.truth() is None
-        folder.mkdir()
-
-    monkeypatch.setattr(acceptance, "capture_bundle", capture)
+    monkeypatch.setattr(acceptance, "capture_frames", nothing_captured)
 
     def go(
         plan: AcceptancePlan = PLAN,

@@ -15,8 +15,9 @@ from slrig.api import acceptance as router_module
 from slrig.api.problems import install_problems
 from slrig.api.service import _of_request
 from slrig.jobs.keys import RequestKeys
-from tests.unit.accept.test_desk import PLAN, TameQueue, desk, desks, queue
+from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.accept.test_running import RIG
+from tests.unit.jobs.tame_queue import TameQueue
 
 __all__ = ["desk", "desks", "queue"]
 
@@ -90,7 +91,7 @@ def test_a_held_rig_answers_409_and_an_unknown_test_404(
     client: TestClient, desk: AcceptanceDesk, queue: TameQueue
 ) -> None:
     test = desk.open(lambda *_: PLAN)
-    queue.busy = True
+    queue.busy = "1"
     answer = client.post(f"/acceptance/{test.id}/position")
     assert (answer.status_code, answer.json()["holder"]) == (409, "1")
     assert client.get("/acceptance/00000000-0000-0000-0000-000000000000").status_code == 404

@@ -98,6 +98,7 @@ def test_calibration_is_opened_shot_solved_and_used(calibrating: TestClient) -> 
         "computing",
         "succeeded",
     ]
+    assert [(event["pose"], event["state"]) for event in events if event["kind"] == "captured"] == [(1, "capturing")]
     pose = client.get(pose["links"]["self"]).json()
     assert (pose["state"], pose["accepted"]) == ("succeeded", True)
     assert (pose["answer"], pose["error"]) == ({"corners_found": {"cam0": 12}}, None)

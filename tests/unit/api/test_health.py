@@ -21,18 +21,19 @@ from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
-from tests.unit.verify.test_verification import TAME, JobQueue
+from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.verify.test_verification import TAME, queue_of
 
 BOARD = {"kind": "chessboard", "corners": [11, 8], "square_mm": 12.0}
 
 
 @pytest.fixture
-def queue() -> JobQueue:
-    return JobQueue()
+def queue() -> TameQueue:
+    return queue_of()
 
 
 @pytest.fixture
-def client(tmp_path: Path, queue: JobQueue) -> Iterator[TestClient]:
+def client(tmp_path: Path, queue: TameQueue) -> Iterator[TestClient]:
     folder = DataFolder(tmp_path / "data")
     store = HealthStore(Database(folder.database))
     desk = VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), tools=TAME)
@@ -77,8 +78,8 @@ def test_a_verification_changes_the_health(client: TestClient) -> None:
     assert "Expected error of a scan" in plot.text
 
 
-def test_a_busy_rig_names_its_holder(client: TestClient, queue: JobQueue) -> None:
-    queue.held = "schedule 'nightly'"
+def test_a_busy_rig_names_its_holder(client: TestClient, queue: TameQueue) -> None:
+    queue.busy = "schedule 'nightly'"
     answer = client.post("/rig/verification", json={"board": BOARD})
     assert answer.status_code == 409
     assert "schedule 'nightly'" in answer.json()["detail"]

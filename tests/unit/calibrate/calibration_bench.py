@@ -27,7 +27,7 @@ from slrig.jobs.store import JobStore
 from slrig.model import Calibration, Pinhole, Size, Solved
 from slrig.scan.plan import Progress, ScanPlan
 from tests.unit.scan.bench import Bench
-from tests.unit.scan.fakes import WAIT_S, TameBench
+from tests.unit.scan.fakes import WAIT_S, TameBench, TameRecording
 
 BOARD = Board(BoardKind.CHESSBOARD, 4, 3, 10.0)
 PNG = b"\x89PNG tame"
@@ -115,7 +115,7 @@ class TameCalibrating:
 
     def _capture(
         self, rig: Rig, plan: ScanPlan, folder: Path, /, *, progress: Progress, cancelled: Callable[[], bool]
-    ) -> None:
+    ) -> TameRecording:
         self.captured.append((rig, plan))
         rig.projector.show(0)
         progress("capture", 0.5, "frame 1 of 2")
@@ -129,6 +129,7 @@ class TameCalibrating:
             raise error
         folder.mkdir()
         (folder / "bundle.json").write_text("{}")
+        return TameRecording()
 
     def _read(self, folder: Path, board: Board, name: str) -> ReadPose:
         assert (folder / "bundle.json").is_file()

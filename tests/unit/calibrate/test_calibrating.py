@@ -376,9 +376,9 @@ def test_scan_uses_the_active_calibration(bench: CalibrationBench) -> None:
     seen = []
     capture = bench.runner._tools.capture
 
-    def watched(rig: object, *given: object, **options: object) -> None:
+    def watched(rig: object, *given: object, **options: object) -> object:
         seen.append(getattr(rig, "calibration"))  # noqa: B009 - any rig
-        capture(rig, *given, **options)  # type: ignore[arg-type] # as it came
+        return capture(rig, *given, **options)  # type: ignore[arg-type] # as it came
 
     object.__setattr__(bench.runner._tools, "capture", watched)
     bench.until(bench.scan().id)
@@ -474,6 +474,8 @@ def test_pose_that_waited_is_shot_after_a_restart_and_one_with_its_frames_is_rea
     bundle = bench.folder.stage(whole.id) / "bundle"
     bundle.mkdir()
     (bundle / "bundle.json").write_text("{}")
+    # It was ended between its answer and its place.
+    (bench.folder.staging(whole.id) / "answer.json").write_text("{}")
     bench.jobs.advance(answered.id, JobState.COMPUTING)
     place = bench.calibrations.store.pose(session_id, 4)
     shutil.copytree(bench.calibrations.store.pose(session_id, 1), place)

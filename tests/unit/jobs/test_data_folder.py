@@ -96,6 +96,24 @@ def test_space_is_asked_for_before_a_scan(tmp_path: Path) -> None:
     folder.release()
 
 
+def test_each_file_of_a_scan_is_brought_to_disk_once(folder: DataFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[Path] = []
+    monkeypatch.setattr("slrig.bundle.storage._sync", lambda path, _flags: synced.append(path))
+    scan_id = uuid4()
+    staged, recording = folder.stage(scan_id), folder.recording(scan_id)
+    recording.mkdir()
+    (recording / "000.png").write_bytes(b"frame")
+    folder.keep_recording(scan_id)
+    result = folder.stage_result(scan_id)
+    (result / "mesh.ply").write_bytes(b"mesh")
+    folder.commit(scan_id)
+    files = (recording / "000.png", staged / "mesh.ply")
+    assert [synced.count(path) for path in (*files, recording, folder.scans)] == [1, 1, 1, 1]
+    # The bundle's name, and then those of the results.
+    assert synced.count(staged) == 2
+    assert not [path for path in synced if path.is_relative_to(staged / "bundle")]
+
+
 def test_committed_scan_has_its_results_beside_its_bundle(folder: DataFolder) -> None:
     scan_id = uuid4()
     staged_bundle(folder, scan_id)

@@ -21,9 +21,9 @@ from slrig.errors import (
     ScanCancelledError,
     ScanInterruptedError,
 )
-from slrig.jobs.job import Holder
-from slrig.jobs.records import JobState
-from slrig.rig.session import ActiveCalibration
+from slrig.jobs.job import Holder, Job
+from slrig.jobs.records import JobState, utc_now
+from slrig.rig.session import ActiveCalibration, RigSession, driver_errors
 from slrig.rig.watchdog import MOVE_LIMIT_S, Calls, GuardedPositioner
 from tests.unit.calibrate.calibration_bench import tame_calibration
 from tests.unit.scan.bench import Bench
@@ -75,9 +75,23 @@ def works() -> Iterator[Callable[..., Work]]:
 
 
 def submitted(bench: Bench, work: Work, *, wait: bool = False) -> UUID:
-    work_id = uuid4()
-    bench.runner.submit_work(work, work_id=work_id, holder=HOLDER, wait=wait, ended=work.ended)
-    return work_id
+    job = job_of(work)
+    bench.runner.queue.submit(lambda: [job], wait=wait)
+    return job.id
+
+
+def job_of(work: Work, do: Callable[[Rig, Callable[[], bool]], None] | None = None) -> Job:
+    """A job that does the work, or what `do` says, with the open rig."""
+
+    def with_rig(held: RigSession, job: Job) -> None:
+        try:
+            with driver_errors(held.name):
+                (do or work)(held.open(), job.stop.is_set)
+        except Exception as error:
+            held.doubt(error)
+            raise
+
+    return Job(uuid4(), HOLDER, utc_now(), with_rig, work.ended)
 
 
 def held(bench: Bench, work: Work) -> UUID:
@@ -133,15 +147,15 @@ def test_recalled_work_ends_early_and_waiting_work_at_once(bench: Bench, works: 
     work, second = works(), works()
     work_id = held(bench, work)
     waiting = submitted(bench, second, wait=True)
-    bench.runner.cancel_work(waiting)
+    bench.runner.queue.cancel(waiting)
     assert second.over.wait(WAIT_S)
     assert isinstance(second.told[0], ScanCancelledError)
     assert "Measuring 7 was cancelled while it waited" in str(second.told[0])
     assert not second.began.is_set()
-    bench.runner.cancel_work(work_id)
+    bench.runner.queue.cancel(work_id)
     assert work.over.wait(WAIT_S)
     assert isinstance(work.told[0], ScanCancelledError)
-    bench.runner.cancel_work(work_id)
+    bench.runner.queue.cancel(work_id)
     assert (len(work.told), bench.opened[0][1].dark) == (1, True)
 
 
@@ -186,13 +200,13 @@ def test_work_that_never_returns_is_darkened_past_and_told_once(bench: Bench, wo
         work.began.set()
         stubborn.wait(WAIT_S)
 
-    bench.runner.submit_work(deaf, work_id=uuid4(), holder=HOLDER, wait=False, ended=work.ended)
+    bench.runner.queue.submit(lambda: [job_of(work, deaf)], wait=False)
     assert work.began.wait(WAIT_S)
     bench.runner.close(timeout_s=0.01)
     assert bench.opened[0][1].dark
     assert [type(told) for told in work.told] == [ScanInterruptedError]
     stubborn.set()
-    bench.runner._queue._owner.join(WAIT_S)
+    bench.runner.queue._owner.join(WAIT_S)
     assert len(work.told) == 1
 
 
@@ -206,7 +220,9 @@ def test_teller_that_fails_does_not_end_the_owner_thread(bench: Bench, works: Ca
         raise ValueError(message)
 
     with capture_logs() as logs:
-        bench.runner.submit_work(work, work_id=uuid4(), holder=HOLDER, wait=False, ended=fail)
+        job = job_of(work)
+        job.ended = fail
+        bench.runner.queue.submit(lambda: [job], wait=False)
         assert work.over.wait(WAIT_S)
         assert bench.until(bench.scan(wait=True).id).state is JobState.SUCCEEDED
     assert "the end of work with the rig went wrong" in [each["event"] for each in logs]
@@ -216,14 +232,12 @@ def test_loan_is_known_before_its_work_begins(bench: Bench, works: Callable[...,
     work = works()
     known: list[bool] = []
     work.gate.set()
-    bench.runner.submit_work(
-        work,
-        work_id=uuid4(),
-        holder=HOLDER,
-        wait=False,
-        ended=work.ended,
-        begun=lambda: known.append(work.began.is_set()),
-    )
+
+    def make() -> list[Job]:
+        known.append(work.began.is_set())
+        return [job_of(work)]
+
+    bench.runner.queue.submit(make, wait=False)
     assert work.over.wait(WAIT_S)
     assert known == [False]
 

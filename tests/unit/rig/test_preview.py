@@ -116,18 +116,18 @@ def test_a_scan_goes_first_and_pictures_go_on_after_it(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     with simulated(tmp_path).head() as head:
         # The cameras of the rendered rig; the tame capture asks nothing of them, and lights the tame projector.
-        bench.runner._queue.rig = RigSession("bench", lambda: replace(rig_of(head), projector=TameProjector()))
+        bench.runner.queue.rig = RigSession("bench", lambda: replace(rig_of(head), projector=TameProjector()))
         bench.runner.start()
         try:
             scan = bench.scan()
             bench.until(scan.id)
             with pytest.raises(CameraNotFoundError, match="left, right"):
-                bench.runner.watch("middle", Light.OFF)
-            with bench.runner.watch("left", Light.OFF) as watch:
+                bench.runner.queue.watch("middle", Light.OFF)
+            with bench.runner.queue.watch("left", Light.OFF) as watch:
                 seen = next_of(watch).number
                 held = bench.held()
                 with pytest.raises(RigBusyError, match=str(held.id)):
-                    bench.runner.watch("left", Light.OFF)
+                    bench.runner.queue.watch("left", Light.OFF)
                 stood = next_of(watch).number
                 assert watch.picture(stood, 0.2) is None
                 bench.gate.set()
@@ -141,6 +141,6 @@ def test_before_the_rig_is_open_there_is_nothing_to_see(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     try:
         with pytest.raises(DeviceBusyError, match="being opened"):
-            bench.runner.watch("cam0", Light.OFF)
+            bench.runner.queue.watch("cam0", Light.OFF)
     finally:
         bench.close()

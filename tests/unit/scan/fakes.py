@@ -14,9 +14,9 @@ from slrig.capture.evidence import EvidenceSummary
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FrameSink
+from slrig.jobs.rig_jobs import Recorded
 from slrig.model import Black, Calibration, CameraFormat, Frame, PatternSequence, Shot, Size, White
 from slrig.model.header import CaptureHeader
-from slrig.scan.job import Recorded
 from slrig.scan.plan import ScanPlan
 
 WAIT_S = 20.0

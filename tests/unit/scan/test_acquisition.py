@@ -27,7 +27,7 @@ from slrig.errors import (
 from slrig.jobs.frame_feed import Abandon, FrameFeed
 from slrig.model import Calibration, Shot
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.report import capture_report
 from slrig.scan.stream import ScanStream
@@ -63,14 +63,14 @@ class Sink:
 
 def captured(fake: FakeRig, folder: Path, sink: Sink | FrameFeed | None = None) -> list[tuple[float, str]]:
     told: list[tuple[float, str]] = []
-    capture_bundle(
+    capture_frames(
         fake.rig,
         ScanPlan(),
         folder,
         progress=lambda _stage, fraction, detail: told.append((fraction, detail)),
         cancelled=lambda: False,
         frames=sink,
-    )
+    ).finish()
     assert fake.at_rest
     return told
 
@@ -89,7 +89,9 @@ def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
         free = replace(rig, cameras={"eye": OtherCamera(rig.cameras["eye"], frozenset({Trigger.FREE}))})
         known = replace(free, synchronisation=Synchronisation(0.0, 0.001))
         for name, each in (("unmeasured", free), ("measured", known), ("triggered", rig)):
-            capture_bundle(each, ScanPlan(), tmp_path / name, progress=lambda *_: None, cancelled=lambda: False)
+            capture_frames(
+                each, ScanPlan(), tmp_path / name, progress=lambda *_: None, cancelled=lambda: False
+            ).finish()
     [note] = read_notes(tmp_path / "unmeasured")
     assert "cameras that run by themselves (eye)" in note
     assert "Run slrig latency" in note
@@ -210,13 +212,13 @@ def test_a_cancel_after_a_refusal_leaves_nothing(tmp_path: Path) -> None:
         return count > 30
 
     with pytest.raises(ScanCancelledError):
-        capture_bundle(
+        capture_frames(
             faulty(stale=frozenset({5})).rig,
             ScanPlan(),
             tmp_path / "bundle",
             progress=lambda *_: None,
             cancelled=cancelled,
-        )
+        ).finish()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -232,13 +234,13 @@ def steady(folder: Path, *, exposures_s: tuple[float, ...] | None = None) -> tup
     }
     told: list[str] = []
     with simulated(folder, projector=display).head() as head:
-        capture_bundle(
+        capture_frames(
             rig_of(head),
             ScanPlan(exposures_s=exposures_s),
             folder / "bundle",
             progress=lambda _stage, _fraction, detail: told.append(detail),
             cancelled=lambda: False,
-        )
+        ).finish()
     shots = read_bundle(folder / "bundle").capture.shots
     return {None if shot.exposure_s is None else round(shot.exposure_s, 9) for shot in shots}, told
 

@@ -110,7 +110,7 @@ def test_frames_are_a_bundle_only_when_they_are_all_on_the_disk(bench: Bench) ->
 def test_a_capture_that_was_given_up_and_ends_well_after_all_leaves_nothing(bench: Bench) -> None:
     scan = bench.held()
     call = Call("camera 'cam0'", "read", 10.0, 0.0)
-    bench.runner._queue._give_up_on(call)
+    bench.runner.queue._give_up_on(call)
     assert failure_code(bench.until(scan.id)) == "device"
     bench.gate.set()
     # The rig is given on when the driver is back.

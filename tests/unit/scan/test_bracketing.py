@@ -19,7 +19,7 @@ from slrig.errors import ScanCancelledError, ScanEvidenceError, SlrigError
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.model import Axis, Calibration, Capture, Frame, Shot
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from slrig.scan.report import capture_notes, capture_report
 from tests.samples import sample_calibration
@@ -141,14 +141,14 @@ def captured(
 ) -> list[tuple[float, str]]:
     told: list[tuple[float, str]] = []
     try:
-        capture_bundle(
+        capture_frames(
             rig.rig,
             ScanPlan(exposures_s=tuple(exposures_s)),
             folder,
             progress=lambda _stage, fraction, detail: told.append((fraction, detail)),
             cancelled=cancelled,
             frames=sink,
-        )
+        ).finish()
     finally:
         assert rig.at_rest
         fractions = [fraction for fraction, _ in told]
@@ -308,7 +308,7 @@ def test_a_camera_that_sets_another_exposure_than_asked_is_refused(tmp_path: Pat
 
 def test_a_recorded_capture_of_two_cameras_with_one_exposure_each_is_no_bracket(tmp_path: Path) -> None:
     rig = fake()
-    capture_bundle(rig.rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+    capture_frames(rig.rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     capture = read_bundle(tmp_path / "bundle").capture
     apart = Capture(
         capture.projector,

@@ -18,7 +18,7 @@ from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.errors import BundleError
 from slrig.model import Calibration, Solved
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import write_converted
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
@@ -32,7 +32,7 @@ BOX = np.array([[-40.0, -40, -40], [40, 40, 40]])
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "bundle"
     with open_rig(read_rig(RIG)) as rig:
-        capture_bundle(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False).finish()
     return folder
 
 

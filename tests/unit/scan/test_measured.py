@@ -13,7 +13,7 @@ from slrig.bundle import read_bundle, write_bundle
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.model import Axis, Gray, Shot
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.measured import measured
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.golden.test_light_axis import BALL, Device, rig_file
@@ -34,7 +34,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("slanted")
     with open_rig(read_rig(rig_file(folder / "rig", BALL, PROJECTOR, CAMERA))) as rig:
         plan = ScanPlan(patterns=PatternPlan(rows=True, line_shift=False, gray_cell_px=1))
-        capture_bundle(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     return folder / "bundle"
 
 

@@ -27,7 +27,7 @@ from slrig.errors import (
 )
 from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Shot, Size, White
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
 from slrig.scan.stream import LiveScan
@@ -39,7 +39,7 @@ RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
 def truthful(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("truthful") / "bundle"
     with open_rig(read_rig(RIG)) as rig:
-        capture_bundle(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), folder, progress=lambda *_: None, cancelled=lambda: False).finish()
     return folder
 
 
@@ -216,7 +216,7 @@ def test_a_cancelled_reconstruction_leaves_nothing(recorded: Path, tmp_path: Pat
 
 def test_a_cancelled_capture_leaves_nothing(tmp_path: Path) -> None:
     with open_rig(read_rig(RIG)) as rig, pytest.raises(ScanCancelledError):
-        capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: True)
+        capture_frames(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: True).finish()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -235,7 +235,7 @@ def both_axes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "rig.toml").write_text(text)
     with open_rig(read_rig(folder / "rig.toml")) as rig:
         plan = ScanPlan(PatternPlan(rows=True))
-        capture_bundle(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     for name in ("truth.ply", "visible_points.npy"):
         assert (folder / "bundle" / name).exists()
     return folder / "bundle"
@@ -327,7 +327,7 @@ def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, 
 @pytest.mark.slow
 def test_two_cameras_taken_live_give_the_bytes_that_the_bundle_gives(tmp_path: Path) -> None:
     with open_rig(read_rig(RIG.with_name("two_cameras.toml"))) as rig:
-        capture_bundle(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     live = reconstruct_bundle(
         tmp_path / "bundle", tmp_path / "live", plan=ReconstructionPlan(), progress=lambda *_: None,
         cancelled=lambda: False, live=seen_live(tmp_path / "bundle"),
@@ -383,9 +383,9 @@ def test_capture_shows_each_frame_that_it_records(tmp_path: Path) -> None:
     sink = Sink()
     with open_rig(read_rig(RIG)) as rig:
         calibration = rig.calibration
-        capture_bundle(
+        capture_frames(
             rig, ScanPlan(), tmp_path / "bundle", progress=lambda *_: None, cancelled=lambda: False, frames=sink
-        )
+        ).finish()
     written = read_bundle(tmp_path / "bundle").capture
     header, known, *shots, evidence = sink.told
     assert header == CaptureHeader.of(written)

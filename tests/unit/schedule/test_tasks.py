@@ -30,8 +30,8 @@ from slrig.errors import (
 )
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
-from slrig.jobs.job import Holder
-from slrig.jobs.records import JobKind, JobState
+from slrig.jobs.job import Holder, Job
+from slrig.jobs.records import JobKind, JobState, utc_now
 from slrig.jobs.store import JobStore
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
 from slrig.schedule.rig_tasks import error_of
@@ -41,8 +41,9 @@ from slrig.schedule.tasks import Tasks
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
 from slrig.verify.verification import VerificationTools
-from tests.unit.accept.test_desk import PLAN, TameQueue, desk, desks, queue
+from tests.unit.accept.test_desk import PLAN, desk, desks, queue
 from tests.unit.calibrate.calibration_bench import CalibrationBench
+from tests.unit.jobs.tame_queue import TameQueue
 from tests.unit.scan.fakes import WAIT_S, SetClock
 from tests.unit.verify.health_bench import a_verification
 
@@ -56,8 +57,8 @@ class TaskBench(CalibrationBench):
 
     def __init__(self, tmp_path: Path, *, positioner: bool = True) -> None:
         super().__init__(tmp_path, positioner=positioner)
-        self.queue = self.runner
-        self.calibrations = Calibrations(self.folder, self.queue, self.jobs, rig_name="bench", tools=self.tame.tools())
+        self.queue = self.runner.queue
+        self.calibrations = Calibrations(self.folder, self.runner, self.jobs, rig_name="bench", tools=self.tame.tools())
         self.health = HealthStore(Database(self.folder.database))
         tools = self.tame.tools()
         verifying = VerificationTools(tools.capture, tools.read, lambda *_: a_verification())
@@ -88,9 +89,8 @@ class TaskBench(CalibrationBench):
     def open(self) -> None:
         """Wait until the rig is open."""
         opened = threading.Event()
-        self.queue.submit_work(
-            lambda *_: None, work_id=uuid4(), holder=Holder("a", "b", "/c"), wait=True, ended=lambda _: opened.set()
-        )
+        job = Job(uuid4(), Holder("a", "b", "/c"), utc_now(), lambda rig, _: rig.open(), lambda _: opened.set())
+        self.queue.submit(lambda: [job], wait=True)
         assert opened.wait(WAIT_S)
 
     def close(self) -> None:
@@ -363,13 +363,13 @@ def test_acceptance_is_measured_by_script_and_tells_its_decision(
 ) -> None:
     monkeypatch.setattr(AcceptanceRequest, "plan", lambda *_: PLAN)
     schedule, run = scheduled(TaskKind.ACCEPTANCE, {})
-    tasks = Tasks(cast("Any", queue), cast("Any", None), cast("Any", None), desk)
+    tasks = Tasks(queue, cast("Any", None), cast("Any", None), desk)
     told = tasks(schedule, run, lambda: False)
     assert queue.holders == [HOLDER.format("acceptance")]
     assert told["decision"] == "passes"
     assert told["quantities"]["PF"]["position"].startswith("sphere-")
     assert desk.file(UUID(told["acceptance"]), "report.html").is_file()
-    queue.busy = True
+    queue.busy = "1"
     with pytest.raises(RigBusyError):
         tasks(schedule, run, lambda: False)
 

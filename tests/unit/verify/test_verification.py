@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 from uuid import UUID, uuid4
 
@@ -29,11 +27,9 @@ from slrig.errors import (
 from slrig.failure import interruption
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
-from slrig.jobs.job import Holder
 from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.jobs.store import JobStore
 from slrig.model import Calibration
-from slrig.scan.runner import RunnerStatus
 from slrig.verify.job import VerificationDesk
 from slrig.verify.store import HealthStore
 from slrig.verify.verification import (
@@ -43,56 +39,25 @@ from slrig.verify.verification import (
     verify_bundle,
 )
 from tests.unit.calibration.health.drifting import bench
+from tests.unit.jobs.tame_queue import TameQueue
+from tests.unit.scan.fakes import TameProjector, TameRecording
 from tests.unit.verify.health_bench import a_verification, hours
 
 BOARD = Board(BoardKind.CHESSBOARD, 11, 8, 12.0)
 CALIBRATION = bench().calibration
 
 
-@dataclass
-class JobQueue:
-    """Does work with a rig that is no rig, at once, on this thread."""
-
-    calibration: Calibration | None = CALIBRATION
-    held: str | None = None
-    error: Exception | None = None
-    recalled: list[UUID] = field(default_factory=list)
-
-    def submit_work(
-        self,
-        work: Callable[[Rig, Callable[[], bool]], None],
-        *,
-        work_id: UUID,  # noqa: ARG002 - as the real one
-        holder: Holder,  # noqa: ARG002 - as the real one
-        wait: bool,
-        ended: Callable[[Exception | None], None],
-        begun: Callable[[], object],
-    ) -> None:
-        if self.held and not wait:
-            message = f"The rig is held by {self.held} since 06:00."
-            raise RigBusyError(message, holder=self.held, since="06:00")
-        begun()
-        rig = Rig("bench", {}, cast("Any", None), {}, self.calibration)
-        error: Exception | None = self.error
-        if error is None:
-            try:
-                work(rig, lambda: False)
-            except Exception as found:  # noqa: BLE001 - as the real one
-                error = found
-        ended(error)
-
-    def cancel_work(self, work_id: UUID) -> None:
-        self.recalled.append(work_id)
-
-    def status(self) -> RunnerStatus:
-        active = None if self.calibration is None else SimpleNamespace(calibration=self.calibration)
-        return cast("RunnerStatus", SimpleNamespace(active=active, facts=None, rig="bench"))
+def queue_of(calibration: Calibration | None = CALIBRATION) -> TameQueue:
+    """One with a rig that is no rig; without a calibration it is not open yet."""
+    rig = Rig("bench", {}, TameProjector(), {}, calibration)
+    return TameQueue(rig, opened=calibration is not None)
 
 
-def capture(_rig: Rig, _plan: object, folder: Path, /, **_options: object) -> None:
+def capture(_rig: Rig, _plan: object, folder: Path, /, **_options: object) -> TameRecording:
     """Writes a bundle that is none."""
     folder.mkdir()
     (folder / "frames").write_text("frames")
+    return TameRecording()
 
 
 def read(folder: Path, _board: Board, name: str) -> ReadPose:
@@ -125,7 +90,7 @@ def store(folder: DataFolder) -> Iterator[HealthStore]:
     found.database.close()
 
 
-def desk_of(folder: DataFolder, store: HealthStore, queue: JobQueue, **options: Any) -> VerificationDesk:
+def desk_of(folder: DataFolder, store: HealthStore, queue: TameQueue, **options: Any) -> VerificationDesk:
     options.setdefault("tools", TAME)
     return VerificationDesk(folder, queue, store, JobStore(store.database, JobKind.VERIFICATION), **options)
 
@@ -147,7 +112,7 @@ def done(desk: VerificationDesk, **options: Any) -> JobRecord:
 
 
 def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, JobQueue(), clock=lambda: hours(1))
+    desk = desk_of(folder, store, queue_of(), clock=lambda: hours(1))
     assert desk.health()[0].state is HealthState.UNKNOWN
     job = done(desk)
     assert job.state is JobState.SUCCEEDED
@@ -155,19 +120,24 @@ def test_a_verification_is_shot_judged_and_put_on_record(folder: DataFolder, sto
     assert latest is not None
     assert job.summary == json.loads(json.dumps(latest.document()))
     assert (latest.at, latest.calibration) == (hours(1), "0123456789ab")
-    states = [event.data["state"] for event in desk.jobs.events(job.id, after=0)]
-    assert states == ["queued", "capturing", "computing", "succeeded"]
+    told = [(event.kind, event.data["state"]) for event in desk.jobs.events(job.id, after=0)]
+    assert told == [
+        ("state", "queued"), ("state", "capturing"), ("captured", "capturing"), ("state", "computing"),
+        ("state", "succeeded"),
+    ]  # fmt: skip
     health, found, calibration = desk.health()
     assert health.state is HealthState.GOOD
     assert found == latest
     assert calibration is CALIBRATION
     assert list(folder.incoming.iterdir()) == []
     # It outlives the service.
-    assert desk_of(folder, store, JobQueue()).jobs.get(job.id) == job
+    assert desk_of(folder, store, queue_of()).jobs.get(job.id) == job
 
 
 def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, JobQueue(held="scan 7"))
+    queue = queue_of()
+    queue.busy = "scan 7"
+    desk = desk_of(folder, store, queue)
     with pytest.raises(RigBusyError, match="scan 7"):
         desk.shoot(BOARD)
     assert desk.jobs.page(before=None, limit=5) == []
@@ -175,7 +145,7 @@ def test_a_rig_that_is_held_names_its_holder(folder: DataFolder, store: HealthSt
 
 
 def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, JobQueue(calibration=None))
+    desk = desk_of(folder, store, queue_of(None))
     job = done(desk)
     assert job.state is JobState.FAILED
     assert job.fault is not None
@@ -186,7 +156,7 @@ def test_a_rig_without_a_calibration_is_told_what_to_do(folder: DataFolder, stor
 
 def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, store: HealthStore) -> None:
     tools = VerificationTools(capture=cast("Any", capture), read=moving, judge=look)
-    job = done(desk_of(folder, store, JobQueue(), tools=tools))
+    job = done(desk_of(folder, store, queue_of(), tools=tools))
     assert job.state is JobState.FAILED
     assert job.fault is not None
     assert "camera 'left': the board moved by 0.90 px while it was shot" in job.fault.message
@@ -195,7 +165,9 @@ def test_a_board_that_moved_is_refused_and_leaves_nothing(folder: DataFolder, st
 
 
 def test_a_cancelled_one_is_cancelled(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, JobQueue(error=ScanCancelledError("asked to")))
+    queue = queue_of()
+    queue.error = ScanCancelledError("asked to")
+    desk = desk_of(folder, store, queue)
     job = done(desk)
     assert job.state is JobState.CANCELLED
     assert desk.cancel(job.id).state is JobState.CANCELLED
@@ -204,17 +176,19 @@ def test_a_cancelled_one_is_cancelled(folder: DataFolder, store: HealthStore) ->
 
 
 def test_one_that_the_end_of_the_service_cuts_off_is_interrupted(folder: DataFolder, store: HealthStore) -> None:
-    def cut_off(*_: Any, **__: Any) -> None:
+    def cut_off(*_: Any, **__: Any) -> TameRecording:
         raise interruption()
 
     tools = VerificationTools(capture=cut_off, read=read, judge=look)
-    assert done(desk_of(folder, store, JobQueue(), tools=tools)).state is JobState.INTERRUPTED
+    assert done(desk_of(folder, store, queue_of(), tools=tools)).state is JobState.INTERRUPTED
 
 
 def test_one_that_waits_at_the_end_of_the_service_waits_on(folder: DataFolder, store: HealthStore) -> None:
-    job = desk_of(folder, store, JobQueue(error=interruption())).shoot(BOARD)
+    queue = queue_of()
+    queue.error = interruption()
+    job = desk_of(folder, store, queue).shoot(BOARD)
     assert job.state is JobState.QUEUED
-    after = desk_of(folder, store, JobQueue())
+    after = desk_of(folder, store, queue_of())
     after.take_up()
     assert over(after, job.id).state is JobState.SUCCEEDED
 
@@ -222,16 +196,12 @@ def test_one_that_waits_at_the_end_of_the_service_waits_on(folder: DataFolder, s
 def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
     folder: DataFolder, store: HealthStore
 ) -> None:
-    class Held(JobQueue):
-        """Never begins what is submitted."""
-
-        def submit_work(self, *_: Any, begun: Callable[[], object], **__: Any) -> None:
-            begun()
-
-    before = desk_of(folder, store, Held())
+    queue = queue_of()
+    queue.lazy = True
+    before = desk_of(folder, store, queue)
     waiting, shot = before.shoot(BOARD, wait=True), before.shoot(BOARD, wait=True)
     before.jobs.advance(shot.id, JobState.CAPTURING)
-    after = desk_of(folder, store, JobQueue())
+    after = desk_of(folder, store, queue_of())
     after.take_up()
     assert over(after, waiting.id).state is JobState.SUCCEEDED
     cut_off = after.jobs.get(shot.id)
@@ -241,7 +211,7 @@ def test_after_a_kill_one_that_waited_is_shot_and_one_under_way_is_interrupted(
 
 
 def test_only_so_many_finished_ones_stay_on_record(folder: DataFolder, store: HealthStore) -> None:
-    desk = desk_of(folder, store, JobQueue())
+    desk = desk_of(folder, store, queue_of())
     made = [done(desk).id for _ in range(4)]
     desk.jobs.prune(2)
     assert [job.id for job in desk.jobs.page(before=None, limit=9)] == made[:1:-1]
