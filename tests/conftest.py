@@ -24,6 +24,10 @@ _ONE_AT_A_TIME = {
 }
 
 
+# One file is run by one process, so the longest of a run comes before all others.
+_LONGEST = ("tests/e2e/test_readme_commands.py", "tests/contract/test_vivid.py")
+
+
 class ByFile(LoadScopeScheduling):  # type: ignore[misc] # xdist is untyped
     """Has several processes share the tests by file: what a file sets up once is set up once.
 
@@ -69,7 +73,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files of few tests that take minutes come first: begun last, they would keep one process busy, and no other."""
-    items.sort(key=lambda item: not item.nodeid.startswith("tests/e2e/"))
+    items.sort(key=lambda item: (not item.nodeid.startswith(_LONGEST), not item.nodeid.startswith("tests/e2e/")))
 
 
 def pytest_collection_finish() -> None:
