@@ -14,6 +14,10 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
+# Before numpy is loaded, here and in what tests start: where processes outnumber cores, threads of OpenBLAS wait for
+# one another by spinning, and small matrices take four times the processor time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # The same draws every time, so that a run fails by the change it tests; --hypothesis-profile=default draws afresh.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
