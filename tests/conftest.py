@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,6 +68,20 @@ class ByFile(LoadScopeScheduling):  # type: ignore[misc] # xdist is untyped
         super().schedule()
         for node in self.nodes:
             self._reschedule(node)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Before several processes share the tests, compile the kernels of a scan, where nothing is compiled yet.
+
+    Each process, and the first service that each starts, would compile them all for itself at the same time.
+    """
+    config = session.config
+    shared_out = config.getoption("numprocesses", None) and not hasattr(config, "workerinput")
+    kept = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).resolve().parents[1] / "slrig")
+    if shared_out and not config.option.collectonly and next(kept.rglob("*.nbc"), None) is None:
+        # What cannot be compiled is told by the tests of it.
+        subprocess.run([sys.executable, "-m", "slrig.cli", "warm"], stdout=subprocess.DEVNULL, check=False)
 
 
 @pytest.hookimpl(optionalhook=True)
