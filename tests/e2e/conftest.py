@@ -82,7 +82,8 @@ class ServiceProcess:
             "PYTHONUNBUFFERED": "1",
         }
         self.process: subprocess.Popen[bytes] | ForkedCommand
-        if fresh:
+        # What is to be preloaded is read as a program begins.
+        if fresh or "LD_PRELOAD" in environment:
             with self.log.open("ab") as log:
                 self.process = subprocess.Popen(  # noqa: S603 - our own command
                     [sys.executable, "-m", "slrig.cli", *command], stdout=subprocess.PIPE, stderr=log, env=environment
