@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gc
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +16,10 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
+# Before numpy is loaded, here and in what tests start: where processes outnumber cores, threads of OpenBLAS wait for
+# one another by spinning, and small matrices take four times the processor time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # The same draws every time, so that a run fails by the change it tests; --hypothesis-profile=default draws afresh.
 settings.register_profile("repeatable", derandomize=True)
 settings.load_profile("repeatable")
@@ -22,6 +28,10 @@ settings.load_profile("repeatable")
 _ONE_AT_A_TIME = {
     "gige-vision": ("tests/unit/drivers/genicam/", "tests/contract/test_contract.py"),
 }
+
+
+# One file is run by one process, so the longest of a run comes before all others.
+_LONGEST = ("tests/e2e/test_readme_commands.py", "tests/contract/test_vivid.py")
 
 
 class ByFile(LoadScopeScheduling):  # type: ignore[misc] # xdist is untyped
@@ -60,6 +70,20 @@ class ByFile(LoadScopeScheduling):  # type: ignore[misc] # xdist is untyped
             self._reschedule(node)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Before several processes share the tests, compile the kernels of a scan, where nothing is compiled yet.
+
+    Each process, and the first service that each starts, would compile them all for itself at the same time.
+    """
+    config = session.config
+    shared_out = config.getoption("numprocesses", None) and not hasattr(config, "workerinput")
+    kept = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).resolve().parents[1] / "slrig")
+    if shared_out and not config.option.collectonly and next(kept.rglob("*.nbc"), None) is None:
+        # What cannot be compiled is told by the tests of it.
+        subprocess.run([sys.executable, "-m", "slrig.cli", "warm"], stdout=subprocess.DEVNULL, check=False)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
     """How `-n` shares the tests out: in the order of collection."""
@@ -69,7 +93,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Files of few tests that take minutes come first: begun last, they would keep one process busy, and no other."""
-    items.sort(key=lambda item: not item.nodeid.startswith("tests/e2e/"))
+    items.sort(key=lambda item: (not item.nodeid.startswith(_LONGEST), not item.nodeid.startswith("tests/e2e/")))
 
 
 def pytest_collection_finish() -> None:

@@ -29,7 +29,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 from slrig.devices import Shown
 from slrig.errors import ScanEvidenceError
@@ -214,6 +213,9 @@ def fitted(camera: str, flashes: Sequence[Flash], levels: RowLevels) -> CameraLa
     """Return what the flashes tell: see the module.
     Raises ScanEvidenceError: too few flashes were seen while they happened.
     """
+    # Here: it takes a tenth of a service's start to load, and few processes of those that capture measure a latency.
+    from scipy.special import stdtrit
+
     found = [(flash, rows) for flash in flashes if (rows := rows_of(flash, levels)) is not None]
     if len(found) < FEWEST_FLASHES:
         raise ScanEvidenceError(_missed(camera, flashes, len(found)))

@@ -56,7 +56,7 @@ def _resident_mb(process: Path) -> float:
 
 def test_hundreds_of_scans_leave_nothing_behind(start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLRIG_KEEP_SCANS", str(KEPT))
-    service = start(write_rig(tmp_path / "rig"))
+    service = start(write_rig(tmp_path / "rig"), fresh=True)
     figures: list[Held] = []
     with service.client() as client:
         pinned = ended(client, client.start({"label": "pinned"}))["links"]["self"]

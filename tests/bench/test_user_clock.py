@@ -127,7 +127,7 @@ def told(rows: Mapping[str, tuple[float, float | None]], title: str) -> None:
 
 
 def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
-    service = start(replayed)
+    service = start(replayed, fresh=True)
     with service.client() as client:
         warmed(client)
         before_s = processor_s(service)
@@ -151,7 +151,7 @@ def test_from_the_last_frame_to_each_file(start: Start, replayed: Path) -> None:
 
 
 def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
-    service = start(replayed)
+    service = start(replayed, fresh=True)
     with service.client() as client:
         warmed(client)
         followed = []

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from slrig.cli.client import ServiceClient
+from tests.e2e.forking import ForkedCommand
 
 KEY = "the key of the tests"
 STOP_LIMIT_S = 30.0
@@ -63,26 +64,32 @@ def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str =
 
 
 class ServiceProcess:
-    """A running `slrig serve`; `url` is where it said that it is."""
+    """A running `slrig serve`; `url` is where it said that it is.
 
-    def __init__(self, rig: Path, data: Path) -> None:
+    fresh : in a Python of its own, for tests of what its start loads, and of limits that it inherits.
+    """
+
+    def __init__(self, rig: Path, data: Path, *, fresh: bool = False) -> None:
         self.data = data
-        command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(data)]
         self.log = data.with_suffix(".log")
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(  # noqa: S603 - our own command
-                command,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env={
-                    # Tests ask as fast as they can.
-                    "SLRIG_REQUESTS_PER_S": "100000",
-                    **os.environ,
-                    "SLRIG_API_KEY": KEY,
-                    "SLRIG_MIN_FREE_BYTES": "0",
-                    "PYTHONUNBUFFERED": "1",
-                },
-            )
+        command = ["serve", str(rig), "--port", "0", "--data", str(data)]
+        environment = {
+            # Tests ask as fast as they can.
+            "SLRIG_REQUESTS_PER_S": "100000",
+            **os.environ,
+            "SLRIG_API_KEY": KEY,
+            "SLRIG_MIN_FREE_BYTES": "0",
+            "PYTHONUNBUFFERED": "1",
+        }
+        self.process: subprocess.Popen[bytes] | ForkedCommand
+        # What is to be preloaded is read as a program begins.
+        if fresh or "LD_PRELOAD" in environment:
+            with self.log.open("ab") as log:
+                self.process = subprocess.Popen(  # noqa: S603 - our own command
+                    [sys.executable, "-m", "slrig.cli", *command], stdout=subprocess.PIPE, stderr=log, env=environment
+                )
+        else:
+            self.process = ForkedCommand(command, environment, self.log)
         assert self.process.stdout is not None
         greeting = self.process.stdout.readline().decode()
         assert " at http://" in greeting, self.log.read_text()
@@ -125,8 +132,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
     """Start a service on a rig and a data folder; whatever still runs at the end of the test is killed."""
     running: list[ServiceProcess] = []
 
-    def started(rig: Path, data: Path = tmp_path / "data") -> ServiceProcess:
-        service = ServiceProcess(rig, data)
+    def started(rig: Path, data: Path = tmp_path / "data", *, fresh: bool = False) -> ServiceProcess:
+        service = ServiceProcess(rig, data, fresh=fresh)
         running.append(service)
         return service
 

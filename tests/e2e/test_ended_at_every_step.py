@@ -35,15 +35,27 @@ STEPS = (
     Step(CAMERA_NAME, "arm"),
     Step(PLAYER, "show", 0),
     Step(CAMERA_NAME, "trigger"),
-    Step(CAMERA_NAME, "read", 0),
     Step("disk", "write"),
-    Step(PLAYER, "show", 7),
     Step(CAMERA_NAME, "read", 7),
     Step(PLAYER, "blank"),
     Step(CAMERA_NAME, "disarm"),
     Step("disk", "sync"),
     Step("disk", "commit"),
 )
+"""The first pattern is shown, a later one read: what is asked for each pattern is left in the same way at each."""
+
+FOUND_AFTERWARDS = (
+    Step(PLAYER, "open"),
+    Step(CAMERA_NAME, "arm"),
+    Step(PLAYER, "show", 0),
+    Step("disk", "write"),
+    Step(CAMERA_NAME, "read", 7),
+    Step(PLAYER, "blank"),
+    Step("disk", "sync"),
+    Step("disk", "commit"),
+)
+"""Nothing of ours runs after a kill, so what counts is what it leaves: a scan that waits, one without a frame in the
+dark and in the light, with a file begun, with some frames, with all frames, all written, all at their place."""
 
 
 @pytest.fixture
@@ -139,7 +151,7 @@ def _opened(desk: Desk) -> set[str]:
 def test_killed_at_every_step(serve: Callable[[], ServiceProcess], desk: Desk) -> None:
     before: dict[str, Any] | None = None
     waiting: dict[str, Any] | None = None
-    for step in STEPS:
+    for step in FOUND_AFTERWARDS:
         with at(desk, step, serve, waiting) as (service, scan):
             if before is not None:
                 print(marked(service, before), end="\n")  # noqa: T201

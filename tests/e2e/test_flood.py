@@ -63,7 +63,7 @@ def test_a_scan_succeeds_beside_a_flood_of_connections(start: Start, tmp_path: P
         # The service starts with the limit that systems give.
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (1024, hard))
-        service = start(write_rig(tmp_path / "rig", head=SLOW))
+        service = start(write_rig(tmp_path / "rig", head=SLOW), fresh=True)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         address = (urlsplit(service.url).hostname, urlsplit(service.url).port)
         with service.client() as client:

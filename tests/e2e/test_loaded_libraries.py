@@ -61,7 +61,7 @@ def worked(service: ServiceProcess) -> None:
 
 @pytest.mark.slow
 def test_the_process_that_holds_the_rig_loads_no_mathematics(start: Start, tmp_path: Path) -> None:
-    service = start(recorded(tmp_path))
+    service = start(recorded(tmp_path), fresh=True)
     worked(service)
     assert "numba" in libraries(service.worker_id())
     assert libraries(service.process.pid) == set()

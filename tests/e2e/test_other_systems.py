@@ -88,7 +88,7 @@ def test_devices_says_which_drivers_are_for_linux_only() -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("elsewhere")
 def test_service_holds_its_rig_and_ends_in_good_order(start: Start, tmp_path: Path) -> None:
-    service = start(write_rig(tmp_path / "rig"))
+    service = start(write_rig(tmp_path / "rig"), fresh=True)
     with service.client() as client:
         assert client.get("/livez")["checks"]
         scan = client.start({})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from slrig.model import Capture
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
-from tests.e2e.conftest import Start, write_rig
+from tests.e2e.conftest import ServiceProcess, Start, write_rig
 
 SECOND_CAMERA = """
 [[head.camera]]
@@ -65,20 +66,37 @@ def require_equal_meshes(first: Path, second: Path) -> None:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
 
 
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """The bundle of a scan, the folder of that scan's other files, and what is reconstructed from the bundle."""
+    folder = tmp_path_factory.mktemp("recording")
+    with ExitStack() as leaving:
+
+        def start(rig: Path, data: Path) -> ServiceProcess:
+            service = ServiceProcess(rig, data)
+            leaving.callback(lambda: service.kill() if service.process.poll() is None else None)
+            return service
+
+        original = scanned(start, write_rig(folder / "rig", faults=SECOND_CAMERA), folder / "first")
+    bundle = folder / "bundle"
+    (original / "bundle").rename(bundle)
+    return bundle, original, reconstructed(bundle, folder / "reconstructed")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 20])
-def test_a_scan_of_a_recorded_scan_is_that_scan(start: Start, tmp_path: Path, speed: int) -> None:
-    original = scanned(start, write_rig(tmp_path / "rig", faults=SECOND_CAMERA), tmp_path / "first")
-    bundle = tmp_path / "recording"
-    (original / "bundle").rename(bundle)
+def test_a_scan_of_a_recorded_scan_is_that_scan(
+    start: Start, tmp_path: Path, recording: tuple[Path, Path, Path], speed: int
+) -> None:
+    bundle, original, from_bundle = recording
     rig = tmp_path / "replayed.toml"
-    rig.write_text(f'name = "replayed"\n[head]\ndriver = "replay"\nbundle = "recording"\nspeed = {speed}\n')
+    rig.write_text(f'name = "replayed"\n[head]\ndriver = "replay"\nbundle = "{bundle}"\nspeed = {speed}\n')
     again = scanned(start, rig, tmp_path / "second")
     # Times and exposures to the last digit, every pixel, and therefore every byte of the mesh.
     assert frames(again / "bundle") == frames(bundle)
     assert images(read_capture(again / "bundle")) == images(read_capture(bundle))
     require_equal_meshes(again, original)
-    require_equal_meshes(again, reconstructed(bundle, tmp_path / "reconstructed"))
+    require_equal_meshes(again, from_bundle)
 
 
 @pytest.mark.shared

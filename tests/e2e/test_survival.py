@@ -16,6 +16,7 @@ import pytest
 from slrig.cli.client import ServiceClient
 from slrig.errors import ServiceError
 from tests.e2e.conftest import STOP_LIMIT_S, Start, write_rig
+from tests.e2e.forking import ForkedCommand
 
 pytestmark = pytest.mark.slow
 
@@ -172,15 +173,24 @@ def test_rig_without_its_driver_scene_or_calibration_ends_the_service(tmp_path: 
         ended_by_rig(rig, words)
 
 
+def refused(rig: Path, data: Path, log: Path, port: str = "0") -> str:
+    """What a service tells that ends with exit code 2 as soon as it is started."""
+    command = ForkedCommand(["serve", str(rig), "--port", port, "--data", str(data)], os.environ, log)
+    code = command.wait(60)
+    command.stdout.close()
+    told = log.read_text()
+    assert code == 2, told
+    assert "Traceback" not in told
+    return told
+
+
 def ended_by_rig(rig: Path, words: str) -> None:
-    """Serve a rig whose file is wrong: exit code 2 and one message."""
-    data = rig.parent / "data"
-    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(data)]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
-    assert found.returncode == 2, found.stderr
-    assert found.stderr.count("error: ") == 1, found.stderr
-    assert words in found.stderr
-    assert "Traceback" not in found.stderr
+    """Serve a rig whose file is wrong: one message."""
+    data, log = rig.parent / "data", rig.parent / "told.log"
+    log.unlink(missing_ok=True)
+    told = refused(rig, data, log)
+    assert told.count("error: ") == 1, told
+    assert words in told
     assert not (data / "service.json").exists()
 
 
@@ -195,8 +205,8 @@ def test_told_to_end_it_lets_the_scan_come_to_its_end_and_keeps_the_queue(
         waiting = client.start({"if_busy": "queue"})
         followed_to(client, under_way, "capture")
         first.process.send_signal(signal.SIGTERM)
-        # It is told to everybody while it comes to its end.
-        assert ended(client, under_way)["state"] == "succeeded"
+        # It is told to everybody while it comes to its end; right after that nobody answers any more.
+        followed_to(client, under_way, "succeeded")
     assert first._gone(STOP_LIMIT_S) == 0
     second = start(rig)
     with second.client() as client:
@@ -241,18 +251,11 @@ def test_service_does_not_outlive_the_program_that_started_it(tmp_path: Path) ->
 def test_second_service_on_one_data_folder_is_refused(start: Start, tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig")
     service = start(rig)
-    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", "0", "--data", str(service.data)]
-    second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
-    assert second.returncode == 2
-    assert f"process id {service.process.pid}" in second.stderr
-    assert "Traceback" not in second.stderr
+    assert f"process id {service.process.pid}" in refused(rig, service.data, tmp_path / "second.log")
 
 
 def test_address_in_use_is_refused(start: Start, tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig")
     service = start(rig)
     port = service.url.rsplit(":", 1)[1]
-    command = [sys.executable, "-m", "slrig.cli", "serve", str(rig), "--port", port, "--data", str(tmp_path / "other")]
-    second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)  # noqa: S603
-    assert second.returncode == 2
-    assert "--port 0" in second.stderr
+    assert "--port 0" in refused(rig, tmp_path / "other", tmp_path / "second.log", port)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.special import stdtr
 
 from slrig.calibration.health.verification import PairFigures, Verification
 from slrig.calibration.solution import device_title
@@ -159,6 +158,9 @@ def _crept(values: Sequence[float]) -> tuple[float, float]:
     The deviation is that of the verifications' own scatter, from the differences of neighbours (von Neumann 1941): a
     slow trend is not in it. Its square has about two thirds as many degrees of freedom as there are differences.
     """
+    # Here: the service judges few times in its life, and scipy takes a tenth of its start to load.
+    from scipy.special import stdtr
+
     count = min(len(values) // 2, _AVERAGED)
     if count < _FEWEST_AVERAGED:
         return 0.0, 1.0

@@ -164,6 +164,8 @@ def _script(command: Sequence[str], environment: Mapping[str, str]) -> str:
         "LANG": "C.UTF-8",
         "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', os.defpath)}",
         "PYTHONUNBUFFERED": "1",
+        # Threads that wait by spinning are emulated, too.
+        "OPENBLAS_NUM_THREADS": "1",
         **environment,
     }
     given = " ".join(shlex.quote(f"{name}={value}") for name, value in variables.items())

@@ -31,8 +31,9 @@ from tests.contract.guest.vivid import BARE, LOOPED, Control, Output, nodes
 from tests.contract.suite import rig_of
 from tests.contract.vivid_bench import DRIVERS
 
-FRAMES = {"v4l2": 1_000, "opencv": 300}
-"""Patterns shown per time stamp source, each paired with a frame under disturbance."""
+FRAMES = {"v4l2": 500, "opencv": 300}
+"""Patterns shown per time stamp source, each paired with a frame under disturbance. See `tests.contract.pairing.FRAMES`
+for what 500 find."""
 DROPPED_PERCENT = 10
 CORRUPT_SHARE = 0.05
 IDLE_SHARE = 0.1

@@ -175,8 +175,24 @@ def as_typed(command: str, person: Person) -> str | None:
     return command
 
 
+_EXTENTS = re.compile(r"^((?:size|focal|principal)_px = )\[([\d.]+), ([\d.]+)\]$", re.MULTILINE)
+
+
+def _halved(extent: re.Match[str]) -> str:
+    halves = [f"{float(text) / 2:g}" if "." in text else str(int(text) // 2) for text in (extent[2], extent[3])]
+    return f"{extent[1]}[{', '.join(halves)}]"
+
+
 def lay_out_rigs(folder: Path) -> None:
-    """Write the rendered rig of the stand-ins, and make the one whose calibration takes minutes as small as it."""
+    """Write the rendered rig of the stand-ins, and make the one whose calibration takes minutes as small as it.
+
+    The others that are scanned and examined have pictures of half their width and height, and a ray a pixel.
+    """
+    for each in ("demo", "plane"):
+        rig = folder / "config" / "rigs" / f"{each}.toml"
+        smaller, count = _EXTENTS.subn(_halved, rig.read_text(encoding="utf-8"))
+        assert count == 6, smaller
+        rig.write_text(re.sub(r"samples_per_axis = \d", "samples_per_axis = 1", smaller), encoding="utf-8")
     for rig, scene, square_mm in (
         (folder / RENDERED, folder / "board.toml", 12.0),
         (folder / _CALIBRATED, folder / "config" / "scenes" / "small-board.toml", 14.0),
