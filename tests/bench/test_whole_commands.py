@@ -24,7 +24,7 @@ import pytest
 
 from slrig.config import read_rig
 from slrig.discovery import open_rig
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ScanPlan
 from tests.bench.test_pipeline_speed import RIG
 
@@ -59,7 +59,7 @@ def rendered(folder: Path, text: str, plan: ScanPlan) -> Path:
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(text.replace("samples_per_axis = 2", "samples_per_axis = 1"))
     with open_rig(read_rig(folder / "rig.toml")) as rig:
-        capture_bundle(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, folder / "bundle", progress=lambda *_: None, cancelled=lambda: False).finish()
     for truth in (*(folder / "bundle").glob("truth*"), folder / "bundle" / "visible_points.npy"):
         truth.unlink()
     return folder / "bundle"

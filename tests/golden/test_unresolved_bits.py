@@ -55,7 +55,8 @@ def decoded(bundle: Path, camera: str, left_out: int) -> NDArray[np.bool_]:
     """(H, W) bool: lit, and every bit but the finest so many swings by at least 5 of 255, as anybody would decode."""
     frames = axis_frames(read_bundle(bundle).capture, camera, Axis.COLUMN)
     assert frames.inverses is not None
-    swing = np.abs(frames.bits - frames.inverses)[: len(frames.bits) - left_out]
+    bits, inverses = (np.array(each, dtype=np.float32) for each in (frames.bits, frames.inverses))
+    swing = np.abs(bits - inverses)[: len(bits) - left_out]
     return np.asarray((frames.contrast > 20) & (swing >= LEAST_SWING).all(axis=0))
 
 

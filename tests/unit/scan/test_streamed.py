@@ -20,7 +20,7 @@ from slrig.discovery import open_rig
 from slrig.errors import BundleError
 from slrig.model import Axis, Black, Capture, LineShift, Pixels, Shot, White
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_bundle
+from slrig.scan.acquisition import capture_frames
 from slrig.scan.measured import measured
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
 from slrig.scan.reconstruct import reconstruct_bundle
@@ -35,7 +35,7 @@ def both_axes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("both") / "bundle"
     with open_rig(read_rig(RIG)) as rig:
         plan = ScanPlan(PatternPlan(rows=True))
-        capture_bundle(rig, plan, folder, progress=lambda *_: None, cancelled=lambda: False)
+        capture_frames(rig, plan, folder, progress=lambda *_: None, cancelled=lambda: False).finish()
     for each in (*folder.glob("truth*"), folder / "visible_points.npy"):
         each.unlink()
     return folder
