@@ -20,7 +20,7 @@ import numpy as np
 import tifffile
 
 from slrig.bundle.frame_headers import BMP_SIGNATURE, JPEG_SIGNATURE, TIFF_SIGNATURES, Bitmap, Jpeg, tiff_page_count
-from slrig.bundle.png import COLOUR, FILTERS, GREY, SIGNATURE, png_file, rows_above_added
+from slrig.bundle.png import COLOUR, FILTERS, GREY, HEADER, SIGNATURE, png_file, rows_above_added
 from slrig.errors import BundleError
 from slrig.model import CameraFormat, Pixels
 
@@ -103,7 +103,7 @@ def _check_header(path: Path, width: int, height: int, bits: int, camera: Camera
 def _png(path: Path, data: bytes, camera: CameraFormat) -> Pixels | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         _refuse(path, "a whole PNG file", f"{len(data)} bytes without a header", "copy the frame again")
-    width, height, bits, colour, _, _, interlaced = struct.unpack(">IIBBBBB", data[16:29])
+    width, height, bits, colour, _, _, interlaced = HEADER.unpack(data[16:29])
     if colour not in (GREY, COLOUR):
         kind = "a palette" if colour == 3 else "an alpha channel"
         _refuse(path, "a grey or colour PNG", f"one with {kind}", "save the frame as grey")

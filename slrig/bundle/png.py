@@ -23,7 +23,8 @@ FILTERS = 4
 
 _UP = 2
 _LEVEL = 1
-_HEADER = struct.Struct(">IIBBBBB")
+HEADER = struct.Struct(">IIBBBBB")
+"""Width, height, bits, colour, and ways of packing, filtering and interlacing."""
 
 
 def encode_frame(image: Pixels, name: str) -> bytes:
@@ -36,7 +37,7 @@ def encode_frame(image: Pixels, name: str) -> bytes:
     rows[:, 0] = _UP
     rows[0, 1:] = samples[0]
     np.subtract(samples[1:], samples[:-1], out=rows[1:, 1:])
-    header = _HEADER.pack(width, height, 8 * image.itemsize, GREY, 0, 0, 0)
+    header = HEADER.pack(width, height, 8 * image.itemsize, GREY, 0, 0, 0)
     return png_file(header, isal_zlib.compress(rows, _LEVEL))
 
 

@@ -129,8 +129,6 @@ class _CameraFrames:
         self._name = name
         self._axis = axis
         self._header = header
-        self._patterns = header.patterns
-        self._projector = header.projector
         self._entered = lambda stage: entered(stage, name)
         self._kept: list[Shot] = []
         self._repeats: dict[Pattern, list[Pixels]] = {}
@@ -166,7 +164,7 @@ class _CameraFrames:
         if self._waiting[shot.pattern] == 0:
             return
         self._waiting[shot.pattern] -= 1
-        pattern = self._patterns[shot.pattern]
+        pattern = self._header.patterns[shot.pattern]
         repeats = self._repeats.setdefault(pattern, [])
         repeats.append(shot.image)
         if len(repeats) == self._wanted[pattern]:
@@ -183,7 +181,7 @@ class _CameraFrames:
             frames, noise = fused.frames, fused.noise
         else:
             frames, noise = axis_frames(capture, self._name, self._axis), None
-        tables = _tables(frames.gray, frames.line_patterns, self._projector)
+        tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
         return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
 
 
