@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from slrig.api.calibration import IMPORT_PATH
 from slrig.api.keys import ALL_SCOPES, Key, KeyRing
+from slrig.api.page import FILES_PATH
 from slrig.api.problems import answer, problem
 from slrig.api.scopes import READING, moves, needed_scope
 from slrig.api.scopes import Scope as KeyScope
@@ -25,8 +26,9 @@ from slrig.errors import StorageError
 from slrig.jobs.audit import Audit
 from slrig.jobs.records import acting_as, utc_now
 
-OPEN_PATHS = frozenset({"/livez", "/readyz", LINK_PATH})
-"""What answers without a key: probes, which tell nothing about scans, and the link that stands for a key."""
+OPEN_PATHS = frozenset({"/", "/livez", "/readyz", LINK_PATH})
+"""What answers without a key: the page, which asks for one, probes, which tell nothing about scans, and the link that
+stands for a key."""
 
 ANYONE = "anyone"
 """Who sends requests to a service that asks for no key."""
@@ -109,7 +111,7 @@ class Access:
         """Who sends a request; None for what needs no key."""
         if self._ring is None or self._sessions is None:
             return Caller(ANYONE)
-        if path in OPEN_PATHS:
+        if path in OPEN_PATHS or path.startswith(f"{FILES_PATH}/"):
             return None
         try:
             return self._known(self._ring, self._sessions, headers)

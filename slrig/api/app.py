@@ -18,6 +18,7 @@ from slrig.api import (
     docs,
     events,
     health,
+    page,
     rig,
     scans,
     schedules,
@@ -65,8 +66,10 @@ def bare_app() -> FastAPI:
         audit,
         system,
         docs,
+        page,
     ):
         app.include_router(part.router)
+    app.mount(page.FILES_PATH, page.page_files())
     app.openapi = lambda: describe(app)  # type: ignore[method-assign] # the way that FastAPI documents
     install_problems(app)
     app.add_middleware(Methods, routes=app.routes)

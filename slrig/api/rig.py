@@ -28,6 +28,10 @@ from slrig.scan.runner import RunnerStatus
 _BOUNDARY = "picture"
 _WIDEST_PX = 1280
 _QUALITY = 80
+_SATURATED = 254
+_TOO_DARK = 12
+"""Grey levels of 255 in white light: four times the contrast below which a scan takes a pixel for unlit."""
+_RED, _BLUE = (32, 32, 224), (224, 80, 32)
 _LOOK_S = 0.5
 """How long one look for a picture holds a thread; then the client is asked whether it is still there."""
 
@@ -99,18 +103,21 @@ async def look_through_camera(
     service: Serving,
     camera: Annotated[str, Path(max_length=64, description="name of a camera of the rig")],
     light: Annotated[Light, Query(description="what the projector does meanwhile: dark, or all white")] = Light.OFF,
+    marks: Annotated[
+        bool, Query(description="saturated pixels in red, and in white light in blue those that are too dark")
+    ] = False,
 ) -> Response:
     """Look through a camera while nobody scans: an `img` element shows it. A scan that comes goes first."""
     place.take()
     watch = await run_in_threadpool(service.runner.queue.watch, camera, light)
     return StreamingResponse(
-        _parts(watch),
+        _parts(watch, marked=marks),
         media_type=f"multipart/x-mixed-replace; boundary={_BOUNDARY}",
         headers={"Cache-Control": "no-store"},
     )
 
 
-async def _parts(watch: Watch) -> AsyncIterator[bytes]:
+async def _parts(watch: Watch, *, marked: bool) -> AsyncIterator[bytes]:
     number = 0
     with watch:
         while True:
@@ -124,14 +131,26 @@ async def _parts(watch: Watch) -> AsyncIterator[bytes]:
                 yield b"\r\n"
                 continue
             number = picture.number
-            jpeg = await run_in_threadpool(encoded, picture.image)
+            shown = marked_picture(picture.image, lit=watch.light is Light.WHITE) if marked else picture.image
+            jpeg = await run_in_threadpool(encoded, shown)
             head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             yield head.encode() + jpeg + b"\r\n"
 
 
+def marked_picture(image: NDArray[np.uint8], *, lit: bool) -> NDArray[np.uint8]:
+    """A grey image (H, W) in colour (H, W, 3), blue, green, red: what is saturated is red, and, where it is lit, what is
+    too dark is blue.
+    """
+    picture = np.repeat(image[:, :, None], 3, axis=2)
+    picture[image >= _SATURATED] = _RED
+    if lit:
+        picture[image < _TOO_DARK] = _BLUE
+    return picture
+
+
 def encoded(image: NDArray[np.uint8]) -> bytes:
-    """A JPEG of an image (H, W) uint8, at most `_WIDEST_PX` wide."""
-    height, width = image.shape
+    """A JPEG of an image (H, W) or (H, W, 3) uint8, at most `_WIDEST_PX` wide."""
+    height, width = image.shape[:2]
     if width > _WIDEST_PX:
         image = np.asarray(
             cv2.resize(image, (_WIDEST_PX, max(round(height * _WIDEST_PX / width), 1)), interpolation=cv2.INTER_AREA)

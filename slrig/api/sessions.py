@@ -121,7 +121,7 @@ async def close_session(request: Request, response: Response) -> None:
     "/link",
     response_class=Response,
     status_code=303,
-    responses={303: {"description": "logged in; on to the description of the interface"}, **problems(401)},
+    responses={303: {"description": "logged in; on to the page of the service"}, **problems(401)},
     openapi_extra={"security": []},
 )
 async def follow_link(request: Request, token: Annotated[str, Query(max_length=200)]) -> Response:
@@ -134,7 +134,7 @@ async def follow_link(request: Request, token: Annotated[str, Query(max_length=2
             "/session, or start the service again for a new link."
         )
         raise HTTPException(401, message)
-    response = RedirectResponse("/docs", 303)
+    response = RedirectResponse("/", 303)
     _set_cookie(request, response, sessions, opened[0])
     return response
 
