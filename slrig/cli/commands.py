@@ -149,31 +149,31 @@ def scan(
     ] = False,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
+    repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
+    every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.scan import FILES, scan_with, tell_result
+    from slrig.cli.scan import FILES, scan_with, series_with, tell_result
 
+    exposures = exposure_s or []
     patterns = given(
-        line_shift_period_px=period_px,
-        line_width_px=line_width_px,
-        gray_cell_px=gray_cell_px,
-        line_shift=False if gray_only else None,
-        rows=rows or None,
-    )
+        line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
+        line_shift=False if gray_only else None, rows=rows or None,
+    )  # fmt: skip
     request = {
         "label": label,
         # One exposure time is one, several are a bracket.
-        **(
-            {"exposures_s": exposure_s}
-            if len(exposure_s or ()) > 1
-            else {"exposure_s": next(iter(exposure_s or ()), None)}
-        ),
+        **({"exposures_s": exposures} if len(exposures) > 1 else {"exposure_s": next(iter(exposures), None)}),
         "if_busy": "queue" if queue else "reject",
         "patterns": patterns,
         "reconstruction": given(**asdict(mesh)),
+        **given(repeat=repeat if repeat > 1 else None, every_s=every_s),
     }
     files = tuple(file or FILES)
     with service.client() as client:
+        if repeat > 1:
+            series_with(client, request, output, files=files)
+            return
         result = scan_with(client, request, output, files=files)
     tell_result(result, output, files=files)
 
