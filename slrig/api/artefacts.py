@@ -22,7 +22,7 @@ from slrig.errors import ArtefactNotReadyError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobRecord, JobState
 from slrig.scan.artefacts import MESH, ON_REQUEST, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, rejected_picture
+from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, causes_picture, rejected_picture
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
 _converting = threading.Lock()
@@ -161,6 +161,17 @@ def fetch_rejected(
 ) -> Response:
     """Return the picture of a camera's refused pixels, one colour per cause."""
     return _file(service, scan_id, rejected_picture(camera), "image/png", known)
+
+
+@router.get(f"/{causes_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
+def fetch_causes(
+    service: Serving,
+    scan_id: UUID,
+    camera: Annotated[str, PathParameter(pattern=CAMERA_NAME)],
+    known: KnownTag = None,
+) -> Response:
+    """Return why each pixel of a camera gave no point: grey values are places in report.json's `causes`."""
+    return _file(service, scan_id, causes_picture(camera), "image/png", known)
 
 
 @router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses={**file_of("application/zip", 409), **_UNCHANGED})

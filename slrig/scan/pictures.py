@@ -40,6 +40,7 @@ _INK = (235, 233, 230)
 _LEGEND_PX = 330
 _REJECTION_WIDTH_PX = 1600 - _LEGEND_PX
 _LEGEND_ROW_PX = 30
+_LEAST_ROWS = (len(Refusal) + 2) * _LEGEND_ROW_PX
 
 # After Okabe and Ito, "Color universal design": told apart by colour-blind readers too. Blue, green, red.
 _COLOURS: dict[Refusal, tuple[int, int, int]] = {
@@ -103,17 +104,20 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     if white is not None:
         grey, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
         picture = np.asarray(cv2.copyTo(grey, (refusals == Refusal.NONE).view(np.uint8), picture), dtype=np.uint8)
-    rows, columns = refusals.shape
-    least_rows = (len(Refusal) + 2) * _LEGEND_ROW_PX
-    enlarged = max(1, min(math.ceil(least_rows / rows), _REJECTION_WIDTH_PX // columns))
-    factor = min(float(enlarged), _REJECTION_WIDTH_PX / columns)
-    size = Size(max(1, round(columns * factor)), max(1, round(rows * factor)))
+    size = rejection_size(Size(refusals.shape[1], refusals.shape[0]))
     picture = resized(picture, size)
-    height = max(size.height_px, least_rows)
+    height = max(size.height_px, _LEAST_ROWS)
     page = np.full((height, size.width_px + _LEGEND_PX, 3), _PAGE, dtype=np.uint8)
     page[: size.height_px, : size.width_px] = picture
     _draw_legend(page, size.width_px + 16, np.bincount(refusals.ravel(), minlength=len(Refusal)))
     return page
+
+
+def rejection_size(camera: Size) -> Size:
+    """The part of `rejection_picture`, from the upper left corner, that holds the camera's pixels."""
+    enlarged = max(1, min(math.ceil(_LEAST_ROWS / camera.height_px), _REJECTION_WIDTH_PX // camera.width_px))
+    factor = min(float(enlarged), _REJECTION_WIDTH_PX / camera.width_px)
+    return Size(max(1, round(camera.width_px * factor)), max(1, round(camera.height_px * factor)))
 
 
 def encode_png(image: Picture) -> bytes:

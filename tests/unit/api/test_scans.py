@@ -370,6 +370,8 @@ def test_picture_of_refused_pixels_goes_by_camera(client: TestClient, served: Se
     (served.service.folder.scans / scan["id"] / "rejected-left.png").write_bytes(b"png")
     assert client.get(f"/scan/{scan['id']}/rejected-left.png").content == b"png"
     assert client.get(f"/scan/{scan['id']}/rejected-right.png").status_code == 409
+    (served.service.folder.scans / scan["id"] / "causes-left.png").write_bytes(b"grey")
+    assert client.get(f"/scan/{scan['id']}/causes-left.png").content == b"grey"
     assert client.get(f"/scan/{scan['id']}/rejected-..%2Fmesh.png").status_code in {404, 422}
 
 
