@@ -12,6 +12,8 @@ MEDIA_TYPES: Mapping[str, str] = {
     "mesh.glb": "model/gltf-binary",
     "mesh.stl": "model/stl",
     "mesh.obj": "model/obj",
+    "view.glb": "model/gltf-binary",
+    "coarse.glb": "model/gltf-binary",
     "points.ply": "application/octet-stream",
     "report.json": "application/json",
     "preview.png": "image/png",
