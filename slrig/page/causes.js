@@ -14,7 +14,7 @@ export function Causes({camera, told, causes, files}) {
     setShown(true);
     setAt([(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height]);
   };
-  const refused = causes.map(({name, words}) => [name === "none" ? told.decoded_pixels : told.refused_pixels[name] ?? 0, words]).filter(([pixels]) => pixels > 0);
+  const refused = causes.map(({name, ...rest}) => [name === "none" ? told.decoded_pixels : told.refused_pixels[name] ?? 0, rest]).filter(([pixels]) => pixels > 0);
   const all = refused.reduce((sum, [pixels]) => sum + pixels, 0);
   const [width, height] = told.rejected_png_px;
   return html`<section aria-label=${`Causes, camera ${camera}`}>
@@ -27,7 +27,8 @@ export function Causes({camera, told, causes, files}) {
         <p class="told">${at ? (map ? sentence(map, causes, at) : "Reading the causes …") : html`<span class="quiet">Point at a pixel, to be told why it gave no point.</span>`}</p>
       </div>
       <div class="wide"><table><thead><tr><th>Pixels</th><th>Share</th><th>Why</th></tr></thead>
-        <tbody>${refused.map(([pixels, words]) => html`<tr><td>${count(pixels)}</td><td>${percent(pixels / all)}</td><td>${words}</td></tr>`)}</tbody></table></div>
+        <tbody>${refused.map(([pixels, {words, colour}]) => html`<tr><td>${count(pixels)}</td><td>${percent(pixels / all)}</td>
+          <td><span class="swatch" style=${{background: colour}}></span> ${words}</td></tr>`)}</tbody></table></div>
     </div>
   </section>`;
 }

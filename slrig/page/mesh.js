@@ -92,7 +92,7 @@ function useLevels(view, slot, scan, setProblem) {
     const load = async () => {
       setWords("The picture comes.");
       for (const [level, path] of [["coarse", "coarse.glb"], ["full", "view.glb"]]) {
-        const mesh = await fetchMesh(scan.links.files[path], ending.signal, (share) => level === "full" && setWords(`A coarse picture; ${percent(Math.round(20 * share) / 20)} of the whole is here.`));
+        const mesh = await fetchMesh(`${scan.links.self}/${path}`, ending.signal, (share) => level === "full" && setWords(`A coarse picture; ${percent(Math.round(20 * share) / 20)} of the whole is here.`));
         view.add(slot, level, mesh, PLAIN[slot]);
         if (level === "full") setWords(`${count(mesh.triangles)} triangles.`);
       }

@@ -46,9 +46,9 @@ function Result({scan, again, may}) {
     <div class="two">
       <section aria-label="Mesh">
         ${!over && html`<div class="box">
-          ${hasMesh && html`<p role="status">The mesh is there and can be downloaded; its picture follows.</p>`}
+          ${hasMesh && html`<p role="status">The mesh is there and can be downloaded. The rest is computed still.</p>`}
           <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`}
-        ${over && files["view.glb"] && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} />`}
+        ${hasMesh && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} />`}
         ${over && !hasMesh && html`<${Ended} scan=${scan} may=${may} />`}
         ${over && hasMesh && html`<${Compare} scan=${scan} other=${other} chosen=${setOther} />`}
       </section>
@@ -110,7 +110,7 @@ function figures({summary}) {
 function Compare({scan, other, chosen}) {
   const [list, problem] = useValue("/scan?limit=50");
   const [id, setId] = useState("");
-  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && each.links.files["view.glb"]);
+  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && MESH in each.links.files && OVER.includes(each.state));
   const choose = (event) => {
     setId(event.target.value);
     chosen(possible.find((each) => each.id === event.target.value) ?? null);

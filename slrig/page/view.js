@@ -1,7 +1,6 @@
 // The mesh in 3-D: a scene that draws only when something changed, the coarse mesh while a slow machine turns the full one.
 import {
-  BufferAttribute, BufferGeometry, Color, DoubleSide, Matrix4, Mesh, PerspectiveCamera, Points, Scene, ShaderMaterial, Sphere, Vector2, Vector3,
-  WebGLRenderer,
+  Box3, BufferAttribute, BufferGeometry, Color, DoubleSide, Matrix4, Mesh, PerspectiveCamera, Points, Scene, ShaderMaterial, Vector2, Vector3, WebGLRenderer,
 } from "three";
 import {firstHit} from "./glb.js";
 import {OrbitControls} from "./vendor/OrbitControls.js";
@@ -13,14 +12,18 @@ const SMOOTH_MS = 50;
 const LIKELY_SMOOTH_TRIANGLES = 200_000;
 const STILL_AFTER_MS = 250;
 const CLICK_PX = 5;
+/** So much of the canvas does the mesh fill at most. */
+const FILLED = 0.92;
 const NAMES = {POSITION: "position", NORMAL: "normal", COLOR_0: "albedo", _SIGMA: "sigma", _STRIPE: "stripe"};
 
 /**
- * The colours of values: lightness rises evenly, from blue over green to yellow, which the colour-blind tell apart, too. They lie on two straight
- * lines of equal length in OKLab (Ottosson 2020, "A perceptual color space for image processing"), as CSS mixes them.
+ * The colours of values lie on a parabola through these points of OKLab (Ottosson 2020, "A perceptual color space for image processing"). Lightness
+ * rises evenly, from blue over green to yellow, which the colour-blind tell apart, too; equal steps look equal within 10 %.
  */
-const STOPS = [[0.28, 0.06, -0.13], [0.6, -0.095, -0.03], [0.92, -0.04, 0.17]];
-export const SCALE_CSS = `linear-gradient(in oklab to right, ${STOPS.map((stop) => `oklab(${stop.join(" ")})`).join(", ")})`;
+const ON_SCALE = [[0.28, 0.04, -0.13], [0.6, -0.075, -0.025], [0.92, -0.05, 0.16]];
+const weights = (share) => [(1 - 2 * share) * (1 - share), 4 * share * (1 - share), share * (2 * share - 1)];
+const scaled = (share) => [0, 1, 2].map((axis) => weights(share).reduce((sum, weight, at) => sum + weight * ON_SCALE[at][axis], 0).toFixed(4));
+export const SCALE_CSS = `linear-gradient(in oklab to right, ${Array.from({length: 17}, (_, at) => `oklab(${scaled(at / 16).join(" ")})`).join(", ")})`;
 
 const VERTEX = `
 attribute vec4 albedo; attribute float sigma; attribute float stripe;
@@ -35,12 +38,12 @@ void main() {
   gl_PointSize = 2.0;
   gl_Position = projectionMatrix * placed;
 }`;
-const vec3 = (numbers) => `vec3(${numbers.map((each) => each.toFixed(4)).join(", ")})`;
+const [LOW, MIDDLE, HIGH] = ON_SCALE.map((point) => `vec3(${point.join(", ")})`);
 const FRAGMENT = `
 uniform int mode; uniform bool bare; uniform vec2 range; uniform vec3 plain;
 varying vec3 facing; varying vec3 seen; varying vec3 own; varying float value;
 vec3 scaled(float share) {
-  vec3 lab = share < 0.5 ? mix(${vec3(STOPS[0])}, ${vec3(STOPS[1])}, 2.0 * share) : mix(${vec3(STOPS[1])}, ${vec3(STOPS[2])}, 2.0 * share - 1.0);
+  vec3 lab = (1.0 - 2.0 * share) * (1.0 - share) * ${LOW} + 4.0 * share * (1.0 - share) * ${MIDDLE} + share * (2.0 * share - 1.0) * ${HIGH};
   vec3 root = lab.x + mat3(0.3963377774, -0.1055613458, -0.0894841775, 0.2158037573, -0.0638541728, -1.2914855480, 0.0, 0.0, 0.0) * lab.yzx;
   return mat3(4.0767416621, -1.2684380046, -0.0041960863, -3.3077115913, 2.6097574011, -0.7034186147, 0.2309699292, -0.3413193965, 1.7076147010)
     * (root * root * root);
@@ -161,9 +164,10 @@ export class View {
       const chosen = each[level] ?? each.full ?? each.coarse;
       for (const held of Object.values(each)) held.object.visible = held === chosen && this.shown[slot];
     });
-    const away = this.camera.position.distanceTo(this.ball.center);
-    this.camera.near = Math.max(away - this.ball.radius * 1.1, away / 1000, 1e-3);
-    this.camera.far = away + this.ball.radius * 1.1;
+    const {center, radius} = this.box;
+    const away = this.camera.position.distanceTo(center);
+    this.camera.near = Math.max(away - radius * 1.1, away / 1000, 1e-3);
+    this.camera.far = away + radius * 1.1;
     this.camera.updateProjectionMatrix();
     const began = performance.now();
     this.renderer.render(this.scene, this.camera);
@@ -192,22 +196,28 @@ export class View {
     this.redraw();
   }
 
-  /** The ball about all that is there, in the view's axes. */
-  get ball() {
-    const ball = new Sphere().makeEmpty();
-    for (const {mesh, object} of this.slots.flatMap((each) => Object.values(each ?? {}))) {
-      const [low, high] = [mesh.min, mesh.max].map((corner) => new Vector3(...corner).applyMatrix4(object.matrix));
-      ball.union(new Sphere(low.clone().add(high).multiplyScalar(0.5), Math.max(low.distanceTo(high) / 2, 1e-3)));
-    }
-    return ball.isEmpty() ? new Sphere(new Vector3(), 1) : ball;
+  /** The box about all that is there, in the view's axes: `center`, `corners`, and `radius` to each of these. */
+  get box() {
+    const box = new Box3();
+    for (const {mesh, object} of this.slots.flatMap((each) => Object.values(each)))
+      box.union(new Box3(new Vector3(...mesh.min), new Vector3(...mesh.max)).applyMatrix4(object.matrix));
+    if (box.isEmpty()) box.set(new Vector3(-1, -1, -1), new Vector3(1, 1, 1));
+    const {min, max} = box;
+    const corners = [min.x, max.x].flatMap((x) => [min.y, max.y].flatMap((y) => [min.z, max.z].map((z) => new Vector3(x, y, z))));
+    return {center: box.getCenter(new Vector3()), corners, radius: Math.max(min.distanceTo(max) / 2, 1e-3)};
   }
 
   /** All in view, from the side that it is looked at from. */
   fit() {
-    const {center, radius} = this.ball;
-    const along = this.camera.position.clone().sub(this.controls.target).normalize();
-    const half = Math.atan(Math.tan((FIELD_DEG * Math.PI) / 360) * Math.min(1, this.camera.aspect));
-    this.look(center.clone().addScaledVector(along, radius / Math.sin(half)), center);
+    const {center} = this.box;
+    const toViewer = new Vector3().setFromMatrixColumn(this.camera.matrix, 2);
+    const [right, up] = [0, 1].map((axis) => new Vector3().setFromMatrixColumn(this.camera.matrix, axis));
+    const high = Math.tan((FIELD_DEG * Math.PI) / 360) * FILLED;
+    const needed = this.box.corners.map((corner) => {
+      const at = corner.clone().sub(center);
+      return at.dot(toViewer) + Math.max(Math.abs(at.dot(right)) / this.camera.aspect, Math.abs(at.dot(up))) / high;
+    });
+    this.look(center.clone().addScaledVector(toViewer, Math.max(...needed)), center);
   }
 
   /** As at the beginning: from the side of the cameras, all in view. */
@@ -221,7 +231,7 @@ export class View {
     const eye = new Vector3(x, -y, -z);
     const [ax, ay, az] = rotation[2];
     const along = new Vector3(ax, -ay, -az);
-    this.look(eye, eye.clone().addScaledVector(along, this.ball.center.clone().sub(eye).dot(along)));
+    this.look(eye, eye.clone().addScaledVector(along, this.box.center.clone().sub(eye).dot(along)));
   }
 
   look(eye, target) {

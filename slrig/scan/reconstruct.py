@@ -33,14 +33,13 @@ from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.offered import causes_picture, rejected_picture
-from slrig.scan.pictures import encode_png, preview, rejection_picture, rejection_size
+from slrig.scan.pictures import described_causes, encode_png, preview, rejection_picture, rejection_size
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
     Stopwatch,
     calibration_report,
     camera_report,
-    causes_report,
     mesh_report,
     redundancy_report,
     view_report,
@@ -172,7 +171,7 @@ def reconstruct_into(
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
-            "causes": causes_report(),
+            "causes": described_causes(),
             "cameras": {
                 each.name: {
                     **camera_report(each.curves, each.exposures),

@@ -37,24 +37,6 @@ from slrig.scan.artefacts import REPORT_FORMAT
 
 _MOST_OFF = 0.1
 
-CAUSES: Mapping[Refusal, str] = {
-    Refusal.NONE: "measured",
-    Refusal.NOT_LIT: "no light, or too little: in shadow, or too dark",
-    Refusal.SATURATED: "too bright: the camera is at its limit",
-    Refusal.AMBIGUOUS_BIT: "the code cannot be read: its light and dark frames differ too little",
-    Refusal.BEYOND_PROJECTOR: "the code names a place that the projector has not, or a line that its border cuts",
-    Refusal.AMBIGUOUS_LINE: "on the boundary of two codes that mean different lines",
-    Refusal.STRAY_CODE: "the code differs from that of the rest of its stripe",
-    Refusal.SHORT_STRIPE: "the stripe is too short to be trusted",
-    Refusal.SHADOW_EDGE: "at the edge of a shadow, which displaces the stripe",
-    Refusal.DEPTH_EDGE: "two surfaces in one pixel: a step in depth is near",
-    Refusal.OFF_PROJECTOR: "its ray meets the light where the projector has no pixel",
-    Refusal.BEHIND_DEVICE: "its ray meets the light behind the camera or the projector",
-    Refusal.NO_INTERSECTION: "its ray does not meet the light",
-    Refusal.SHEET_SEEN_ALONG: "its ray runs along the light, so there is no depth",
-}
-"""What a refusal means, in words."""
-
 
 class Stopwatch:
     """Seconds per stage, by a monotonic clock; a stage entered again adds up."""
@@ -118,11 +100,6 @@ def view_report(camera: Pinhole, picture: Size) -> dict[str, object]:
         "rotation": camera.rotation.tolist(),
         "rejected_png_px": [picture.width_px, picture.height_px],
     }
-
-
-def causes_report() -> list[dict[str, object]]:
-    """The causes in words, each in the place that is its value in a camera's map of causes."""
-    return [{"name": cause.name.lower(), "words": CAUSES[cause]} for cause in Refusal]
 
 
 def share_by_bits(curves: CameraCurves) -> list[float] | None:
