@@ -138,9 +138,7 @@ async def _parts(watch: Watch, *, marked: bool) -> AsyncIterator[bytes]:
 
 
 def marked_picture(image: NDArray[np.uint8], *, lit: bool) -> NDArray[np.uint8]:
-    """A grey image (H, W) in colour (H, W, 3), blue, green, red: what is saturated is red, and, where it is lit, what is
-    too dark is blue.
-    """
+    """A grey image (H, W) as (H, W, 3), blue, green, red: saturated pixels are red, and too dark ones, if lit, blue."""
     picture = np.repeat(image[:, :, None], 3, axis=2)
     picture[image >= _SATURATED] = _RED
     if lit:

@@ -29,6 +29,8 @@ def test_every_module_and_template_is_in_the_wheel(tmp_path: Path) -> None:
     (wheel,) = tmp_path.glob("*.whl")
     held = set(ZipFile(wheel).namelist())
     needed = [path for package in PACKAGES for path in (ROOT / package).rglob("*.*")]
-    names = [path.relative_to(ROOT).as_posix() for path in needed if path.suffix in {".py", ".html", ".css"}]
+    names = [
+        path.relative_to(ROOT).as_posix() for path in needed if path.suffix in {".py", ".html", ".css", ".js", ".svg"}
+    ]
     assert "slrig/reports/templates/report.html" in names
     assert [name for name in names if name not in held] == []

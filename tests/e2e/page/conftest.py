@@ -1,0 +1,93 @@
+"""A browser with an empty profile, and a look at a page that must not complain."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.e2e.conftest import KEY, ServiceProcess
+from tests.e2e.viewers.three_js import BROWSERS
+from tests.npm import lacking, npm_package
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+LIMIT_MS = 30_000
+DESK, PHONE = (1280, 800), (390, 844)
+_AXE = "axe-core@4.14.1"
+_OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+
+Visit = Callable[..., "Page"]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        lacking("needs Chromium: apt install chromium")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        lacking("needs Playwright, to drive a browser: pip install -e '.[browser]'")
+    with sync_playwright() as driver:
+        # Drawn by the processor, as on a laptop without a GPU.
+        opened = driver.chromium.launch(executable_path=path, args=list(_OPTIONS))
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def visit(browser: Browser) -> Iterator[Visit]:
+    """Open the page of a service, logged in unless `key` is None. At the end no page may have complained."""
+    complaints: list[str] = []
+    contexts = []
+
+    def opened(
+        service: ServiceProcess,
+        place: str = "",
+        *,
+        key: str | None = KEY,
+        size: tuple[int, int] = DESK,
+        dark: bool = False,
+        ignored: str | None = None,
+    ) -> Page:
+        context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]}, color_scheme="dark" if dark else "light"
+        )
+        contexts.append(context)
+        context.set_default_timeout(LIMIT_MS)
+        page = context.new_page()
+
+        def note(what: str) -> None:
+            if ignored is None or ignored not in what:
+                complaints.append(what)
+
+        page.on("console", lambda message: note(message.text) if message.type in {"error", "warning"} else None)
+        page.on("pageerror", lambda error: note(str(error)))
+        page.on("request", lambda request: note(request.url) if foreign(request.url, service.url) else None)
+        if key is not None:
+            sent = context.request.post(f"{service.url}/session", headers={"Authorization": f"Bearer {key}"})
+            assert sent.status == 201
+        page.goto(f"{service.url}/#/{place}")
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def foreign(url: str, service: str) -> bool:
+    """Whether a request leaves the service."""
+    return not url.startswith((service, "blob:", "data:"))
+
+
+def violations(page: Page) -> list[str]:
+    """What axe finds wrong with a page as it is now: the rule, and where."""
+    axe = npm_package(_AXE, "to look for what keeps people from using a page") / "axe.min.js"
+    page.evaluate(axe.read_text(encoding="utf-8"))
+    found: list[dict[str, Any]] = page.evaluate("() => axe.run().then((found) => found.violations)")
+    return [f"{each['id']}: {node['html'][:200]}" for each in found for node in each["nodes"]]

@@ -1,0 +1,65 @@
+"""From the key to a scan: what somebody sees who has never used the service."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import Scope
+from slrig.config import ServiceSettings
+from tests.e2e.conftest import KEY, Start, write_rig
+from tests.e2e.page.conftest import PHONE, Visit, violations
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit: Visit) -> None:
+    # In real time, so that there is something to see of the progress.
+    service = start(write_rig(tmp_path / "rig", head="realtime = true"))
+    page = visit(service, key=None, ignored="401")
+    page.get_by_label("Key").fill("not the key")
+    page.get_by_role("button", name="Enter").click()
+    page.get_by_role("alert").get_by_text("needs an API key").wait_for()
+    assert violations(page) == []
+    page.get_by_label("Key").fill(KEY)
+    page.keyboard.press("Enter")
+    page.get_by_text("None yet.").wait_for()
+    page.get_by_text("ready").wait_for()
+
+    page.get_by_role("group", name="Camera").get_by_role("button", name="left").click()
+    page.get_by_role("img", name="Live picture of camera left").wait_for()
+    # Told by the picture itself, so it is there.
+    page.get_by_text("% saturated").wait_for()
+    assert violations(page) == []
+    page.screenshot(path=str(tmp_path / "live.png"))
+    page.get_by_role("button", name="Off").click()
+
+    page.get_by_role("button", name="Scan", exact=True).click()
+    progress = page.get_by_role("progressbar")
+    progress.wait_for()
+    assert violations(page) == []
+    page.screenshot(path=str(tmp_path / "progress.png"))
+    # Whoever asked for it is led to the mesh; a page that is loaded anew still shows what is under way.
+    page.wait_for_url("**/#/scan/*-*")
+    page.goto(f"{service.url}/#/scan")
+    page.reload()
+    page.get_by_text("succeeded").wait_for()
+    page.get_by_text("triangles, σ").wait_for()
+    assert page.get_by_role("list").get_by_role("link").count() == 1
+    assert violations(page) == []
+
+
+def test_a_phone_a_dark_room_and_a_key_for_looking(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    page = visit(service, key=secret, size=PHONE, dark=True, ignored="401")
+    page.get_by_text("Your key is for looking only.").wait_for()
+    assert page.get_by_role("button", name="Scan", exact=True).is_disabled()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+    page.screenshot(path=str(tmp_path / "phone.png"))
+    page.get_by_role("button", name="Log out").click()
+    page.get_by_label("Key").wait_for()
+    assert page.evaluate("fetch('/scan').then((answer) => answer.status)") == 401

@@ -1,0 +1,101 @@
+"""/: the page of the service, what it may load, and that it holds what it names."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from slrig.api.page import FOLDER, policy
+from slrig.api.rig import encoded, marked_picture
+from tests.unit.api.conftest import ServedBench
+from tests.unit.api.test_access import stranger
+
+MOST_GZIPPED_BYTES = 600_000
+_IMPORTED = re.compile(r"""(?:^|[\s;}])(?:import|export)\b[^"';]*?from\s*["']([^"']+)["']""", re.MULTILINE)
+
+
+@pytest.mark.usefixtures("client")
+def test_the_page_and_its_files_need_no_key_and_tell_nothing(served: ServedBench) -> None:
+    visitor = stranger(served)
+    page = visitor.get("/")
+    assert (page.status_code, page.headers["content-type"]) == (200, "text/html; charset=utf-8")
+    for path in re.findall(r'(?:src|href)="([^"]+)"', page.text):
+        assert path.startswith("/page/")
+        assert visitor.get(path).status_code == 200
+    for path in ("/page/", "/page/none-such.js", "/page/../api/keys.py", "/page/%2e%2e/api/keys.py", "/page/vendor"):
+        assert visitor.get(path).status_code in {401, 404}, path
+    assert visitor.get("/rig").status_code == 401
+
+
+@pytest.mark.usefixtures("client")
+def test_nothing_runs_but_what_the_service_sends(served: ServedBench) -> None:
+    page = stranger(served).get("/")
+    told = page.headers["Content-Security-Policy"]
+    assert "unsafe" not in told
+    assert "http" not in told
+    assert "default-src 'none'" in told
+    assert len(re.findall(r"'sha256-[\w+/=]+'", told)) == 1
+    assert "sha256" not in policy('<script src="a.js"></script>')
+    # Attributes that hold scripts or styles would be dropped by a browser without a word.
+    assert re.findall(r"\s(?:on\w+|style)=", page.text) == []
+
+
+@pytest.mark.usefixtures("client")
+def test_files_are_packed_and_asked_for_once(served: ServedBench) -> None:
+    visitor = stranger(served)
+    first = visitor.get("/page/vendor/three.core.js")
+    assert first.headers["Content-Encoding"] == "gzip"
+    assert first.headers["Cache-Control"] == "no-cache"
+    assert first.headers["X-Content-Type-Options"] == "nosniff"
+    again = visitor.get("/page/vendor/three.core.js", headers={"If-None-Match": first.headers["ETag"]})
+    assert (again.status_code, again.content) == (304, b"")
+
+
+def test_modules_import_what_is_there() -> None:
+    imported = [
+        (path, name) for path in FOLDER.glob("*.js") for name in _IMPORTED.findall(path.read_text(encoding="utf-8"))
+    ]
+    assert [
+        (path.name, name)
+        for path, name in imported
+        if name != "three" and not (name.startswith("./") and (path.parent / name).is_file())
+    ] == []
+
+
+def test_libraries_are_those_that_the_readme_names() -> None:
+    text = (FOLDER / "README.md").read_text(encoding="utf-8")
+    named = dict(re.findall(r"^\| `([\w.-]+\.js)` \|.*`(\w{64})` \|$", text, re.MULTILINE))
+    found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in (FOLDER / "vendor").glob("*.js")}
+    assert named == found
+    licences = {path.name for path in (FOLDER / "vendor").glob("LICENSE.*")}
+    assert licences == {"LICENSE.htm.txt", "LICENSE.preact.txt", "LICENSE.three.txt"}
+
+
+def test_the_page_is_small() -> None:
+    files = [path for path in FOLDER.rglob("*") if path.suffix in {".js", ".css", ".html", ".svg"}]
+    assert sum(len(gzip.compress(path.read_bytes(), 6)) for path in files) < MOST_GZIPPED_BYTES
+
+
+def test_screens_have_one_subject() -> None:
+    lengths = {path.name: len(path.read_text(encoding="utf-8").splitlines()) for path in FOLDER.glob("*.*")}
+    assert {name: lines for name, lines in lengths.items() if lines > 400} == {}
+
+
+def test_marks_are_on_what_is_saturated_and_in_light_on_what_is_dark() -> None:
+    image = np.full((16, 30), 128, dtype=np.uint8)
+    image[:, :10], image[:, 20:] = 255, 3
+    lit, dark = marked_picture(image, lit=True), marked_picture(image, lit=False)
+    assert (lit[:, 10:20] == 128).all()
+    assert (lit[:, :10, 2] > lit[:, :10, 1] + 100).all()
+    assert (lit[:, 20:, 0] > lit[:, 20:, 1] + 100).all()
+    assert (dark[:, 20:] == 3).all()
+    np.testing.assert_array_equal(dark[:, :20], lit[:, :20])
+    decoded = cv2.imdecode(np.frombuffer(encoded(lit), dtype=np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    assert decoded.shape == (16, 30, 3)
+    assert decoded[8, 4, 2] > 180 > decoded[8, 4, 1]
