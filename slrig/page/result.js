@@ -66,8 +66,9 @@ function Result({scan, again, may}) {
 function Ended({scan, may}) {
   const titles = {failed: "The scan failed", cancelled: "The scan was stopped", interrupted: "The service ended while it scanned"};
   const [repeat, busy, problem] = useAction(async () => {
-    const {series, ...plan} = scan.plan;
-    await ask("POST", "/scan", {body: {...plan, label: scan.label, if_busy: "queue"}, headers: once()}).then((made) => sessionStorage.setItem("asked", made.id));
+    const {series, patterns: {codes, ...patterns}, ...plan} = scan.plan;
+    const made = await ask("POST", "/scan", {body: {...plan, patterns, label: scan.label, if_busy: "queue"}, headers: once()});
+    sessionStorage.setItem("asked", made.id);
     location.hash = "#/scan";
   });
   return html`<${Refusal} problem=${{document: {title: titles[scan.state] ?? "There is no mesh"}, message: scan.error?.detail ?? "It gave no mesh."}}>
