@@ -67,7 +67,7 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tm
     first, scan = scanned(service), scanned(service)
     folder = service.data / "scans" / scan.rpartition("/")[2]
     report = json.loads((folder / "report.json").read_text())
-    page = visit(service, scan[1:], size=(1280, 1100))
+    page = visit(service, scan[1:], size=(1280, 1100), ignored="404")
     plain = picture(page)
     page.get_by_text(f"{report['mesh']['figures']['triangles']:,} triangles.").wait_for()
     assert (plain != plain[20, 20]).any(axis=2).mean() > 0.3
@@ -134,14 +134,14 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tm
         for path in (scan, first)
     )
     difference = theirs["triangles"] - mine["triangles"]
-    written = f"{'−' if difference < 0 else '+'}{abs(difference):,}"  # noqa: RUF001 - as people write it
+    written = f"{'−' if difference < 0 else '+'}{abs(difference):,}"
     page.get_by_role("row", name="Triangles").get_by_role("cell", name=written, exact=True).wait_for()
     page.get_by_role("button", name="Shaded").click()
     page.locator("canvas").focus()
     page.keyboard.press("b")
-    assert orange(picture(page)) < 0.01
+    assert orange(picture(page)) < 0.001
     page.keyboard.press("b")
-    assert orange(picture(page)) > 0.2
+    assert orange(picture(page)) > 0.05
     page.keyboard.press("ArrowLeft")
     assert violations(page) == []
 
