@@ -1,7 +1,7 @@
 """What the files for pages cost: processor seconds, bytes and memory. `pytest tests/bench/test_view_files.py -s`.
 
-A mesh of 1.68 million triangles, from the mesh.ply that the service reads to the bytes that it sends. Memory is the most
-that was allocated above the mesh.ply.
+A mesh of 1.68 million triangles, from the mesh.ply that the service reads to the bytes that it sends. Memory is what
+was allocated at most, besides mesh.ply.
 """
 
 from __future__ import annotations
