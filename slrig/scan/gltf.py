@@ -24,10 +24,10 @@ _POINTS, _TRIANGLES = 0, 4
 
 
 class Part(NamedTuple):
-    """One attribute of the vertices, or the corners of the triangles (`INDICES`).
+    """One attribute of the vertices, or the corners of the triangles (`INDICES`). more : of the accessor.
 
-    array : contiguous, little endian, a row for each element. Its rows may be longer than `kind` says, because each
-    element of an attribute begins at a multiple of 4 bytes (section 3.6.2.4). more : of the accessor.
+    array : contiguous, little endian, a row for each element; longer than `kind` says where that is no multiple of 4
+    bytes, at which each element of an attribute begins (section 3.6.2.4).
     """
 
     name: str
@@ -37,10 +37,7 @@ class Part(NamedTuple):
 
 
 def encode_glb(parts: Sequence[Part], node: Mapping[str, object], *, extensions: Sequence[str] = ()) -> bytes:
-    """The bytes of a GLB. Without indices its vertices are points; without parts it holds the node alone.
-
-    node : what the node has besides its mesh. extensions : those that a reader must know.
-    """
+    """A GLB: of points where there are no indices. node : without its mesh; extensions : that readers must know."""
     length = sum(part.array.nbytes for part in parts)
     tree = json.dumps(_tree(parts, node, extensions, length), separators=(",", ":")).encode()
     tree += b" " * (-len(tree) % 4)

@@ -81,9 +81,9 @@ def coarse_mesh(mesh: Mesh) -> Mesh:
     Each vertex is thus one of the scan's, and what is measured between two of them holds; a mean of positions would be
     more certain than the mean or the greatest of their standard deviations says.
 
-    Triangles keep their orientation. Those that lose a corner go, of those with the same three corners the first stays,
-    and those that look away from their vertices' normals go: the surface is folded there, and others cover the place.
-    Without triangles, vertices are points.
+    Triangles keep their orientation. Those that lose a corner go, and of those with the same three corners the first
+    stays. Where merging folds the surface over, so that a triangle looks away from its vertices' normals, it is turned
+    round: left out it would leave a hole, and as it is it would be lit from behind. Of points alone it holds points.
     """
     if max(len(mesh.vertices_mm), len(mesh.faces)) <= COARSE_TRIANGLES:
         return mesh
@@ -94,7 +94,8 @@ def coarse_mesh(mesh: Mesh) -> Mesh:
     faces = faces[np.sort(once)]
     turned = (_twice_areas(mesh.vertices_mm[chosen], faces) * mesh.normals[chosen][faces].sum(axis=1)).sum(axis=1) < 0
     if len(faces):
-        used, corners = np.unique(faces[~turned], return_inverse=True)
+        faces[turned] = faces[turned][:, ::-1]
+        used, corners = np.unique(faces, return_inverse=True)
         chosen, faces = chosen[used], corners.reshape(-1, 3).astype(np.int32)
     of_vertices = {each.name: getattr(mesh, each.name)[chosen] for each in fields(mesh) if each.name != "faces"}
     return replace(mesh, faces=faces, **of_vertices)

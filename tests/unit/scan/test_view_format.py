@@ -212,7 +212,7 @@ def test_a_small_mesh_is_its_own_coarse_one() -> None:
 def test_triangles_of_the_same_corners_are_kept_once_as_they_stood_first() -> None:
     mesh = sheet(100, 200)
     again = np.concatenate([mesh.faces, mesh.faces[:, [0, 2, 1]], mesh.faces[::7]])
-    # Without normals nothing is left out because it looks away.
+    # Without normals nothing is turned round.
     coarse = coarse_mesh(replace(mesh, faces=again, normals=np.full_like(mesh.normals, np.nan)))
     assert len(np.unique(np.sort(coarse.faces, axis=1), axis=0)) == len(coarse.faces)
     assert (normal_of(coarse)[:, 2] < 0).mean() > 0.99
