@@ -6,7 +6,7 @@ import os
 import threading
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Annotated, Any
 from uuid import UUID
@@ -21,8 +21,8 @@ from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobRecord, JobState
-from slrig.scan.artefacts import MESH, ON_REQUEST, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, rejected_picture
+from slrig.scan.artefacts import MESH, ON_REQUEST, converted, write_converted
+from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, causes_picture, rejected_picture
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
 _converting = threading.Lock()
@@ -42,12 +42,12 @@ def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
         names = _known_files(folder.result(record.id))
     elif record.state.final and folder.owns(folder.scan(record.id)):
         names = _known_files(folder.scan(record.id))
-        if MESH in names:
-            names |= set(ON_REQUEST)
         if folder.owns(folder.scan(record.id) / "bundle"):
             names.add(BUNDLE_ZIP)
     else:
         return {}
+    if MESH in names:
+        names |= set(ON_REQUEST)
     return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
 
 
@@ -74,15 +74,16 @@ def _refuse_absent(record: JobRecord, name: str) -> None:
 
 
 def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: str | None) -> Response:
-    record = service.store.get(scan_id)
-    service.scan_retention.reading(scan_id)
     place = service.folder.scan(scan_id)
     path = place / name
-    if record.state.final and name in ON_REQUEST and service.folder.owns(place / MESH):
-        with _converting:
-            if not os.path.lexists(path):
-                write_converted(place, name)
-    made = _made_so_far(service.folder, record, name)
+    is_made = name in ON_REQUEST and not os.path.lexists(path)
+    with _converting if is_made else nullcontext():
+        # Looked up now: while others waited for their conversion the scan may have ended, and then this one is kept.
+        record = service.store.get(scan_id)
+        service.scan_retention.reading(scan_id)
+        if is_made and record.state.final and service.folder.owns(place / MESH) and not os.path.lexists(path):
+            write_converted(place, name)
+        made = _made_so_far(service.folder, record, name)
     if made is None and not (record.state.final and service.folder.owns(path)):
         _refuse_absent(record, name)
     headers = _headers(scan_id, name)
@@ -95,14 +96,14 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
 
 
 def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | None:
-    """A file of a scan that is being reconstructed, once it is there. Read as a whole: the scan may be put in its place
-    at any moment.
+    """A file of a scan that is being reconstructed, once it is there, or its mesh. Read as a whole: the scan may be put
+    in its place at any moment; what is made of the mesh is kept only there.
     """
     if record.state is not JobState.COMPUTING:
         return None
     for place in (folder.result(record.id), folder.scan(record.id)):
         with suppress(FileNotFoundError):
-            return folder.read(place / name)
+            return converted(folder.read(place / MESH), name) if name in ON_REQUEST else folder.read(place / name)
     return None
 
 
@@ -122,7 +123,7 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
     def fetch(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
         return _file(service, scan_id, name, media_type, known)
 
-    made = " It is made of mesh.ply when it is first asked for, and kept." if name in ON_REQUEST else ""
+    made = " It is made of mesh.ply when it is asked for, and kept once the scan is over." if name in ON_REQUEST else ""
     fetch.__doc__ = (
         f"Return {name} of a scan that succeeded, or that is being reconstructed, as soon as it is there.{made} ETags "
         "are honoured, and ranges once the scan is over."
@@ -161,6 +162,17 @@ def fetch_rejected(
 ) -> Response:
     """Return the picture of a camera's refused pixels, one colour per cause."""
     return _file(service, scan_id, rejected_picture(camera), "image/png", known)
+
+
+@router.get(f"/{causes_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
+def fetch_causes(
+    service: Serving,
+    scan_id: UUID,
+    camera: Annotated[str, PathParameter(pattern=CAMERA_NAME)],
+    known: KnownTag = None,
+) -> Response:
+    """Return why each pixel of a camera gave no point: grey values are places in report.json's `causes`."""
+    return _file(service, scan_id, causes_picture(camera), "image/png", known)
 
 
 @router.get(f"/{BUNDLE_ZIP}", response_class=Response, responses={**file_of("application/zip", 409), **_UNCHANGED})

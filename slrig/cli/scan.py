@@ -15,7 +15,7 @@ from slrig.cli.client import ServiceClient
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
-from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, not_offered, rejected_picture
+from slrig.scan.offered import BUNDLE_ZIP, CAMERA_PICTURES, MEDIA_TYPES, not_offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -149,7 +149,7 @@ def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:
         cameras = [each["name"] for each in client.get("/rig")["cameras"]] or None
         unknown = not_offered(files, cameras)
     if unknown:
-        pictures = [rejected_picture(name) for name in cameras or ("CAMERA",)]
+        pictures = [named(name) for name in cameras or ("CAMERA",) for named in CAMERA_PICTURES]
         there_are = ", ".join([*MEDIA_TYPES, *pictures, BUNDLE_ZIP])
         message = f"--file: a scan has no {', '.join(unknown)}. There are: {there_are}."
         raise ConfigError(message)

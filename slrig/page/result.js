@@ -1,3 +1,163 @@
-// placeholder until the next slice
-import {html} from "./vendor/preact-htm.js";
-export const ResultScreen = () => html`<p class="quiet">…</p>`;
+// A scan's result: its mesh, its figures, why pixels are missing, its files, and another scan beside it.
+import {Causes} from "./causes.js";
+import {Mesh} from "./mesh.js";
+import {ask, follow, once, useAction, useValue} from "./service.js";
+import {Action, Confirm, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
+import {html, useEffect, useState} from "./vendor/preact-htm.js";
+
+const OVER = ["succeeded", "failed", "cancelled", "interrupted"];
+const MESH = "mesh.ply";
+const LOOK_AGAIN_S = 10;
+
+const PURPOSES = {
+  "mesh.ply": "the mesh in mm, with σ for each vertex", "mesh.glb": "for viewers and web pages, in metres", "mesh.stl": "for CAD and printing, in mm",
+  "mesh.obj": "for modelling programs, in mm", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
+  "preview.png": "a picture to send", "bundle.zip": "the frames and the calibration, to compute it all again", "view.glb": "what this page shows",
+  "coarse.glb": "what this page shows first",
+};
+/** Made when they are asked for: to ask for their size would make them. */
+const MADE_LATER = ["mesh.stl", "mesh.obj", "view.glb", "coarse.glb", "bundle.zip"];
+const purpose = (name) => PURPOSES[name] ?? (name.startsWith("causes-") ? "causes as numbers, for programs" : "why pixels gave no point, as a picture");
+
+export function ResultScreen({id, may}) {
+  const [scan, problem, again] = useValue(`/scan/${encodeURIComponent(id)}`, LOOK_AGAIN_S);
+  if (problem?.status === 404 || problem?.status === 422)
+    return html`<${Back} /><${Refusal} problem=${{document: {title: "This scan is not there"}, message: "It was deleted, or the address is not right."}} />`;
+  if (!scan) return html`<${Back} /><${Refusal} problem=${problem} />${!problem && html`<p class="wait">Asking for the scan …</p>`}`;
+  return html`<${Back} /><${Result} scan=${scan} again=${again} may=${may} />`;
+}
+
+const Back = () => html`<p><a href="#/scan">All scans</a></p>`;
+
+function Result({scan, again, may}) {
+  const {files} = scan.links;
+  const over = OVER.includes(scan.state);
+  const [told, setTold] = useState(scan.progress);
+  const [report, refused] = useValue(files["report.json"] ?? null);
+  const [other, setOther] = useState(null);
+  useEffect(() => over ? undefined : follow(scan.links.events, (kind, data) => {
+    if (kind === "progress") setTold(data);
+    else again();
+  }, again), [over]);
+  const hasMesh = MESH in files;
+  return html`
+    <div class="between"><h2>${scan.label ?? `Scan of ${moment(scan.created_at)}`} <${JobBadge} state=${scan.state} /></h2>
+      ${hasMesh && html`<a class="action primary" href=${files[MESH]} download="mesh.ply">Download the mesh</a>`}</div>
+    <div class="two">
+      <section aria-label="Mesh">
+        ${!over && html`<div class="box">
+          ${hasMesh && html`<p role="status">The mesh is there and can be downloaded. The rest is computed still.</p>`}
+          <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`}
+        ${hasMesh && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} />`}
+        ${over && !hasMesh && html`<${Ended} scan=${scan} may=${may} />`}
+        ${over && hasMesh && html`<${Compare} scan=${scan} other=${other} chosen=${setOther} />`}
+      </section>
+      <section aria-label="Figures">
+        <${Refusal} problem=${refused} />
+        ${hasMesh && html`<${Figures} scan=${scan} report=${report} />`}
+        ${Object.keys(files).length > 0 && html`<${Downloads} key=${over} files=${files} />`}
+        <${Keeping} scan=${scan} over=${over} again=${again} may=${may} />
+      </section>
+    </div>
+    ${report && Object.entries(report.cameras).map(([name, told]) => html`<${Causes} key=${name} camera=${name} told=${told} causes=${report.causes} files=${files} />`)}`;
+}
+
+/** A scan without a mesh: why, and what now. */
+function Ended({scan, may}) {
+  const titles = {failed: "The scan failed", cancelled: "The scan was stopped", interrupted: "The service ended while it scanned"};
+  const [repeat, busy, problem] = useAction(async () => {
+    const {series, patterns: {codes, ...patterns}, ...plan} = scan.plan;
+    const made = await ask("POST", "/scan", {body: {...plan, patterns, label: scan.label, if_busy: "queue"}, headers: once()});
+    sessionStorage.setItem("asked", made.id);
+    location.hash = "#/scan";
+  });
+  return html`<${Refusal} problem=${{document: {title: titles[scan.state] ?? "There is no mesh"}, message: scan.error?.detail ?? "It gave no mesh."}}>
+      ${scan.links.files["bundle.zip"] && html`<p>Its frames are kept: the bundle can be downloaded, to reconstruct it elsewhere or to ask for help.</p>`}
+    <//>
+    ${may("scan") && html`<${Action} kind="primary" busy=${busy} onClick=${repeat}>Scan again<//>`}
+    <${Refusal} problem=${problem} />`;
+}
+
+/** What the report says that a person should know, warnings first. */
+function Figures({scan, report}) {
+  const {summary} = scan;
+  const {mesh, notes = []} = summary ?? {};
+  if (!mesh) return html`<p class="quiet">The figures come with the report.</p>`;
+  const calibration = report?.calibration;
+  const warnings = [...notes, ...(report?.evidence.contradictions ?? [])];
+  const age = calibration?.age_days;
+  return html`
+    ${warnings.length > 0 && html`<h3>Take note</h3><ul class="warning">${warnings.map((each) => html`<li>${each}</li>`)}</ul>`}
+    <h3>Figures</h3>
+    <${Facts} of=${[
+      ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value)]),
+      ["Patterns", summary.identity],
+      ["Calibration", calibration && (calibration.solved_at ? `${age === null ? "age not known" : `${Number(age.toPrecision(2))} days old`}` : calibration.absent)],
+      ["Its expected error", calibration?.expected_error_mm && length(calibration.expected_error_mm)],
+      ["Against the known truth, rms", summary.truth && length(summary.truth.rms_mm)],
+    ]} />
+    <p><a href=${scan.links.files["report.json"]}>The whole report</a></p>`;
+}
+
+/** [name, value, how it is written] of the figures that two scans are compared by. */
+function figures({summary}) {
+  const {figures: of, sigma_mm: sigma, covers_of_decoded: covered} = summary.mesh;
+  return [
+    ["Triangles", of.triangles, count], ["Vertices", of.vertices, count], ["Area", of.area_mm2, (mm2) => `${count(Math.round(mm2))} mm²`],
+    ["σ, median", sigma.p50, length], ["σ, 95 % are below", sigma.p95, length], ["Decoded pixels that the mesh covers", covered ?? undefined, percent],
+  ];
+}
+
+function Compare({scan, other, chosen}) {
+  const [list, problem] = useValue("/scan?limit=50");
+  const [id, setId] = useState("");
+  const possible = (list?.scans ?? []).filter((each) => each.id !== scan.id && MESH in each.links.files && OVER.includes(each.state));
+  const choose = (event) => {
+    setId(event.target.value);
+    chosen(possible.find((each) => each.id === event.target.value) ?? null);
+  };
+  const rows = other?.summary?.mesh && scan.summary?.mesh ? figures(scan).map((row, at) => [...row, figures(other)[at][1]]) : [];
+  return html`<h3>Compare</h3><${Refusal} problem=${problem?.status ? problem : null} />
+    ${list && possible.length === 0 ? html`<p class="quiet">There is no other scan with a mesh yet.</p>` : html`
+      <label>with <select value=${id} onChange=${choose}>
+        <option value="">no other scan</option>
+        ${possible.map((each) => html`<option value=${each.id}>${each.label ?? "Scan"}, ${moment(each.created_at)}</option>`)}
+      </select></label>`}
+    ${rows.length > 0 && html`<div class="wide"><table><thead><tr><th>Figure</th><th>This scan</th><th>The other</th><th>Difference</th></tr></thead>
+      <tbody>${rows.map(([name, mine, written, theirs]) => html`<tr><th scope="row">${name}</th><td>${mine === undefined ? "–" : written(mine)}</td>
+        <td>${theirs === undefined ? "–" : written(theirs)}</td><td>${mine === undefined || theirs === undefined ? "–" : `${theirs < mine ? "−" : "+"}${written(Math.abs(theirs - mine))}`}</td></tr>`)}</tbody></table></div>
+      <p class="quiet">Both are shown where their own calibration puts them. How far apart the surfaces are is not computed here.</p>`}`;
+}
+
+function Downloads({files}) {
+  const [sizes, setSizes] = useState({});
+  useEffect(() => {
+    for (const name of Object.keys(files).filter((each) => !MADE_LATER.includes(each)))
+      fetch(files[name], {method: "HEAD"}).then((answer) => {
+        const bytes = Number(answer.headers.get("Content-Length"));
+        if (answer.ok && bytes) setSizes((before) => ({...before, [name]: bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`}));
+      }, () => {});
+  }, []);
+  return html`<h3>Files</h3><div class="wide"><table><thead><tr><th>File</th><th>Size</th><th>For</th></tr></thead>
+    <tbody>${Object.entries(files).map(([name, path]) => html`<tr><td><a href=${path} download=${name}>${name}</a></td>
+      <td>${sizes[name] ?? (MADE_LATER.includes(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
+}
+
+function Keeping({scan, over, again, may}) {
+  const [sure, setSure] = useState(false);
+  const [cancel, cancelling, uncancelled] = useAction(() => ask("POST", scan.links.cancel).then(again));
+  const [pin, pinning, unpinned] = useAction(() => ask(scan.pinned ? "DELETE" : "PUT", `${scan.links.self}/pin`).then(again));
+  const [remove, removing, unremoved] = useAction(() => ask("DELETE", scan.links.self).then(() => {
+    location.hash = "#/scan";
+  }));
+  const problem = uncancelled ?? unpinned ?? unremoved;
+  if (!may("scan")) return null;
+  return html`<h3>Keep or delete</h3>
+    ${sure ? html`<${Confirm} question="Delete this scan with all its files? Nothing brings it back." yes="Delete it" onYes=${remove} onNo=${() => setSure(false)} />`
+    : html`<div class="row">
+        ${!over && html`<${Action} busy=${cancelling} onClick=${cancel}>Stop it<//>`}
+        ${over && html`<${Action} busy=${pinning} aria-pressed=${scan.pinned} onClick=${pin}>${scan.pinned ? "Kept for good: let it go when old" : "Keep it for good"}<//>
+        <${Action} busy=${removing} onClick=${() => setSure(true)}>Delete<//>`}
+      </div>`}
+    <${Refusal} problem=${problem} />`;
+}

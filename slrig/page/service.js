@@ -37,7 +37,8 @@ export async function ask(method, path, {body, headers} = {}) {
     tell(problem);
     throw problem;
   }
-  const isJson = /json/.test(response.headers.get("Content-Type") || "");
+  // An answer without content may have a type all the same.
+  const isJson = response.status !== 204 && /json/.test(response.headers.get("Content-Type") || "");
   const answered = isJson ? await response.json() : null;
   if (response.ok) {
     tell(null);

@@ -24,12 +24,18 @@ from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tr
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl
+from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 
 MESH = "mesh.ply"
 REPORT = "report.json"
 REPORT_FORMAT = "slrig-report"
-ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {"mesh.stl": encode_mesh_stl, "mesh.obj": encode_mesh_obj}
-"""Files that are large, and made only when somebody wants them."""
+ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {
+    "mesh.stl": encode_mesh_stl,
+    "mesh.obj": encode_mesh_obj,
+    "view.glb": encode_view_glb,
+    "coarse.glb": encode_coarse_glb,
+}
+"""Files that are made of mesh.ply, and only when somebody wants them."""
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _END_OF_HEADER = b"\nend_header\n"
@@ -57,7 +63,12 @@ def write_converted(folder: Path, name: str) -> None:
     """
     with refusals_of(folder / MESH):
         data = (folder / MESH).read_bytes()
-    write_file(folder / name, ON_REQUEST[name](decode_mesh_ply(data)))
+    write_file(folder / name, converted(data, name))
+
+
+def converted(ply: bytes, name: str) -> bytes:
+    """One of `ON_REQUEST`, made of a mesh.ply. Raises InvalidInputError: that is not as slrig wrote it."""
+    return ON_REQUEST[name](decode_mesh_ply(ply))
 
 
 def write_report(report: Mapping[str, object], path: Path) -> None:

@@ -6,7 +6,6 @@ and whoever waits for it should not wait for checks of what is known. The same m
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,15 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh
+from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
 
-_METRES_PER_MM = 0.001
-_HALF_A_TURN_ABOUT_X = (1, 0, 0, 0)  # quaternion, x y z w
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
-
-_GLB_MAGIC, _GLB_VERSION = b"glTF", 2
-_FLOAT, _UNSIGNED_BYTE, _UNSIGNED_INT = 5126, 5121, 5125
-_ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
-_POINTS, _TRIANGLES = 0, 4
 
 _OBJ_POSITION_DECIMALS, _OBJ_UNIT_DECIMALS = 5, 4
 
@@ -38,57 +31,17 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
     positions = np.ascontiguousarray(mesh.vertices_mm, dtype="<f4")
     opaque = np.full((len(mesh.grey), 4), 255, dtype=np.uint8)
     opaque[:, :3] = mesh.grey[:, None]
-    parts: list[tuple[str, NDArray[Any], dict[str, object]]] = []
+    parts = []
     if len(positions):
         ends = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-        parts.append(("POSITION", positions, {"componentType": _FLOAT, "type": "VEC3", **ends}))
+        parts.append(Part("POSITION", positions, "VEC3", ends))
         if np.isfinite(mesh.normals).all():
-            normals = np.ascontiguousarray(mesh.normals, dtype="<f4")
-            parts.append(("NORMAL", normals, {"componentType": _FLOAT, "type": "VEC3"}))
-        parts.append(("COLOR_0", opaque, {"componentType": _UNSIGNED_BYTE, "type": "VEC4", "normalized": True}))
+            parts.append(Part("NORMAL", np.ascontiguousarray(mesh.normals, dtype="<f4"), "VEC3"))
+        parts.append(Part("COLOR_0", opaque, "VEC4", {"normalized": True}))
     if len(mesh.faces):
-        indices = np.ascontiguousarray(mesh.faces, dtype="<u4").reshape(-1)
-        parts.append(("indices", indices, {"componentType": _UNSIGNED_INT, "type": "SCALAR"}))
-    length = sum(array.nbytes for _, array, _ in parts)
-    tree = json.dumps(_gltf_tree(parts, length), separators=(",", ":")).encode()
-    tree += b" " * (-len(tree) % 4)
-    chunks: list[bytes | memoryview] = [np.array([len(tree)], dtype="<u4").tobytes(), b"JSON", tree]
-    if parts:
-        chunks += [np.array([length], dtype="<u4").tobytes(), b"BIN\0"]
-        chunks += [array.reshape(-1).view(np.uint8).data for _, array, _ in parts]
-    whole = 12 + sum(len(chunk) for chunk in chunks)
-    return b"".join([_GLB_MAGIC, np.array([_GLB_VERSION, whole], dtype="<u4").tobytes(), *chunks])
-
-
-def _gltf_tree(parts: list[tuple[str, NDArray[Any], dict[str, object]]], length: int) -> dict[str, object]:
-    node: dict[str, object] = {
-        "name": "scan",
-        "rotation": [*_HALF_A_TURN_ABOUT_X],
-        "scale": [_METRES_PER_MM] * 3,
-    }
-    tree: dict[str, object] = {
-        "asset": {"version": "2.0", "generator": "slrig"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-    }
-    tree["nodes"] = [node]
-    if not parts:
-        return tree
-    views, accessors, offset = [], [], 0
-    for index, (name, array, described) in enumerate(parts):
-        target = _ELEMENT_ARRAY_BUFFER if name == "indices" else _ARRAY_BUFFER
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": target})
-        accessors.append({"bufferView": index, "count": len(array), **described})
-        offset += array.nbytes
-    places = {name: index for index, (name, _, _) in enumerate(parts)}
-    indices = places.pop("indices", None)
-    drawn = {"mode": _POINTS} if indices is None else {"mode": _TRIANGLES, "indices": indices}
-    node["mesh"] = 0
-    tree["meshes"] = [{"name": "mesh_mm", "primitives": [{"attributes": places, "material": 0, **drawn}]}]
-    # Without a dull material a viewer assumes metal, which shows little but reflections.
-    tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}, "doubleSided": True}]
-    tree |= {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": length}]}
-    return tree
+        parts.append(Part(INDICES, np.ascontiguousarray(mesh.faces, dtype="<u4").reshape(-1), "SCALAR"))
+    node = {"name": "scan", "rotation": [*HALF_A_TURN_ABOUT_X], "scale": [METRES_PER_MM] * 3}
+    return encode_glb(parts, node)
 
 
 def encode_mesh_stl(mesh: Mesh) -> bytes:

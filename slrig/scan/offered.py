@@ -12,6 +12,8 @@ MEDIA_TYPES: Mapping[str, str] = {
     "mesh.glb": "model/gltf-binary",
     "mesh.stl": "model/stl",
     "mesh.obj": "model/obj",
+    "view.glb": "model/gltf-binary",
+    "coarse.glb": "model/gltf-binary",
     "points.ply": "application/octet-stream",
     "report.json": "application/json",
     "preview.png": "image/png",
@@ -23,12 +25,24 @@ BUNDLE_ZIP = "bundle.zip"
 
 
 def rejected_picture(camera: str) -> str:
-    """The picture of a camera's refused pixels.
+    """The picture of a camera's refused pixels, for people.
 
     >>> rejected_picture("left")
     'rejected-left.png'
     """
     return f"rejected-{camera}.png"
+
+
+def causes_picture(camera: str) -> str:
+    """The same for programs: grey, a camera pixel each, whose value is the place of its cause in the report's `causes`.
+
+    >>> causes_picture("left")
+    'causes-left.png'
+    """
+    return f"causes-{camera}.png"
+
+
+CAMERA_PICTURES = (rejected_picture, causes_picture)
 
 
 def not_offered(names: Iterable[str], cameras: Iterable[str] | None) -> tuple[str, ...]:
@@ -37,10 +51,12 @@ def not_offered(names: Iterable[str], cameras: Iterable[str] | None) -> tuple[st
     >>> not_offered(["mesh.ply", "mesh.e57", "rejected-left.png"], ["right"])
     ('mesh.e57', 'rejected-left.png')
     """
-    pictures = None if cameras is None else {rejected_picture(camera) for camera in cameras}
-    before, after = rejected_picture("\0").split("\0")
+    pictures = None if cameras is None else {named(camera) for camera in cameras for named in CAMERA_PICTURES}
+    ends = [named("\0").split("\0") for named in CAMERA_PICTURES]
 
     def is_picture(name: str) -> bool:
-        return name.startswith(before) and name.endswith(after) if pictures is None else name in pictures
+        if pictures is not None:
+            return name in pictures
+        return any(name.startswith(before) and name.endswith(after) for before, after in ends)
 
     return tuple(name for name in names if name not in MEDIA_TYPES and name != BUNDLE_ZIP and not is_picture(name))

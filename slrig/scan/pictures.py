@@ -6,6 +6,7 @@ Pictures are (H, W, 3) uint8, blue, green, red, as OpenCV has them.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import cv2
@@ -40,6 +41,7 @@ _INK = (235, 233, 230)
 _LEGEND_PX = 330
 _REJECTION_WIDTH_PX = 1600 - _LEGEND_PX
 _LEGEND_ROW_PX = 30
+_LEAST_ROWS = (len(Refusal) + 2) * _LEGEND_ROW_PX
 
 # After Okabe and Ito, "Color universal design": told apart by colour-blind readers too. Blue, green, red.
 _COLOURS: dict[Refusal, tuple[int, int, int]] = {
@@ -57,6 +59,23 @@ _COLOURS: dict[Refusal, tuple[int, int, int]] = {
     Refusal.BEHIND_DEVICE: (150, 150, 0),
     Refusal.NO_INTERSECTION: (120, 40, 120),
     Refusal.SHEET_SEEN_ALONG: (90, 90, 200),
+}
+
+_WORDS: Mapping[Refusal, str] = {
+    Refusal.NONE: "measured",
+    Refusal.NOT_LIT: "no light, or too little: in shadow, or too dark",
+    Refusal.SATURATED: "too bright: the camera is at its limit",
+    Refusal.AMBIGUOUS_BIT: "the code cannot be read: its light and dark frames differ too little",
+    Refusal.BEYOND_PROJECTOR: "the code names a place that the projector has not, or a line that its border cuts",
+    Refusal.AMBIGUOUS_LINE: "on the boundary of two codes that mean different lines",
+    Refusal.STRAY_CODE: "the code differs from that of the rest of its stripe",
+    Refusal.SHORT_STRIPE: "the stripe is too short to be trusted",
+    Refusal.SHADOW_EDGE: "at the edge of a shadow, which displaces the stripe",
+    Refusal.DEPTH_EDGE: "two surfaces in one pixel: a step in depth is near",
+    Refusal.OFF_PROJECTOR: "its ray meets the light where the projector has no pixel",
+    Refusal.BEHIND_DEVICE: "its ray meets the light behind the camera or the projector",
+    Refusal.NO_INTERSECTION: "its ray does not meet the light",
+    Refusal.SHEET_SEEN_ALONG: "its ray runs along the light, so there is no depth",
 }
 
 
@@ -103,17 +122,36 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     if white is not None:
         grey, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
         picture = np.asarray(cv2.copyTo(grey, (refusals == Refusal.NONE).view(np.uint8), picture), dtype=np.uint8)
-    rows, columns = refusals.shape
-    least_rows = (len(Refusal) + 2) * _LEGEND_ROW_PX
-    enlarged = max(1, min(math.ceil(least_rows / rows), _REJECTION_WIDTH_PX // columns))
-    factor = min(float(enlarged), _REJECTION_WIDTH_PX / columns)
-    size = Size(max(1, round(columns * factor)), max(1, round(rows * factor)))
+    size = rejection_size(Size(refusals.shape[1], refusals.shape[0]))
     picture = resized(picture, size)
-    height = max(size.height_px, least_rows)
+    height = max(size.height_px, _LEAST_ROWS)
     page = np.full((height, size.width_px + _LEGEND_PX, 3), _PAGE, dtype=np.uint8)
     page[: size.height_px, : size.width_px] = picture
     _draw_legend(page, size.width_px + 16, np.bincount(refusals.ravel(), minlength=len(Refusal)))
     return page
+
+
+def rejection_size(camera: Size) -> Size:
+    """The part of `rejection_picture`, from the upper left corner, that holds the camera's pixels."""
+    enlarged = max(1, min(math.ceil(_LEAST_ROWS / camera.height_px), _REJECTION_WIDTH_PX // camera.width_px))
+    factor = min(float(enlarged), _REJECTION_WIDTH_PX / camera.width_px)
+    return Size(max(1, round(camera.width_px * factor)), max(1, round(camera.height_px * factor)))
+
+
+def described_causes() -> list[dict[str, str]]:
+    """Each cause by name, in words, and in the colour it has in a picture, at the place that is its value in the maps.
+
+    >>> described_causes()[Refusal.SATURATED]["colour"]
+    '#f0e442'
+    """
+    return [
+        {
+            "name": cause.name.lower(),
+            "words": _WORDS[cause],
+            "colour": "#{2:02x}{1:02x}{0:02x}".format(*_COLOURS[cause]),
+        }
+        for cause in Refusal
+    ]
 
 
 def encode_png(image: Picture) -> bytes:

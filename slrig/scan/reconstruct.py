@@ -32,8 +32,8 @@ from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_pl
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
-from slrig.scan.offered import rejected_picture
-from slrig.scan.pictures import encode_png, preview, rejection_picture
+from slrig.scan.offered import causes_picture, rejected_picture
+from slrig.scan.pictures import described_causes, encode_png, preview, rejection_picture, rejection_size
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.preparation import prepare_kernels
 from slrig.scan.report import (
@@ -42,6 +42,7 @@ from slrig.scan.report import (
     camera_report,
     mesh_report,
     redundancy_report,
+    view_report,
     with_seconds,
 )
 from slrig.scan.stream import CameraResult, LiveScan
@@ -108,9 +109,9 @@ def reconstruct_into(
 
     `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
 
-    Writes mesh.ply first, then mesh.glb and points.ply, then preview.png and a picture of the refused pixels per
-    camera, and report.json. Each file appears whole, and `made` is told its name; whoever keeps the folder has to bring
-    it to disk.
+    Writes mesh.ply first, then mesh.glb and points.ply, then preview.png, two pictures of the refused pixels
+    per camera, and report.json. Each file appears whole, and `made` is told its name; whoever keeps the folder has to
+    bring it to disk.
 
     Raises
     ------
@@ -170,7 +171,14 @@ def reconstruct_into(
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
-            "cameras": {each.name: camera_report(each.curves, each.exposures) for each in cameras},
+            "causes": described_causes(),
+            "cameras": {
+                each.name: {
+                    **camera_report(each.curves, each.exposures),
+                    **view_report(each.device, rejection_size(each.device.size)),
+                }
+                for each in cameras
+            },
             "redundancy": dict(meshed.redundancy),
             "mesh": {**figures, "covers_of_decoded": covered, "stages": with_seconds(meshed.stages, seconds)},
             **known,
@@ -286,6 +294,7 @@ def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, byte
     for seen in cameras:
         picture = rejection_picture(seen.curves.refusal, seen.white, int(seen.full_scale))
         encoded[rejected_picture(seen.name)] = encode_png(picture)
+        encoded[causes_picture(seen.name)] = encode_png(seen.curves.refusal)
     return encoded
 
 

@@ -15,7 +15,19 @@ from numpy.typing import NDArray
 from slrig.bundle.description import read_description
 from slrig.capture.evidence import EvidenceSummary
 from slrig.meshing.surface import FinishedMesh, Stage
-from slrig.model import Axis, Calibration, FloatArray, LineShift, Mesh, PointCurves, Refusal, Solved, Source
+from slrig.model import (
+    Axis,
+    Calibration,
+    FloatArray,
+    LineShift,
+    Mesh,
+    Pinhole,
+    PointCurves,
+    Refusal,
+    Size,
+    Solved,
+    Source,
+)
 from slrig.model.header import CaptureHeader
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.fusion import ExposureUse
@@ -78,6 +90,15 @@ def camera_report(curves: CameraCurves, exposures: Sequence[ExposureUse] = ()) -
         "bridges": int(curves.ensemble.bridge_after.sum()),
         "refined_by_all_lines": curves.refined,
         "frame_disagreement_px": curves.disagreement_px.tolist(),
+    }
+
+
+def view_report(camera: Pinhole, picture: Size) -> dict[str, object]:
+    """Where a camera stood, X_cam = R (X - centre), and which part of its picture of refused pixels is its image."""
+    return {
+        "centre_mm": camera.centre_mm.tolist(),
+        "rotation": camera.rotation.tolist(),
+        "rejected_png_px": [picture.width_px, picture.height_px],
     }
 
 

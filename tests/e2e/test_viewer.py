@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import subprocess
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +16,10 @@ from numpy.typing import NDArray
 
 from slrig.model import Mesh
 from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 from tests.e2e.viewers.f3d import SIZE_PX, f3d_picture
 from tests.e2e.viewers.three_js import three_js
+from tests.npm import npm_package
 from tests.unit.scan.test_mesh_formats import half_ball
 
 pytestmark = pytest.mark.slow
@@ -63,13 +69,37 @@ def test_f3d_by_itself_shows_the_side_that_was_scanned_upright(tmp_path: Path) -
     assert_upright_and_from_the_front(f3d_picture(tmp_path / "mesh.glb", tmp_path))
 
 
-def test_three_js_by_itself_shows_the_side_that_was_scanned_upright_and_in_metres(tmp_path: Path) -> None:
+@pytest.mark.parametrize("encode", [encode_mesh_glb, encode_view_glb])
+def test_three_js_by_itself_shows_the_side_that_was_scanned_upright_and_in_metres(
+    tmp_path: Path, encode: Callable[[Mesh], bytes]
+) -> None:
     mesh = two_shades()
-    shown = three_js(encode_mesh_glb(mesh), tmp_path)
+    shown = three_js(encode(mesh), tmp_path)
     assert_upright_and_from_the_front(shown.picture)
     placed_m = mesh.vertices_mm[np.unique(mesh.faces)] * TO_GLTF
     np.testing.assert_allclose(shown.least_m, placed_m.min(axis=0), rtol=0, atol=1e-6)
     np.testing.assert_allclose(shown.most_m, placed_m.max(axis=0), rtol=0, atol=1e-6)
+
+
+# Tells what Khronos' own validator finds in the files it is given.
+VALIDATE = """
+const validator = require(process.argv[1]), {readFileSync} = require("fs");
+Promise.all(process.argv.slice(2).map((path) => validator.validateBytes(new Uint8Array(readFileSync(path)))))
+  .then((reports) => console.log(JSON.stringify(reports.map(({issues}) => issues))));
+"""
+
+
+def test_the_validator_of_the_format_finds_nothing_to_say(tmp_path: Path) -> None:
+    package = npm_package("gltf-validator@2.0.0-dev.3.10", "to validate a GLB")
+    mesh = two_shades()
+    meshes = [mesh, half_ball(200, 200), replace(mesh, faces=mesh.faces[:1]), replace(mesh, faces=mesh.faces[:0])]
+    encoders = (encode_mesh_glb, encode_view_glb, encode_coarse_glb)
+    paths = [str(tmp_path / f"{each}.glb") for each in range(len(meshes) * len(encoders))]
+    for path, (encode, shape) in zip(paths, product(encoders, meshes), strict=True):
+        Path(path).write_bytes(encode(shape))
+    command = ["node", "-e", VALIDATE, str(package), *paths]
+    told = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)  # noqa: S603
+    assert [issues["messages"] for issues in told] == [[]] * len(paths)
 
 
 def from_the_eye(mesh: Mesh, folder: Path) -> NDArray[np.uint8]:

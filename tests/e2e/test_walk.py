@@ -29,6 +29,7 @@ def test_scan_of_the_rendered_rig_gives_a_mesh_whose_bundle_gives_it_again(
         "preview.png",
         "report.json",
         "rejected-left.png",
+        "causes-left.png",
         "bundle.zip",
     )
     chosen = [argument for name in files for argument in ("--file", name)]

@@ -476,9 +476,15 @@ def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path
     ("name", "cameras", "told"),
     [
         ("mesh.e57", ["left"], "a scan has no mesh.e57. There are: mesh.ply, "),
-        ("rejected-top.png", ["left"], "no rejected-top.png. There are: .*, rejected-left.png, bundle.zip"),
+        (
+            "rejected-top.png",
+            ["left"],
+            "There are: .*, rejected-left.png, causes-left.png, bundle.zip",
+        ),
         ("rejected-top.png", [], None),
         ("rejected-left.png", ["left"], None),
+        ("causes-left.png", ["left"], None),
+        ("causes-top.png", ["left"], "no causes-top.png"),
         ("bundle.zip", ["left"], None),
     ],
 )

@@ -30,7 +30,7 @@ def test_link_among_the_files_of_a_scan_is_not_served(client: TestClient, served
     (place / "bundle" / "more").symlink_to(tmp_path)
     files = client.get(f"/scan/{scan}").json()["links"]["files"]
     assert sorted(files) == ["bundle.zip", "mesh.glb", "points.ply"]
-    for name in ("report.json", "preview.png", "mesh.obj", "mesh.stl", "mesh.ply"):
+    for name in ("report.json", "preview.png", "mesh.obj", "mesh.stl", "view.glb", "mesh.ply"):
         answer = client.get(f"/scan/{scan}/{name}")
         assert (answer.status_code, answer.json()["type"]) == (409, "/problems/artefact-not-ready"), name
     with zipfile.ZipFile(io.BytesIO(client.get(files["bundle.zip"]).content)) as archive:

@@ -9,6 +9,7 @@ import zipfile
 from typing import Any
 from uuid import UUID, uuid4
 
+import numpy as np
 import pytest
 import trimesh
 from fastapi.testclient import TestClient
@@ -17,6 +18,7 @@ from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
+from slrig.scan.artefacts import ON_REQUEST
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.scan.fakes import WAIT_S
 
@@ -52,6 +54,7 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     files = done["links"]["files"]
     assert set(files) == {
         "bundle.zip",
+        "coarse.glb",
         "mesh.glb",
         "mesh.obj",
         "mesh.ply",
@@ -59,13 +62,14 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
         "points.ply",
         "preview.png",
         "report.json",
+        "view.glb",
     }
     for name, path in files.items():
         assert client.get(path).status_code == 200, name
     assert client.get(files["report.json"]).json()["truth"] == {"rms_mm": 0.01}
 
 
-@pytest.mark.parametrize("name", ["mesh.obj", "mesh.stl"])
+@pytest.mark.parametrize("name", ["mesh.obj", "mesh.stl", "view.glb", "coarse.glb"])
 def test_other_formats_of_the_mesh_are_made_when_asked_for_and_kept(
     client: TestClient, served: ServedBench, name: str
 ) -> None:
@@ -78,7 +82,11 @@ def test_other_formats_of_the_mesh_are_made_when_asked_for_and_kept(
     made = place / name
     assert first.content == made.read_bytes()
     found = trimesh.load(io.BytesIO(first.content), file_type=name[-3:], process=False)
-    assert found.triangles.tolist() == [[[0, 0, 0], [10, 0, 0], [0, 10, 0]]]
+    if isinstance(found, trimesh.Scene):
+        assert first.headers["Content-Type"] == "model/gltf-binary"
+        (found,) = found.dump()
+        found.apply_transform(np.diag([1000, -1000, -1000, 1]))
+    np.testing.assert_allclose(found.triangles, [[[0, 0, 0], [10, 0, 0], [0, 10, 0]]], rtol=0, atol=1e-9)
     before = made.stat()
     part = client.get(f"/scan/{scan['id']}/{name}", headers={"Range": "bytes=5-9"})
     assert (part.status_code, part.content) == (206, first.content[5:10])
@@ -282,14 +290,20 @@ def test_mesh_can_be_fetched_while_pictures_and_figures_are_made(client: TestCli
     scan_id = client.post("/scan").json()["id"]
     await_announcement(served.service.store, UUID(scan_id))
     scan = client.get(f"/scan/{scan_id}").json()
-    assert (scan["state"], list(scan["links"]["files"])) == ("computing", ["mesh.ply"])
+    assert (scan["state"], list(scan["links"]["files"])) == (
+        "computing",
+        ["coarse.glb", "mesh.obj", "mesh.ply", "mesh.stl", "view.glb"],
+    )
     early = client.get(scan["links"]["files"]["mesh.ply"])
     assert (early.status_code, early.headers["ETag"]) == (200, f'"{scan_id}/mesh.ply"')
     # The rig is free of it, and says what it computes.
     rig = client.get("/rig").json()
     assert (rig["holder"], rig["computing"], rig["backlog_length"]) == (None, [scan_id], 16)
-    # What is made of the mesh, and what is not there yet, waits for the end.
-    for name in ("mesh.stl", "report.json", "bundle.zip"):
+    # What is made of the mesh is there with it, and kept when the scan is in its place.
+    converted = {name: client.get(scan["links"]["files"][name]).content for name in ON_REQUEST}
+    assert [path.name for path in served.service.folder.result(UUID(scan_id)).iterdir()] == ["mesh.ply"]
+    # What is not there yet waits for the end.
+    for name in ("mesh.glb", "report.json", "bundle.zip"):
         refused = client.get(f"/scan/{scan_id}/{name}")
         assert (refused.status_code, refused.json()["type"]) == (409, "/problems/artefact-not-ready")
     (served.service.folder.staging(UUID(scan_id)) / "bundle" / "go-on").touch()
@@ -299,6 +313,8 @@ def test_mesh_can_be_fetched_while_pictures_and_figures_are_made(client: TestCli
     scan = ended(client, scan_id)
     assert (scan["state"], "report.json" in scan["links"]["files"]) == ("succeeded", True)
     assert client.get(f"/scan/{scan_id}/mesh.ply").content == early.content
+    assert {name: client.get(f"/scan/{scan_id}/{name}").content for name in ON_REQUEST} == converted
+    assert {path.name for path in served.service.folder.scan(UUID(scan_id)).iterdir()} > set(ON_REQUEST)
 
 
 def await_announcement(store: JobStore, scan_id: UUID) -> None:
@@ -370,6 +386,8 @@ def test_picture_of_refused_pixels_goes_by_camera(client: TestClient, served: Se
     (served.service.folder.scans / scan["id"] / "rejected-left.png").write_bytes(b"png")
     assert client.get(f"/scan/{scan['id']}/rejected-left.png").content == b"png"
     assert client.get(f"/scan/{scan['id']}/rejected-right.png").status_code == 409
+    (served.service.folder.scans / scan["id"] / "causes-left.png").write_bytes(b"grey")
+    assert client.get(f"/scan/{scan['id']}/causes-left.png").content == b"grey"
     assert client.get(f"/scan/{scan['id']}/rejected-..%2Fmesh.png").status_code in {404, 422}
 
 

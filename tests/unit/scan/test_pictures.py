@@ -14,7 +14,7 @@ from slrig.errors import StorageError
 from slrig.meshing import rasteriser
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import pictures
-from slrig.scan.pictures import _COLOURS, encode_png, preview, rejection_picture
+from slrig.scan.pictures import _COLOURS, described_causes, encode_png, preview, rejection_picture
 
 SIZE = Size(640, 480)
 PANEL = Size(520, 390)
@@ -228,6 +228,9 @@ def test_pictures_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Mon
 def test_every_cause_has_a_colour_of_its_own() -> None:
     assert set(_COLOURS) == set(Refusal)
     assert len(set(_COLOURS.values())) == len(Refusal)
+    described = described_causes()
+    assert [each["name"].upper() for each in described] == [cause.name for cause in Refusal]
+    assert len({each["words"] for each in described}) == len(Refusal)
 
 
 def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,7 +26,7 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
-from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Shot, Size, White
+from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Refusal, Shot, Size, White
 from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
@@ -84,8 +85,21 @@ def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(recorded: Path, tmp
     report = run(recorded, tmp_path / "out")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"mesh.ply", "mesh.glb", "points.ply", "report.json", "preview.png"} <= names
-    assert any(name.startswith("rejected-") for name in names)
     written = json.loads((tmp_path / "out" / "report.json").read_text())
+    for camera, told in written["cameras"].items():
+        causes = cv2.imread(str(tmp_path / "out" / f"causes-{camera}.png"), cv2.IMREAD_UNCHANGED)
+        assert causes is not None
+        assert causes.shape == tuple(reversed(written["frames"]["cameras_px"][camera]))
+        counts = np.bincount(causes.ravel(), minlength=len(written["causes"]))
+        named = {each["name"]: int(count) for each, count in zip(written["causes"], counts, strict=True)}
+        assert named.pop("none") > 0
+        assert named == told["refused_pixels"]
+        picture = cv2.imread(str(tmp_path / "out" / f"rejected-{camera}.png"))
+        assert picture is not None
+        width, height = told["rejected_png_px"]
+        row, column = (each[len(each) // 2] for each in np.nonzero(causes == Refusal.NOT_LIT))
+        at = (int((row + 0.5) / causes.shape[0] * height), int((column + 0.5) / causes.shape[1] * width))
+        assert tuple(picture[at]) == (30, 26, 24)
     assert written["mesh"]["initial"] == report["mesh"]["initial"]  # type: ignore[index]
     initial = written["mesh"]["initial"]
     assert initial["triangles"] == initial["strip_triangles"] - initial["dropped_triangles"]

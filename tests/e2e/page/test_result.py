@@ -1,0 +1,175 @@
+"""A scan's result as somebody looks at it: the mesh, what is measured on it, why pixels are missing, its files."""
+
+from __future__ import annotations
+
+import json
+import re
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from slrig.model import FloatArray, Refusal
+from tests.e2e.conftest import Start, write_rig
+from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.test_browser import scanned
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+pytestmark = pytest.mark.slow
+
+# Of tests.e2e.conftest: where the plate, the camera and what it looks at are.
+PLATE_NORMAL: FloatArray = Rotation.from_euler("xyz", (8.0, -12.0, 0.0), degrees=True).as_matrix()[:, 2]
+EYE_MM: FloatArray = np.array((-150.0, -12.0, -560.0))
+HALF_FIELD = np.tan(np.radians(15))
+
+
+def on_plate(right: float, down: float) -> FloatArray:
+    """Where on the plate, mm, the view from the camera looks, in half heights of the picture from its middle."""
+    forward = -EYE_MM / np.linalg.norm(EYE_MM)
+    sideways = np.cross((0.0, 1.0, 0.0), forward)
+    sideways /= np.linalg.norm(sideways)
+    ray = forward + HALF_FIELD * (right * sideways + down * np.cross(forward, sideways))
+    return np.asarray(EYE_MM - ray * (EYE_MM @ PLATE_NORMAL) / (ray @ PLATE_NORMAL))
+
+
+def picture(page: Page) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8, blue, green, red: the mesh as it is shown, once it stands still and is whole."""
+    page.wait_for_timeout(600)
+    page.locator("canvas[data-level=full]").wait_for()
+    shot = page.locator("canvas").screenshot()
+    decoded = cv2.imdecode(np.frombuffer(shot, dtype=np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.asarray(decoded, dtype=np.uint8)
+
+
+def orange(shown: NDArray[np.uint8]) -> float:
+    """The share of a picture that shows the other scan."""
+    return float((shown[..., 2].astype(int) - shown[..., 0] > 60).mean())
+
+
+def measured(page: Page, right: float, down: float) -> None:
+    """Click on the mesh, in half heights of the picture from its middle."""
+    box = page.locator("canvas").bounding_box()
+    assert box is not None
+    x, y = (box["width"] + right * box["height"]) / 2, (1 + down) * box["height"] / 2
+    page.locator("canvas").click(position={"x": x, "y": y})
+
+
+def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    first, scan = scanned(service), scanned(service)
+    folder = service.data / "scans" / scan.rpartition("/")[2]
+    report = json.loads((folder / "report.json").read_text())
+    page = visit(service, scan[1:], size=(1280, 1100), ignored="404")
+    plain = picture(page)
+    page.get_by_text(f"{report['mesh']['figures']['triangles']:,} triangles.").wait_for()
+    assert (plain != plain[20, 20]).any(axis=2).mean() > 0.3
+    page.screenshot(path=str(tmp_path / "result.png"), full_page=True)
+
+    page.get_by_role("button", name="Stripe").click()
+    page.get_by_text(f"{report['frames']['projector_px'][0]} px").wait_for()
+    coloured = picture(page)
+    row = coloured[len(coloured) // 2]
+    shown = np.flatnonzero((row != coloured[20, 20]).any(axis=1))[10:-10]
+    greens = [float(part.mean()) for part in np.array_split(row[shown, 1].astype(float), 6)]
+    assert all(before < after for before, after in pairwise(greens)), greens
+    page.get_by_role("button", name="σ").click()
+    page.get_by_text(f"{report['mesh']['sigma_mm']['p95'] * 1000:.3g} µm").first.wait_for()
+    assert (picture(page) != coloured).any()
+    page.get_by_role("button", name="Albedo").click()
+    albedo = picture(page)
+    assert (albedo[..., 0] == albedo[..., 2]).mean() > 0.9, "a grey plate"
+
+    # Truth is the plate's own geometry: the camera looks at its middle.
+    page.get_by_role("button", name="From left").click()
+    page.get_by_role("button", name="Measure").click()
+    page.locator("canvas").focus()
+    page.keyboard.press("Enter")
+    measured(page, 0.12, -0.1)
+    page.get_by_text("Distances").wait_for()
+    told = page.locator(".distances tbody td").all_inner_texts()
+    points = np.array([[float(mm) for mm in line.split(", ")] for line in told[3].splitlines()])
+    expected = np.array((on_plate(0.0, 0.0), on_plate(0.12, -0.1)))
+    assert np.abs((points - expected) @ PLATE_NORMAL).max() < 0.1
+    # A click is right to a pixel of the screen, half a millimetre of the plate.
+    assert np.linalg.norm(points - expected, axis=1).max() < 0.6
+    distance_mm = float(np.linalg.norm(points[1] - points[0]))
+    assert float(told[1].removesuffix(" mm")) == pytest.approx(distance_mm, abs=0.002)
+    assert distance_mm == pytest.approx(np.linalg.norm(expected[1] - expected[0]), abs=0.8)
+    sigma = re.fullmatch(r"([\d.]+) µm", told[2])
+    assert sigma is not None
+    assert 1.0 < float(sigma[1]) / 1000 / report["mesh"]["sigma_mm"]["p50"] < 3.0
+
+    causes = cv2.imread(str(folder / "causes-left.png"), cv2.IMREAD_UNCHANGED)
+    assert causes is not None
+    for cause, words in ((Refusal.NONE, "measured"), (Refusal.NOT_LIT, "refused: no light, or too little")):
+        rows, columns = np.nonzero(causes == cause)
+        row_px, column_px = rows[len(rows) // 2], columns[len(columns) // 2]
+        area = page.locator(".causes")
+        box = area.bounding_box()
+        assert box is not None
+        area.hover(
+            position={
+                "x": (column_px + 0.5) * box["width"] / causes.shape[1],
+                "y": (row_px + 0.5) * box["height"] / causes.shape[0],
+            }
+        )
+        page.get_by_text(f"Column {column_px}, row {row_px}: {words}").wait_for()
+
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download the mesh").click()
+    assert Path(download.value.path()).read_bytes() == (folder / "mesh.ply").read_bytes()
+
+    page.get_by_label("with").select_option(first.rpartition("/")[2])
+    page.get_by_text(re.compile(r"Other scan: [\d,]+ triangles")).wait_for()
+    mine, theirs = (
+        json.loads((service.data / "scans" / path.rpartition("/")[2] / "report.json").read_text())["mesh"]["figures"]
+        for path in (scan, first)
+    )
+    difference = theirs["triangles"] - mine["triangles"]
+    written = f"{'−' if difference < 0 else '+'}{abs(difference):,}"
+    page.get_by_role("row", name="Triangles").get_by_role("cell", name=written, exact=True).wait_for()
+    page.get_by_role("button", name="Shaded").click()
+    page.locator("canvas").focus()
+    page.keyboard.press("b")
+    assert orange(picture(page)) < 0.001
+    page.keyboard.press("b")
+    assert orange(picture(page)) > 0.05
+    page.keyboard.press("ArrowLeft")
+    assert violations(page) == []
+
+    with service.client() as client:
+        client.delete(scan)
+    page.get_by_text("It was deleted, or the address is not right.").wait_for()
+
+
+def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig", head="realtime = true"))
+    with service.client() as client:
+        scan: str = client.start({"label": "a wrong one"})["links"]["self"]
+    page = visit(service, scan[1:], size=PHONE, dark=True)
+    page.get_by_role("button", name="Stop it").click()
+    page.get_by_text("The scan was stopped").wait_for()
+    assert page.get_by_text("Download the mesh").count() == 0
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+    page.get_by_role("button", name="Scan again").click()
+    page.wait_for_url(re.compile(r"#/scan$"))
+    # The result shows itself as soon as there is a mesh, while the rest is computed.
+    page.wait_for_url(re.compile(r"#/scan/.+"))
+    page.locator("canvas[data-level=full]").wait_for()
+    page.get_by_text("Size").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+    page.get_by_role("button", name="Keep it for good").click()
+    page.get_by_role("button", name="Kept for good").wait_for()
+    page.get_by_role("button", name="Delete").click()
+    page.get_by_role("button", name="Delete it").click()
+    page.get_by_text("Recent scans").wait_for()
