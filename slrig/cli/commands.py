@@ -147,6 +147,9 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
+    colour: Annotated[
+        bool | None, typer.Option(help="Keep white and black frames in colour. Default: where a camera has it.")
+    ] = None,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
 ) -> None:
@@ -170,6 +173,7 @@ def scan(
         ),
         "if_busy": "queue" if queue else "reject",
         "patterns": patterns,
+        "colour": colour,
         "reconstruction": given(**asdict(mesh)),
     }
     files = tuple(file or FILES)
