@@ -55,15 +55,11 @@ def read_colour(path: Path, camera: CameraFormat) -> Pixels:
     """Return a file's picture in colour, (H, W, 3) of blue, green and red. Raises BundleError: see `read_pages`; or it
     is grey, or a sample lies beyond the camera's full scale.
     """
-    colours = read_with_colour(path, (0,), camera, coloured=(0,))[1]
-    if 0 not in colours:
-        _refuse(
-            path,
-            f"a colour image with samples of 0 to {camera.full_scale}",
-            "a grey one, or a brighter sample",
-            "save it in colour, or remove colour_file from its entry in bundle.json",
-        )
-    return colours[0]
+    found = read_with_colour(path, (0,), camera, coloured=(0,))[1]
+    if not found:
+        wanted = f"a colour image with samples of 0 to {camera.full_scale}"
+        _refuse(path, wanted, "a grey one, or a brighter sample", "save it in colour, or leave colour_file out")
+    return found[0]
 
 
 def read_with_colour(

@@ -48,15 +48,14 @@ def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo]) -> frozenset[st
     """The cameras whose white and black frames a plan keeps in colour.
     Raises UnsupportedByDeviceError: it asks for colour, and a camera has none.
     """
-    having = frozenset(name for name, camera in cameras.items() if camera.colour)
-    if plan.colour and having != set(cameras):
-        mono = ", ".join(f"'{name}'" for name in cameras if name not in having)
+    mono = [name for name, camera in cameras.items() if not camera.colour]
+    if plan.colour and mono:
         message = (
-            f"{setting('colour')}: asked for, and camera {mono} has none, or its driver was told to read it in grey. "
-            "Leave it out, and the cameras that have colour give it."
+            f"{setting('colour')}: asked for, and camera '{mono[0]}' has none in the format that it is read in. Leave "
+            "it out, and the cameras that have colour give it."
         )
         raise UnsupportedByDeviceError(message)
-    return having if plan.colour is not False else frozenset()
+    return frozenset(cameras if plan.colour is not False else ()).difference(mono)
 
 
 def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
@@ -75,11 +74,8 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
     sequence = pattern_sequence(
         plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded
     )
-    count, ends = (
-        number * max(len(exposures_s), 1)
-        for number in (len(sequence), sum(isinstance(each, White | Black) for each in sequence.patterns))
-    )
-    coloured = in_colour(plan, facts.cameras)
+    count, coloured = len(sequence) * max(len(exposures_s), 1), in_colour(plan, facts.cameras)
+    ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * max(len(exposures_s), 1)
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0
     for name, camera in facts.cameras.items():
