@@ -111,7 +111,7 @@ def grey(data: bytes, form: PixelFormat, size: Size, *, padding_bytes: int = 0, 
     if not in_colour:
         return np.asarray(cv2.cvtColor(image, _GREY[form.mosaic]))
     if form.samples > 1:
-        return image if form.mosaic == "BGR" else np.ascontiguousarray(image[..., ::-1])
+        return image if form.mosaic == "BGR" else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{form.mosaic}2BGR")))
 
 

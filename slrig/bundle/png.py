@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 
+import cv2
 import numpy as np
 from isal import isal_zlib
 
@@ -36,7 +37,7 @@ def encode_frame(image: Pixels, name: str) -> bytes:
         raise BundleError(f"{name}: expected an image of 8 or 16 bits, found {image.shape} {image.dtype}")
     height, width = image.shape[:2]
     # A PNG's colours are red, green and blue.
-    ordered = image if kind == GREY else image[..., ::-1].reshape(height, -1)
+    ordered = image if kind == GREY else cv2.cvtColor(image, cv2.COLOR_BGR2RGB).reshape(height, -1)
     samples = np.ascontiguousarray(ordered, dtype=">u2" if image.itemsize == 2 else np.uint8).view(np.uint8)
     rows = np.zeros((height, 1 + samples.shape[1]), dtype=np.uint8)
     rows[:, 0] = _UP

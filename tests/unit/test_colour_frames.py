@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from drivers.replay import ReplayHead
 from slrig.bundle import read_bundle, read_capture, write_bundle
 from slrig.bundle.reading import open_bundle
 from slrig.capture.evidence import EvidenceSummary
+from slrig.devices import Rig
 from slrig.errors import BundleError, UnsupportedByDeviceError
 from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Shot, White
 from slrig.model.header import CaptureHeader
@@ -196,6 +198,20 @@ def test_colour_is_left_out_or_refused_as_was_asked(tmp_path: Path) -> None:
     assert not (tmp_path / "refused").exists()
     infos = {name: camera.info for name, camera in coloured_rig().cameras.items() if name == "left"}
     assert in_colour(ScanPlan(colour=True), infos) == {"left"}
+
+
+def test_a_replayed_recording_has_the_colour_that_was_recorded(tmp_path: Path) -> None:
+    captured(coloured_rig(), tmp_path / "first")
+    head = ReplayHead(read_bundle(tmp_path / "first"))
+    assert {name: camera.info.colour for name, camera in head.cameras.items()} == {"left": True, "right": False}
+    rig = Rig("replay", head.cameras, head.projector, {}, head=head, clock=head.clock)
+    again = tmp_path / "again"
+    capture_frames(rig, ScanPlan(), again, progress=lambda *_: None, cancelled=lambda: False).finish()
+    for one, other in zip(read_bundle(tmp_path / "first").capture.shots, read_bundle(again).capture.shots, strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+        assert (one.colour is None) == (other.colour is None)
+        if one.colour is not None and other.colour is not None:
+            np.testing.assert_array_equal(one.colour, other.colour)
 
 
 def sequence_of(fake: FakeRig) -> PatternSequence:
