@@ -163,14 +163,11 @@ def scan(
         line_shift=False if gray_only else None,
         rows=rows or None,
     )
+    times_s = exposure_s or []
     request = {
         "label": label,
         # One exposure time is one, several are a bracket.
-        **(
-            {"exposures_s": exposure_s}
-            if len(exposure_s or ()) > 1
-            else {"exposure_s": next(iter(exposure_s or ()), None)}
-        ),
+        **({"exposures_s": times_s} if times_s[1:] else {"exposure_s": next(iter(times_s), None)}),
         "if_busy": "queue" if queue else "reject",
         "patterns": patterns,
         "colour": colour,
