@@ -62,6 +62,9 @@ class ScanDefaults(Strict):
         description="a bracket: play the sequence once for each of these exposures, and fuse the frames. On a video "
         "projector, whole refresh periods",
     )
+    colour: bool | None = Field(
+        default=None, description="keep white and black frames in colour. Default: where a camera has it"
+    )
 
 
 class DriverTable(Strict, use_attribute_docstrings=True):

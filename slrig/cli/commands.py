@@ -147,6 +147,9 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
+    colour: Annotated[
+        bool | None, typer.Option(help="Keep white and black frames in colour. Default: where a camera has it.")
+    ] = None,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
     repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
@@ -155,20 +158,21 @@ def scan(
     """Scan with a running service, and fetch the mesh."""
     from slrig.cli.scan import FILES, scan_with, series_with, tell_result
 
-    exposures = exposure_s or []
-    patterns = given(
-        line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
-        line_shift=False if gray_only else None, rows=rows or None,
-    )  # fmt: skip
-    request = {
-        "label": label,
+    request = given(
+        label=label,
         # One exposure time is one, several are a bracket.
-        **({"exposures_s": exposures} if len(exposures) > 1 else {"exposure_s": next(iter(exposures), None)}),
-        "if_busy": "queue" if queue else "reject",
-        "patterns": patterns,
-        "reconstruction": given(**asdict(mesh)),
-        **given(repeat=repeat if repeat > 1 else None, every_s=every_s),
-    }
+        exposure_s=exposure_s[0] if exposure_s and len(exposure_s) == 1 else None,
+        exposures_s=exposure_s if exposure_s and len(exposure_s) > 1 else None,
+        if_busy="queue" if queue else "reject",
+        colour=colour,
+        repeat=repeat if repeat > 1 else None,
+        every_s=every_s,
+        patterns=given(
+            line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
+            line_shift=False if gray_only else None, rows=rows or None,
+        ),
+        reconstruction=given(**asdict(mesh)),
+    )  # fmt: skip
     files = tuple(file or FILES)
     with service.client() as client:
         if repeat > 1:

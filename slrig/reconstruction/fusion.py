@@ -219,6 +219,22 @@ def _fused(images: Sequence[NDArray[Any]], gains: NDArray[np.float32]) -> Image:
     return np.asarray(total, dtype=np.float32)
 
 
+def fused_colour(repeats: Sequence[Sequence[NDArray[Any]]], fused: FusedFrames, full_scale: float) -> Image:
+    """(H, W, 3) float32: a pattern's frames in colour, in units of the longest exposure: of each channel the exposures
+    that did not clip it, by their light; what all clip, as the shortest has it.
+
+    repeats : of each exposure, from long to short, as `fused` has them.
+    """
+    total = np.zeros(repeats[0][0].shape, dtype=np.float32)
+    weight = np.zeros_like(total)
+    for light, images in zip(fused.light, repeats, strict=True):
+        usable = np.max(images, axis=0) < _NEARLY_FULL * full_scale
+        np.add(total, mean_image(images), out=total, where=usable)
+        np.add(weight, np.float32(light), out=weight, where=usable)
+    shortest = mean_image(repeats[-1]) / np.float32(fused.light[-1])
+    return np.asarray(np.divide(total, weight, out=shortest.astype(np.float32), where=weight > 0))
+
+
 def exposure_use(fused: FusedFrames, used: NDArray[np.bool_]) -> tuple[ExposureUse, ...]:
     """What each exposure gave to the pixels `used`, (H, W) bool; from short to long."""
     count = max(int(np.count_nonzero(used)), 1)

@@ -9,12 +9,28 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
-from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Pattern, Pinhole, Pixels, Refusal, Shot, Size
+from slrig.model import (
+    Axis,
+    Black,
+    Calibration,
+    Capture,
+    Gray,
+    LineShift,
+    Pattern,
+    Pinhole,
+    Pixels,
+    Refusal,
+    Shot,
+    Size,
+    White,
+    exposure_groups,
+)
 from slrig.model.header import CaptureHeader
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
@@ -27,8 +43,9 @@ from slrig.reconstruction.frames import (
     exposure_count,
     mean_image,
     telling,
+    telling_shots,
 )
-from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_frames
+from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_colour, fused_frames
 from slrig.scan.light_axis import chosen_axis
 from slrig.scan.report import Stopwatch
 
@@ -47,6 +64,8 @@ class CameraResult:
 
     white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white. A bracket's are
     those of the longest exposure, and go beyond the camera's full scale. exposures : of a bracket, from short to long.
+    white_colour, black_colour : (H, W, 3) uint8, uint16 or float32, blue, green and red in the same units, as the
+    camera gave them: `curves.gamma` tells how it bent its values, where the frames tell it; None without colour.
     """
 
     name: str
@@ -56,6 +75,8 @@ class CameraResult:
     largest_contrast: float
     full_scale: float
     exposures: tuple[ExposureUse, ...] = ()
+    white_colour: NDArray[Any] | None = None
+    black_colour: NDArray[Any] | None = None
 
 
 class ScanStream:
@@ -102,7 +123,9 @@ class ScanStream:
         seen = []
         for name in list(self._cameras):
             # What it held of its frames is not needed any more, and the memory is.
-            curves, frames, fused = self._cameras.pop(name).finish()
+            camera = self._cameras.pop(name)
+            curves, frames, fused = camera.finish()
+            white, black = (camera.colour(each, fused) for each in (White(), Black()))
             used = curves.refusal == Refusal.NONE
             seen.append(
                 CameraResult(
@@ -113,6 +136,8 @@ class ScanStream:
                     largest_contrast=float(frames.contrast.max()),
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
+                    white_colour=white,
+                    black_colour=black,
                 )
             )
         return seen
@@ -132,6 +157,7 @@ class _CameraFrames:
         self._entered = lambda stage: entered(stage, name)
         self._kept: list[Shot] = []
         self._repeats: dict[Pattern, list[Pixels]] = {}
+        self._colours: defaultdict[Pattern, list[tuple[float | None, Pixels]]] = defaultdict(list)
         listed = [index for index, camera in header.frames if camera == name]
         shown = [header.patterns[index] for index in listed]
         tells = telling(shown, [None] * len(shown))
@@ -164,6 +190,7 @@ class _CameraFrames:
         if self._waiting[shot.pattern] == 0:
             return
         self._waiting[shot.pattern] -= 1
+        self._keep_colour(shot)
         pattern = self._header.patterns[shot.pattern]
         repeats = self._repeats.setdefault(pattern, [])
         repeats.append(shot.image)
@@ -176,6 +203,8 @@ class _CameraFrames:
             return *self._stream.finish(), None
         header, fused = self._header, None
         capture = Capture(header.projector, header.patterns, header.cameras, tuple(self._kept))
+        for shot in telling_shots(capture, self._name):
+            self._keep_colour(shot)
         if exposure_count([shot.exposure_s for shot in self._kept]) > 1:
             fused = fused_frames(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
@@ -183,6 +212,22 @@ class _CameraFrames:
             frames, noise = axis_frames(capture, self._name, self._axis), None
         tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
         return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
+
+    def _keep_colour(self, shot: Shot) -> None:
+        if shot.colour is not None:
+            self._colours[self._header.patterns[shot.pattern]].append((shot.exposure_s, shot.colour))
+
+    def colour(self, pattern: White | Black, fused: FusedFrames | None) -> NDArray[Any] | None:
+        """(H, W, 3): a pattern in colour, in the units of its grey image; None where not every exposure has colour."""
+        found = self._colours.pop(pattern, [])
+        if fused is None:
+            return mean_image([image for _, image in found]) if found else None
+        alike = exposure_groups(each for each, _ in found)
+        groups = sorted({each or 0.0 for each in alike.values()}, reverse=True)
+        if len(groups) < len(fused.exposures_s):
+            return None
+        images = [[image for each, image in found if alike[each] == time_s] for time_s in groups]
+        return fused_colour(images, fused, float(self._header.cameras[self._name].full_scale))
 
 
 class LiveScan(ScanStream):
