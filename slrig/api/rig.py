@@ -23,6 +23,7 @@ from slrig.discovery import found_devices, installed_drivers
 from slrig.errors import SlrigError
 from slrig.jobs.records import utc_now
 from slrig.rig.preview import Light, Watch
+from slrig.rig.settings import SettingsInUse
 from slrig.scan.runner import RunnerStatus
 
 _BOUNDARY = "picture"
@@ -51,7 +52,7 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 def look_at_rig(service: Serving) -> RigBody:
     """Return the rig: its devices, who holds it, and how many scans wait. Touches no device."""
     status = service.runner.status()
-    facts = status.facts
+    facts, settings = status.facts, service.runner.queue.rig.settings
     return filled(
         RigBody,
         status,
@@ -61,7 +62,7 @@ def look_at_rig(service: Serving) -> RigBody:
         calibrated=None if facts is None else (status.active is not None or facts.calibration is not None),
         calibration=_in_use(status),
         positions=[] if facts is None else facts.positions,
-        cameras=[] if facts is None else [_camera(name, camera) for name, camera in facts.cameras.items()],
+        cameras=[] if facts is None else [_camera(*each, settings.get(each[0])) for each in facts.cameras.items()],
         projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
     )
@@ -92,9 +93,19 @@ def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
     )
 
 
-def _camera(name: str, camera: CameraInfo) -> CameraBody:
-    form, triggers = camera.format, sorted(camera.triggers)
-    return filled(CameraBody, camera, name=name, size_px=form.size, bit_depth=form.bit_depth, triggers=triggers)
+def _camera(name: str, camera: CameraInfo, settings: SettingsInUse | None) -> CameraBody:
+    form, applied = camera.format, None if settings is None else settings.applied
+    return filled(
+        CameraBody,
+        camera,
+        name=name,
+        size_px=form.size,
+        bit_depth=form.bit_depth,
+        triggers=sorted(camera.triggers),
+        exposure_s=None if applied is None else applied.exposure_s,
+        gain=None if applied is None else applied.gain,
+        notes=[*camera.notes, *(() if settings is None else settings.words)],
+    )
 
 
 @router.get("/preview/{camera}", response_class=Response, responses={**_STREAM, **problems(409, 429, 502, 503)})

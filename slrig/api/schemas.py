@@ -249,7 +249,7 @@ Extent = Annotated[
 
 
 class CameraBody(BaseModel):
-    """A camera of the rig, as it declares itself."""
+    """A camera of the rig, as it declares itself, and as it is set."""
 
     name: str
     model: str
@@ -260,6 +260,13 @@ class CameraBody(BaseModel):
     exposure_range_s: tuple[float, float]
     gain_range: tuple[float, float]
     colour: bool
+    exposure_s: float | None = Field(
+        description="in use, as the camera read it back when it was last set; null before the first picture or scan"
+    )
+    gain: float | None = Field(description="in use, likewise")
+    notes: list[str] = Field(
+        description="what its driver tells of how it runs, and settings that it refused or bent; each with what to do"
+    )
 
 
 class ProjectorBody(BaseModel):

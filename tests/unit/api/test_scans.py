@@ -16,9 +16,11 @@ from fastapi.testclient import TestClient
 
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
+from slrig.devices import AppliedSettings, CameraSettings
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.artefacts import ON_REQUEST
+from slrig.rig.settings import SettingsInUse
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.scan.fakes import WAIT_S
 
@@ -411,8 +413,16 @@ def test_disk_without_room_is_told_before_the_scan(client: TestClient, served: S
     assert "are free" in ready.json()["checks"]["disk"]
 
 
-def test_rig_says_what_it_is(client: TestClient) -> None:
+def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, served: ServedBench) -> None:
     ended(client, client.post("/scan").json()["id"])
+    camera = client.get("/rig").json()["cameras"][0]
+    assert (camera["exposure_s"], camera["gain"], camera["notes"]) == (None, None, [])
+    settings = served.service.runner.queue.rig.settings
+    settings[camera["name"]] = SettingsInUse(CameraSettings(0.02), AppliedSettings(0.01, 1.0))
+    camera = client.get("/rig").json()["cameras"][0]
+    assert (camera["exposure_s"], camera["gain"]) == (0.01, 1.0)
+    assert "asked for an exposure of 20 ms, and uses 10 ms" in camera["notes"][0]
+    settings.clear()
     rig = client.get("/rig").json()
     assert (rig["name"], rig["open"], rig["error"], rig["holder"]) == ("bench", True, None, None)
     assert rig["cameras"][0]["size_px"] == [64, 48]
