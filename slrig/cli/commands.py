@@ -17,7 +17,17 @@ import typer.core
 
 from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
-from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
+from slrig.cli.options import (
+    AcceptanceOptions,
+    AsJson,
+    BoardOptions,
+    MeshOptions,
+    RigFile,
+    Service,
+    ShownData,
+    given,
+    grouped,
+)
 from slrig.cli.patterns import patterns
 from slrig.errors import SlrigError
 
@@ -285,6 +295,7 @@ def warm() -> None:
 @app.command()
 def conform(
     rig: RigFile,
+    data: ShownData = None,
     as_json: AsJson = False,
 ) -> None:
     """Examine a rig by the driver contract, and score it.
@@ -293,7 +304,7 @@ def conform(
     """
     from slrig.cli.examine import conform as examine
 
-    if not examine(rig, as_json=as_json):
+    if not examine(rig, data=data, as_json=as_json):
         raise typer.Exit(1)
 
 
@@ -326,6 +337,7 @@ def doctor(
     output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
+    data: ShownData = None,
     as_json: AsJson = False,
 ) -> None:
     """Examine a rig before a still object: what is wrong?
@@ -334,7 +346,7 @@ def doctor(
     """
     from slrig.cli.examine import doctor as examine
 
-    if not examine(rig, output=output, force=force, search_s=search_s, as_json=as_json):
+    if not examine(rig, output=output, force=force, search_s=search_s, data=data, as_json=as_json):
         raise typer.Exit(1)
 
 

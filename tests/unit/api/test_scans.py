@@ -17,6 +17,7 @@ from fastapi.testclient import TestClient
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
 from slrig.devices import AppliedSettings, CameraSettings
+from slrig.jobs.examinations import keep
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.artefacts import ON_REQUEST
@@ -433,6 +434,18 @@ def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, ser
 def test_drivers_and_devices_are_listed(client: TestClient) -> None:
     found = client.get("/device").json()
     assert ("head", "simulated", None) in [(each["kind"], each["name"], each["fault"]) for each in found["drivers"]]
+
+
+def test_last_examinations_of_the_rig_are_shown_with_what_to_run(client: TestClient, served: ServedBench) -> None:
+    root = served.service.folder.root
+    found = client.get("/rig/examinations").json()
+    assert (found["doctor"], found["conform"]) == (None, None)
+    assert found["commands"]["doctor"] == f"slrig doctor RIG.toml --data {root}"
+    for rig in ("bench", "another"):
+        keep(root, "doctor" if rig == "bench" else "conform", {"rig": rig, "findings": []})
+    found = client.get("/rig/examinations").json()
+    assert found["doctor"]["found"] == {"rig": "bench", "findings": []}
+    assert found["conform"] is None
 
 
 def test_probes_are_well(client: TestClient) -> None:
