@@ -2,8 +2,8 @@
 import {html, useEffect, useRef, useState} from "./vendor/preact-htm.js";
 import {Action, Choice, percent} from "./ui.js";
 
-/** What a camera sees while nobody scans. Looking takes the rig between scans, so it is asked for, never begun by itself. Without `setBracket` nothing is said of the exposure. */
-export function Live({rig, may, bracket, setBracket}) {
+/** What a camera sees while nobody scans. Looking takes the rig between scans, so it is asked for, never begun by itself. Without `setBracket` nothing is said of the exposure. `aim`: where a board goes next, as a calibration says it. */
+export function Live({rig, may, bracket, setBracket, aim}) {
   const [camera, setCamera] = useState(null);
   const [light, setLight] = useState("white");
   const [failed, setFailed] = useState(false);
@@ -11,6 +11,8 @@ export function Live({rig, may, bracket, setBracket}) {
   const names = rig?.cameras.map((each) => each.name) ?? [];
   const seen = camera !== null && names.includes(camera) ? camera : null;
   if (!may("scan")) return html`<p class="quiet">A key for scans shows the live picture.</p>`;
+  const {size_px} = rig?.cameras.find((each) => each.name === seen) ?? {};
+  const outline = aim?.camera === seen && aim?.outline_px.length ? aim.outline_px : null;
   return html`
     <div class="row">
       <${Choice} label="Camera" value=${seen} options=${[[null, "Off"], ...names.map((name) => [name, name])]} chosen=${(name) => { setCamera(name); setFailed(false); }} />
@@ -18,8 +20,9 @@ export function Live({rig, may, bracket, setBracket}) {
     </div>
     ${!seen && html`<p class="live none">Choose a camera to see what it sees.</p>`}
     ${seen && failed && html`<p class="live none" role="alert">No picture comes. ${rig.error ?? "Choose the camera again to try once more."}</p>`}
-    ${seen && !failed && html`<${Picture} key=${`${seen} ${light}`} image=${image} camera=${seen} light=${light} failed=${() => setFailed(true)} />
-      <p class="legend"><span class="swatch saturated"></span>saturated <span class="swatch dark"></span>too dark ${rig.holder && " · waits while the rig is held"}</p>
+    ${seen && !failed && html`<div class="aimed"><${Picture} key=${`${seen} ${light}`} image=${image} camera=${seen} light=${light} failed=${() => setFailed(true)} />
+        ${outline && html`<svg viewBox=${`0 0 ${size_px.join(" ")}`} aria-hidden="true"><polygon points=${outline.join(" ")} /><circle cx=${outline[0][0]} cy=${outline[0][1]} r=${size_px[0] / 60} /></svg>`}</div>
+      <p class="legend">${outline && html`<span><span class="swatch aim"></span> the board goes here, its upper left corner to the dot</span>`}<span class="swatch saturated"></span>saturated <span class="swatch dark"></span>too dark ${rig.holder && " · waits while the rig is held"}</p>
       ${light === "white" && setBracket && html`<${Exposure} image=${image} camera=${rig.cameras.find((each) => each.name === seen)} bracket=${bracket} setBracket=${setBracket} />`}`}`;
 }
 
