@@ -89,6 +89,23 @@ class Source(IntEnum):
     ALL = 2
 
 
+class AlbedoMark(IntEnum):
+    """Why the albedo of a point is not to be relied on, the first cause that holds; NONE where it is.
+
+    SATURATED : a pixel that it was read from is clipped, so that it is brighter than told. GRAZING : light comes in so
+    flat that a small error of the normal is a large one of albedo. BORDER : at the border of the projector's image,
+    where its light fades. UNKNOWN : the surface has no normal there, and the point a neutral colour. SHADED : no
+    calibrated projector, so that nothing tells how much light came in; the colour is brightness.
+    """
+
+    NONE = 0
+    SATURATED = 1
+    GRAZING = 2
+    BORDER = 3
+    UNKNOWN = 4
+    SHADED = 5
+
+
 @dataclass(frozen=True, slots=True)
 class PointCurves:
     """Curves of surface points in the world, one per light sheet, ordered along it and by column.
