@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh
+from slrig.model.srgb import light_of
 
 _METRES_PER_MM = 0.001
 _HALF_A_TURN_ABOUT_X = (1, 0, 0, 0)  # quaternion, x y z w
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
 
 _GLB_MAGIC, _GLB_VERSION = b"glTF", 2
-_FLOAT, _UNSIGNED_BYTE, _UNSIGNED_INT = 5126, 5121, 5125
+_FLOAT, _UNSIGNED_SHORT, _UNSIGNED_INT = 5126, 5123, 5125
 _ARRAY_BUFFER, _ELEMENT_ARRAY_BUFFER = 34962, 34963
 _POINTS, _TRIANGLES = 0, 4
 
@@ -33,11 +34,12 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
     glTF is in metres, with y up and the front towards +z (section 3.4); a scan is in mm, with y down and the front
     towards the camera, -z. The vertices keep their values, under a node that scales by 0.001 and turns by half a turn
     about x: (x, y, z) mm stands at (x, -y, -z) / 1000 m. Normals are left out if one is not known, because glTF has no
-    form for that; a mesh without triangles is shown as points.
+    form for that; a mesh without triangles is shown as points. Colours are light, not sRGB (section 3.9.2), of 16 bits.
     """
     positions = np.ascontiguousarray(mesh.vertices_mm, dtype="<f4")
-    opaque = np.full((len(mesh.grey), 4), 255, dtype=np.uint8)
-    opaque[:, :3] = mesh.grey[:, None]
+    # Three components of two bytes would not end on a multiple of four.
+    opaque = np.full((len(mesh.colour), 4), 2**16 - 1, dtype="<u2")
+    opaque[:, :3] = light_of(mesh.colour)
     parts: list[tuple[str, NDArray[Any], dict[str, object]]] = []
     if len(positions):
         ends = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
@@ -45,7 +47,7 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
         if np.isfinite(mesh.normals).all():
             normals = np.ascontiguousarray(mesh.normals, dtype="<f4")
             parts.append(("NORMAL", normals, {"componentType": _FLOAT, "type": "VEC3"}))
-        parts.append(("COLOR_0", opaque, {"componentType": _UNSIGNED_BYTE, "type": "VEC4", "normalized": True}))
+        parts.append(("COLOR_0", opaque, {"componentType": _UNSIGNED_SHORT, "type": "VEC4", "normalized": True}))
     if len(mesh.faces):
         indices = np.ascontiguousarray(mesh.faces, dtype="<u4").reshape(-1)
         parts.append(("indices", indices, {"componentType": _UNSIGNED_INT, "type": "SCALAR"}))
@@ -116,13 +118,14 @@ def encode_mesh_stl(mesh: Mesh) -> bytes:
 
 
 def encode_mesh_obj(mesh: Mesh) -> bytes:
-    """Wavefront OBJ in mm, with vertex normals, and grey as the three numbers that many programs read after x y z.
+    """Wavefront OBJ in mm, with vertex normals, and sRGB colours as the three numbers that many programs read after x y
+    z.
 
     Positions have five decimals (10 nm), normals and colours four. Normals are left out if one is not known.
     """
     known = bool(np.isfinite(mesh.normals).all())
     positions = _rounded(mesh.vertices_mm, _OBJ_POSITION_DECIMALS)
-    vertices = np.column_stack([positions, np.repeat(mesh.grey[:, None] / 255, 3, axis=1)])
+    vertices = np.column_stack([positions, mesh.colour / 255])
     number = f"%.{_OBJ_POSITION_DECIMALS}f"
     unit = f"%.{_OBJ_UNIT_DECIMALS}f"
     pieces = ["# slrig mesh, millimetres; v x y z red green blue\no scan\n"]
