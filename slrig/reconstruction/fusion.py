@@ -23,6 +23,7 @@ from slrig.errors import PatternError
 from slrig.model import Axis, Capture, FloatArray, Gray, Pattern, exposure_groups
 from slrig.reconstruction.compression import compression_loss
 from slrig.reconstruction.frames import (
+    NEARLY_FULL,
     AxisFrames,
     AxisPatterns,
     FrameStacks,
@@ -34,7 +35,6 @@ from slrig.reconstruction.frames import (
 )
 from slrig.reconstruction.noise import NoiseModel, fitted_noise, noise_samples
 
-_NEARLY_FULL = 0.97  # of full scale: from here on sensors bend
 _CLEAR_SIGMA = 20.0  # the ratio of two exposures is then known to a twentieth at each pixel,
 _LEAST_FOR_LIGHT = 500  # and the median of so many to a three-hundredth
 
@@ -172,7 +172,7 @@ def _exposed(
     for each in repeats.values():
         for image in each:
             np.maximum(brightest, image, out=brightest)
-    usable = brightest < _NEARLY_FULL * full_scale
+    usable = brightest < NEARLY_FULL * full_scale
     return _Exposed(images, frames.white, frames.black, usable, noise_samples(frames, unseen & usable))
 
 

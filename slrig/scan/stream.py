@@ -35,8 +35,10 @@ from slrig.model.header import CaptureHeader
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import (
+    NEARLY_FULL,
     AxisFrames,
     FrameStacks,
+    Image,
     axis_frames,
     axis_patterns,
     ends_repeats,
@@ -62,8 +64,9 @@ _WHITE_OVER_USUAL = 2.5
 class CameraResult:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
-    white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white. A bracket's are
-    those of the longest exposure, and go beyond the camera's full scale. exposures : of a bracket, from short to long.
+    white : (H, W) uint16, the white frame in camera units; contrast : (H, W) float32, white minus black; full_scale :
+    what to show as white. A bracket's are those of the longest exposure, and go beyond the camera's full scale.
+    clipped : (H, W) bool, where white is no measure of light. exposures : of a bracket, from short to long.
     white_colour, black_colour : (H, W, 3) uint8, uint16 or float32, blue, green and red in the same units, as the
     camera gave them: `curves.gamma` tells how it bent its values, where the frames tell it; None without colour.
     """
@@ -72,7 +75,8 @@ class CameraResult:
     device: Pinhole
     curves: CameraCurves
     white: Pixels
-    largest_contrast: float
+    contrast: Image
+    clipped: NDArray[np.bool_]
     full_scale: float
     exposures: tuple[ExposureUse, ...] = ()
     white_colour: NDArray[Any] | None = None
@@ -133,7 +137,8 @@ class ScanStream:
                     device=self.calibration.cameras[name],
                     curves=curves,
                     white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
-                    largest_contrast=float(frames.contrast.max()),
+                    contrast=frames.contrast,
+                    clipped=frames.white >= NEARLY_FULL * frames.clipped_at,
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
                     white_colour=white,
