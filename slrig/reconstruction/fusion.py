@@ -228,7 +228,7 @@ def fused_colour(repeats: Sequence[Sequence[NDArray[Any]]], fused: FusedFrames, 
     total = np.zeros(repeats[0][0].shape, dtype=np.float32)
     weight = np.zeros_like(total)
     for light, images in zip(fused.light, repeats, strict=True):
-        usable = np.max(images, axis=0) < _NEARLY_FULL * full_scale
+        usable = np.max(images, axis=0) < NEARLY_FULL * full_scale
         np.add(total, mean_image(images), out=total, where=usable)
         np.add(weight, np.float32(light), out=weight, where=usable)
     shortest = mean_image(repeats[-1]) / np.float32(fused.light[-1])

@@ -78,7 +78,7 @@ def coarse_mesh(mesh: Mesh) -> Mesh:
     """A mesh of about `COARSE_TRIANGLES` triangles, or the mesh itself where it has no more vertices and triangles.
 
     The vertices of each cell of a grid become one (Rossignac and Borrel 1993, "Multi-resolution 3D approximations for
-    rendering complex scenes"): the one nearest to their mean, with its own normal, colour, standard deviation and stripe.
+    rendering complex scenes"): the one nearest to their mean, with its own normal, colour, deviation and stripe.
     Each vertex is thus one of the scan's, and what is measured between two of them holds; a mean of positions would be
     more certain than the mean or the greatest of their standard deviations says.
 

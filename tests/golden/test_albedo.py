@@ -88,6 +88,12 @@ def replaced(text: str, changes: Mapping[str, str]) -> str:
 
 def painted(rig: Path, work: Path, plan: ScanPlan | None = None) -> Painted:
     """Scan, and ask the renderer what each vertex is painted with: along the ray of a camera that meets it."""
+    (grey,) = channels(rig, work, plan)
+    return grey
+
+
+def channels(rig: Path, work: Path, plan: ScanPlan | None = None) -> list[Painted]:
+    """`painted` in each channel that a camera of the rig has: one, or red, green and blue."""
     bundle = captured(rig, plan or ScanPlan(), work / "bundle")
     report = reconstructed(bundle, work / "out")
     mesh = decode_mesh_ply((work / "out" / "mesh.ply").read_bytes())
@@ -95,21 +101,22 @@ def painted(rig: Path, work: Path, plan: ScanPlan | None = None) -> Painted:
     options = HeadOptions.model_validate({key: value for key, value in table.items() if key != "driver"})
     surface = surface_of(read_scene(rig.parent / options.scene), rig.parent)
     rays, lamp = caster(surface.vertices_mm, surface.faces), options.projector.pinhole()
-    truth, brightness = np.zeros(len(mesh.vertices_mm)), np.zeros(len(mesh.vertices_mm))
+    truth, brightness = np.zeros((len(mesh.vertices_mm), 3)), np.zeros(len(mesh.vertices_mm))
     vertices = mesh.vertices_mm.astype(np.float64)
     for eye in options.camera:
         pixels = opencv_pixels(eye.pinhole(), vertices)
         columns, rows = pixels.T.copy()
         met = trace(columns, rows, eye.pinhole(), lamp, surface, rays, working_distance_mm=600.0)
-        mine = (truth == 0) & (np.linalg.norm(met.points_mm - vertices, axis=1) < 0.3)
-        truth[mine] = met.albedo[mine]
+        mine = (truth == 0).all(axis=1) & (np.linalg.norm(met.points_mm - vertices, axis=1) < 0.3)
+        truth[mine] = met.albedo[mine, None] * met.hue[mine, ::-1]
         nearest = np.rint(np.clip(pixels[mine], 0, np.array(eye.size_px) - 1)).astype(int)
         brightness[mine] = white_frame(bundle, eye.name)[nearest[:, 1], nearest[:, 0]]
-    share = mesh.colour[:, 0] / 255
-    assert (mesh.colour == mesh.colour[:, :1]).all()
+    share = mesh.colour / 255
+    count = report["albedo"]["channels"]
+    assert count == 3 or (mesh.colour == mesh.colour[:, :1]).all()
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     assert (truth > 0).mean() > 0.99
-    return Painted(light, truth, brightness, mesh.mark, report)
+    return [Painted(light[:, each], truth[:, each], brightness, mesh.mark, report) for each in range(count)]
 
 
 def opencv_pixels(device: Pinhole, points_mm: FloatArray) -> FloatArray:
@@ -184,3 +191,21 @@ def test_saturated_paint_is_marked_and_a_bracket_needs_no_mark(tmp_path: Path) -
     assert rms <= 0.04
     assert correlation >= 0.98
     assert not (bracket.mark == AlbedoMark.SATURATED).any()
+
+
+@pytest.mark.slow
+def test_a_camera_that_has_colour_gives_each_channel_as_it_is_painted(tmp_path: Path) -> None:
+    scene = {
+        'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': "colour = [0.25, 0.6, 0.95]\n"
+        'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0, colour = [0.9, 0.5, 0.3] }'
+    }
+    sees = {'name = "left"': 'name = "left"\ncolour = [0.7, 1.0, 0.8]'}
+    seen = channels(rig_file(tmp_path, "relief", scene=scene, head={**SMALL, **sees}), tmp_path)
+    assert len(seen) == 3
+    for name, channel in zip(("red", "green", "blue"), seen, strict=True):
+        rms, correlation = channel.told(name, channel.found)
+        assert rms <= 0.05
+        assert correlation >= 0.85
+    # Between channels there is one scale: how strongly the camera sees each, and no more.
+    red, blue = (np.median(each.found[each.sound] / each.truth[each.sound]) for each in (seen[0], seen[2]))
+    assert red / blue == pytest.approx(0.8 / 0.7, rel=0.02)

@@ -20,8 +20,8 @@ from slrig.devices import AppliedSettings, CameraSettings
 from slrig.jobs.examinations import keep
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
-from slrig.scan.artefacts import ON_REQUEST
 from slrig.rig.settings import SettingsInUse
+from slrig.scan.artefacts import ON_REQUEST
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.scan.fakes import WAIT_S
 
