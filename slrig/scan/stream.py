@@ -28,6 +28,7 @@ from slrig.reconstruction.frames import (
     ends_repeats,
     exposure_count,
     mean_image,
+    straight,
     telling,
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_frames
@@ -47,9 +48,10 @@ _WHITE_OVER_USUAL = 2.5
 class CameraResult:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
-    white : (H, W) uint16, the white frame in camera units; contrast : (H, W) float32, white minus black; full_scale :
-    what to show as white. A bracket's are those of the longest exposure, and go beyond the camera's full scale.
-    clipped : (H, W) bool, where white is no measure of light. exposures : of a bracket, from short to long.
+    white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white; contrast :
+    (H, W) float32, white minus black in proportion to light. A bracket's are those of the longest exposure, and go
+    beyond the camera's full scale. clipped : (H, W) bool, where white is no measure of light. exposures : of a bracket,
+    from short to long.
     """
 
     name: str
@@ -108,13 +110,15 @@ class ScanStream:
             # What it held of its frames is not needed any more, and the memory is.
             curves, frames, fused = self._cameras.pop(name).finish()
             used = curves.refusal == Refusal.NONE
+            # The ends are as the camera gave them.
+            white, black = (straight(each, curves.gamma, frames.full_scale) for each in (frames.white, frames.black))
             seen.append(
                 CameraResult(
                     name=name,
                     device=self.calibration.cameras[name],
                     curves=curves,
                     white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
-                    contrast=frames.contrast,
+                    contrast=white - black,
                     clipped=frames.white >= NEARLY_FULL * frames.clipped_at,
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
