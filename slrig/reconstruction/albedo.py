@@ -5,8 +5,8 @@ A dull surface of albedo ρ at distance d from the projector, on which the light
     white - black = g · L · ρ · cos(i) / d²
 
 with the camera's gain g and the projector's light L in that direction (Lambert's law). Light of the room is in both
-frames and cancels. What this leaves out: gloss, light from one part of the object to another, and what the camera's
-lens takes from its corners.
+frames and cancels. What this leaves out: gloss, light from one part of the object to another, and what lenses take
+from the corners: the camera's always, the projector's where nobody states it.
 
 Albedo has no scale of its own here: g and L are not known. Cameras are brought to one gain by the points that two of
 them saw, and the whole to a usual albedo of bright surfaces.

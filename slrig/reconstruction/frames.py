@@ -54,6 +54,14 @@ def at_rows(values: Any, rows: slice) -> Any:
     return values[rows] if isinstance(values, np.ndarray) else values
 
 
+def straight(image: NDArray[Any], gamma: float, full_scale: float) -> Image:
+    """As the image, float32: values in proportion to light, of a camera whose values are light to the power of 1/gamma."""
+    if gamma == 1:
+        return np.asarray(image, dtype=np.float32)
+    share = np.maximum(image, 0).astype(np.float32) / np.float32(full_scale)
+    return np.asarray(np.float32(full_scale) * share ** np.float32(gamma))
+
+
 @dataclass(frozen=True, slots=True)
 class AxisFrames:
     """What one camera saw of the patterns of one axis. Images are (H, W) in camera units, white and black float32.
@@ -267,8 +275,7 @@ class FrameStacks:
         self._ends = {pattern: self._straight(image) for pattern, image in self._ends.items()}
 
     def _straight(self, image: NDArray[Any]) -> NDArray[np.float32]:
-        share = np.maximum(image, 0).astype(np.float32) / np.float32(self._scales["full_scale"])
-        return np.asarray(np.float32(self._scales["full_scale"]) * share ** np.float32(self._gamma))
+        return straight(image, self._gamma, self._scales["full_scale"])
 
     def has(self, pattern: Pattern) -> bool:
         """Whether the image of a pattern is in."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from slrig.model import AlbedoMark, Axis, Mesh, Pinhole, Refusal, Source
 from slrig.model.srgb import srgb_of
 from slrig.reconstruction.albedo import BRIGHT_ALBEDO, BRIGHT_PERCENT, Albedo, LitPoints, LitView, albedo
-from slrig.reconstruction.frames import NEARLY_FULL
 from slrig.reconstruction.merging import MergedCurves
 from slrig.reconstruction.sheet_curves import SheetCurves
 from slrig.scan.stream import CameraResult
@@ -43,25 +42,11 @@ def coloured(
     points = LitPoints(
         curves.points_mm, normals, curves.pixels_px, joined.camera, curves.source == Source.ALL, border
     )  # fmt: skip
-    found = albedo(points, [_lit(seen) for seen in cameras], None if projector is None else projector.centre_mm)
+    views = [LitView(seen.device, seen.contrast, seen.clipped, seen.curves.refusal == Refusal.NONE) for seen in cameras]
+    found = albedo(points, views, None if projector is None else projector.centre_mm)
     colour = srgb_of(found.value)
     colour[found.mark == AlbedoMark.UNKNOWN] = _NEUTRAL
     return Coloured(np.repeat(colour, 3, axis=1) if colour.shape[1] == 1 else colour, found.mark, found)
-
-
-def _lit(seen: CameraResult) -> LitView:
-    """What a camera saw of the light: in red, green and blue where it has them, in one channel else."""
-    contrast, clipped = seen.contrast[..., None], seen.clipped
-    if seen.white_colour is not None and seen.black_colour is not None:
-        full = np.float32(seen.full_scale)
-        # A bracket's values are light already, and go beyond full scale.
-        if not seen.exposures:
-            clipped = clipped | (seen.white_colour.max(axis=2) >= NEARLY_FULL * full)
-        white, black = (image[..., ::-1].astype(np.float32) for image in (seen.white_colour, seen.black_colour))
-        if seen.curves.gamma != 1:
-            white, black = (full * (image / full) ** np.float32(seen.curves.gamma) for image in (white, black))
-        contrast = white - black
-    return LitView(seen.device, contrast, clipped, seen.curves.refusal == Refusal.NONE)
 
 
 def _at_border(curves: SheetCurves, projector: Pinhole, axis: Axis) -> NDArray[np.bool_]:

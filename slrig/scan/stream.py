@@ -44,6 +44,7 @@ from slrig.reconstruction.frames import (
     ends_repeats,
     exposure_count,
     mean_image,
+    straight,
     telling,
     telling_shots,
 )
@@ -64,11 +65,10 @@ _WHITE_OVER_USUAL = 2.5
 class CameraResult:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
-    white : (H, W) uint16, the white frame in camera units; contrast : (H, W) float32, white minus black; full_scale :
-    what to show as white. A bracket's are those of the longest exposure, and go beyond the camera's full scale.
-    clipped : (H, W) bool, where white is no measure of light. exposures : of a bracket, from short to long.
-    white_colour, black_colour : (H, W, 3) uint8, uint16 or float32, blue, green and red in the same units, as the
-    camera gave them: `curves.gamma` tells how it bent its values, where the frames tell it; None without colour.
+    white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white; contrast :
+    (H, W, C) float32, white minus black in proportion to light, as grey or as red, green and blue. A bracket's are those
+    of the longest exposure, and go beyond the camera's full scale. clipped : (H, W) bool, where white is no measure of
+    light. exposures : of a bracket, from short to long.
     """
 
     name: str
@@ -79,8 +79,6 @@ class CameraResult:
     clipped: NDArray[np.bool_]
     full_scale: float
     exposures: tuple[ExposureUse, ...] = ()
-    white_colour: NDArray[Any] | None = None
-    black_colour: NDArray[Any] | None = None
 
 
 class ScanStream:
@@ -129,20 +127,25 @@ class ScanStream:
             # What it held of its frames is not needed any more, and the memory is.
             camera = self._cameras.pop(name)
             curves, frames, fused = camera.finish()
-            white, black = (camera.colour(each, fused) for each in (White(), Black()))
             used = curves.refusal == Refusal.NONE
+            white, black = (camera.colour(each, fused) for each in (White(), Black()))
+            clipped = frames.white >= NEARLY_FULL * frames.clipped_at
+            if white is None or black is None:
+                white, black = frames.white[..., None], frames.black[..., None]
+            elif fused is None:
+                clipped |= white.max(axis=2) >= NEARLY_FULL * frames.full_scale
+            # They are as the camera gave them.
+            white, black = (straight(each[..., ::-1], curves.gamma, frames.full_scale) for each in (white, black))
             seen.append(
                 CameraResult(
                     name=name,
                     device=self.calibration.cameras[name],
                     curves=curves,
                     white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
-                    contrast=frames.contrast,
-                    clipped=frames.white >= NEARLY_FULL * frames.clipped_at,
+                    contrast=white - black,
+                    clipped=clipped,
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
-                    white_colour=white,
-                    black_colour=black,
                 )
             )
         return seen

@@ -158,6 +158,16 @@ def test_light_of_the_room_and_dark_paint_change_little(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_values_made_for_a_display_become_light_again(tmp_path: Path) -> None:
+    scene = {'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': MOTTLED}
+    head = {**SMALL, "saturation_s = 0.02": "saturation_s = 0.02\nresponse = 0.45"}
+    seen = painted(rig_file(tmp_path, "relief", scene=scene, head=head), tmp_path)
+    rms, correlation = seen.told("gamma 2.2", seen.found)
+    assert rms <= 0.05
+    assert correlation >= 0.98
+
+
+@pytest.mark.slow
 def test_two_cameras_of_different_gain_give_one_picture(tmp_path: Path) -> None:
     path = rig_file(tmp_path, "two_cameras", scene={}, head={})
     first, second = path.read_text().split('name = "right"')

@@ -19,7 +19,7 @@ from tests.unit.scan.test_triangulated import BALL, COLUMNS, MANY, curves_in, se
 def lit(name: str, device: Pinhole, projector: Pinhole = PROJECTOR) -> CameraResult:
     """A camera before the ball that sees the same contrast everywhere, in a frame without a clipped pixel."""
     found = seen(name, device, curves_in(device, MANY, projector))
-    return replace(found, contrast=np.full(device.size.shape, 100, dtype=np.float32))
+    return replace(found, contrast=np.full((*device.size.shape, 1), 100, dtype=np.float32))
 
 
 def normals_of(found: Triangulated) -> FloatArray:
