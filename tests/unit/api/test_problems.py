@@ -75,7 +75,8 @@ def test_every_refusal_is_documented_as_a_problem() -> None:
         ({"label": ""}, ["label"]),
         ({"label": "x" * 201}, ["label"]),
         ({"label": "a\x1b[2J"}, ["label"]),
-        ({"exposure_s": 0, "if_busy": 1, "colour": "red"}, ["exposure_s", "if_busy", "colour"]),
+        ({"exposure_s": 0, "if_busy": 1, "paint": "red"}, ["exposure_s", "if_busy", "paint"]),
+        ({"colour": "red"}, ["colour"]),
         ([], ["body"]),
     ],
 )

@@ -107,7 +107,7 @@ def test_a_pose_may_be_given_as_a_calibration_has_it(tmp_path: Path) -> None:
         ("", "object"),
         ("object = []", "at least one"),
         ('[[object]]\nshape = "cube"\n', "shape"),
-        ('[[object]]\nshape = "sphere"\nradius_mm = -1.0\ncolour = 3\n', r"(?s)radius_mm.*colour: unknown key"),
+        ('[[object]]\nshape = "sphere"\nradius_mm = -1.0\npaint = 3\n', r"(?s)radius_mm.*paint: unknown key"),
         ('[[object]]\nshape = "mesh"\nfile = "absent.stl"\n', "absent.stl"),
         ('[[object]]\nshape = "mesh"\nfile = "broken.stl"\n', "broken.stl"),
         ('[[object]]\nshape = "mesh"\nfile = "strange.xyzzy"\n', "strange.xyzzy"),
