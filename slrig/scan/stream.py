@@ -66,9 +66,9 @@ class CameraResult:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
     white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white; contrast :
-    (H, W, C) float32, white minus black in proportion to light, as grey or as red, green and blue. A bracket's are those
-    of the longest exposure, and go beyond the camera's full scale. clipped : (H, W) bool, where white is no measure of
-    light. exposures : of a bracket, from short to long.
+    (H, W, C) float32, white minus black in proportion to light, as grey or as red, green and blue. A bracket's are
+    those of the longest exposure, and go beyond the camera's full scale. clipped : (H, W) bool, where white is no
+    measure of light. exposures : of a bracket, from short to long.
     """
 
     name: str

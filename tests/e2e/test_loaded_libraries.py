@@ -40,6 +40,7 @@ def worked(service: ServiceProcess) -> None:
     """All kinds of work, each to its end."""
     assert scanned(service)["state"] == "succeeded"
     with Caller(service) as caller:
+        assert caller.http.get("/calibration/board.pdf").content[:4] == b"%PDF"
         made = caller.post("/calibration", 201, board=BOARD)
         caller.post(made["links"]["pose"], 202)
         (pose,) = caller.settled(made)["shot"]

@@ -1,0 +1,154 @@
+"""From nothing to an activated calibration: a board to print, its poses, the solve, the verdict."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import Scope
+from slrig.config import read_settings
+from tests.e2e.conftest import Start
+from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.test_calibration_walk import SLOW, Caller, write_rig
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+pytestmark = pytest.mark.slow
+
+_SOLVED_MS = 120_000
+
+
+def choose_board(page: Page) -> None:
+    """Describe the board of the rendered rig."""
+    page.get_by_role("button", name="Chessboard").click()
+    page.get_by_label("Inner corners across").fill("8")
+    page.get_by_label("Inner corners down").fill("5")
+    page.get_by_label("Side of a square").fill("20")
+
+
+def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    page = visit(service, "calibrate", ignored="422")
+    page.get_by_text("None is kept here yet.").wait_for()
+    page.get_by_text("The rig has no calibration yet").wait_for()
+    choose_board(page)
+    page.get_by_label("Side of a square").fill("60")
+    page.get_by_role("button", name="Board sheet").click()
+    page.get_by_role("alert").get_by_text("the largest square that fits there is").wait_for()
+    assert violations(page) == []
+    page.get_by_label("Side of a square").fill("20")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Board sheet").click()
+    download.value.save_as(tmp_path / "board.pdf")
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    page.get_by_label("Scale below").fill("180")
+    page.get_by_label("Scale on the left").fill("120")
+    page.get_by_label("Name").fill("walk")
+    page.get_by_role("button", name="Start").click()
+
+    page.wait_for_url("**/#/calibrate/*-*")
+    page.get_by_text("Hold the board where every camera sees it").wait_for()
+    assert violations(page) == []
+    # The first of these is behind the wall, and refused; the others are enough.
+    page.get_by_role("button", name="Shoot all 11 of the positioner").click()
+    page.get_by_text("✗ Pose 1 refused: no camera sees the board").wait_for(timeout=_SOLVED_MS)
+    assert "camera 'left': no chessboard 8x5, 20 mm found" in page.get_by_role("list").last.inner_text()
+    page.reload()
+    page.get_by_text("You may move the board.").wait_for()
+    assert violations(page) == []
+    page.get_by_text("✓ Pose 11 accepted").wait_for(timeout=_SOLVED_MS)
+    page.get_by_text("10 poses accepted. Still wanted:").wait_for()
+    page.get_by_text("40 of 40 corners").first.wait_for()
+    page.get_by_role("img", name="left: 78 % of the image covered").wait_for()
+    page.screenshot(path=str(tmp_path / "poses.png"), full_page=True)
+
+    page.get_by_role("button", name="Solve").click()
+    page.get_by_text("Solving …").wait_for()
+    page.reload()
+    page.get_by_role("heading", name="What the solve says").wait_for(timeout=_SOLVED_MS)
+    page.get_by_text(re.compile("✓ good: a scanned point is expected within")).wait_for()
+    assert page.get_by_role("row", name="left").get_by_text(re.compile(r"0\.0\d\d px")).count() == 3
+    page.get_by_role("button", name="Use it").click()
+    page.get_by_role("banner").get_by_text("ready").wait_for()
+    assert violations(page) == []
+    page.screenshot(path=str(tmp_path / "solved.png"), full_page=True)
+    with page.context.expect_page() as report:
+        page.get_by_role("link", name="Report with pictures").click()
+    report.value.get_by_role("heading", name="walk").first.wait_for()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="calibration.json").click()
+    download.value.save_as(tmp_path / "calibration.json")
+
+    page.get_by_role("link", name="All calibrations").click()
+    page.get_by_text("Scans use walk.").wait_for()
+    (tmp_path / "notes.json").write_text('{"cameras": 1}')
+    page.get_by_label("A calibration of slrig's").set_input_files(tmp_path / "notes.json")
+    page.get_by_role("alert").get_by_text("the calibration sent").wait_for()
+    page.get_by_label("A calibration of slrig's").set_input_files(tmp_path / "calibration.json")
+    page.get_by_role("heading", name="What the file holds").wait_for()
+    page.get_by_role("button", name="Compare with the one in use").click()
+    page.get_by_text("Points in the working volume move by").wait_for()
+    page.get_by_role("button", name="Delete this calibration").click()
+    assert violations(page) == []
+    page.get_by_role("alertdialog").get_by_role("button", name="Delete").click()
+    page.get_by_text("Scans use walk.").wait_for()
+    assert page.get_by_role("listitem").count() == 1
+
+
+def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig", head=SLOW))
+    with Caller(service) as caller:
+        calibration = caller.opened()
+        caller.post(calibration["links"]["pose"], 202, position=1)
+        page = visit(service, f"calibrate/{calibration['id']}", size=PHONE, dark=True, ignored="409")
+        page.get_by_text("✓ Pose 1 accepted").wait_for()
+        page.get_by_role("group", name="Camera").get_by_role("button", name="left").click()
+        picture = page.get_by_role("img", name="Live picture of camera left")
+        page.wait_for_function("image => image.naturalWidth > 0", arg=picture.element_handle())
+        page.get_by_text("the board goes here").wait_for()
+        page.screenshot(path=str(tmp_path / "live.png"), full_page=True)
+
+        # The space bar presses what has the focus, and shoots otherwise. The board did not move.
+        page.get_by_role("heading", name="walk").click()
+        page.keyboard.press("Space")
+        page.get_by_text("Hold the board still.").wait_for()
+        assert violations(page) == []
+        page.get_by_text("You may move the board.").wait_for()
+        page.get_by_text("✗ Pose 2 refused").wait_for()
+        page.get_by_text("the same as pose 1").first.wait_for()
+        assert violations(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        page.screenshot(path=str(tmp_path / "refused.png"), full_page=True)
+
+        page.get_by_role("button", name="Delete pose 1").click()
+        page.get_by_text("0 poses accepted.").wait_for()
+        page.get_by_role("button", name="3 s", exact=True).click()
+        page.get_by_role("button", name="Shoot every 3 s").click()
+        page.get_by_role("timer").get_by_text("2").wait_for()
+        page.screenshot(path=str(tmp_path / "timer.png"))
+        page.get_by_text("✓ Pose 3 accepted").wait_for()
+        page.get_by_role("timer").wait_for()
+        assert violations(page) == []
+        page.keyboard.press("x")
+        page.get_by_role("timer").wait_for(state="detached")
+
+        page.get_by_role("button", name="Shoot (space bar)").click()
+        page.get_by_role("button", name="Stop", exact=True).click()
+        page.get_by_text("Pose 4 stopped").wait_for()
+        page.get_by_role("button", name="Solve").click()
+        page.get_by_role("alert").get_by_text("Solve refused").wait_for()
+        assert violations(page) == []
+        assert [pose["number"] for pose in caller.settled(calibration)["shot"]] == [2, 3, 4]
+
+    key = KeyRing(read_settings(None, data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    page = visit(service, f"calibrate/{calibration['id']}", key=key)
+    page.get_by_text("Your key is for looking").wait_for()
+    page.get_by_text("Pose 4 stopped").wait_for()
+    for name in ("Shoot (space bar)", "Solve", "Delete pose 3", "Delete this calibration"):
+        assert page.get_by_role("button", name=name).is_disabled()
+    assert violations(page) == []
