@@ -65,7 +65,7 @@ export class View {
   constructor(canvas, drawn) {
     this.canvas = canvas;
     this.drawn = drawn;
-    this.renderer = new WebGLRenderer({canvas, antialias: false});
+    this.renderer = new WebGLRenderer({canvas, antialias: false, alpha: true});
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 1, 1000);
     this.controls = new OrbitControls(this.camera, canvas);
@@ -78,26 +78,17 @@ export class View {
     this.sizes = new ResizeObserver(() => this.fitCanvas());
     this.sizes.observe(canvas);
     this.fitCanvas();
-    this.ground();
-    this.scheme = matchMedia("(prefers-color-scheme: dark)");
-    this.scheme.onchange = () => this.ground();
   }
 
   dispose() {
     cancelAnimationFrame(this.frame);
     clearTimeout(this.timer);
     this.sizes.disconnect();
-    this.scheme.onchange = null;
     this.controls.dispose();
     [0, 1].forEach((slot) => this.remove(slot));
     this.renderer.dispose();
     this.renderer.forceContextLoss();
     this.gone = true;
-  }
-
-  ground() {
-    this.scene.background = new Color(getComputedStyle(this.canvas).backgroundColor);
-    this.redraw();
   }
 
   /** Put a mesh into slot 0 (this scan) or 1 (the one beside it); `level` is "coarse" or "full". */
