@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from slrig.devices import COMPUTED, AppliedSettings, CameraInfo, CameraSettings,
 from slrig.errors import DeviceGoneError, FrameTimeoutError
 from slrig.model import CameraFormat, Frame, Pixels
 
-_NOISE, _FATE, _GARBLE, _STALE, _CORRUPT, _START, _DELIVERY = range(7)
+_NOISE, _FATE, _GARBLE, _STALE, _CORRUPT, _START, _DELIVERY, _COLOUR = range(8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ class SimulatedCamera:
         self._t_busy_ns = 0
         self._free_index = 0
         self._last_image: Pixels | None = None
+        self._last_colour: Callable[[], Pixels] | None = None
         self._gone = False
 
     @property
@@ -78,6 +80,7 @@ class SimulatedCamera:
             exposure_range_s=(options.exposure_min_s, options.exposure_max_s),
             gain_range=(1.0, options.gain_max),
             limits=COMPUTED,
+            colour=options.colour is not None,
         )
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
@@ -215,6 +218,9 @@ class SimulatedCamera:
         repeated = self._last_image if stale else None
         image = repeated if repeated is not None else self._rendered(exposure)
         self._last_image = image
+        if repeated is None and self._options.colour is not None:
+            mean = self._view.colour(self._lights(exposure), ambient=self._ambient(exposure))
+            self._last_colour = partial(self._coloured, mean, exposure.number, self._settings)
         if self._befalls(self._faults.corrupt_frames, exposure.number) or self._chance(
             self._faults.corrupt_probability, _CORRUPT, exposure.number
         ):
@@ -230,6 +236,7 @@ class SimulatedCamera:
             exposure_s=self._settings.exposure_s,
             gain=self._settings.gain,
             shutter_skew_s=self._options.shutter_skew_s,
+            colour=self._last_colour,
         )
 
     def _rendered(self, exposure: _Exposure) -> Pixels:
@@ -237,6 +244,13 @@ class SimulatedCamera:
         exposure_s = self._settings.exposure_s * self._crept(exposure.number)
         electrons = self._sensor.electrons(mean, exposure_s)
         return self._sensor.read_out(electrons, gain=self._settings.gain, rng=self._rng(_NOISE, exposure.number))
+
+    def _coloured(self, mean: Callable[[], Float32Array], number: int, settings: AppliedSettings) -> Pixels:
+        """A frame in colour, with a noise of its own."""
+        light = mean() * np.array(self._options.colour, np.float32)
+        electrons = self._sensor.electrons(light, settings.exposure_s * self._crept(number))
+        flat = electrons.reshape(len(electrons), -1)
+        return self._sensor.read_out(flat, gain=settings.gain, rng=self._rng(_COLOUR, number)).reshape(light.shape)
 
     def _crept(self, number: int) -> float:
         """How much more light a frame has than the settings say."""

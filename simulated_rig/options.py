@@ -178,6 +178,9 @@ class CameraOptions(Device):
     pedestal_dn: NotNegative = 0.0
     """The value of a dark sample."""
 
+    colour: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)] | None = None
+    """How strongly it sees blue, green and red, beside its grey picture, whose unit is 1; else it is mono."""
+
     response: Annotated[float, Field(gt=0, le=4)] = 1.0
     """Values grow with light to the power of this: 0.45 as a webcam's, made for displays."""
 

@@ -15,15 +15,23 @@ from slrig.model import FloatArray
 TEXTURES = ("uniform", "checker", "noise")
 
 
+Colour = Annotated[tuple[Fraction, Fraction, Fraction], Field(strict=False)]
+"""Albedo for blue, green and red light, as a share of the albedo."""
+
+WHITE: Colour = (1.0, 1.0, 1.0)
+
+
 class Texture(Strict):
     """Albedo that varies: times 1 - contrast * t, t in 0..1 over the object's own coordinates.
 
     `checker` alternates squares of `scale_mm` over x and y; `noise` is smooth random shading with grains of that size.
+    colour : the object's where t is 1, if it is another one there.
     """
 
     kind: Literal["uniform", "checker", "noise"] = "uniform"
     contrast: Fraction = 0.5
     scale_mm: Positive = 10.0
+    colour: Colour | None = None
 
 
 class Specular(Strict):
@@ -41,11 +49,16 @@ class Standing(Strict):
     rotation_deg: Triple = (0.0, 0.0, 0.0)
     specular: Specular = Specular()
 
+    def colours(self) -> tuple[Colour, Colour]:
+        """The colour where a texture is light, and where it is dark."""
+        return WHITE, WHITE
+
 
 class Placed(Standing):
-    """An object of one albedo, or of one that a texture varies."""
+    """An object of one albedo and colour, or of those that a texture varies."""
 
     albedo: Annotated[float, Field(gt=0, le=1)] = 0.8
+    colour: Colour = WHITE
     texture: Texture = Texture()
 
     def material(self) -> tuple[float, ...]:
@@ -53,6 +66,10 @@ class Placed(Standing):
         texture, lobe = self.texture, self.specular
         kind = float(TEXTURES.index(texture.kind))
         return (self.albedo, kind, texture.contrast, texture.scale_mm, lobe.strength, lobe.exponent)
+
+    def colours(self) -> tuple[Colour, Colour]:
+        """See `Standing`."""
+        return self.colour, self.colour if self.texture.colour is None else self.texture.colour
 
 
 def turned_by(rotation_deg: Triple) -> FloatArray:

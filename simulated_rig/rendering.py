@@ -169,6 +169,23 @@ class View:
             total += np.asarray(fraction, np.float32) * self._under(seen, paths, light)
         return total
 
+    def colour(
+        self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
+    ) -> Callable[[], Float32Array]:
+        """What makes `image` in blue, green and red, (H, W, 3) float32, of what stands there now."""
+        seen = self._seen
+
+        def channel(number: int) -> Float32Array:
+            paths = self._traced_paths(seen).in_light(number)
+            total = blurred(paths.albedo * np.float32(self._ambient), self._blur_px) * (
+                1 if ambient is None else ambient
+            )
+            for fraction, light in lights:
+                total = total + np.asarray(fraction, np.float32) * self._lit(seen, paths, light)
+            return total
+
+        return lambda: np.stack([channel(number) for number in range(3)], axis=2)
+
     def rehearse(self, lights: Sequence[tuple[float | Float32Array, LightTable]]) -> None:
         """Do the work of `image` that does not depend on fractions, so that it is quick when time matters."""
         seen = self._seen
@@ -179,11 +196,14 @@ class View:
     def _under(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
         # A free-running camera sees the same light many times over: keep the last image.
         if seen.last is None or seen.last[0] is not light:
-            image = self._defocused(seen, paths, light)
-            if light.glow > 0:
-                image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
-            seen.last = (light, image)
+            seen.last = (light, self._lit(seen, paths, light))
         return seen.last[1]
+
+    def _lit(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
+        image = self._defocused(seen, paths, light)
+        if light.glow > 0:
+            image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
+        return image
 
     def _defocused(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
         """The light of the projector on each pixel, blended from images at several levels of defocus."""

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from simulated_rig import shapes
 from simulated_rig.boards import Board, Print
-from simulated_rig.placed import Placed, turned_by
+from simulated_rig.placed import Colour, Placed, turned_by
 from simulated_rig.shapes import Part
 from simulated_rig.tables import NotNegative, Pair, Positive, at_least_one
 from slrig.bundle.faults import Strict, checked, read_toml
@@ -209,6 +209,7 @@ class SceneSurface:
     sphere_mm : (P, 4) float64, centre and radius of a part that is a ball, radius 0 for the others.
     to_object : (P, 3, 4) float64, world to the object's own frame.
     material : (P, 6) float64: albedo, texture (index in TEXTURES), contrast, scale_mm, lobe strength, exponent.
+    colours : (P, 2, 3) float64, blue, green and red where a texture is light, and where it is dark.
     prints : what is printed on the parts that are boards.
     """
 
@@ -219,6 +220,7 @@ class SceneSurface:
     sphere_mm: FloatArray
     to_object: FloatArray
     material: FloatArray
+    colours: FloatArray
     prints: Mapping[int, Print] = field(default_factory=dict)
 
 
@@ -233,6 +235,7 @@ def surface_of(scene: Scene, folder: Path) -> SceneSurface:
     spheres: list[tuple[float, ...]] = []
     inverses: list[FloatArray] = []
     materials: list[tuple[float, ...]] = []
+    colours: list[tuple[Colour, Colour]] = []
     prints: dict[int, Print] = {}
     faults, first = [], 0
     for thing in scene.object:
@@ -253,6 +256,7 @@ def surface_of(scene: Scene, folder: Path) -> SceneSurface:
             spheres.append((*(rotation @ np.array(part.sphere_mm[:3]) + shift), part.sphere_mm[3]))
             inverses.append(np.column_stack([rotation.T, -rotation.T @ shift]))
             materials.append(thing.material())
+            colours.append(thing.colours())
             first += len(part.vertices_mm)
     if faults:
         message = "\n".join(faults)
@@ -265,5 +269,6 @@ def surface_of(scene: Scene, folder: Path) -> SceneSurface:
         sphere_mm=np.array(spheres, np.float64),
         to_object=np.array(inverses, np.float64),
         material=np.array(materials, np.float64),
+        colours=np.array(colours, np.float64),
         prints=prints,
     )

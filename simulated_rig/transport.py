@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ SHADOW_BIAS_MM = 0.05
 """A surface shades a point only if it lies nearer to the projector by more than this: facets must not shade
 the curved surface that they stand for."""
 
+LUMA = (0.114, 0.587, 0.299)
+"""What blue, green and red light are of grey (Rec. 601)."""
+
 _BLOCK_RAYS = 120_000
 
 
@@ -36,6 +39,7 @@ class Hits:
     column_px, row_px : (n,) float64, where the projector's lens images the point (perhaps beside its image), NaN in
     shadow.
     weight : (n,) float32, light sent to the camera per unit of projector light; albedo : (n,) float32.
+    hue : (n, 3) float32, what a part of blue, green and red light makes of both, over what all light does.
     """
 
     points_mm: FloatArray
@@ -45,6 +49,7 @@ class Hits:
     row_px: FloatArray
     weight: NDArray[np.float32]
     albedo: NDArray[np.float32]
+    hue: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,12 +58,22 @@ class Paths:
 
     column_px, row_px, weight : (H, W, S) float32, weight 0 where the sample is not lit.
     albedo : (H, W) float32, mean over the pixel's samples, 0 where they meet nothing.
+    hue : (H, W, S, 3) float32 as of `Hits`; None where nothing is coloured.
     """
 
     column_px: NDArray[np.float32]
     row_px: NDArray[np.float32]
     weight: NDArray[np.float32]
     albedo: NDArray[np.float32]
+    hue: NDArray[np.float32] | None = None
+
+    def in_light(self, channel: int) -> Paths:
+        """The paths of blue, green or red light alone: 0, 1, 2."""
+        if self.hue is None:
+            return self
+        hue = self.hue[..., channel]
+        # Samples of one pixel have nearly one albedo, and only the room's light takes the mean of both.
+        return replace(self, weight=self.weight * hue, albedo=self.albedo * hue.mean(axis=2), hue=None)
 
 
 def trace(
@@ -101,6 +116,7 @@ def trace(
     blocker = rays.first_hit(lamp, towards)
     column, row = np.full(len(u), np.nan), np.full(len(u), np.nan)
     weight, albedo = np.zeros(len(u), np.float32), np.zeros(len(u), np.float32)
+    hue = np.ones((len(u), 3), np.float32)
     _light_points(
         points,
         normals,
@@ -114,6 +130,7 @@ def trace(
         surface.part,
         surface.to_object,
         surface.material,
+        surface.colours,
         pigments,
         lamp,
         lens_array(projector),
@@ -125,10 +142,11 @@ def trace(
         row,
         weight,
         albedo,
+        hue,
     )
     width, height = projector.size.width_px, projector.size.height_px
     inside = (column >= -0.5) & (column <= width - 0.5) & (row >= -0.5) & (row <= height - 0.5)
-    return Hits(points, seen, inside & (weight > 0), column, row, weight, albedo)
+    return Hits(points, seen, inside & (weight > 0), column, row, weight, albedo, hue)
 
 
 def paths(
@@ -155,6 +173,7 @@ def paths(
         row_px=np.zeros((rows, columns, count), np.float32),
         weight=np.zeros((rows, columns, count), np.float32),
         albedo=np.zeros((rows, columns), np.float32),
+        hue=np.ones((rows, columns, count, 3), np.float32) if (surface.colours != 1).any() else None,
     )
     block_rows = max(_BLOCK_RAYS // (columns * count), 1)
 
@@ -179,6 +198,8 @@ def paths(
         out.row_px[first:last] = np.where(known, hits.row_px, 0.0).reshape(shape)
         out.weight[first:last] = np.where(known, hits.weight, 0.0).reshape(shape)
         out.albedo[first:last] = hits.albedo.reshape(shape).mean(axis=2)
+        if out.hue is not None:
+            out.hue[first:last] = hits.hue.reshape(*shape, 3)
 
     starts = range(0, rows, block_rows)
     with ThreadPoolExecutor(workers, thread_name_prefix="trace") as pool:
@@ -312,6 +333,7 @@ def _light_points(
     part: IntArray,
     to_object: FloatArray,
     material: FloatArray,
+    colours: FloatArray,
     pigments: FloatArray,
     lamp: FloatArray,
     lens: LensArray,
@@ -323,8 +345,9 @@ def _light_points(
     row: FloatArray,
     weight: NDArray[np.float32],
     albedo: NDArray[np.float32],
+    hue: NDArray[np.float32],
 ) -> None:
-    """Fill column, row, weight and albedo (see `Hits`) for points met by camera rays `view`."""
+    """Fill column, row, weight, albedo and hue (see `Hits`) for points met by camera rays `view`."""
     for i in range(len(triangle)):
         if not np.isfinite(points[i, 0]):
             continue
@@ -338,7 +361,15 @@ def _light_points(
             y = (f[1, 0] * p[0] + f[1, 1] * p[1] + f[1, 2] * p[2] + f[1, 3]) / grain
             z = (f[2, 0] * p[0] + f[2, 1] * p[1] + f[2, 2] * p[2] + f[2, 3]) / grain
             darkness = texture_value(int(m[1]), x, y, z)
-        albedo[i] = m[0] * (1.0 - m[2] * darkness) * pigments[i]
+        light_tint, dark_tint = colours[owner, 0], colours[owner, 1]
+        # Written so that white makes exactly 1.
+        luma = 1.0
+        for channel in range(3):
+            hue[i, channel] = light_tint[channel] + darkness * (dark_tint[channel] - light_tint[channel])
+            luma += LUMA[channel] * (hue[i, channel] - 1.0)
+        for channel in range(3):
+            hue[i, channel] = hue[i, channel] / luma if luma > 0.0 else 0.0
+        albedo[i] = m[0] * (1.0 - m[2] * darkness) * pigments[i] * luma
         cosine = -(n[0] * light[0] + n[1] * light[1] + n[2] * light[2])
         if cosine <= 0.0:
             continue

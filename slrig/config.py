@@ -62,6 +62,9 @@ class ScanDefaults(Strict):
         description="a bracket: play the sequence once for each of these exposures, and fuse the frames. On a video "
         "projector, whole refresh periods",
     )
+    colour: bool | None = Field(
+        default=None, description="keep white and black frames in colour. Default: where a camera has it"
+    )
 
 
 class DriverTable(Strict, use_attribute_docstrings=True):
@@ -270,7 +273,8 @@ class ServiceSettings(BaseSettings):
     backlog_length: Annotated[int, Field(ge=1, le=1000)] = 16
     max_body_bytes: Annotated[int, Field(ge=1024)] = 2**16
     min_free_bytes: Annotated[int, Field(ge=0)] = 2**30
-    max_event_streams: Annotated[int, Field(ge=1)] = 32
+    # Twenty people who look at the page have two each: a picture, and what happens.
+    max_event_streams: Annotated[int, Field(ge=1)] = 48
     requests_per_s: Annotated[float, Field(gt=0)] = 50.0
     max_connections: Annotated[int, Field(ge=16, le=1536)] = 512
     max_connections_per_address: Annotated[int, Field(ge=1)] = 64

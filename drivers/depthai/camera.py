@@ -17,7 +17,7 @@ from typing import Any
 from drivers.depthai.board import Board, Link, board_of
 from drivers.depthai.feed import KEPT_FRAMES, Feed
 from drivers.depthai.library import library
-from drivers.depthai.messages import Delivery, brightness
+from drivers.depthai.messages import Delivery, brightness, coloured
 from drivers.depthai.options import OakOptions, Stream
 from drivers.depthai.sensors import Sensor
 from slrig.bundle.faults import checked
@@ -221,6 +221,7 @@ class OakCamera:
             triggers=frozenset({trigger}),
             exposure_range_s=(LEAST_EXPOSURE_S, LONGEST_SHARE / self._stream.fps),
             gain_range=(1.0, MOST_GAIN),
+            colour=self._stream.colour,
         )
 
     def _prepare(self, control: Any) -> None:
@@ -252,9 +253,10 @@ class OakCamera:
         # The last row was read out by the time the frame was here.
         skew_ns = min(self._sensor.longest_skew_ns(self._stream.fps), delivery.received_ns - delivery.t_end_ns)
         skew_ns = max(skew_ns, 0)
+        image = brightness(delivery.message, self._stream)
         return Frame(
             camera=self._name,
-            image=brightness(delivery.message, self._stream),
+            image=image,
             t_start_ns=delivery.t_start_ns,
             t_end_ns=delivery.t_end_ns + skew_ns,
             t_err_ns=self._board.err_ns,
@@ -263,6 +265,7 @@ class OakCamera:
             exposure_s=delivery.exposure_us / 1e6,
             gain=delivery.iso / ISO_OF_GAIN_1,
             shutter_skew_s=skew_ns / 1e9,
+            colour=coloured(delivery.message, image) if self._stream.colour else None,
         )
 
     def _not_settled(self, last: Delivery | None) -> Exception:

@@ -1,4 +1,4 @@
-"""Frames as the library delivers them: whether one is whole, when it was exposed, and its brightness.
+"""Frames as the library delivers them: whether one is whole, when it was exposed, its brightness and colour.
 
 The library's time stamp is that of the first byte on the sensor's bus: a few microseconds after the exposure's end, of
 the first row where the shutter rolls (github.com/luxonis/depthai/issues/795). It counts in the library's clock, which
@@ -7,6 +7,7 @@ is CLOCK_MONOTONIC.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from drivers.depthai.library import microseconds, nanoseconds
 from drivers.depthai.options import Stream
+from drivers.v4l2.formats import from_luma
 from slrig.model import Pixels
 
 
@@ -73,6 +75,16 @@ def brightness(message: Any, stream: Stream) -> Pixels:
     stride, size = message.getStride(), stream.size
     plane = np.asarray(message.getData(), dtype=np.uint8)[: stride * size.height_px]
     return plane.reshape(size.height_px, stride)[:, : size.width_px].copy()
+
+
+def coloured(message: Any, luma: Pixels) -> Callable[[], Pixels]:
+    """What makes a colour frame of its brightness and of the differences of blue and red, copied, which follow it in
+    NV12: in turn, half as many rows and columns.
+    """
+    stride, (rows, columns) = message.getStride(), luma.shape
+    planes = np.asarray(message.getData(), dtype=np.uint8)[stride * rows :][: stride * (rows // 2)]
+    differences = planes.reshape(-1, stride)[:, :columns].copy()
+    return lambda: from_luma(luma, differences[:, ::2], differences[:, 1::2])
 
 
 def kind_of(stream: Stream, vendor: Any) -> Any:

@@ -164,6 +164,7 @@ class GenicamCamera:
             triggers=frozenset(triggers),
             exposure_range_s=(max(least_us, 1.0) / 1e6, most_us / 1e6),
             gain_range=(float(gains[0]), float(gains[1])),
+            colour=bool(FORMATS[self._options.pixel_format].mosaic),
         )
 
     def _in_use(self) -> AppliedSettings:

@@ -1,4 +1,4 @@
-"""Pixel formats of the PFNC (Pixel Format Naming Convention): what the camera sends, as a grey image."""
+"""Pixel formats of the PFNC (Pixel Format Naming Convention): what the camera sends, in grey and in colour."""
 
 from __future__ import annotations
 
@@ -74,8 +74,9 @@ _GREY = {
 }
 
 
-def grey(data: bytes, form: PixelFormat, size: Size, *, padding_bytes: int = 0) -> Pixels:
-    """(H, W) uint8 or uint16: the image in a buffer.
+def grey(data: bytes, form: PixelFormat, size: Size, *, padding_bytes: int = 0, in_colour: bool = False) -> Pixels:
+    """(H, W) uint8 or uint16: the image in a buffer; in_colour : (H, W, 3), blue, green and red, of a format that is
+    not grey.
 
     A colour filter's mosaic is interpolated and weighted as luma (OpenCV), so a mono camera sees sharper. Samples
     beyond the bit depth are cut off; `padding_bytes` follow every row of an unpacked format.
@@ -107,8 +108,11 @@ def grey(data: bytes, form: PixelFormat, size: Size, *, padding_bytes: int = 0) 
         return image
     if form.samples > 1:
         image = image.reshape(*size.shape, form.samples)
-    converted: Pixels = np.asarray(cv2.cvtColor(image, _GREY[form.mosaic]))
-    return converted
+    if not in_colour:
+        return np.asarray(cv2.cvtColor(image, _GREY[form.mosaic]))
+    if form.samples > 1:
+        return image if form.mosaic == "BGR" else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{form.mosaic}2BGR")))
 
 
 def _bytes(data: bytes, count: int, form: PixelFormat) -> Bytes:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from drivers.genicam.connection import Connection, Delivery, Stream
 from drivers.genicam.options import CameraOptions
@@ -28,9 +30,10 @@ _TIE_AGAIN_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class _Exposed:
-    """A sound frame, and when its exposure began."""
+    """A sound frame, in colour too where there is any, and when its exposure began."""
 
     image: Pixels
+    colour: Callable[[], Pixels] | None
     number: int
     start: Interval
 
@@ -139,8 +142,8 @@ class Session:
 
     def _judge(self, delivery: Delivery) -> None:
         number = self._numbers.next(delivery.block_id)
-        image = self._image(delivery)
-        if image is None:
+        pictures = self._pictures(delivery)
+        if pictures is None:
             self._passed["corrupt"] += 1
             return
         if number is None:
@@ -153,7 +156,7 @@ class Session:
         if start is None:
             self._passed["unasked"] += 1
             return
-        self._waiting.append(_Exposed(image, number, start))
+        self._waiting.append(_Exposed(*pictures, number, start))
 
     def _frame(self, exposed: _Exposed) -> Frame:
         start = exposed.start
@@ -171,15 +174,17 @@ class Session:
             dropped_count=self._numbers.made - self._good,
             exposure_s=self._applied.exposure_s,
             gain=self._applied.gain,
+            colour=exposed.colour,
         )
 
-    def _image(self, delivery: Delivery) -> Pixels | None:
-        """The image, or None if packets are missing or it is not what was set."""
+    def _pictures(self, delivery: Delivery) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
+        """The image, and what makes it in colour, or None if packets are missing or it is not what was set."""
         image = delivery.image
         if image is None or image.size != self._size:
             return None
+        made = partial(grey, image.data, self._form, self._size, padding_bytes=image.padding_bytes)
         try:
-            return grey(image.data, self._form, self._size, padding_bytes=image.padding_bytes)
+            return made(), partial(made, in_colour=True) if self._form.mosaic else None
         except ValueError:
             return None
 

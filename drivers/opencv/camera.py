@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -84,6 +85,7 @@ class OpenCvCamera:
             exposure_range_s=exposures_s,
             gain_range=gains,
             notes=self._notes,
+            colour=self._picture.has_colour,
         )
         if source.kind is Kind.LIVE:
             self._reader.start()
@@ -187,6 +189,7 @@ class OpenCvCamera:
             dropped_count=taken.lost - self._lost_before + self._corrupt,
             exposure_s=self._applied.exposure_s,
             gain=self._applied.gain,
+            colour=partial(self._picture.colour, taken.data) if self._picture.has_colour else None,
         )
 
     def _nothing_came(self, after_ns: int, timeout_s: float, passed: _PassedOver) -> str:

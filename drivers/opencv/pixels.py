@@ -1,7 +1,8 @@
-"""What OpenCV hands over, as a grey image: raw buffers of the kernel, JPEGs as they were sent, decoded pictures."""
+"""What OpenCV hands over, in grey and in colour: raw buffers of the kernel, JPEGs as sent, decoded pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,16 +10,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, grey_image
+from drivers.v4l2.formats import LAYOUTS, CorruptFrameError, colour_image, grey_image
 from slrig.model import CameraFormat, Pixels, Size
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What comes from OpenCV: the pixel format of raw data (None: decoded pictures), and the camera's format."""
+    """What comes from OpenCV: the pixel format of raw data (None: decoded pictures), the camera's format, and whether
+    there is colour in it.
+    """
 
     code: str | None
     format: CameraFormat
+    has_colour: bool = False
 
     def grey(self, data: NDArray[Any]) -> Pixels:
         """Return (H, W), uint8 up to 8 bit and uint16 beyond.
@@ -46,10 +50,14 @@ class Picture:
             return np.asarray(cv2.cvtColor(data, cv2.COLOR_BGR2GRAY))
         return np.ascontiguousarray(data[..., 0] if data.ndim == 3 else data)
 
-    def _read(self, data: NDArray[Any], code: str) -> Pixels:
+    def colour(self, data: NDArray[Any]) -> Pixels:
+        """Return (H, W, 3), blue, green and red, of data that `grey` has taken and that has colour."""
+        return data if self.code is None else self._read(data, self.code, colour_image)
+
+    def _read(self, data: NDArray[Any], code: str, made: Callable[..., Pixels] = grey_image) -> Pixels:
         layout, size = LAYOUTS[code], self.format.size
         plain = np.ascontiguousarray(data).reshape(-1).view(np.uint8)
-        return grey_image(plain, layout, size, stride_bytes=len(plain) // size.height_px)
+        return made(plain, layout, size, stride_bytes=len(plain) // size.height_px)
 
 
 def raw_picture(code: str | None, size: Size, bit_depth: int | None) -> Picture:
@@ -58,7 +66,8 @@ def raw_picture(code: str | None, size: Size, bit_depth: int | None) -> Picture:
     bit_depth : how many bits of a 16-bit sample are used; None for all of them.
     """
     depth = 8 if code is None else LAYOUTS[code].bit_depth
-    return Picture(code, CameraFormat(size, bit_depth if depth == 16 and bit_depth is not None else depth))
+    form = CameraFormat(size, bit_depth if depth == 16 and bit_depth is not None else depth)
+    return Picture(code, form, code is None or LAYOUTS[code].has_colour)
 
 
 def decoded_picture(data: NDArray[Any], bit_depth: int | None) -> Picture:
@@ -74,4 +83,4 @@ def decoded_picture(data: NDArray[Any], bit_depth: int | None) -> Picture:
         raise CorruptFrameError(message)
     rows, columns = data.shape[:2]
     depth = 8 if data.dtype == np.uint8 else bit_depth or 16
-    return Picture(None, CameraFormat(Size(columns, rows), depth))
+    return Picture(None, CameraFormat(Size(columns, rows), depth), data.shape[2:] == (3,))

@@ -230,9 +230,10 @@ class PiCamera:
         # All rows are read out within a frame of the fastest mode, and were by the time the frame was here.
         skew_ns = 0 if self._options.global_shutter else round(self._controls["FrameDurationLimits"][0] * 1e3)
         skew_ns = max(min(skew_ns, now_ns - start_ns - exposure_ns), 0)
+        data = request.make_buffer(self._stream.name)
         return Frame(
             camera=self._name,
-            image=self._stream.image(request.make_buffer(self._stream.name)),
+            image=self._stream.image(data),
             t_start_ns=start_ns,
             t_end_ns=start_ns + exposure_ns + skew_ns,
             t_err_ns=_ERROR_NS,
@@ -241,6 +242,7 @@ class PiCamera:
             exposure_s=exposure_ns / 1e9,
             gain=float(metadata["AnalogueGain"]),
             shutter_skew_s=skew_ns / 1e9,
+            colour=self._stream.colour(data),
         )
 
     def _declared(self, known: Mapping[str, Any]) -> CameraInfo:
@@ -256,6 +258,7 @@ class PiCamera:
             triggers=frozenset({Trigger.FREE}),
             exposure_range_s=(shortest["ExposureTime"] / 1e6, min(most_us / 1e6, LONGEST_S)),
             gain_range=(max(float(least), 1.0), float(most)),
+            colour=self._stream.layout.has_colour,
         )
 
     def _fixed(self) -> dict[str, object]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.v4l2.formats import Layout, Packing, grey_image
+from drivers.v4l2.formats import Layout, Packing, colour_image, grey_image
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import Pixels, Size
 
@@ -26,6 +28,12 @@ class Stream:
     layout: Layout
     size: Size
     stride_bytes: int
+
+    def colour(self, data: NDArray[np.uint8]) -> Callable[[], Pixels] | None:
+        """What makes (H, W, 3), blue, green and red, of a buffer; None where there is none."""
+        if not self.layout.has_colour:
+            return None
+        return partial(colour_image, data, self.layout, self.size, stride_bytes=self.stride_bytes)
 
     def image(self, data: NDArray[np.uint8]) -> Pixels:
         """(H, W): the image in a buffer. Raises ValueError: it is too short."""

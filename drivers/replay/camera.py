@@ -43,6 +43,7 @@ class ReplayCamera:
             exposure_range_s=(exposures[0], exposures[-1]) if exposures else (1e-6, 3600.0),
             gain_range=(1.0, 1.0),
             limits=COMPUTED,
+            colour=any(shot.colour is not None for shots in self._recorded.values() for shot in shots),
         )
         self._applied = AppliedSettings(exposures[0] if exposures else 0.01, 1.0)
         self._clock = clock
@@ -91,6 +92,7 @@ class ReplayCamera:
         self._state.require_armed()
         shot = self._shot()
         exposure_s = self._applied.exposure_s if shot.exposure_s is None else shot.exposure_s
+        colour = shot.colour
         start_ns = max(self._clock.now_ns(), self._busy_ns, self._clock.recorded_ns(shot.time_s))
         end_ns = start_ns + round(exposure_s * 1e9)
         self._busy_ns = end_ns
@@ -106,6 +108,7 @@ class ReplayCamera:
                 dropped_count=0,
                 exposure_s=exposure_s,
                 gain=self._applied.gain,
+                colour=None if colour is None else lambda: colour,
             )
         )
         self._number += 1

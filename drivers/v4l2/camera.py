@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 
 from drivers.v4l2 import controls as ctl
 from drivers.v4l2 import kernel
 from drivers.v4l2.finding import Identity, Node, identity_of, resolved
-from drivers.v4l2.formats import CorruptFrameError, Layout, grey_image, prepare
+from drivers.v4l2.formats import CorruptFrameError, Layout, colour_image, grey_image, prepare
 from drivers.v4l2.negotiation import agree
 from drivers.v4l2.options import V4L2Options
 from drivers.v4l2.processing import switch_off_processing
@@ -195,34 +197,33 @@ class V4L2Camera:
         elif not taken.corrupt and exposure.earliest_ns < after_ns:
             passed.stale += 1
         else:
-            image = self._image(taken, passed)
-            if image is not None:
+            pictures = self._pictures(taken, passed)
+            if pictures is not None:
                 self._stream.give_back(taken)
-                return self._frame(image, exposure)
+                return self._frame(*pictures, exposure)
             self._tally.note_corrupt()
         self._stream.give_back(taken)
         return None
 
-    def _image(self, taken: Taken, passed: _PassedOver) -> Pixels | None:
+    def _pictures(self, taken: Taken, passed: _PassedOver) -> tuple[Pixels, Callable[[], Pixels] | None] | None:
         if taken.corrupt:
             passed.corrupt += 1
             passed.last_fault = "the driver says that its data are damaged"
             return None
         agreed = self._agreed
+        sent = self._stream.data(taken), agreed.layout, agreed.size
+        grey, colour = (
+            partial(made, *sent, stride_bytes=agreed.stride_bytes, limited_luma=self._options.limited_luma)
+            for made in (grey_image, colour_image)
+        )
         try:
-            return grey_image(
-                self._stream.data(taken),
-                agreed.layout,
-                agreed.size,
-                stride_bytes=agreed.stride_bytes,
-                limited_luma=self._options.limited_luma,
-            )
+            return grey(), colour if agreed.layout.has_colour else None
         except CorruptFrameError as fault:
             passed.corrupt += 1
             passed.last_fault = str(fault)
             return None
 
-    def _frame(self, image: Pixels, exposure: Exposure) -> Frame:
+    def _frame(self, image: Pixels, colour: Callable[[], Pixels] | None, exposure: Exposure) -> Frame:
         start_ns, end_ns, error_ns = exposure.centred(round(self._applied.exposure_s * 1e9))
         return Frame(
             camera=self._name,
@@ -234,6 +235,7 @@ class V4L2Camera:
             dropped_count=self._tally.lost,
             exposure_s=self._applied.exposure_s,
             gain=self._applied.gain,
+            colour=colour,
         )
 
     def _exposure_of(self, taken: Taken) -> Exposure:
@@ -332,6 +334,7 @@ class V4L2Camera:
             exposure_range_s=exposures,
             gain_range=self._scale.range,
             notes=notes,
+            colour=self._agreed.layout.has_colour,
         )
 
 

@@ -1,10 +1,11 @@
-"""Pixel formats: a buffer's bytes as a grey image.
+"""Pixel formats: a buffer's bytes as a grey image, and in colour.
 
 Bayer samples are raw, and turned to grey by OpenCV's interpolation: a stripe detector needs one brightness per pixel,
 and under any light that is not white for this sensor the bare samples are a chequered pattern that it would take for
 stripes. The interpolation costs resolution (each grey value is a mean over 3 x 3 pixels) and mixes red, green and blue
 as 0.30, 0.59, 0.11; a monochrome sensor is the better choice. MJPG costs more: its blocks of 8 x 8 pixels are coarse.
-Luma of YUV formats and MJPG is as the camera encodes it, in general not proportional to light.
+Luma of YUV formats and MJPG is as the camera encodes it, in general not proportional to light; nor are their colours,
+which come of luma and of differences of bent red, green and blue by the weights of Rec. 601, as JFIF has them.
 """
 
 from __future__ import annotations
@@ -46,16 +47,25 @@ class Packing(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a pixel format is read. bayer : the first row's two colours and the second row's, None for grey."""
+    """How a pixel format is read. bayer : the first row's two colours and the second row's, None for grey.
+
+    red_first : of two differences of colour, that of red comes before that of blue.
+    """
 
     bit_depth: int
     packing: Packing
     bayer: str | None = None
+    red_first: bool = False
 
     @property
     def is_luma(self) -> bool:
         """Whether the samples are the luma of a colour image."""
         return self.packing in (Packing.EVEN_BYTES, Packing.ODD_BYTES, Packing.JPEG)
+
+    @property
+    def has_colour(self) -> bool:
+        """Whether `colour_image` reads it."""
+        return self.bayer is not None or self.is_luma
 
 
 def _layouts() -> dict[str, Layout]:
@@ -68,9 +78,9 @@ def _layouts() -> dict[str, Layout]:
         "Y10P": Layout(10, Packing.MIPI10),
         "Y12P": Layout(12, Packing.MIPI12),
         "YUYV": Layout(8, Packing.EVEN_BYTES),
-        "YVYU": Layout(8, Packing.EVEN_BYTES),
+        "YVYU": Layout(8, Packing.EVEN_BYTES, red_first=True),
         "UYVY": Layout(8, Packing.ODD_BYTES),
-        "VYUY": Layout(8, Packing.ODD_BYTES),
+        "VYUY": Layout(8, Packing.ODD_BYTES, red_first=True),
         "MJPG": Layout(8, Packing.JPEG),
         "JPEG": Layout(8, Packing.JPEG),
     }
@@ -160,7 +170,7 @@ def grey_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, li
         Bytes are missing, or the JPEG is damaged.
     """
     if layout.packing is Packing.JPEG:
-        image = _decoded(data, size)
+        image = _decoded(data, size, cv2.IMREAD_GRAYSCALE)
     else:
         image = _UNPACK[layout.packing](_rows(data, layout, size, stride_bytes), size)
     if layout.bayer is not None:
@@ -168,6 +178,33 @@ def grey_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, li
     if limited_luma and layout.is_luma:
         image = _SPREAD[image]
     return image
+
+
+def colour_image(data: Bytes, layout: Layout, size: Size, *, stride_bytes: int, limited_luma: bool = False) -> Pixels:
+    """Return a buffer of a layout that `has_colour` as (H, W, 3), blue, green and red, of `grey_image`'s type.
+    Parameters, and what is raised, as there.
+    """
+    if layout.packing is Packing.JPEG:
+        image = _decoded(data, size, cv2.IMREAD_COLOR)
+    else:
+        rows = _rows(data, layout, size, stride_bytes)
+        image = _UNPACK[layout.packing](rows, size)
+        if layout.bayer is not None:
+            return np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_Bayer{layout.bayer}2BGR")))
+        first = 1 if layout.packing is Packing.EVEN_BYTES else 0
+        image = from_luma(image, *(rows[:, first + 2 * (second != layout.red_first) :: 4] for second in (False, True)))
+    return _SPREAD[image] if limited_luma else image
+
+
+def from_luma(luma: Pixels, blue: Bytes, red: Bytes) -> Pixels:
+    """(H, W, 3) uint8, blue, green and red, of luma (H, W) and of the differences of blue and red, of fewer rows or
+    columns: full range, 128 is none.
+    """
+    planes = [
+        cv2.resize(np.ascontiguousarray(each), luma.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        for each in (red, blue)
+    ]
+    return np.asarray(cv2.cvtColor(cv2.merge([luma, *planes]), cv2.COLOR_YCrCb2BGR), dtype=np.uint8)
 
 
 def _rows(data: Bytes, layout: Layout, size: Size, stride_bytes: int) -> Bytes:
@@ -221,7 +258,7 @@ _UNPACK: dict[Packing, Callable[[Bytes, Size], Pixels]] = {
 _SPREAD: NDArray[np.uint8] = np.clip(np.rint((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 
 
-def _decoded(data: Bytes, size: Size) -> Pixels:
+def _decoded(data: Bytes, size: Size, flag: int) -> Pixels:
     if len(data) < 4 or data[0] != 0xFF or data[1] != 0xD8:
         message = f"{len(data)} bytes came that do not begin as a JPEG does"
         raise CorruptFrameError(message)
@@ -229,8 +266,8 @@ def _decoded(data: Bytes, size: Size) -> Pixels:
     if fault:
         message = f"the JPEG is damaged: {fault}"
         raise CorruptFrameError(message)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.shape != size.shape:
+    image = cv2.imdecode(data, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.shape[:2] != size.shape:
         found = "nothing" if image is None else f"{image.shape[1]} x {image.shape[0]}"
         message = f"the JPEG decodes to {found}, expected {size}"
         raise CorruptFrameError(message)

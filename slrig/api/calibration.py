@@ -1,4 +1,4 @@
-"""/calibration: open a session, shoot its poses, solve it, have scans use it; list, import, compare, delete; files."""
+"""/calibration: a board to print; a session, its poses, its solve, its use; list, import, compare, delete; files."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from slrig.api.calibration_schemas import (
     CalibrationList,
     CalibrationRequest,
     ComparisonBody,
+    CornerCount,
+    Millimetres,
     PoseBody,
     PoseRequestBody,
     ScriptRequest,
@@ -32,12 +34,12 @@ from slrig.api.schemas import filled, pattern_plan
 from slrig.api.service import Service, Serving
 from slrig.bundle.calibration_file import MOST_CALIBRATION_BYTES
 from slrig.bundle.description import CAMERA_NAME
-from slrig.bundle.free_text import FreeText
+from slrig.bundle.free_text import FreeText, SafeText
 from slrig.calibrate.calibrating import EXPORTS
 from slrig.calibrate.pose_shooting import PoseRequest
 from slrig.calibrate.records import PoseRecord, SessionRecord, pose_of
 from slrig.calibrate.store import REPORT, picture_name
-from slrig.calibration.board import USUAL_BOARD
+from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
 from slrig.errors import ArtefactNotReadyError, CameraNotFoundError
 
 IMPORT_PATH = "/calibration/import"
@@ -135,6 +137,31 @@ async def import_calibration(
     record = await run_in_threadpool(service.calibrations.submit, text, ending, label=label)
     response.headers["Location"] = f"/calibration/{record.id}"
     return await run_in_threadpool(_answered, service, record)
+
+
+@router.get("/board.pdf", response_class=Response, responses=file_of("application/pdf"))
+def fetch_board(
+    kind: BoardKind = USUAL_BOARD.kind,
+    columns: CornerCount = USUAL_BOARD.columns,
+    rows: CornerCount = USUAL_BOARD.rows,
+    square_mm: Millimetres = USUAL_BOARD.square_mm,
+    marker_mm: Millimetres | None = None,
+    dictionary: Annotated[SafeText | None, Query(max_length=64)] = None,
+    page: Annotated[
+        str,
+        Query(max_length=32, description="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm"),
+    ] = "A4",
+) -> Response:
+    """Return the sheet of a board, to be printed at 100 %, with a scale below the board and one left of it. The fields
+    are those of POST /calibration.
+    """
+    # Late: what draws a PDF takes a while to load.
+    from slrig.calibration.boards.printing import board_pdf
+
+    board = Board(kind, columns, rows, square_mm, marker_mm, dictionary)
+    name = f"board-{kind}-{columns}x{rows}-{square_mm:g}mm.pdf"
+    headers = {"Content-Disposition": f'inline; filename="{name}"', "Cache-Control": "no-store"}
+    return Response(board_pdf(board, page=page), media_type="application/pdf", headers=headers)
 
 
 @router.get("/compare", responses=problems(404, 409))

@@ -17,7 +17,7 @@ from slrig.api.service import Service, Serving
 from slrig.bundle.faults import Strict
 from slrig.bundle.moments import AwareMoment
 from slrig.calibration.board import Board
-from slrig.calibration.health.verdict import HealthState
+from slrig.calibration.health.verdict import THRESHOLDS, HealthState
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.verify.plot import health_svg
@@ -71,6 +71,17 @@ class VerificationFigures(BaseModel):
     unseen: list[str] = Field(description="devices that took no part, of which nothing was learned")
 
 
+class ThresholdsBody(BaseModel):
+    """From where on a rig is to be watched, and from where its calibration is stale. mean: of a pair's spare equation;
+    error_ratio: of the expected error over the stated one, where a device has changed.
+    """
+
+    watch_mean_px: float
+    stale_mean_px: float
+    watch_error_ratio: float
+    stale_error_ratio: float
+
+
 class HealthBody(BaseModel):
     """The health of the calibration in use."""
 
@@ -80,6 +91,7 @@ class HealthBody(BaseModel):
     calibration: str | None
     calibration_age_s: float | None
     refuses_scans_when_stale: bool
+    thresholds: ThresholdsBody
     latest: VerificationFigures | None
     links: dict[str, str]
 
@@ -124,6 +136,7 @@ def look_at_health(service: Serving) -> HealthBody:
         calibration=None if calibration is None else calibration.solve_id,
         calibration_age_s=age_s,
         refuses_scans_when_stale=service.refuse_when_stale,
+        thresholds=filled(ThresholdsBody, THRESHOLDS),
         latest=None if latest is None else VerificationFigures.model_validate(latest.document()),
         links={"history": "/rig/health/history", "plot": "/rig/health.svg", "verify": "/rig/verification"},
     )

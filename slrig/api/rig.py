@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import AsyncIterator
 from datetime import datetime
 from typing import Annotated, Any
@@ -12,6 +13,7 @@ import numpy as np
 from fastapi import APIRouter, Path, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 from starlette.responses import StreamingResponse
 
 from slrig.api.events import StreamPlace
@@ -21,8 +23,10 @@ from slrig.api.service import Serving
 from slrig.devices import CameraInfo
 from slrig.discovery import found_devices, installed_drivers
 from slrig.errors import SlrigError
+from slrig.jobs.examinations import Examination, last_examination
 from slrig.jobs.records import utc_now
 from slrig.rig.preview import Light, Watch
+from slrig.rig.settings import SettingsInUse
 from slrig.scan.runner import RunnerStatus
 
 _BOUNDARY = "picture"
@@ -51,7 +55,7 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 def look_at_rig(service: Serving) -> RigBody:
     """Return the rig: its devices, who holds it, and how many scans wait. Touches no device."""
     status = service.runner.status()
-    facts = status.facts
+    facts, settings = status.facts, service.runner.queue.rig.settings
     return filled(
         RigBody,
         status,
@@ -61,7 +65,7 @@ def look_at_rig(service: Serving) -> RigBody:
         calibrated=None if facts is None else (status.active is not None or facts.calibration is not None),
         calibration=_in_use(status),
         positions=[] if facts is None else facts.positions,
-        cameras=[] if facts is None else [_camera(name, camera) for name, camera in facts.cameras.items()],
+        cameras=[] if facts is None else [_camera(*each, settings.get(each[0])) for each in facts.cameras.items()],
         projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
     )
@@ -72,6 +76,25 @@ def list_devices() -> DeviceList:
     """Return the drivers that are installed, the devices that are plugged in, and the libraries that are missing."""
     found = found_devices()
     return filled(DeviceList, found, drivers=installed_drivers(), faults=[str(fault) for fault in found.faults])
+
+
+class Examinations(BaseModel):
+    """What `slrig doctor` and `slrig conform` found last; null where they did not run with this data folder."""
+
+    doctor: Examination | None
+    conform: Examination | None
+    commands: dict[str, str] = Field(description="what to run, with the rig file of this service")
+
+
+@router.get("/rig/examinations")
+def list_examinations(service: Serving) -> Examinations:
+    """Return what `slrig doctor` and `slrig conform` found last on this rig. Touches no device."""
+    root, rig = service.folder.root, service.runner.queue.rig.name
+    return Examinations(
+        doctor=last_examination(root, "doctor", rig),
+        conform=last_examination(root, "conform", rig),
+        commands={name: f"slrig {name} RIG.toml --data {shlex.quote(str(root))}" for name in ("doctor", "conform")},
+    )
 
 
 def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
@@ -92,9 +115,19 @@ def _in_use(status: RunnerStatus) -> CalibrationInUse | None:
     )
 
 
-def _camera(name: str, camera: CameraInfo) -> CameraBody:
-    form, triggers = camera.format, sorted(camera.triggers)
-    return filled(CameraBody, camera, name=name, size_px=form.size, bit_depth=form.bit_depth, triggers=triggers)
+def _camera(name: str, camera: CameraInfo, settings: SettingsInUse | None) -> CameraBody:
+    form, applied = camera.format, None if settings is None else settings.applied
+    return filled(
+        CameraBody,
+        camera,
+        name=name,
+        size_px=form.size,
+        bit_depth=form.bit_depth,
+        triggers=sorted(camera.triggers),
+        exposure_s=None if applied is None else applied.exposure_s,
+        gain=None if applied is None else applied.gain,
+        notes=[*camera.notes, *(() if settings is None else settings.words)],
+    )
 
 
 @router.get("/preview/{camera}", response_class=Response, responses={**_STREAM, **problems(409, 429, 502, 503)})

@@ -62,6 +62,7 @@ class ScheduleLinks(BaseModel):
 
     self: str
     runs: str
+    run: str
     pause: str
     resume: str
 
@@ -125,7 +126,9 @@ def _body(schedule: Schedule) -> ScheduleBody:
         time_zone=order.cron.time_zone,
         created_at=schedule.created_at,
         upcoming=[order.cron.local(due) for due in order.cron.upcoming(utc_now(), _UPCOMING)],
-        links=ScheduleLinks(self=here, runs=f"{here}/runs", pause=f"{here}/pause", resume=f"{here}/resume"),
+        links=ScheduleLinks(
+            self=here, runs=f"{here}/runs", run=f"{here}/run", pause=f"{here}/pause", resume=f"{here}/resume"
+        ),
     )
 
 
@@ -170,6 +173,17 @@ def list_runs(
         response,
     )
     return RunPage(runs=[filled(RunBody, run, due=cron.local(run.due)) for run in shown], next=following)
+
+
+@router.post("/{schedule_id}/run", status_code=202, responses=problems(409))
+def run_now(service: Serving, schedule_id: UUID) -> RunBody:
+    """Do what a schedule does now, once, though it is not due, or paused. It waits for the rig as every run does, and
+    is listed with the others. The answer comes at once.
+    """
+    cron = service.schedules.get(schedule_id).order.cron
+    run = service.schedules.run_now(schedule_id, utc_now())
+    service.scheduler.wake()
+    return filled(RunBody, run, due=cron.local(run.due))
 
 
 @router.post("/{schedule_id}/pause")

@@ -91,6 +91,11 @@ class ScanRequest(Strict):
         "exposure times of every camera, seconds, and the frames are fused. Two to six in place of exposure_s; on a "
         "video projector, whole refresh periods. Default: as the rig file says",
     )
+    colour: bool | None = Field(
+        default=None,
+        description="true: keep white and black frames in colour, and refuse where a camera has none. false: in grey. "
+        "Default: as the rig file says, else in colour where a camera has it",
+    )
     if_busy: Literal["reject", "queue"] = Field(
         default="reject", description="what to do while the rig is held: answer 409, or wait in line"
     )
@@ -144,6 +149,7 @@ def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
         reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, defaults)),
         exposure_s=request.exposure_s,
         exposures_s=request.exposures_s if request.exposures_s is not None else usual,
+        colour=request.colour if request.colour is not None else defaults.colour,
     )
 
 
@@ -243,7 +249,7 @@ Extent = Annotated[
 
 
 class CameraBody(BaseModel):
-    """A camera of the rig, as it declares itself."""
+    """A camera of the rig, as it declares itself, and as it is set."""
 
     name: str
     model: str
@@ -253,6 +259,14 @@ class CameraBody(BaseModel):
     triggers: list[str]
     exposure_range_s: tuple[float, float]
     gain_range: tuple[float, float]
+    colour: bool
+    exposure_s: float | None = Field(
+        description="in use, as the camera read it back when it was last set; null before the first picture or scan"
+    )
+    gain: float | None = Field(description="in use, likewise")
+    notes: list[str] = Field(
+        description="what its driver tells of how it runs, and settings that it refused or bent; each with what to do"
+    )
 
 
 class ProjectorBody(BaseModel):

@@ -64,18 +64,24 @@ PatternEntry = Annotated[Pattern, Field(discriminator="kind"), WrapValidator(_po
 
 
 class FrameEntry(Strict):
-    """One frame: which pattern, which camera, which file (and page of it), and when."""
+    """One frame: which pattern, which camera, which file (and page of it), and when.
+
+    colour_file : the same picture in colour, of a white or black frame.
+    """
 
     pattern: Annotated[int, Field(ge=0)]
     camera: CameraName
     file: str
     page: Annotated[int, Field(ge=0, le=65535)] = 0
+    colour_file: str | None = None
     exposure_s: Annotated[float, Field(gt=0)] | None = None
     time_s: float | None = None
 
-    @field_validator("file")
+    @field_validator("file", "colour_file")
     @classmethod
-    def _inside(cls, file: str) -> str:
+    def _inside(cls, file: str | None) -> str | None:
+        if file is None:
+            return None
         path = PurePosixPath(file)
         if not path.parts or path.is_absolute() or ".." in path.parts or "\\" in file or ":" in file or "\0" in file:
             raise ValueError(
@@ -147,7 +153,8 @@ def _cross_faults(description: Description) -> list[str]:
                 "name a camera of the list `cameras`"
             )
             continue
-        size_bytes += camera.size.width_px * camera.size.height_px * (1 if camera.bit_depth <= 8 else 2)
+        images = 1 if frame.colour_file is None else 4
+        size_bytes += images * camera.size.width_px * camera.size.height_px * (1 if camera.bit_depth <= 8 else 2)
     if size_bytes > MOST_CAPTURE_BYTES:
         faults.append(
             f"frames: expected at most {MOST_CAPTURE_BYTES / 1e9:.1f} GB of samples, "

@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -48,6 +48,26 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     Samples are right-aligned; colour becomes grey with the weights of Rec. 601.
     Raises BundleError: the file is missing, cut, damaged, of another kind, extent or depth, or has no such page.
     """
+    return read_with_colour(path, pages, camera)[0]
+
+
+def read_colour(path: Path, camera: CameraFormat) -> Pixels:
+    """Return a file's picture in colour, (H, W, 3) of blue, green and red. Raises BundleError: see `read_pages`; or it
+    is grey, or a sample lies beyond the camera's full scale.
+    """
+    found = read_with_colour(path, (0,), camera, coloured=(0,))[1]
+    if not found:
+        wanted = f"a colour image with samples of 0 to {camera.full_scale}"
+        _refuse(path, wanted, "a grey one, or a brighter sample", "save it in colour, or leave colour_file out")
+    return found[0]
+
+
+def read_with_colour(
+    path: Path, pages: Sequence[int], camera: CameraFormat, *, coloured: Collection[int] = ()
+) -> tuple[dict[int, Pixels], dict[int, Pixels]]:
+    """As `read_pages`, and of the pages `coloured` those that are in colour, (H, W, 3) of blue, green and red. Colour
+    that does not fit the camera's full scale is left out: the grey of it may. Raises as `read_pages` does.
+    """
     data = _read_bytes(path)
     readers = {SIGNATURE: _png, BMP_SIGNATURE: _bitmap, JPEG_SIGNATURE: _jpeg}
     read = next((each for signature, each in readers.items() if data.startswith(signature)), None)
@@ -61,7 +81,9 @@ def read_pages(path: Path, pages: Sequence[int], camera: CameraFormat) -> dict[i
     else:
         found = "an empty file" if not data else f"a file that begins with {data[:8]!r}"
         _refuse(path, "a PNG, TIFF, BMP or JPEG file", found, "save the frame as PNG")
-    return {page: _grey(path, page, image, camera) for page, image in images.items()}
+    grey = {page: _grey(path, page, image, camera) for page, image in images.items()}
+    kept = {page: image for page, image in images.items() if page in coloured and image is not None and image.ndim == 3}
+    return grey, {page: image for page, image in kept.items() if int(image.max()) <= camera.full_scale}
 
 
 def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:

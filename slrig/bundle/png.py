@@ -1,4 +1,4 @@
-"""Grey frames as PNG (ISO/IEC 15948), packed and unpacked without a general decoder.
+"""Frames as PNG (ISO/IEC 15948), packed and unpacked without a general decoder.
 
 Stripes run down the image: by differences to the row above, files are a quarter smaller than by differences to the
 left. Rows are packed by ISA-L's deflate, four times as fast as OpenCV's at the same size within a fifth, and unpacked
@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 import zlib
 
+import cv2
 import numpy as np
 from isal import isal_zlib
 
@@ -28,16 +29,21 @@ HEADER = struct.Struct(">IIBBBBB")
 
 
 def encode_frame(image: Pixels, name: str) -> bytes:
-    """A frame, (H, W) uint8 or uint16, as PNG. name : for the error. Raises BundleError: it is no such image."""
-    if image.ndim != 2 or image.size == 0 or image.dtype not in (np.uint8, np.uint16):
-        raise BundleError(f"{name}: expected a grey image of 8 or 16 bits, found {image.shape} {image.dtype}")
-    height, width = image.shape
-    samples = np.ascontiguousarray(image, dtype=">u2" if image.itemsize == 2 else np.uint8).view(np.uint8)
+    """A frame, (H, W) or, blue, green and red, (H, W, 3) uint8 or uint16, as PNG. name : for the error.
+    Raises BundleError: it is no such image.
+    """
+    kind = {(): GREY, (3,): COLOUR}.get(image.shape[2:])
+    if image.ndim < 2 or kind is None or image.size == 0 or image.dtype not in (np.uint8, np.uint16):
+        raise BundleError(f"{name}: expected an image of 8 or 16 bits, found {image.shape} {image.dtype}")
+    height, width = image.shape[:2]
+    # A PNG's colours are red, green and blue.
+    ordered = image if kind == GREY else cv2.cvtColor(image, cv2.COLOR_BGR2RGB).reshape(height, -1)
+    samples = np.ascontiguousarray(ordered, dtype=">u2" if image.itemsize == 2 else np.uint8).view(np.uint8)
     rows = np.zeros((height, 1 + samples.shape[1]), dtype=np.uint8)
     rows[:, 0] = _UP
     rows[0, 1:] = samples[0]
     np.subtract(samples[1:], samples[:-1], out=rows[1:, 1:])
-    header = HEADER.pack(width, height, 8 * image.itemsize, GREY, 0, 0, 0)
+    header = HEADER.pack(width, height, 8 * image.itemsize, kind, 0, 0, 0)
     return png_file(header, isal_zlib.compress(rows, _LEVEL))
 
 

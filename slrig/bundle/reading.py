@@ -12,13 +12,16 @@ from pathlib import Path
 import numpy as np
 
 from slrig.bundle.calibration_file import check_calibration, read_calibration
-from slrig.bundle.description import Description, read_description
-from slrig.bundle.images import read_pages
+from slrig.bundle.description import Description, FrameEntry, read_description
+from slrig.bundle.images import read_colour, read_with_colour
 from slrig.errors import BundleError
-from slrig.model import Calibration, Capture, Pixels, Shot
+from slrig.model import Black, Calibration, Capture, Pixels, Shot, White
 
 CALIBRATION = "calibration.json"
 MOST_READERS = 4  # threads, for files that are decoded at the same time
+
+_Pages = tuple[dict[int, Pixels], dict[int | str, Pixels]]
+"""Grey by page; colour by page, or by the name of a file of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,23 +45,30 @@ class BundleFiles:
     folder: Path
     _description: Description
 
-    def shots(self, order: Sequence[int]) -> Iterator[Shot]:
-        """The frames of these indices of the outline, while a few that follow are read on other threads. Raises
-        BundleError: a frame is missing, cut, or of another size or depth; the first such in this order is told.
+    def shots(self, order: Sequence[int], *, colour: bool = True) -> Iterator[Shot]:
+        """The frames of these indices of the outline, while a few that follow are read on other threads; white and
+        black in colour, too, where there is any and `colour` asks for it. Raises BundleError: a frame is missing, cut,
+        or of another size or depth; the first such in this order is told.
         """
         frames = [self._description.frames[index] for index in order]
-        pages: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+        files: defaultdict[tuple[str, str], list[FrameEntry]] = defaultdict(list)
         for frame in frames:
-            pages[frame.camera, frame.file].append(frame.page)
-        paths = {file: _inside(self.folder, file) for _, file in pages}
+            files[frame.camera, frame.file].append(frame)
+        paths = {file: _inside(self.folder, file) for _, file in files}
+        paths |= {each: _inside(self.folder, each) for frame in frames if (each := frame.colour_file) is not None}
 
-        def read(key: tuple[str, str]) -> dict[int, Pixels]:
-            camera, file = key
-            return read_pages(paths[file], pages[key], self.outline.cameras[camera])
+        def read(key: tuple[str, str]) -> _Pages:
+            form, entries = self.outline.cameras[key[0]], files[key]
+            ends = [each for each in entries if colour and self._is_end(each)]
+            pages, own = [each.page for each in entries], [each.page for each in ends if each.colour_file is None]
+            grey, found = read_with_colour(paths[key[1]], pages, form, coloured=own)
+            colours: dict[int | str, Pixels] = {page: found[page] for page in found}
+            colours.update((file, read_colour(paths[file], form)) for each in ends if (file := each.colour_file))
+            return grey, colours
 
         readers = min(MOST_READERS, os.cpu_count() or 1)
-        keys, under_way = iter(pages), dict[tuple[str, str], Future[dict[int, Pixels]]]()
-        left = {key: len(each) for key, each in pages.items()}
+        keys, under_way = iter(files), dict[tuple[str, str], Future[_Pages]]()
+        left = {key: len(each) for key, each in files.items()}
         # OpenCV and zlib let other threads run while they decode.
         with ThreadPoolExecutor(readers) as pool:
             for index, frame in zip(order, frames, strict=True):
@@ -68,11 +78,15 @@ class BundleFiles:
                     if following is None:
                         break
                     under_way[following] = pool.submit(read, following)
-                image = under_way[key].result()[frame.page]
+                images, colours = under_way[key].result()
                 left[key] -= 1
                 if left[key] == 0:
                     del under_way[key]
-                yield replace(self.outline.shots[index], image=image)
+                seen = colours.get(frame.colour_file or frame.page) if self._is_end(frame) else None
+                yield replace(self.outline.shots[index], image=images[frame.page], colour=seen)
+
+    def _is_end(self, frame: FrameEntry) -> bool:
+        return isinstance(self.outline.patterns[frame.pattern], White | Black)
 
 
 def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle:
@@ -81,7 +95,7 @@ def read_bundle(folder: Path, *, calibration_file: Path | None = None) -> Bundle
     CalibrationError: the calibration is malformed, not finite, or made for devices of another size.
     """
     files = open_bundle(folder, calibration_file=calibration_file)
-    return Bundle(_whole(files), files.calibration, folder)
+    return Bundle(_whole(files, colour=True), files.calibration, folder)
 
 
 def open_bundle(folder: Path, *, calibration_file: Path | None = None) -> BundleFiles:
@@ -102,7 +116,7 @@ def read_capture(folder: Path) -> Capture:
     Raises BundleError: bundle.json or a frame is missing, cut, of another size or depth, or has an unknown key.
     """
     description = read_description(folder)
-    return _whole(BundleFiles(_outline(description), None, folder, description))
+    return _whole(BundleFiles(_outline(description), None, folder, description), colour=False)
 
 
 def _outline(description: Description) -> Capture:
@@ -115,8 +129,8 @@ def _outline(description: Description) -> Capture:
     return Capture(description.projector_size(), description.pattern_list(), cameras, shots)
 
 
-def _whole(files: BundleFiles) -> Capture:
-    return replace(files.outline, shots=tuple(files.shots(range(len(files.outline.shots)))))
+def _whole(files: BundleFiles, *, colour: bool) -> Capture:
+    return replace(files.outline, shots=tuple(files.shots(range(len(files.outline.shots)), colour=colour)))
 
 
 def _inside(folder: Path, file: str) -> Path:

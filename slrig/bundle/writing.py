@@ -96,7 +96,11 @@ class BundleWriter:
         with refusals_of(self._staging / file):
             write_durably(self._staging / file, encode_frame(shot.image, file))
         self._count[shot.camera] += 1
-        frame = {"pattern": shot.pattern, "camera": shot.camera, "file": file, **_times(shot)}
+        frame: dict[str, Any] = {"pattern": shot.pattern, "camera": shot.camera, "file": file, **_times(shot)}
+        if shot.colour is not None:
+            frame["colour_file"] = file.replace(".png", "-colour.png")
+            with refusals_of(self._staging / frame["colour_file"]):
+                write_durably(self._staging / frame["colour_file"], encode_frame(shot.colour, frame["colour_file"]))
         place = self._latest(shot.pattern, shot.camera, vacant=True)
         if place is None:
             self._places.append(_Place(frame))
@@ -117,6 +121,9 @@ class BundleWriter:
                 entry |= {"file": file, **_times(refused.shot)}
             elif refused.delivered and place is not None:
                 (self._staging / place.frame["file"]).rename(self._staging / file)
+                if "colour_file" in place.frame:
+                    # What was wrong with a frame shows in grey.
+                    (self._staging / place.frame.pop("colour_file")).unlink()
                 entry |= {**place.frame, "file": file}
         if place is None:
             # Frames stay in the order of their patterns, however often one is shot.
@@ -208,7 +215,10 @@ class BundleWriter:
             )
         wanted = "uint8" if camera.bit_depth <= 8 else "uint16"
         brightest = int(shot.image.max(initial=0))
-        if shot.image.shape != camera.size.shape or shot.image.dtype != wanted or brightest > camera.full_scale:
+        if shot.colour is not None:
+            brightest = max(brightest, int(shot.colour.max(initial=0)))
+        fits = shot.image.dtype == wanted and (shot.colour is None or shot.colour.dtype == wanted)
+        if shot.image.shape != camera.size.shape or not fits or brightest > camera.full_scale:
             rows, columns = shot.image.shape
             raise BundleError(
                 f"{self.folder}: expected {camera.size} {wanted} samples up to {camera.full_scale} from camera "

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from slrig.bundle.refused import Refused
 from slrig.capture.checks import Contradiction, place
 from slrig.capture.evidence import Evidence
 from slrig.errors import FrameTimeoutError, ScanEvidenceError
-from slrig.model import Frame, PatternSequence, Shot
+from slrig.model import Black, Frame, PatternSequence, Shot, White
 
 MOST_FAILURES = 3
 """A pattern whose frame failed so often ends the scan."""
@@ -26,7 +26,7 @@ class RetryPolicy:
     """Takes every frame of a capture once, and knows which patterns have to be shown again to which cameras.
 
     refused : is told of every exposure that does not count. since_ns : when times count from; None stands for the start
-    of the first frame.
+    of the first frame. colour : cameras whose white and black frames are kept in colour, too.
     """
 
     def __init__(
@@ -36,6 +36,7 @@ class RetryPolicy:
         refused: Callable[[Refused], None],
         *,
         since_ns: int | None = None,
+        colour: Collection[str] = (),
     ) -> None:
         self.evidence = evidence
         self.again: dict[int, list[str]] = {}
@@ -46,6 +47,7 @@ class RetryPolicy:
         self._causes: defaultdict[tuple[str, int], list[str]] = defaultdict(list)
         self._missing: defaultdict[tuple[str, int], list[str]] = defaultdict(list)
         self._t_first_ns = since_ns
+        self._colour = colour
         self._last_cause = ""
 
     @property
@@ -68,7 +70,9 @@ class RetryPolicy:
         if self._t_first_ns is None:
             self._t_first_ns = frame.t_start_ns
         time_s = (frame.t_start_ns - self._t_first_ns) / 1e9
-        return Shot(index, frame.camera, frame.image, frame.exposure_s, time_s)
+        wanted = frame.camera in self._colour and isinstance(self._sequence.patterns[index], White | Black)
+        colour = frame.colour() if wanted and frame.colour is not None else None
+        return Shot(index, frame.camera, frame.image, frame.exposure_s, time_s, colour)
 
     def took(self, index: int, frame: Frame, fault: str | None) -> Shot | None:
         """Judge a frame; return it if it counts. `fault` is what it says against itself.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, suppress
 
 from slrig.bundle.refused import Refused
@@ -27,6 +27,7 @@ def capture(
     evidence: Evidence | None = None,
     refused: Callable[[Refused], None] = lambda _: None,
     since_ns: int | None = None,
+    colour: Collection[str] = (),
 ) -> Iterator[Shot]:
     """Show every pattern, expose every camera to it, and yield the frames that are what they claim, as they come.
 
@@ -44,7 +45,7 @@ def capture(
     frame. timeout_s : how long a frame may take beyond its exposure. evidence : where the frames are judged; give one
     to read its summary afterwards. refused : told of every exposure that does not count, before another one takes its
     place. since_ns : when times count from, by the rig's clock, for one sequence of several; None is the start of the
-    first frame's exposure.
+    first frame's exposure. colour : cameras whose white and black frames are yielded in colour, too.
 
     Raises UnsupportedByDeviceError: a device cannot do what is asked (settings, size, no trigger in common);
     FrameTimeoutError: a frame did not come, three times (names pattern, camera, times); ScanEvidenceError: the frame of
@@ -63,7 +64,7 @@ def capture(
             # The light goes off before anything else is tried.
             lit.callback(_whatever_happens, rig.projector.blank)
             session = Session(rig, sequence, _configure(rig), triggers, timeout_s, cancelled)
-            retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns)
+            retries = RetryPolicy(sequence, evidence, refused, since_ns=since_ns, colour=colour)
             if Trigger.HARDWARE in triggers.values():
                 lit.callback(_whatever_happens, rig.projector.stop)
                 yield from hardware_triggered(session, retries)

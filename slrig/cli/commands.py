@@ -17,7 +17,17 @@ import typer.core
 
 from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
-from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
+from slrig.cli.options import (
+    AcceptanceOptions,
+    AsJson,
+    BoardOptions,
+    MeshOptions,
+    RigFile,
+    Service,
+    ShownData,
+    given,
+    grouped,
+)
 from slrig.cli.patterns import patterns
 from slrig.errors import SlrigError
 
@@ -147,33 +157,37 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
+    colour: Annotated[
+        bool | None, typer.Option(help="Keep white and black frames in colour. Default: where a camera has it.")
+    ] = None,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
+    repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
+    every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.scan import FILES, scan_with, tell_result
+    from slrig.cli.scan import FILES, scan_with, series_with, tell_result
 
-    patterns = given(
-        line_shift_period_px=period_px,
-        line_width_px=line_width_px,
-        gray_cell_px=gray_cell_px,
-        line_shift=False if gray_only else None,
-        rows=rows or None,
-    )
-    request = {
-        "label": label,
+    request = given(
+        label=label,
         # One exposure time is one, several are a bracket.
-        **(
-            {"exposures_s": exposure_s}
-            if len(exposure_s or ()) > 1
-            else {"exposure_s": next(iter(exposure_s or ()), None)}
+        exposure_s=exposure_s[0] if exposure_s and len(exposure_s) == 1 else None,
+        exposures_s=exposure_s if exposure_s and len(exposure_s) > 1 else None,
+        if_busy="queue" if queue else "reject",
+        colour=colour,
+        repeat=repeat if repeat > 1 else None,
+        every_s=every_s,
+        patterns=given(
+            line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
+            line_shift=False if gray_only else None, rows=rows or None,
         ),
-        "if_busy": "queue" if queue else "reject",
-        "patterns": patterns,
-        "reconstruction": given(**asdict(mesh)),
-    }
+        reconstruction=given(**asdict(mesh)),
+    )  # fmt: skip
     files = tuple(file or FILES)
     with service.client() as client:
+        if repeat > 1:
+            series_with(client, request, output, files=files)
+            return
         result = scan_with(client, request, output, files=files)
     tell_result(result, output, files=files)
 
@@ -281,6 +295,7 @@ def warm() -> None:
 @app.command()
 def conform(
     rig: RigFile,
+    data: ShownData = None,
     as_json: AsJson = False,
 ) -> None:
     """Examine a rig by the driver contract, and score it.
@@ -289,7 +304,7 @@ def conform(
     """
     from slrig.cli.examine import conform as examine
 
-    if not examine(rig, as_json=as_json):
+    if not examine(rig, data=data, as_json=as_json):
         raise typer.Exit(1)
 
 
@@ -322,6 +337,7 @@ def doctor(
     output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
+    data: ShownData = None,
     as_json: AsJson = False,
 ) -> None:
     """Examine a rig before a still object: what is wrong?
@@ -330,7 +346,7 @@ def doctor(
     """
     from slrig.cli.examine import doctor as examine
 
-    if not examine(rig, output=output, force=force, search_s=search_s, as_json=as_json):
+    if not examine(rig, output=output, force=force, search_s=search_s, data=data, as_json=as_json):
         raise typer.Exit(1)
 
 

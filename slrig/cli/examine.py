@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
@@ -16,13 +18,16 @@ from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.capture.latency import measure_latency
 from slrig.capture.latency_fit import STEADY, CameraLatency
 from slrig.cli.display import print_json, progress_shown
-from slrig.config import RigConfig, read_rig
+from slrig.cli.options import given
+from slrig.config import RigConfig, read_rig, read_settings
 from slrig.conformance import Outcome, Report, run
 from slrig.devices import Rig, Synchronisation, Trigger
 from slrig.discovery import found_devices, installed_drivers, open_rig
 from slrig.doctor.doctor import Diagnosis, examine
 from slrig.doctor.findings import Severity
 from slrig.doctor.rig_file import refuse_existing, write_rig_file
+from slrig.errors import StorageError
+from slrig.jobs.examinations import ExaminedBy, keep
 from slrig.logs import set_up_logs_for_a_person
 from slrig.model import PatternSequence
 from slrig.scan.plan import PatternPlan
@@ -39,8 +44,11 @@ _COLOURS = {
 }
 
 
-def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float, as_json: bool) -> bool:
-    """Examine the rig, print what was found, write the new rig file, and return whether there is no fault.
+def doctor(
+    rig_file: Path, *, output: Path | None, force: bool, search_s: float, data: Path | None, as_json: bool
+) -> bool:
+    """Examine the rig, print what was found, keep it in the data folder, write the new rig file, and return whether
+    there is no fault.
 
     Raises SlrigError where a rig file is wrong or cannot be written, or the rig cannot be opened.
     """
@@ -65,6 +73,7 @@ def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float,
             )
     if output is not None:
         write_rig_file(diagnosis, rig_file, output, force=force)
+    _keep(data, "doctor", diagnosis.document())
     if as_json:
         print_json(diagnosis.document())
     else:
@@ -72,8 +81,9 @@ def doctor(rig_file: Path, *, output: Path | None, force: bool, search_s: float,
     return diagnosis.healthy
 
 
-def conform(rig: Path, *, as_json: bool) -> bool:
-    """Examine the rig by the driver contract, print the report, and return whether every check that applies has passed.
+def conform(rig: Path, *, data: Path | None, as_json: bool) -> bool:
+    """Examine the rig by the driver contract, print the report, keep it in the data folder, and return whether every
+    check that applies has passed.
 
     Raises SlrigError where the rig file is wrong, or the rig cannot be opened.
     """
@@ -84,11 +94,24 @@ def conform(rig: Path, *, as_json: bool) -> bool:
         with open_rig(config) as opened:
             sequence = _own_sequence(opened, config)
         report = run(lambda: open_rig(config), sequence, progress=display)
+    _keep(data, "conform", report.document())
     if as_json:
         print_json(report.document())
     else:
         _tell_report(report, Console())
     return report.conforms
+
+
+def _keep(data: Path | None, command: ExaminedBy, found: Mapping[str, Any]) -> None:
+    """Keep what was found where a service shows it. An examination that cannot be kept is told all the same."""
+    folder = read_settings(None, **given(data_dir=data)).data_dir
+    try:
+        there = keep(folder, command, found)
+    except StorageError as error:
+        typer.echo(f"the service will not show this: {error}", err=True)
+        return
+    if not there and data is not None:
+        typer.echo(f"the service will not show this: {folder} is no data folder of slrig serve", err=True)
 
 
 def tell_latency(

@@ -1,4 +1,4 @@
-"""`slrig scan`: one scan with a running service."""
+"""`slrig scan`: one scan with a running service, or a series of them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import typer
+from rich.table import Column
 
 from slrig.bundle.storage import refusals_of
 from slrig.cli.client import ServiceClient
-from slrig.cli.display import progress_shown
+from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import BUNDLE_ZIP, CAMERA_PICTURES, MEDIA_TYPES, not_offered
 
+_HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
+_DIGITS = 3
+"""Of a scan's number in its series, which has at most 500."""
 _STATES = {"queued": "waiting for the rig", "capturing": "preparing the rig", "computing": "reconstructing"}
 
 FILES = ("mesh.ply", "preview.png", "report.json")
@@ -43,37 +47,98 @@ def scan_with(
     _require_offered(client, files)
     with progress_shown() if display is None else nullcontext(display) as told:
         started = client.start(request)
-        fraction = 0.0
-        try:
-            for event in client.follow(started):
-                if event["kind"] == "progress":
-                    fraction = event["fraction"]
-                    told(event["stage"], fraction, event["detail"])
-                elif event["kind"] == "state" and event["state"] in _STATES:
-                    told(_STATES[event["state"]], fraction, "")
-        except KeyboardInterrupt:
-            with suppress(ServiceError):
-                client.post(started["links"]["cancel"], None)
-            raise
-        scan = client.get(started["links"]["self"])
-        if scan["state"] == "cancelled":
-            message = f"Scan {scan['id']} was cancelled by another client."
-            raise ScanCancelledError(message)
-        if scan["state"] != "succeeded":
-            message = f"Scan {scan['id']} {scan['state']}: {scan['error']['detail']}"
-            raise ServiceError(message)
-        offered = scan["links"]["files"]
-        missing = [name for name in files if name not in offered]
-        if missing:
-            message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
-            raise ServiceError(message)
-        with refusals_of(output):
-            output.mkdir(parents=True, exist_ok=True)
-        for name in files:
-            told(f"fetching {name}", 1.0, "")
-            client.fetch(offered[name], output / name)
-        told("done", 1.0, "")
-        return scan
+        return _completed(client, started, started["links"]["cancel"], output, files, told)
+
+
+def series_with(
+    client: ServiceClient,
+    request: Mapping[str, Any],
+    output: Path,
+    *,
+    files: tuple[str, ...] = FILES,
+    display: Callable[[str, float, str], None] | None = None,
+) -> None:
+    """Scan a series, fetch the files of each scan into a folder of its number, and print what became of them.
+
+    A scan that fails is told at the end; the others go on. Ctrl-C cancels those that are left.
+
+    Raises
+    ------
+    ConfigError
+        No scan has one of the files. Nothing was shot.
+    ServiceError
+        The service refused, is gone, or a scan failed or was cancelled.
+    """
+    _require_offered(client, files)
+    rows: list[tuple[str, ...]] = []
+    failures: list[str] = []
+    try:
+        with progress_shown() if display is None else nullcontext(display) as told:
+            series = client.start(request)["links"]["series"]
+            scans = client.get(series)["scans"]
+            for number, started in enumerate(scans, 1):
+                name = f"{number:0{_DIGITS}}"
+
+                def of_all(stage: str, fraction: float, detail: str, name: str = name) -> None:
+                    told(f"{name} of {len(scans)}: {stage}", fraction, detail)
+
+                try:
+                    scan = _completed(client, started, f"{series}/cancel", output / name, files, of_all)
+                except (ServiceError, ScanCancelledError) as error:
+                    rows.append((name, "", "", str(error)))
+                    failures.append(name)
+                else:
+                    mesh = scan["summary"]["mesh"]
+                    rows.append((name, f"{mesh['figures']['triangles']:,}", f"{mesh['sigma_mm']['p50']:.4f}", ""))
+    finally:
+        if rows:
+            print_table(_HEADS, rows)
+    typer.echo(f"{'files':<9} {output}")
+    if failures:
+        message = f"{len(failures)} of {len(scans)} scans did not succeed: {', '.join(failures)}."
+        raise ServiceError(message)
+
+
+def _completed(
+    client: ServiceClient,
+    started: Mapping[str, Any],
+    cancel: str,
+    output: Path,
+    files: Sequence[str],
+    told: Callable[[str, float, str], None],
+) -> dict[str, Any]:
+    """Follow a scan to its end, fetch its files, and return it. cancel : what Ctrl-C asks for."""
+    fraction = 0.0
+    try:
+        for event in client.follow(started):
+            if event["kind"] == "progress":
+                fraction = event["fraction"]
+                told(event["stage"], fraction, event["detail"])
+            elif event["kind"] == "state" and event["state"] in _STATES:
+                told(_STATES[event["state"]], fraction, "")
+    except KeyboardInterrupt:
+        with suppress(ServiceError):
+            client.post(cancel, None)
+        raise
+    scan = client.get(started["links"]["self"])
+    if scan["state"] == "cancelled":
+        message = f"Scan {scan['id']} was cancelled by another client."
+        raise ScanCancelledError(message)
+    if scan["state"] != "succeeded":
+        message = f"Scan {scan['id']} {scan['state']}: {scan['error']['detail']}"
+        raise ServiceError(message)
+    offered = scan["links"]["files"]
+    missing = [name for name in files if name not in offered]
+    if missing:
+        message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
+        raise ServiceError(message)
+    with refusals_of(output):
+        output.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        told(f"fetching {name}", 1.0, "")
+        client.fetch(offered[name], output / name)
+    told("done", 1.0, "")
+    return scan
 
 
 def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from slrig.conformance.bench import View
 from slrig.conformance.check import Need, view_check
-from slrig.conformance.expectation import expect, near
+from slrig.conformance.expectation import NotApplicableError, expect, near
 from slrig.devices import AppliedSettings, CameraInfo
 from slrig.model import Frame
 
@@ -113,6 +113,41 @@ def a_frame_keeps_its_pixels(view: View) -> None:
         asked="a frame's image is its own after eight more frames",
         found=f"{changed} of {kept.size} pixels changed",
         do="copy the image out of the driver's buffer before the buffer is used again",
+    )
+
+
+@view_check(Need.WHITE_AND_BLACK)
+def frames_come_in_colour_where_it_is_declared(view: View) -> None:
+    """A camera that declares colour gives the same picture in blue, green and red, and another gives none."""
+    lit = view.learn().lit
+    info, frames = view.camera.info, [view.expose(index) for index in (0, 1)]
+    asked = (
+        f"CameraInfo.colour is {info.colour}, and frames have a function that makes their colour, or none, accordingly"
+    )
+    for frame in frames:
+        expect(
+            (frame.colour is not None) == info.colour, asked=asked, found=frame.colour, do="declare what frames have"
+        )
+    if not info.colour:
+        raise NotApplicableError("has no colour")
+    for _ in range(8):
+        view.expose(1)
+    white, black = (frame.colour() for frame in frames if frame.colour is not None)
+    wanted = ((*frames[0].image.shape, 3), frames[0].image.dtype)
+    expect(
+        (white.shape, white.dtype) == wanted and white.max() <= info.format.full_scale,
+        asked=f"colour is {wanted[0]} {wanted[1]}, up to {info.format.full_scale}",
+        found=f"{white.shape} {white.dtype}, up to {white.max()}",
+        do="return blue, green and red along the last axis, in the units of the image",
+    )
+    brighter = [
+        float(np.mean(white[lit, each], dtype=float) - np.mean(black[lit, each], dtype=float)) for each in range(3)
+    ]
+    expect(
+        max(brighter) > 0 and min(brighter) >= -0.1 * max(brighter),
+        asked="eight frames later, white is still brighter than black in colour, too",
+        found=f"by {', '.join(f'{each:.1f}' for each in brighter)} DN of blue, green and red",
+        do="make colour of a copy of what the camera sent, not of the driver's buffer",
     )
 
 

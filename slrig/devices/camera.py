@@ -25,7 +25,7 @@ class CameraInfo:
     """Declared data about a camera. `triggers` are the ways in which an exposure can be started.
 
     `limits` say how long its calls may take. `notes` say what a person should know of how it runs, each in a sentence
-    with what to do about it.
+    with what to do about it. `colour` : its frames can be had in colour, see `Frame.colour`.
     """
 
     name: str
@@ -37,6 +37,7 @@ class CameraInfo:
     gain_range: tuple[float, float]
     limits: CallLimits = USUAL
     notes: tuple[str, ...] = ()
+    colour: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,29 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.meshing.topology import used_vertices
-from slrig.model import FloatArray, IntArray, Mesh, Pixels
-
-
-def brightness(
-    pixels_px: FloatArray, camera: NDArray[np.int32], whites: list[Pixels], full_scales: list[float], /
-) -> NDArray[np.uint8]:
-    """(n,) uint8: each point's pixel in the white frame of its camera, of 255 at full scale.
-
-    pixels_px : (n, 2) float64, (column, row), inside the frame; camera : (n,) int32, which of the frames.
-    """
-    grey = np.zeros(len(pixels_px), dtype=np.uint8)
-    for index, (white, full_scale) in enumerate(zip(whites, full_scales, strict=True)):
-        mine = camera == index
-        columns, rows = np.rint(pixels_px[mine]).astype(np.intp).T
-        grey[mine] = np.clip(np.rint(white[rows, columns] * (255 / full_scale)), 0, 255)
-    return grey
+from slrig.model import FloatArray, IntArray, Mesh
 
 
 def compact_mesh(
     faces: IntArray,
     points_mm: FloatArray,
     normals: NDArray[np.float32],
-    grey: NDArray[np.uint8],
+    colour: NDArray[np.uint8],
+    mark: NDArray[np.uint8],
     sigma_mm: FloatArray,
     offsets: IntArray,
     position_px: FloatArray,
@@ -36,7 +22,8 @@ def compact_mesh(
 ) -> Mesh:
     """The mesh of the points that a face uses, in their order.
 
-    faces : (F, 3) int32 into points_mm (n, 3) float64; normals (n, 3), grey (n,), sigma_mm (n,) of the points.
+    faces : (F, 3) int32 into points_mm (n, 3) float64; normals (n, 3), colour (n, 3), mark (n,), sigma_mm (n,) of
+    the points.
     offsets : (c + 1,) int32, curve i holds points offsets[i]:offsets[i + 1], all points belong to one;
     position_px : (c,) float64, projector column of each curve.
     """
@@ -46,7 +33,8 @@ def compact_mesh(
         vertices_mm=np.take(points_mm, where, axis=0).astype(np.float32),
         faces=numbers[faces],
         normals=np.take(normals, where, axis=0),
-        grey=np.take(grey, where),
+        colour=np.take(colour, where, axis=0),
+        mark=np.take(mark, where),
         sigma_mm=np.take(sigma_mm, where).astype(np.float32),
         stripe=np.take(np.repeat(np.floor(position_px).astype(np.int32), np.diff(offsets)), where),
     )

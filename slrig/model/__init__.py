@@ -19,13 +19,24 @@ from slrig.model.light_axis import LEAST_SHARE, share_across, told_depth, triang
 from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, White
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, Pinhole, Size, Solved
-from slrig.model.surfaces import CameraTruth, FlipRule, Mesh, PointCurves, Refusal, Source, Surface, Truth
+from slrig.model.surfaces import (
+    AlbedoMark,
+    CameraTruth,
+    FlipRule,
+    Mesh,
+    PointCurves,
+    Refusal,
+    Source,
+    Surface,
+    Truth,
+)
 
 __all__ = [
     "DEVICE_PARAMETERS",
     "FEWEST_EXPOSURES",
     "LEAST_SHARE",
     "MOST_EXPOSURES",
+    "AlbedoMark",
     "Axis",
     "Black",
     "Calibration",

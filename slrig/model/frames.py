@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,6 +20,8 @@ class Frame:
     row's start to the last row's end. `sequence_number` counts every frame the sensor made; `dropped_count` those lost
     since the camera was armed. `shutter_skew_s` : a rolling shutter's last row is exposed this much later than its
     first; 0 for a global shutter, and where the driver does not know. The times span exposure_s + shutter_skew_s.
+    colour : makes the same picture in colour when it is called, (H, W, 3) of the image's type, blue, green and red, of
+    what the camera sent: the few frames that are wanted so cost time, and the others none. None of a mono camera.
     """
 
     camera: str
@@ -32,6 +34,7 @@ class Frame:
     exposure_s: float
     gain: float
     shutter_skew_s: float = 0.0
+    colour: Callable[[], Pixels] | None = None
 
     def __post_init__(self) -> None:
         require(self.image, "Frame.image", (None, None), "u")
@@ -56,16 +59,23 @@ class CameraFormat:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One frame that shows one pattern, seen by one camera. `time_s` counts from the first frame."""
+    """One frame that shows one pattern, seen by one camera. `time_s` counts from the first frame.
+
+    colour : (H, W, 3) of the image's type, blue, green and red, of white and black frames of a camera that has colour;
+    None of all others. What is made of stripes takes the image alone.
+    """
 
     pattern: int
     camera: str
     image: Pixels
     exposure_s: float | None = None
     time_s: float | None = None
+    colour: Pixels | None = None
 
     def __post_init__(self) -> None:
         require(self.image, "Shot.image", (None, None), "u")
+        if self.colour is not None:
+            require(self.colour, "Shot.colour", (*self.image.shape, 3), "u")
 
 
 @dataclass(frozen=True, slots=True)

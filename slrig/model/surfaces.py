@@ -89,6 +89,23 @@ class Source(IntEnum):
     ALL = 2
 
 
+class AlbedoMark(IntEnum):
+    """Why the albedo of a point is not to be relied on, the first cause that holds; NONE where it is.
+
+    SATURATED : a pixel that it was read from is clipped, so that it is brighter than told. GRAZING : light comes in so
+    flat that a small error of the normal is a large one of albedo. BORDER : at the border of the projector's image,
+    where its light fades. UNKNOWN : the surface has no normal there, and the point a neutral colour. SHADED : no
+    calibrated projector, so that nothing tells how much light came in; the colour is brightness.
+    """
+
+    NONE = 0
+    SATURATED = 1
+    GRAZING = 2
+    BORDER = 3
+    UNKNOWN = 4
+    SHADED = 5
+
+
 @dataclass(frozen=True, slots=True)
 class PointCurves:
     """Curves of surface points in the world, one per light sheet, ordered along it and by column.
@@ -98,7 +115,7 @@ class PointCurves:
     offsets : (c + 1,) int32; column_px : (c,) float64, the projector column of each curve.
     points_mm : (n, 3) float64; sigma_mm : (n,) float64, standard deviation along the viewing ray's surface normal.
     bridge_after : (n,) bool, True where the step to the next point joins two stripes (paper, section 2).
-    source : (n,) uint8, `Source`; grey : (n,) uint8, brightness in the white frame.
+    source : (n,) uint8, `Source`; colour : (n, 3) uint8, albedo as sRGB; mark : (n,) uint8, `AlbedoMark`.
     """
 
     offsets: IntArray
@@ -107,7 +124,8 @@ class PointCurves:
     sigma_mm: FloatArray
     bridge_after: NDArray[np.bool_]
     source: NDArray[np.uint8]
-    grey: NDArray[np.uint8]
+    colour: NDArray[np.uint8]
+    mark: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
         count = len(self.points_mm)
@@ -116,7 +134,8 @@ class PointCurves:
         require(self.sigma_mm, "PointCurves.sigma_mm", (count,), "f")
         require(self.bridge_after, "PointCurves.bridge_after", (count,), "b")
         require(self.source, "PointCurves.source", (count,), "u")
-        require(self.grey, "PointCurves.grey", (count,), "u")
+        require(self.colour, "PointCurves.colour", (count, 3), "u")
+        require(self.mark, "PointCurves.mark", (count,), "u")
         if self.offsets[0] != 0 or self.offsets[-1] != count or (np.diff(self.offsets) < 0).any():
             raise ValueError("PointCurves.offsets must rise from 0 to the number of points")
 
@@ -126,14 +145,16 @@ class Mesh:
     """A triangle mesh in the calibration's world frame; triangles counter-clockwise seen from the camera.
 
     vertices_mm : (V, 3) float32; faces : (F, 3) int32; normals : (V, 3) float32, unit;
-    grey : (V,) uint8, brightness in the white frame; sigma_mm : (V,) float32, standard deviation along the normal;
+    colour : (V, 3) uint8, relative albedo as sRGB; mark : (V,) uint8, `AlbedoMark`;
+    sigma_mm : (V,) float32, standard deviation along the normal;
     stripe : (V,) int32, the projector column (rounded down) that the vertex was found on.
     """
 
     vertices_mm: NDArray[np.float32]
     faces: IntArray
     normals: NDArray[np.float32]
-    grey: NDArray[np.uint8]
+    colour: NDArray[np.uint8]
+    mark: NDArray[np.uint8]
     sigma_mm: NDArray[np.float32]
     stripe: IntArray
 
@@ -142,6 +163,7 @@ class Mesh:
         require(self.vertices_mm, "Mesh.vertices_mm", (None, 3), "f")
         require(self.faces, "Mesh.faces", (None, 3), "i")
         require(self.normals, "Mesh.normals", (count, 3), "f")
-        require(self.grey, "Mesh.grey", (count,), "u")
+        require(self.colour, "Mesh.colour", (count, 3), "u")
+        require(self.mark, "Mesh.mark", (count,), "u")
         require(self.sigma_mm, "Mesh.sigma_mm", (count,), "f")
         require(self.stripe, "Mesh.stripe", (count,), "i")

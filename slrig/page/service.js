@@ -24,13 +24,13 @@ function tell(problem) {
   for (const told of watchers) told(problem);
 }
 
-/** Send a request and return what was answered: JSON as a value, or null. Throws Problem. */
-export async function ask(method, path, {body, headers} = {}) {
+/** Send a request and return what was answered: JSON as a value, or null. `file` is sent as it is. Throws Problem. */
+export async function ask(method, path, {body, file, headers} = {}) {
   const sent = body === undefined ? {} : {"Content-Type": "application/json"};
   let response;
   try {
     response = await fetch(path, {
-      method, headers: {...sent, ...headers}, body: body === undefined ? undefined : JSON.stringify(body),
+      method, headers: {...sent, ...headers}, body: body === undefined ? file : JSON.stringify(body),
     });
   } catch {
     const problem = new Problem(0, UNREACHABLE);

@@ -35,7 +35,7 @@ export function Refusal({problem, children}) {
 
 /** A button that says when it is at work. */
 export function Action({busy, children, kind = "", ...given}) {
-  return html`<button type="button" class=${`action ${kind}`} aria-busy=${busy} disabled=${busy || given.disabled} ...${given}>
+  return html`<button type="button" ...${given} class=${`action ${kind}`} aria-busy=${busy} disabled=${busy || given.disabled}>
     ${children}
   </button>`;
 }

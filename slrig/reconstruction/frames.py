@@ -24,6 +24,9 @@ Image = NDArray[np.float32]
 Images = Sequence[NDArray[Any]] | NDArray[np.float32]
 """(H, W) each, of one extent, of whole numbers or float32."""
 
+NEARLY_FULL = 0.97
+"""Of full scale: from here on sensors bend."""
+
 _BAND_BYTES = 2**22
 """Of what is made of images at a time: it stays in a core's cache."""
 

@@ -23,6 +23,7 @@ from slrig.errors import PatternError
 from slrig.model import Axis, Capture, FloatArray, Gray, Pattern, exposure_groups
 from slrig.reconstruction.compression import compression_loss
 from slrig.reconstruction.frames import (
+    NEARLY_FULL,
     AxisFrames,
     AxisPatterns,
     FrameStacks,
@@ -34,7 +35,6 @@ from slrig.reconstruction.frames import (
 )
 from slrig.reconstruction.noise import NoiseModel, fitted_noise, noise_samples
 
-_NEARLY_FULL = 0.97  # of full scale: from here on sensors bend
 _CLEAR_SIGMA = 20.0  # the ratio of two exposures is then known to a twentieth at each pixel,
 _LEAST_FOR_LIGHT = 500  # and the median of so many to a three-hundredth
 
@@ -172,7 +172,7 @@ def _exposed(
     for each in repeats.values():
         for image in each:
             np.maximum(brightest, image, out=brightest)
-    usable = brightest < _NEARLY_FULL * full_scale
+    usable = brightest < NEARLY_FULL * full_scale
     return _Exposed(images, frames.white, frames.black, usable, noise_samples(frames, unseen & usable))
 
 
@@ -217,6 +217,22 @@ def _fused(images: Sequence[NDArray[Any]], gains: NDArray[np.float32]) -> Image:
     for image, gain in zip(images[1:], gains[1:], strict=True):
         total += image * gain
     return np.asarray(total, dtype=np.float32)
+
+
+def fused_colour(repeats: Sequence[Sequence[NDArray[Any]]], fused: FusedFrames, full_scale: float) -> Image:
+    """(H, W, 3) float32: a pattern's frames in colour, in units of the longest exposure: of each channel the exposures
+    that did not clip it, by their light; what all clip, as the shortest has it.
+
+    repeats : of each exposure, from long to short, as `fused` has them.
+    """
+    total = np.zeros(repeats[0][0].shape, dtype=np.float32)
+    weight = np.zeros_like(total)
+    for light, images in zip(fused.light, repeats, strict=True):
+        usable = np.max(images, axis=0) < NEARLY_FULL * full_scale
+        np.add(total, mean_image(images), out=total, where=usable)
+        np.add(weight, np.float32(light), out=weight, where=usable)
+    shortest = mean_image(repeats[-1]) / np.float32(fused.light[-1])
+    return np.asarray(np.divide(total, weight, out=shortest.astype(np.float32), where=weight > 0))
 
 
 def exposure_use(fused: FusedFrames, used: NDArray[np.bool_]) -> tuple[ExposureUse, ...]:

@@ -14,6 +14,7 @@ from slrig.devices import CameraInfo, ProjectorInfo, Rig
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
 from slrig.failure import UNEXPECTED, JobFailure, failure_of
 from slrig.model import Calibration, Size
+from slrig.rig.settings import SettingsInUse
 from slrig.rig.watchdog import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
 
 _LAST_RESORT_S = 1.0
@@ -62,8 +63,8 @@ def driver_errors(rig: str) -> Iterator[None]:
 
 
 class RigSession:
-    """A rig and the one thread that may touch it: all but `calls`, `facts`, `fault`, `active`, `calibration`, `misfit`,
-    `refuse_misfit`, `give_up` and `darken_from_outside` belong to it.
+    """A rig and the one thread that may touch it: all but `calls`, `facts`, `settings`, `fault`, `active`,
+    `calibration`, `misfit`, `refuse_misfit`, `give_up` and `darken_from_outside` belong to it.
 
     Whoever sets `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
     for other devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
@@ -76,6 +77,8 @@ class RigSession:
         self._rig: Rig | None = None
         self._bare: Rig | None = None
         self.facts: RigFacts | None = None
+        self.settings: dict[str, SettingsInUse] = {}
+        """Of each camera that was set since the rig was opened, by its name."""
         self.fault: JobFailure | None = None
         self.active: ActiveCalibration | None = None
         self._dropped = False
@@ -94,7 +97,8 @@ class RigSession:
                 if rig is not None:
                     self._close(rig)
                 raise
-            self._rig, self._bare = guarded(rig, self.calls), rig
+            self.settings = {}
+            self._rig, self._bare = guarded(rig, self.calls, self.settings), rig
             self.calls.failure = None
             self.fault = None
         active = self.active

@@ -42,6 +42,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.model import Frame, PatternSequence
+from slrig.rig.settings import SettingsInUse
 
 OPEN = "open"
 """The step of opening a whole rig."""
@@ -215,11 +216,13 @@ class Watchdog:
                 self._on_hang(call)
 
 
-def guarded(rig: Rig, calls: Calls) -> Rig:
-    """The same rig, all calls of its devices and of what moves the board by way of `calls`."""
+def guarded(rig: Rig, calls: Calls, settings: dict[str, SettingsInUse]) -> Rig:
+    """The same rig, all calls of its devices and of what moves the board by way of `calls`. settings : where those of
+    each camera are kept, by its name.
+    """
     return replace(
         rig,
-        cameras={name: _GuardedCamera(camera, f"camera '{name}'", calls) for name, camera in rig.cameras.items()},
+        cameras={name: _GuardedCamera(camera, name, calls, settings) for name, camera in rig.cameras.items()},
         projector=_GuardedProjector(rig.projector, f"projector '{rig.projector.info.name}'", calls),
         positioner=None if rig.positioner is None else GuardedPositioner(rig.positioner, calls),
     )
@@ -245,12 +248,25 @@ class _Guarded(Generic[_Device]):
 class _GuardedCamera(_Guarded[Camera]):
     """Implements `slrig.devices.Camera` by another one."""
 
+    def __init__(self, camera: Camera, name: str, calls: Calls, settings: dict[str, SettingsInUse]) -> None:
+        super().__init__(camera, f"camera '{name}'", calls)
+        self._key = name
+        self._settings = settings
+
     @property
     def info(self) -> CameraInfo:
         return self._device.info
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
-        return self._made("configure", lambda: self._device.configure(settings))
+        try:
+            applied = self._made("configure", lambda: self._device.configure(settings))
+        except UnsupportedByDeviceError as error:
+            before = self._settings.get(self._key)
+            kept = None if before is None else before.applied
+            self._settings[self._key] = SettingsInUse(settings, kept, str(error))
+            raise
+        self._settings[self._key] = SettingsInUse(settings, applied)
+        return applied
 
     def arm(self, count: int, trigger: Trigger) -> None:
         self._made("arm", lambda: self._device.arm(count, trigger))

@@ -32,7 +32,7 @@ from slrig.model import Shot, Truth
 from slrig.model.header import CaptureHeader
 from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import Progress, ScanPlan
-from slrig.scan.plan_check import pattern_sequence
+from slrig.scan.plan_check import in_colour, pattern_sequence
 
 MOST_WAITING_BYTES = 256 * 2**20
 """How much of frames may wait for the disk."""
@@ -160,7 +160,7 @@ def capture_frames(
     PatternError
         The plan does not fit the projector, or its patterns tell no depth by the rig's calibration.
     DeviceError
-        The rig failed.
+        The rig failed, or has no colour where the plan asks for it.
     ScanCancelledError
         `cancelled()` became true.
     StorageError
@@ -180,13 +180,14 @@ def capture_frames(
         _log.info(words, rig=rig.name)
         progress("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
+    colour = in_colour(plan, {name: camera.info for name, camera in rig.cameras.items()})
     writer = BundleWriter(
         folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
     )
     with ExitStack() as writing:
         writing.enter_context(writer)
         recorder = writing.enter_context(Recorder(writer))
-        exposing = Exposing(rig, sequence, exposures_s, cancelled=cancelled, refused=recorder.refuse)
+        exposing = Exposing(rig, sequence, exposures_s, cancelled=cancelled, refused=recorder.refuse, colour=colour)
         if frames is not None:
             once = tuple((index, name) for index in range(len(sequence)) for name in formats)
             listed = once * max(len(exposures_s), 1)

@@ -40,12 +40,14 @@ ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _END_OF_HEADER = b"\nend_header\n"
 _CALIBRATION_PART = "sigma_calibration_mm"
+_MARK = "albedo_mark"
 _FACE = np.dtype([("count", "<u1"), ("vertices", "<i4", (3,))])
 _NO_MESH = Mesh(
     vertices_mm=np.zeros((0, 3), dtype=np.float32),
     faces=np.zeros((0, 3), dtype=np.int32),
     normals=np.zeros((0, 3), dtype=np.float32),
-    grey=np.zeros(0, dtype=np.uint8),
+    colour=np.zeros((0, 3), dtype=np.uint8),
+    mark=np.zeros(0, dtype=np.uint8),
     sigma_mm=np.zeros(0, dtype=np.float32),
     stripe=np.zeros(0, dtype=np.int32),
 )
@@ -89,8 +91,10 @@ def encode_report(report: Mapping[str, object]) -> bytes:
 
 
 def encode_mesh_ply(mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
-    """Binary little-endian PLY in mm: position, normal, colour, `sigma_mm`, `stripe` per vertex; triangles.
+    """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe` per vertex;
+    triangles.
 
+    Colours are sRGB; `albedo_mark` is a number of `slrig.model.AlbedoMark`.
     sigma_calibration_mm : (V,), the part of `sigma_mm` that the calibration's own error makes, one property more; None
     where the calibration does not state it.
     """
@@ -132,7 +136,8 @@ def decode_mesh_ply(data: bytes) -> Mesh:
         vertices_mm=np.stack([vertices[name] for name in ("x", "y", "z")], axis=1),
         faces=np.ascontiguousarray(faces),
         normals=np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1),
-        grey=np.ascontiguousarray(vertices["red"]),
+        colour=np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1),
+        mark=np.ascontiguousarray(vertices[_MARK]),
         sigma_mm=np.ascontiguousarray(vertices["sigma_mm"]),
         stripe=np.ascontiguousarray(vertices["stripe"]),
     )
@@ -142,7 +147,8 @@ def _vertex_properties(mesh: Mesh) -> dict[str, tuple[str, NDArray[Any]]]:
     return {
         **_columns(("x", "y", "z"), "f4", mesh.vertices_mm),
         **_columns(("nx", "ny", "nz"), "f4", mesh.normals),
-        **_columns(("red", "green", "blue"), "u1", _rgb(mesh.grey)),
+        **_columns(("red", "green", "blue"), "u1", mesh.colour),
+        _MARK: ("u1", mesh.mark),
         "sigma_mm": ("f4", mesh.sigma_mm),
         "stripe": ("i4", mesh.stripe),
     }
@@ -158,7 +164,8 @@ def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count:
 
 
 def encode_points_ply(curves: PointCurves, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
-    """Binary little-endian PLY in mm: position, colour, `sigma_mm`, `stripe`, `source`, `bridge_after` per point.
+    """Binary little-endian PLY in mm: position, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
+    `bridge_after` per point.
 
     `stripe` is the projector column rounded down, as in the mesh; `bridge_after` is 1 where the step to the next
     point of its curve joins two stripes. sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
@@ -168,7 +175,8 @@ def encode_points_ply(curves: PointCurves, *, sigma_calibration_mm: FloatArray |
         len(curves.points_mm),
         {
             **_columns(("x", "y", "z"), "f4", curves.points_mm),
-            **_columns(("red", "green", "blue"), "u1", _rgb(curves.grey)),
+            **_columns(("red", "green", "blue"), "u1", curves.colour),
+            _MARK: ("u1", curves.mark),
             "sigma_mm": ("f4", curves.sigma_mm),
             "stripe": ("i4", np.repeat(columns, np.diff(curves.offsets))),
             "source": ("u1", curves.source),
@@ -177,10 +185,6 @@ def encode_points_ply(curves: PointCurves, *, sigma_calibration_mm: FloatArray |
         },
     )
     return _ply(_vertex_element(points), points)
-
-
-def _rgb(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.repeat(grey[:, None], 3, axis=1)
 
 
 def _columns(names: tuple[str, ...], kind: str, array: NDArray[Any]) -> dict[str, tuple[str, NDArray[Any]]]:

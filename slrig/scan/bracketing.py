@@ -8,7 +8,7 @@ a frame ends the scan, as it does with one exposure.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from slrig.bundle.refused import Refused
@@ -52,6 +52,8 @@ class Exposing:
         From short to long, for every camera; empty leaves each as its rig file has it.
     refused
         Is told of every exposure that does not count.
+    colour
+        Cameras whose white and black frames are kept in colour, too.
     """
 
     def __init__(
@@ -62,12 +64,14 @@ class Exposing:
         *,
         cancelled: Callable[[], bool],
         refused: Callable[[Refused], None],
+        colour: Collection[str] = (),
     ) -> None:
         self._rig = rig
         self._sequence = sequence
         self._exposures_s: tuple[float | None, ...] = tuple(exposures_s) or (None,)
         self._cancelled = cancelled
         self._tell = refused
+        self._colour = colour
         self._formats = {name: camera.info.format for name, camera in rig.cameras.items()}
         self._samplers = {name: Sampler.of(form.size) for name, form in self._formats.items()} if self._bracket else {}
         self._runs: list[_Run] = []
@@ -153,6 +157,7 @@ class Exposing:
             evidence=run.evidence,
             refused=lambda refused: self._take_refusal(run, refused),
             since_ns=since_ns,
+            colour=self._colour,
         )
         for taken in shots:
             shot = self._timed(taken)

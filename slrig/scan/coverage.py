@@ -51,7 +51,7 @@ def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[Came
         return
     figures = "; ".join(
         f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
-        f"{seen.largest_contrast:.0f} above black, {(seen.curves.refusal != Refusal.NOT_LIT).mean():.1%} of the image "
+        f"{seen.contrast.max():.0f} above black, {(seen.curves.refusal != Refusal.NOT_LIT).mean():.1%} of the image "
         f"lit, {seen.curves.decoded_pixels} pixels decoded"
         for seen in cameras
     )

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh
+from slrig.model.srgb import light_of
 from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
 
 _MOST_ROWS = 2**15  # rows that are worked on together: they stay in the processor's cache
@@ -26,11 +27,12 @@ def encode_mesh_glb(mesh: Mesh) -> bytes:
     glTF is in metres, with y up and the front towards +z (section 3.4); a scan is in mm, with y down and the front
     towards the camera, -z. The vertices keep their values, under a node that scales by 0.001 and turns by half a turn
     about x: (x, y, z) mm stands at (x, -y, -z) / 1000 m. Normals are left out if one is not known, because glTF has no
-    form for that; a mesh without triangles is shown as points.
+    form for that; a mesh without triangles is shown as points. Colours are light, not sRGB (section 3.9.2), of 16 bits.
     """
     positions = np.ascontiguousarray(mesh.vertices_mm, dtype="<f4")
-    opaque = np.full((len(mesh.grey), 4), 255, dtype=np.uint8)
-    opaque[:, :3] = mesh.grey[:, None]
+    # Three components of two bytes would not end on a multiple of four.
+    opaque = np.full((len(mesh.colour), 4), 2**16 - 1, dtype="<u2")
+    opaque[:, :3] = light_of(mesh.colour)
     parts = []
     if len(positions):
         ends = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
@@ -69,13 +71,14 @@ def encode_mesh_stl(mesh: Mesh) -> bytes:
 
 
 def encode_mesh_obj(mesh: Mesh) -> bytes:
-    """Wavefront OBJ in mm, with vertex normals, and grey as the three numbers that many programs read after x y z.
+    """Wavefront OBJ in mm, with vertex normals, and sRGB colours as the three numbers that many programs read after x y
+    z.
 
     Positions have five decimals (10 nm), normals and colours four. Normals are left out if one is not known.
     """
     known = bool(np.isfinite(mesh.normals).all())
     positions = _rounded(mesh.vertices_mm, _OBJ_POSITION_DECIMALS)
-    vertices = np.column_stack([positions, np.repeat(mesh.grey[:, None] / 255, 3, axis=1)])
+    vertices = np.column_stack([positions, mesh.colour / 255])
     number = f"%.{_OBJ_POSITION_DECIMALS}f"
     unit = f"%.{_OBJ_UNIT_DECIMALS}f"
     pieces = ["# slrig mesh, millimetres; v x y z red green blue\no scan\n"]

@@ -109,8 +109,8 @@ class ScanPlan:
     exposures_s : a bracket, for an object that is dark here and shines there: the sequence is played once for each of
     these exposure times, and the frames are fused. They are times and not multiples of what each camera has, like
     `exposure_s`: so every one can be a whole number of a projector's refreshes (of 1/60 s, say), and is checked against
-    what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order. series : None for a
-    scan alone.
+    what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order. colour : keep white
+    and black frames in colour, None where a camera has it. series : None for a scan alone.
 
     Raises
     ------
@@ -122,6 +122,7 @@ class ScanPlan:
     reconstruction: ReconstructionPlan = field(default_factory=ReconstructionPlan)
     exposure_s: float | None = None
     exposures_s: tuple[float, ...] | None = None
+    colour: bool | None = None
     series: SeriesPlace | None = None
 
     def __post_init__(self) -> None:

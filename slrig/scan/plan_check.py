@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from slrig.bundle.description import MOST_CAPTURE_BYTES
-from slrig.errors import UnsupportedByDeviceError
-from slrig.model import Axis, Calibration, Pattern, PatternSequence, Size
+from slrig.devices import CameraInfo
+from slrig.errors import UnsupportedByDeviceError, setting
+from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
 from slrig.rig.session import RigFacts
 from slrig.scan.light_axis import played_axes
@@ -43,6 +44,20 @@ def pattern_sequence(
     return encode(patterns, size)
 
 
+def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo]) -> frozenset[str]:
+    """The cameras whose white and black frames a plan keeps in colour.
+    Raises UnsupportedByDeviceError: it asks for colour, and a camera has none.
+    """
+    mono = [name for name, camera in cameras.items() if not camera.colour]
+    if plan.colour and mono:
+        message = (
+            f"{setting('colour')}: asked for, and camera '{mono[0]}' has none in the format that it is read in. Leave "
+            "it out, and the cameras that have colour give it."
+        )
+        raise UnsupportedByDeviceError(message)
+    return frozenset(cameras if plan.colour is not False else ()).difference(mono)
+
+
 def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
     """Return the bytes that the frames of a scan take on this rig, uncompressed. calibration : that it is to use.
 
@@ -51,7 +66,7 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
     PatternError
         The patterns do not fit the projector, or by the calibration they tell no depth.
     UnsupportedByDeviceError
-        A camera cannot expose that long, or that briefly, or the frames are more than a bundle holds.
+        A camera cannot expose that long, or that briefly, or has no colour, or the frames are more than a bundle holds.
     """
     exposures_s = plan.rising_exposures_s
     axis = plan.reconstruction.axis
@@ -59,7 +74,8 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
     sequence = pattern_sequence(
         plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded
     )
-    count = len(sequence) * max(len(exposures_s), 1)
+    count, coloured = len(sequence) * max(len(exposures_s), 1), in_colour(plan, facts.cameras)
+    ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * max(len(exposures_s), 1)
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0
     for name, camera in facts.cameras.items():
@@ -72,7 +88,8 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
                 )
                 raise UnsupportedByDeviceError(message)
         size = camera.format.size
-        total += count * size.width_px * size.height_px * (1 if camera.format.bit_depth <= 8 else 2)
+        images = count + (3 * ends if name in coloured else 0)
+        total += images * size.width_px * size.height_px * (1 if camera.format.bit_depth <= 8 else 2)
     if total > MOST_CAPTURE_BYTES:
         message = (
             f"The frames of this scan would take {total / 1e9:.1f} GB, a bundle holds {MOST_CAPTURE_BYTES / 1e9:.1f} "

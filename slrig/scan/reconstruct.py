@@ -23,12 +23,13 @@ from slrig.jobs.frame_feed import FedFrames
 from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
-from slrig.meshing.vertices import brightness, compact_mesh
+from slrig.meshing.vertices import compact_mesh
 from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
+from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
@@ -65,6 +66,7 @@ class _Meshed:
     stages: tuple[Stage, ...]
     figures: Mapping[str, object]
     redundancy: Mapping[str, object]
+    albedo: Mapping[str, object]
     notes: tuple[str, ...]
 
 
@@ -180,6 +182,7 @@ def reconstruct_into(
                 for each in cameras
             },
             "redundancy": dict(meshed.redundancy),
+            "albedo": dict(meshed.albedo),
             "mesh": {**figures, "covers_of_decoded": covered, "stages": with_seconds(meshed.stages, seconds)},
             **known,
             "stages_s": seconds,
@@ -239,10 +242,7 @@ def _meshed(
     apart = disagreement(joined_curves, share)
     if apart is not None:
         sigma = np.hypot(sigma, apart.sigma_mm)
-    grey = brightness(
-        points.pixels_px, joined_curves.camera,
-        [seen.white for seen in cameras], [float(seen.full_scale) for seen in cameras],
-    )  # fmt: skip
+    colours = coloured(cameras, joined_curves, surface.normals, projector, axis)
     curves = PointCurves(
         offsets=points.offsets,
         column_px=points.position_px,
@@ -250,11 +250,13 @@ def _meshed(
         sigma_mm=sigma,
         bridge_after=points.bridge_after,
         source=points.source,
-        grey=grey,
+        colour=colours.colour,
+        mark=colours.mark,
     )
     mesh = compact_mesh(
-        surface.faces, points.points_mm, surface.normals, grey, sigma, points.offsets, points.position_px
-    )
+        surface.faces, points.points_mm, surface.normals, colours.colour, colours.mark, sigma, points.offsets,
+        points.position_px,
+    )  # fmt: skip
     return _Meshed(
         mesh=mesh,
         curves=curves,
@@ -264,6 +266,7 @@ def _meshed(
         stages=surface.stages,
         figures=mesh_report(surface, mesh, curves),
         redundancy=redundancy_report(joined_curves, points.source, found.spare),
+        albedo=albedo_report(colours, mesh, cameras, lit=projector is not None),
         notes=() if apart is None else (str(apart),),
     )
 

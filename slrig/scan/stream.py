@@ -9,26 +9,45 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slrig.capture.evidence import EvidenceSummary
-from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Pattern, Pinhole, Pixels, Refusal, Shot, Size
+from slrig.model import (
+    Axis,
+    Black,
+    Calibration,
+    Capture,
+    Gray,
+    LineShift,
+    Pattern,
+    Pinhole,
+    Pixels,
+    Refusal,
+    Shot,
+    Size,
+    White,
+    exposure_groups,
+)
 from slrig.model.header import CaptureHeader
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
 from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import (
+    NEARLY_FULL,
     AxisFrames,
     FrameStacks,
+    Image,
     axis_frames,
     axis_patterns,
     ends_repeats,
     exposure_count,
     mean_image,
     telling,
+    telling_shots,
 )
-from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_frames
+from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_colour, fused_frames
 from slrig.scan.light_axis import chosen_axis
 from slrig.scan.report import Stopwatch
 
@@ -45,17 +64,23 @@ _WHITE_OVER_USUAL = 2.5
 class CameraResult:
     """One camera: its calibration, its curves, and of its frames what the results still need.
 
-    white : (H, W) uint16, the white frame in camera units; full_scale : of them what to show as white. A bracket's are
-    those of the longest exposure, and go beyond the camera's full scale. exposures : of a bracket, from short to long.
+    white : (H, W) uint16, the white frame in camera units; contrast : (H, W) float32, white minus black; full_scale :
+    what to show as white. A bracket's are those of the longest exposure, and go beyond the camera's full scale.
+    clipped : (H, W) bool, where white is no measure of light. exposures : of a bracket, from short to long.
+    white_colour, black_colour : (H, W, 3) uint8, uint16 or float32, blue, green and red in the same units, as the
+    camera gave them: `curves.gamma` tells how it bent its values, where the frames tell it; None without colour.
     """
 
     name: str
     device: Pinhole
     curves: CameraCurves
     white: Pixels
-    largest_contrast: float
+    contrast: Image
+    clipped: NDArray[np.bool_]
     full_scale: float
     exposures: tuple[ExposureUse, ...] = ()
+    white_colour: NDArray[Any] | None = None
+    black_colour: NDArray[Any] | None = None
 
 
 class ScanStream:
@@ -102,7 +127,9 @@ class ScanStream:
         seen = []
         for name in list(self._cameras):
             # What it held of its frames is not needed any more, and the memory is.
-            curves, frames, fused = self._cameras.pop(name).finish()
+            camera = self._cameras.pop(name)
+            curves, frames, fused = camera.finish()
+            white, black = (camera.colour(each, fused) for each in (White(), Black()))
             used = curves.refusal == Refusal.NONE
             seen.append(
                 CameraResult(
@@ -110,9 +137,12 @@ class ScanStream:
                     device=self.calibration.cameras[name],
                     curves=curves,
                     white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
-                    largest_contrast=float(frames.contrast.max()),
+                    contrast=frames.contrast,
+                    clipped=frames.white >= NEARLY_FULL * frames.clipped_at,
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
+                    white_colour=white,
+                    black_colour=black,
                 )
             )
         return seen
@@ -132,6 +162,7 @@ class _CameraFrames:
         self._entered = lambda stage: entered(stage, name)
         self._kept: list[Shot] = []
         self._repeats: dict[Pattern, list[Pixels]] = {}
+        self._colours: defaultdict[Pattern, list[tuple[float | None, Pixels]]] = defaultdict(list)
         listed = [index for index, camera in header.frames if camera == name]
         shown = [header.patterns[index] for index in listed]
         tells = telling(shown, [None] * len(shown))
@@ -164,6 +195,7 @@ class _CameraFrames:
         if self._waiting[shot.pattern] == 0:
             return
         self._waiting[shot.pattern] -= 1
+        self._keep_colour(shot)
         pattern = self._header.patterns[shot.pattern]
         repeats = self._repeats.setdefault(pattern, [])
         repeats.append(shot.image)
@@ -176,6 +208,8 @@ class _CameraFrames:
             return *self._stream.finish(), None
         header, fused = self._header, None
         capture = Capture(header.projector, header.patterns, header.cameras, tuple(self._kept))
+        for shot in telling_shots(capture, self._name):
+            self._keep_colour(shot)
         if exposure_count([shot.exposure_s for shot in self._kept]) > 1:
             fused = fused_frames(capture, self._name, self._axis)
             frames, noise = fused.frames, fused.noise
@@ -183,6 +217,22 @@ class _CameraFrames:
             frames, noise = axis_frames(capture, self._name, self._axis), None
         tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
         return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
+
+    def _keep_colour(self, shot: Shot) -> None:
+        if shot.colour is not None:
+            self._colours[self._header.patterns[shot.pattern]].append((shot.exposure_s, shot.colour))
+
+    def colour(self, pattern: White | Black, fused: FusedFrames | None) -> NDArray[Any] | None:
+        """(H, W, 3): a pattern in colour, in the units of its grey image; None where not every exposure has colour."""
+        found = self._colours.pop(pattern, [])
+        if fused is None:
+            return mean_image([image for _, image in found]) if found else None
+        alike = exposure_groups(each for each, _ in found)
+        groups = sorted({each or 0.0 for each in alike.values()}, reverse=True)
+        if len(groups) < len(fused.exposures_s):
+            return None
+        images = [[image for each, image in found if alike[each] == time_s] for time_s in groups]
+        return fused_colour(images, fused, float(self._header.cameras[self._name].full_scale))
 
 
 class LiveScan(ScanStream):

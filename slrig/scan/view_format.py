@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh
+from slrig.model.srgb import light_of
 from slrig.scan.gltf import HALF_A_TURN_ABOUT_X, INDICES, METRES_PER_MM, Part, encode_glb
 
 SIGMA_STEP_MM = 1e-4
@@ -27,12 +28,12 @@ _SAMPLED_TRIANGLES = 2**15
 
 
 def encode_view_glb(mesh: Mesh) -> bytes:
-    """Binary glTF 2.0 with KHR_mesh_quantization: 24 bytes for each vertex.
+    """Binary glTF 2.0 with KHR_mesh_quantization: 28 bytes for each vertex.
 
-    POSITION uint16, NORMAL int8, COLOR_0 uint8; `_SIGMA` uint16, the standard deviation in 0.1 µm (`sigma_step_mm` in
-    the extras); `_STRIPE` uint16, the projector column. Their greatest value, 65535, says "that much or more, or not
-    known". Each element begins at a multiple of 4 bytes (glTF 2.0, section 3.6.2.4), so the two last are 2 bytes of 4.
-    Normals are left out if one is not known, as in mesh.glb.
+    POSITION uint16, NORMAL int8, COLOR_0 uint16, light as in mesh.glb; `_SIGMA` uint16, the standard deviation in
+    0.1 µm (`sigma_step_mm` in the extras); `_STRIPE` uint16, the projector column. Their greatest value, 65535, says
+    "that much or more, or not known". Each element begins at a multiple of 4 bytes (glTF 2.0, section 3.6.2.4), so the
+    two last are 2 bytes of 4. Normals are left out if one is not known, as in mesh.glb.
     """
     count = len(mesh.vertices_mm)
     origin, step_mm = _lattice(mesh)
@@ -53,8 +54,8 @@ def encode_view_glb(mesh: Mesh) -> bytes:
         normals = np.zeros((count, 4), dtype=np.int8)
         normals[:, :3] = np.rint(mesh.normals * np.float32(127))
         parts.append(Part("NORMAL", normals, "VEC3", {"normalized": True}))
-    colours = np.full((count, 4), 255, dtype=np.uint8)
-    colours[:, :3] = mesh.grey[:, None]
+    colours = np.full((count, 4), _MOST, dtype="<u2")
+    colours[:, :3] = light_of(mesh.colour)
     sigma, stripe = np.zeros((count, 2), dtype="<u2"), np.zeros((count, 2), dtype="<u2")
     sigma[:, 0] = np.fmin(np.rint(mesh.sigma_mm / np.float32(SIGMA_STEP_MM)), _MOST)
     # A negative number, read without its sign, is a great one.
@@ -77,7 +78,7 @@ def coarse_mesh(mesh: Mesh) -> Mesh:
     """A mesh of about `COARSE_TRIANGLES` triangles, or the mesh itself where it has no more vertices and triangles.
 
     The vertices of each cell of a grid become one (Rossignac and Borrel 1993, "Multi-resolution 3D approximations for
-    rendering complex scenes"): the one nearest to their mean, with its own normal, grey, standard deviation and stripe.
+    rendering complex scenes"): the one nearest to their mean, with its own normal, colour, deviation and stripe.
     Each vertex is thus one of the scan's, and what is measured between two of them holds; a mean of positions would be
     more certain than the mean or the greatest of their standard deviations says.
 

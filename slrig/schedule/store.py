@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
-from slrig.errors import ScheduleNotFoundError
+from slrig.errors import ScanStateError, ScheduleNotFoundError
 from slrig.jobs.database import Database
 from slrig.jobs.records import stamp
 from slrig.jobs.tables import RunRow, ScheduleRow
@@ -27,6 +27,7 @@ LIFE_S = 60.0
 """How long a run counts as alive after its process last said so."""
 
 _KEPT_RUNS = 5000
+_PENDING = tuple(str(state) for state in RunState if not state.final)
 
 _AS_ORDERED = ("task", "options", "label", "grace_s", "retry_s", "catch_up", "enabled")
 """The columns that are as an order's attributes of the same name."""
@@ -117,6 +118,26 @@ class ScheduleStore:
                     _prune(session, row.id)
             session.flush()
             return [_run(each) for each in made]
+
+    def run_now(self, schedule_id: UUID, now: datetime) -> Run:
+        """Record a run that is due at this moment, whatever the order's times are, and though it may be paused.
+
+        Raises ScheduleNotFoundError; ScanStateError: one of its runs is under way, or waits for the rig.
+        """
+        with self.database.changing() as session:
+            schedule = _found(session, schedule_id)
+            pending = select(RunRow).where(RunRow.schedule_id == schedule.id, RunRow.state.in_(_PENDING)).limit(1)
+            if (other := session.scalar(pending)) is not None:
+                message = (
+                    f"Schedule {schedule_id} has a run that is {other.state} already. Wait until it is over, or end it "
+                    f"(POST /schedule/{schedule_id}/cancel)."
+                )
+                raise ScanStateError(message)
+            deadline = now + timedelta(seconds=schedule.grace_s)
+            due = DueRun(now, RunState.WAITING, "asked for by a person, not by the clock", 1, deadline)
+            made = self._recorded(session, schedule, due, now)
+            _prune(session, schedule.id)
+            return _run(made[0])
 
     def startable(self, now: datetime) -> Sequence[Run]:
         """The runs that wait for the rig and may try it now, the one due first first."""

@@ -126,8 +126,10 @@ class _Panel:
 def _errors(records: Records, at: Thresholds, top: float) -> list[Markup]:
     errors = [record.found.expected_mm for record in records]
     known = [error for error in errors if error is not None]
-    if not known:
-        return [shape("text", "No verification tells an expected error: they are all of scans.", x=_LEFT, y=top + 20)]
+    # A calibration that says nothing of its own error expects none.
+    if not any(known):
+        words = "No verification tells an expected error: they are of scans, or the calibration does not tell its own."
+        return [shape("text", words, x=_LEFT, y=top + 20)]
     stated = next((record.found.stated_mm for record in reversed(records) if record.found.stated_mm), 0.0)
     panel = _Panel(records, top, max(*known, 1.2 * at.watch_error_ratio * stated), "Expected error of a scan, mm")
     if stated:

@@ -12,11 +12,15 @@ import json
 import os
 import statistics
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from http.client import HTTPConnection
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -26,12 +30,13 @@ from slrig.discovery import open_rig
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import ScanPlan
 from tests.bench.test_pipeline_speed import RIG
-from tests.e2e.conftest import ServiceProcess, Start, start
+from tests.e2e.conftest import KEY, ServiceProcess, Start, start
 
 __all__ = ["start"]
 
 RUNS, ROW = 5, 10
 FRAMES_PER_S = 30
+VIEWERS, MOST_SLOWER = 20, 1.02
 TO_MESH_S, TO_ALL_S, BETWEEN_S = 0.40, 0.80, 0.10
 
 
@@ -168,3 +173,52 @@ def test_from_one_scan_to_the_next(start: Start, replayed: Path) -> None:
         "last POST to last end": (clocks[-1].over_s - clocks[-1].posted_s, None),
     }
     told(rows, f"{ROW} scans in a row, each sent when the rig is free")
+
+
+def test_viewers_do_not_slow_a_capture(start: Start, replayed: Path) -> None:
+    """Twenty people look: each follows the scan and wants a picture, and their page asks after the rig each second."""
+    service = start(replayed, fresh=True)
+    over = threading.Event()
+
+    def look(scan: Mapping[str, Any] | None) -> None:
+        with service.client() as client:
+            while not over.is_set():
+                if scan is None:
+                    client.get("/rig")
+                    over.wait(1.0)
+                else:
+                    for _ in client.follow(scan):
+                        pass
+                    return
+
+    def capture_s(viewers: int) -> float:
+        over.clear()
+        watched = Watched(client)
+        looking = [threading.Thread(target=look, args=(each,)) for each in viewers * [watched.scan] + viewers * [None]]
+        pictures = [previewing(service) for _ in range(viewers)]
+        for thread in looking:
+            thread.start()
+        clock = watched.clock()
+        over.set()
+        for thread in looking:
+            thread.join()
+        for connection in pictures:
+            connection.close()
+        return clock.captured_s - clock.began_s
+
+    with service.client() as client:
+        warmed(client)
+        pairs = [(capture_s(0), capture_s(VIEWERS)) for _ in range(RUNS)]
+    alone_s, watched_s = (statistics.median(each) for each in zip(*pairs, strict=True))
+    told(
+        {"capture alone": (alone_s, None), f"beside {VIEWERS} viewers": (watched_s, MOST_SLOWER * alone_s)},
+        f"capture of a scan, medians of {RUNS}",
+    )
+
+
+def previewing(service: ServiceProcess) -> HTTPConnection:
+    """Somebody who looks through the camera; while it is held no picture comes."""
+    parts = urlsplit(service.url)
+    connection = HTTPConnection(str(parts.hostname), parts.port, timeout=30)
+    connection.request("GET", "/preview/left?light=white", headers={"Authorization": f"Bearer {KEY}"})
+    return connection

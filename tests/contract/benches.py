@@ -60,8 +60,8 @@ def _eye(name: str, x_mm: float, **options: object) -> dict[str, object]:
 
 
 def eyes(**options: object) -> list[dict[str, object]]:
-    """Two cameras, one of 8 and one of 12 bit."""
-    return [_eye("left", -60.0, **options), _eye("right", 180.0, bit_depth=12, **options)]
+    """Two cameras, one of 8 bit in colour and one of 12 bit in grey."""
+    return [_eye("left", -60.0, colour=[0.7, 1.0, 0.6], **options), _eye("right", 180.0, bit_depth=12, **options)]
 
 
 def beamer(**options: object) -> dict[str, object]:
@@ -95,7 +95,7 @@ def replayed(folder: Path, **options: object) -> Bench:
     """A recording, made here on the rendered rig, with the times and exposures of its frames."""
     bench = simulated(folder)
     with bench.head() as head:
-        shots = tuple(capture(rig_of(head), bench.sequence))
+        shots = tuple(capture(rig_of(head), bench.sequence, colour=head.cameras))
         formats = {name: camera.info.format for name, camera in head.cameras.items()}
         recorded = Capture(PROJECTOR, bench.sequence.patterns, formats, shots)
         write_bundle(folder / "recording", recorded, head.calibration)

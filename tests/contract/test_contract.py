@@ -36,6 +36,7 @@ ABOUT = {
     "frame_times_lie_on_the_projectors_clock": "Camera.read Projector.show",
     "a_frame_lies_wholly_in_its_pattern": "Camera.read Camera.trigger Projector.show",
     "a_frame_keeps_its_pixels": "Camera.read",
+    "frames_come_in_colour_where_it_is_declared": "Camera.info Camera.read",
     "read_passes_over_stale_frames": "Camera.read Camera.trigger",
     "stale_frames_never_come_back": "Camera.read",
     "read_times_out_in_time": "Camera.read",

@@ -38,7 +38,8 @@ def two_shades() -> Mesh:
     mesh = half_ball(60, 160)
     right, low = (mesh.vertices_mm - CENTRE_MM)[:, :2].T > 0
     missing = (right & low)[mesh.faces].all(axis=1)
-    return replace(mesh, grey=np.where(right, 230, 60).astype(np.uint8), faces=mesh.faces[~missing])
+    shade = np.where(right, 230, 60).astype(np.uint8)
+    return replace(mesh, colour=np.repeat(shade[:, None], 3, axis=1), faces=mesh.faces[~missing])
 
 
 def assert_upright_and_from_the_front(shown: NDArray[np.uint8]) -> None:
@@ -125,8 +126,9 @@ def test_the_mesh_is_seen_in_metres(tmp_path: Path) -> None:
 
 def test_the_shade_is_that_of_the_stored_normals(tmp_path: Path) -> None:
     mesh = half_ball(60, 160)
-    shown = from_the_eye(replace(mesh, grey=np.full_like(mesh.grey, 200)), tmp_path / "front")
-    turned = from_the_eye(replace(mesh, grey=np.full_like(mesh.grey, 200), normals=-mesh.normals), tmp_path / "turned")
+    mesh = replace(mesh, colour=np.full_like(mesh.colour, 200))
+    shown = from_the_eye(mesh, tmp_path / "front")
+    turned = from_the_eye(replace(mesh, normals=-mesh.normals), tmp_path / "turned")
     light = shown[HEIGHT_PX // 2, :, :3].astype(float).mean(axis=1)
     opaque = shown[HEIGHT_PX // 2, :, 3] == 255
     across = light[opaque]

@@ -36,7 +36,8 @@ def mesh_of(vertices: NDArray[np.floating[Any]], faces: IntArray, sigma_mm: floa
         vertices_mm=np.asarray(vertices, dtype=np.float32),
         faces=faces,
         normals=vertex_normals(vertices, faces),
-        grey=np.zeros(count, dtype=np.uint8),
+        colour=np.zeros((count, 3), dtype=np.uint8),
+        mark=np.zeros(count, dtype=np.uint8),
         sigma_mm=np.full(count, sigma_mm, dtype=np.float32),
         stripe=np.zeros(count, dtype=np.int32),
     )

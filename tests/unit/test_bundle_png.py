@@ -88,8 +88,8 @@ def test_frames_are_as_small_as_by_zlib_but_for_a_quarter() -> None:
 
 
 @pytest.mark.parametrize(
-    "image", [np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.float32), np.zeros((0, 5), np.uint8)]
+    "image", [np.zeros((4, 5, 4), np.uint8), np.zeros((4, 5), np.float32), np.zeros((0, 5, 3), np.uint8)]
 )
-def test_what_is_no_grey_frame_is_refused(image: Pixels) -> None:
-    with pytest.raises(BundleError, match="a grey image of 8 or 16 bits"):
+def test_what_is_no_frame_is_refused(image: Pixels) -> None:
+    with pytest.raises(BundleError, match="an image of 8 or 16 bits"):
         encode_frame(image, "frame.png")

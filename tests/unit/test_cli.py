@@ -23,7 +23,7 @@ from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
 from slrig.cli.quality import quality_lines
-from slrig.cli.scan import scan_with, tell_result
+from slrig.cli.scan import scan_with, series_with, tell_result
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError, SlrigError
 from slrig.scan.offered import MEDIA_TYPES
 
@@ -411,6 +411,59 @@ def test_failed_scan_tells_the_cause(tmp_path: Path) -> None:
 def test_scan_cancelled_elsewhere_is_told_as_such(tmp_path: Path) -> None:
     with client_of(Walk("cancelled")) as client, pytest.raises(ScanCancelledError):
         scan_with(client, {}, tmp_path / "out", display=ignore)
+
+
+def test_a_series_goes_on_after_a_failure_and_tells_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ends = {"1": Walk("succeeded"), "2": Walk("failed", {"detail": "No stripe was found."}), "3": Walk("succeeded")}
+    asked: list[dict[str, Any]] = []
+
+    def numbered(scan: dict[str, Any], number: str) -> dict[str, Any]:
+        here = f"/scan/{number}"
+        links = {**scan["links"], "self": here, "events": f"{here}/events", "series": "/scan/series/9"}
+        return {**scan, "id": number, "links": {**links, "files": {"mesh.ply": f"{here}/mesh.ply"}}}
+
+    def answer(request: httpx2.Request) -> httpx2.Response:
+        path = request.url.path
+        if path == "/scan":
+            asked.append(json.loads(request.content))
+            return httpx2.Response(202, json=numbered(SCAN, "1"))
+        if path == "/scan/series/9":
+            return httpx2.Response(200, json={"scans": [numbered(SCAN, number) for number in ends]})
+        number = path.split("/")[2]
+        found = ends[number](request)
+        is_scan = found.headers.get("Content-Type") == "application/json"
+        return httpx2.Response(200, json=numbered(found.json(), number)) if is_scan else found
+
+    request = {"repeat": 3, "every_s": 2.0}
+    assert ScanRequest.model_validate(request).repeat == 3
+    with client_of(answer) as client, pytest.raises(ServiceError, match=r"^1 of 3 scans did not succeed: 002\.$"):
+        series_with(client, request, tmp_path, files=("mesh.ply",), display=ignore)
+    assert asked == [request]
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.ply")) == [
+        "001/mesh.ply",
+        "003/mesh.ply",
+    ]
+    rows = [line.split(maxsplit=3) for line in capsys.readouterr().out.splitlines()]
+    assert rows[1] == ["001", "2,301", "0.0079"]
+    assert rows[2][0] == "002"
+    assert "No stripe was found." in " ".join(rows[2])
+
+
+def test_a_series_that_is_broken_off_is_cancelled_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    posted: list[str] = []
+
+    def answer(request: httpx2.Request) -> httpx2.Response:
+        started = {**SCAN, "links": {**SCAN["links"], "series": "/scan/series/9"}}  # type: ignore[dict-item]
+        posted.extend([request.url.path] if request.method == "POST" else [])
+        return httpx2.Response(202, json={**started, "scans": [started, started]})
+
+    def interrupted(_client: ServiceClient, _scan: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ServiceClient, "follow", interrupted)
+    with client_of(answer) as client, pytest.raises(KeyboardInterrupt):
+        series_with(client, {"repeat": 2}, tmp_path, display=ignore)
+    assert posted == ["/scan", "/scan/series/9/cancel"]
 
 
 def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path: Path) -> None:

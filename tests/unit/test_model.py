@@ -163,6 +163,7 @@ def _curves(offsets: list[int]) -> PointCurves:
         np.zeros(5),
         np.zeros(5, bool),
         np.zeros(5, np.uint8),
+        np.zeros((5, 3), np.uint8),
         np.zeros(5, np.uint8),
     )
 
@@ -183,6 +184,7 @@ def test_a_mesh_has_one_value_per_vertex() -> None:
             np.zeros((3, 3), np.float32),
             np.array([[0, 1, 2]], np.int32),
             np.zeros((3, 3), np.float32),
+            np.zeros((3, 3), np.uint8),
             np.zeros(3, np.uint8),
             np.zeros(2, np.float32),
             np.zeros(3, np.int32),

@@ -239,7 +239,7 @@ def _page_mm(board: Board, page: str) -> tuple[float, float]:
     needed = _needed_mm(board, max(sides))
     message = (
         f"the board: {board.title} needs a page of {needed[0]:.0f} x {needed[1]:.0f} mm with its rulers, and {page} "
-        f"has {sides[0]:g} x {sides[1]:g} mm: {advice}; --page {FIT} makes a page as large as it needs"
+        f"has {sides[0]:g} x {sides[1]:g} mm: {advice}; page {FIT} (--page {FIT}) is as large as it needs"
     )
     raise CalibrationError(message)
 

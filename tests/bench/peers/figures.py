@@ -80,7 +80,8 @@ def _bare(surface: Surface) -> Mesh:
         vertices_mm=surface.vertices_mm.astype(np.float32),
         faces=np.ascontiguousarray(surface.faces, dtype=np.int32),
         normals=np.full((count, 3), np.nan, dtype=np.float32),
-        grey=np.zeros(count, dtype=np.uint8),
+        colour=np.zeros((count, 3), dtype=np.uint8),
+        mark=np.zeros(count, dtype=np.uint8),
         sigma_mm=np.full(count, np.nan, dtype=np.float32),
         stripe=np.zeros(count, dtype=np.int32),
     )

@@ -106,6 +106,7 @@ def mesh_in(results: Path) -> Mesh:
         np.asarray(read.vertices, np.float32),
         np.asarray(read.faces, np.int32),
         np.asarray(read.vertex_normals, np.float32),
+        np.zeros((count, 3), np.uint8),
         np.zeros(count, np.uint8),
         np.full(count, np.nan, np.float32),
         np.zeros(count, np.int32),

@@ -91,6 +91,7 @@ def scan_of(step: Step, *, scale: float = 1.0, noise_mm: float = NOISE_MM, seed:
         points.astype(np.float32),
         np.concatenate([grid_faces(at * GRID * GRID) for at in range(len(parts))]),
         np.concatenate([part[1] for part in parts]).astype(np.float32),
+        np.zeros((count, 3), np.uint8),
         np.zeros(count, np.uint8),
         np.full(count, noise_mm, np.float32),
         np.zeros(count, np.int32),

@@ -13,6 +13,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.bundle.calibration_file import write_calibration
+from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
+from slrig.calibration.boards.printing import board_pdf
 from slrig.errors import SolveRefusedError
 from slrig.model import Calibration, Size
 from slrig.scan.plan_check import pattern_sequence
@@ -406,3 +408,30 @@ def test_stream_of_a_quiet_calibration_is_empty(calibrating: TestClient) -> None
     last = calibrating.get(made["links"]["self"]).json()["last_event"]
     assert last == everything[-1]["id"]
     assert calibrating.get(made["links"]["events"], headers={"Last-Event-ID": str(last)}).status_code == 204
+
+
+def test_sheet_of_a_board_is_what_the_command_writes(client: TestClient) -> None:
+    found = client.get("/calibration/board.pdf")
+    assert (found.status_code, found.headers["content-type"]) == (200, "application/pdf")
+    assert found.content == board_pdf(USUAL_BOARD)
+    asked = {"kind": "chessboard", "columns": "7", "rows": "5", "square_mm": "24.5", "page": "A3"}
+    found = client.get("/calibration/board.pdf", params=asked)
+    assert found.content == board_pdf(Board(BoardKind.CHESSBOARD, 7, 5, 24.5), page="A3")
+    assert "board-chessboard-7x5-24.5mm.pdf" in found.headers["content-disposition"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"columns": "2"}, "greater than or equal to 3"),
+        ({"kind": "hexagons"}, "'charuco', 'chessboard' or 'circles'"),
+        ({"square_mm": "20"}, "the largest square that fits"),
+        ({"page": "napkin"}, "WIDTHxHEIGHT in mm"),
+        ({"kind": "circles", "marker_mm": "9"}, "belong to a ChArUco board"),
+        ({"dictionary": "DICT_NONE"}, "DICT_"),
+    ],
+)
+def test_sheet_that_cannot_be_printed_is_refused(client: TestClient, asked: dict[str, str], words: str) -> None:
+    found = client.get("/calibration/board.pdf", params=asked)
+    assert found.status_code == 422
+    assert words in found.text

@@ -16,8 +16,11 @@ from fastapi.testclient import TestClient
 
 from slrig.api.idempotency import fingerprint, own_key
 from slrig.api.schemas import ScanRequest
+from slrig.devices import AppliedSettings, CameraSettings
+from slrig.jobs.examinations import keep
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
+from slrig.rig.settings import SettingsInUse
 from slrig.scan.artefacts import ON_REQUEST
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.scan.fakes import WAIT_S
@@ -411,8 +414,16 @@ def test_disk_without_room_is_told_before_the_scan(client: TestClient, served: S
     assert "are free" in ready.json()["checks"]["disk"]
 
 
-def test_rig_says_what_it_is(client: TestClient) -> None:
+def test_rig_says_what_it_is_and_how_its_cameras_are_set(client: TestClient, served: ServedBench) -> None:
     ended(client, client.post("/scan").json()["id"])
+    camera = client.get("/rig").json()["cameras"][0]
+    assert (camera["exposure_s"], camera["gain"], camera["notes"]) == (None, None, [])
+    settings = served.service.runner.queue.rig.settings
+    settings[camera["name"]] = SettingsInUse(CameraSettings(0.02), AppliedSettings(0.01, 1.0))
+    camera = client.get("/rig").json()["cameras"][0]
+    assert (camera["exposure_s"], camera["gain"]) == (0.01, 1.0)
+    assert "asked for an exposure of 20 ms, and uses 10 ms" in camera["notes"][0]
+    settings.clear()
     rig = client.get("/rig").json()
     assert (rig["name"], rig["open"], rig["error"], rig["holder"]) == ("bench", True, None, None)
     assert rig["cameras"][0]["size_px"] == [64, 48]
@@ -423,6 +434,18 @@ def test_rig_says_what_it_is(client: TestClient) -> None:
 def test_drivers_and_devices_are_listed(client: TestClient) -> None:
     found = client.get("/device").json()
     assert ("head", "simulated", None) in [(each["kind"], each["name"], each["fault"]) for each in found["drivers"]]
+
+
+def test_last_examinations_of_the_rig_are_shown_with_what_to_run(client: TestClient, served: ServedBench) -> None:
+    root = served.service.folder.root
+    found = client.get("/rig/examinations").json()
+    assert (found["doctor"], found["conform"]) == (None, None)
+    assert found["commands"]["doctor"] == f"slrig doctor RIG.toml --data {root}"
+    for rig in ("bench", "another"):
+        keep(root, "doctor" if rig == "bench" else "conform", {"rig": rig, "findings": []})
+    found = client.get("/rig/examinations").json()
+    assert found["doctor"]["found"] == {"rig": "bench", "findings": []}
+    assert found["conform"] is None
 
 
 def test_probes_are_well(client: TestClient) -> None:

@@ -70,7 +70,8 @@ def test_schedule_is_paused_resumed_and_removed(client: TestClient) -> None:
         assert client.post(made["links"]["resume"]).json()["enabled"] is True
     assert client.delete(made["links"]["self"]).status_code == 204
     for method, path in (
-        ("GET", ""), ("GET", "/runs"), ("POST", "/pause"), ("POST", "/resume"), ("POST", "/cancel"), ("DELETE", ""),
+        ("GET", ""), ("GET", "/runs"), ("POST", "/run"), ("POST", "/pause"), ("POST", "/resume"), ("POST", "/cancel"),
+        ("DELETE", ""),
     ):  # fmt: skip
         response = client.request(method, f"{made['links']['self']}{path}")
         assert (response.status_code, response.json()["type"]) == (404, "/problems/schedule-not-found"), path
@@ -151,6 +152,23 @@ def test_cancel_without_a_run_is_refused(client: TestClient) -> None:
     response = client.post(f"{made['links']['self']}/cancel")
     assert (response.status_code, response.json()["type"]) == (409, "/problems/scan-state")
     assert "no run under way" in response.json()["detail"]
+
+
+def test_paused_schedule_runs_now_and_tells_what_became_of_it(client: TestClient) -> None:
+    opened(client)
+    made = added(client, enabled=False)
+    begun = client.post(made["links"]["run"])
+    assert begun.status_code == 202, begun.text
+    run = begun.json()
+    assert (run["state"], run["reason"], run["count"]) == ("waiting", "asked for by a person, not by the clock", 1)
+    assert abs(datetime.fromisoformat(run["due"]) - datetime.now(UTC)) < timedelta(seconds=WAIT_S)
+    deadline_s = time.monotonic() + WAIT_S
+    while (found := client.get(made["links"]["runs"]).json()["runs"])[0]["state"] != "failed":
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    assert [each["number"] for each in found] == [run["number"]]
+    assert "The rig has no calibration that could be verified" in found[0]["reason"]
+    assert client.get(made["links"]["self"]).json()["enabled"] is False
 
 
 def test_metrics_tell_what_the_service_is_at(client: TestClient, served: ServedBench) -> None:

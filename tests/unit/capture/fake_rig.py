@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,7 +249,7 @@ class CameraFaults:
 
 @dataclass
 class FakeCamera:
-    """Implements `Camera`."""
+    """Implements `Camera`. coloured : how often a frame was asked for its colour; None of a mono camera."""
 
     name: str
     world: World
@@ -262,13 +262,19 @@ class FakeCamera:
     last_image: Pixels | None = None
     dropped: int = 0
     gone: bool = False
+    coloured: int | None = None
 
     def __post_init__(self) -> None:
         self.world.on_wire.append(self._on_wire)
 
     @property
     def info(self) -> CameraInfo:
-        return CameraInfo(self.name, "fake", "0", self.scene.format, self.triggers, (1e-5, 1.0), (1.0, 1.0))
+        info = CameraInfo(self.name, "fake", "0", self.scene.format, self.triggers, (1e-5, 1.0), (1.0, 1.0))
+        return replace(info, colour=self.coloured is not None)
+
+    def _in_colour(self, image: Pixels) -> Pixels:
+        self.coloured = (self.coloured or 0) + 1
+        return np.dstack([image // 2, image, image // 4])
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         self.world.calls.append(f"configure {self.name}")
@@ -316,6 +322,7 @@ class FakeCamera:
                 dropped_count=self.dropped,
                 exposure_s=EXPOSURE_NS / 1e9 * (1.5 if number in self.faults.over_exposed else 1.0),
                 gain=1.0,
+                colour=None if self.coloured is None else lambda: self._in_colour(image),
             )
         )
 

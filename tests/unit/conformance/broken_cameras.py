@@ -275,6 +275,14 @@ class ReusesItsBuffer(ModelCamera):
         return replace(frame, image=self.buffer)
 
 
+class ColoursItsBuffer(ReusesItsBuffer):
+    """Makes colour of the memory that the next frames are written to."""
+
+    def frame(self, exposure: Exposure) -> Frame:
+        frame = super().frame(exposure)
+        return replace(frame, image=frame.image.copy(), colour=lambda: np.dstack([frame.image] * 3))
+
+
 class DeclaresAnotherSize(ModelCamera):
     """Declares what its data sheet says, and sends what its mode gives."""
 

@@ -115,7 +115,7 @@ class ModelCamera:
     @property
     def info(self) -> CameraInfo:
         form = self.world.scene.format
-        return CameraInfo(self.name, "model", "1", form, self.triggers, (1e-4, 0.5), (1.0, 8.0))
+        return CameraInfo(self.name, "model", "1", form, self.triggers, (1e-4, 0.5), (1.0, 8.0), colour=True)
 
     def configure(self, settings: CameraSettings) -> AppliedSettings:
         self.require(unarmed=True)
@@ -207,6 +207,7 @@ class ModelCamera:
             0,
             self.applied.exposure_s,
             self.applied.gain,
+            colour=lambda: np.dstack([image // 2, image, image // 3]),
         )
 
     def disarm(self) -> None:

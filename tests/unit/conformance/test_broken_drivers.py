@@ -127,6 +127,17 @@ BROKEN: list[tuple[Maker, str, str]] = [
     (Maker(projector=projectors.LightsLate), "a_frame_lies_wholly_in_its_pattern", "of white's light"),
     (Maker(cameras.FlushesOneFrame), "a_frame_lies_wholly_in_its_pattern", "of white's light"),
     (Maker(cameras.ReusesItsBuffer), "a_frame_keeps_its_pixels", "pixels changed"),
+    (
+        Maker(cameras.delivering(lambda frame: replace(frame, colour=None))),
+        "frames_come_in_colour_where_it_is_declared",
+        "CameraInfo.colour is True",
+    ),
+    (
+        Maker(cameras.delivering(lambda frame: replace(frame, colour=lambda: frame.image))),
+        "frames_come_in_colour_where_it_is_declared",
+        "(80, 110)",
+    ),
+    (Maker(cameras.ColoursItsBuffer), "frames_come_in_colour_where_it_is_declared", "by 0.0, 0.0, 0.0 DN"),
     (Maker(cameras.DeliversStale), "read_passes_over_stale_frames", "ms before"),
     (Maker(cameras.DeliversStaleFreely), "read_passes_over_stale_frames", "free trigger"),
     (Maker(cameras.BringsBack), "stale_frames_never_come_back", "no error"),
@@ -187,7 +198,7 @@ def test_every_check_finds_a_broken_driver() -> None:
         ({Trigger.SOFTWARE, Trigger.FREE}, False, 3),
         ({Trigger.FREE}, False, 3),
         ({Trigger.SOFTWARE}, False, 4),
-        ({Trigger.HARDWARE}, True, 16),
+        ({Trigger.HARDWARE}, True, 17),
     ],
     ids=lambda value: "-".join(sorted(value)) if isinstance(value, set | frozenset) else str(value),
 )

@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slrig.cli.commands import app
+from slrig.jobs.examinations import last_examination
 
 PLATE = """
 name = "plate"
@@ -66,14 +67,20 @@ def test_conform_scores_a_rig_that_keeps_the_contract(tmp_path: Path) -> None:
 def test_conform_says_what_is_wrong_and_what_to_do(tmp_path: Path) -> None:
     # Light that comes three exposures after the projector says so.
     rig = small_rig(tmp_path, faults="faults = {light_delay_s = 0.05}")
-    shown = CliRunner().invoke(app, ["conform", str(rig)])
+    data = tmp_path / "data"
+    (data / "scans").mkdir(parents=True)
+    shown = CliRunner().invoke(app, ["conform", str(rig), "--data", str(data)])
     assert shown.exit_code == 1
     assert "100 %" not in shown.stdout
+    kept = last_examination(data, "conform", "small")
+    assert kept is not None
+    assert f"{kept.found['passed']} of {kept.found['applicable']} checks" in shown.stdout
     told = " ".join(shown.stdout.split())
     assert "(a_frame_lies_wholly_in_its_pattern)" in told
     assert "do read returns frames whose whole exposure, all rows, lies after after_ns" in told
-    document = json.loads(CliRunner().invoke(app, ["conform", str(rig), "--json"]).stdout)
-    assert document["conforms"] is False
+    shown = CliRunner().invoke(app, ["conform", str(rig), "--json", "--data", str(tmp_path)])
+    assert json.loads(shown.stdout)["conforms"] is False
+    assert "is no data folder of slrig serve" in shown.stderr
 
 
 def test_conform_on_a_rig_that_cannot_be_opened_is_exit_code_2(tmp_path: Path) -> None:

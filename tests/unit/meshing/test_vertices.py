@@ -11,8 +11,8 @@ from slrig.meshing.flips import BLOCK, GAMMA, prefer_flips, prefers_flip
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.quality import mesh_figures, weighted_percentiles
 from slrig.meshing.topology import duplicate_face_count
-from slrig.meshing.vertices import brightness, compact_mesh
-from slrig.model import FloatArray, IntArray, Pixels
+from slrig.meshing.vertices import compact_mesh
+from slrig.model import FloatArray, IntArray
 
 
 def soup(seed: int, *, points: int = 700, faces: int = 5000) -> tuple[FloatArray, IntArray]:
@@ -93,28 +93,20 @@ def test_figures_of_any_triangles_are_those_of_plain_numpy() -> None:
     assert figures["sliver_fraction_below_10deg"] == pytest.approx(slivers.mean())
 
 
-def test_brightness_is_that_of_the_pixel_of_its_camera() -> None:
-    random = np.random.default_rng(8)
-    eight: Pixels = random.integers(0, 256, (20, 30)).astype(np.uint8)
-    twelve: Pixels = random.integers(0, 4096, (20, 30)).astype(np.uint16)
-    pixels, camera = random.random((500, 2)) * (29, 19), random.integers(0, 2, 500).astype(np.int32)
-    columns, rows = np.rint(pixels).astype(int).T
-    expected = np.where(camera == 0, eight[rows, columns], np.rint(twelve[rows, columns] * (255 / 4095)))
-    np.testing.assert_array_equal(brightness(pixels, camera, [eight, twelve], [255.0, 4095.0]), expected)
-
-
 def test_a_mesh_is_gathered_from_the_points_in_use() -> None:
     points, faces = soup(9, faces=200)
     random = np.random.default_rng(10)
     normals, sigma = random.normal(size=(700, 3)).astype(np.float32), random.random(700)
-    grey, offsets = random.integers(0, 256, 700).astype(np.uint8), np.array([0, 100, 100, 420, 700], dtype=np.int32)
+    colour, mark = random.integers(0, 256, (700, 3)).astype(np.uint8), random.integers(0, 6, 700).astype(np.uint8)
+    offsets = np.array([0, 100, 100, 420, 700], dtype=np.int32)
     columns = np.array([3.9, 4.5, 6.0, 11.2])
-    mesh = compact_mesh(faces, points, normals, grey, sigma, offsets, columns)
+    mesh = compact_mesh(faces, points, normals, colour, mark, sigma, offsets, columns)
     used = np.unique(faces)
     assert len(used) < 500
     np.testing.assert_array_equal(used[mesh.faces], faces)
     np.testing.assert_array_equal(mesh.vertices_mm, points[used].astype(np.float32))
     np.testing.assert_array_equal(mesh.normals, normals[used])
-    np.testing.assert_array_equal(mesh.grey, grey[used])
+    np.testing.assert_array_equal(mesh.colour, colour[used])
+    np.testing.assert_array_equal(mesh.mark, mark[used])
     np.testing.assert_array_equal(mesh.sigma_mm, sigma[used].astype(np.float32))
     np.testing.assert_array_equal(mesh.stripe, np.repeat([3, 4, 6, 11], np.diff(offsets))[used])

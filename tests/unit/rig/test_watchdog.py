@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import pytest
 from structlog.testing import capture_logs
 
-from slrig.devices import CallLimits, CameraSettings, Rig, Trigger, progress_reporter
+from slrig.devices import AppliedSettings, CallLimits, CameraSettings, Rig, Trigger, progress_reporter
 from slrig.errors import (
     ConfigError,
     DeviceBusyError,
@@ -23,6 +23,7 @@ from slrig.errors import (
     UnsupportedByDeviceError,
 )
 from slrig.rig.session import RigSession
+from slrig.rig.settings import SettingsInUse
 from slrig.rig.watchdog import OPEN, Call, Calls, Watchdog, guarded
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
 
@@ -160,7 +161,7 @@ def test_limits_are_those_that_a_device_declares_and_nothing_computed_is_unplugg
             found.append(calls.overdue())
 
     camera.read = slow  # type: ignore[assignment, method-assign]
-    rig = guarded(Rig("bench", {"cam0": camera}, TameProjector(), {}), calls)
+    rig = guarded(Rig("bench", {"cam0": camera}, TameProjector(), {}), calls, {})
     with pytest.raises(DeviceError) as told:
         rig.cameras["cam0"].read(0, 1.0)
     assert [call is not None for call in found] == [False, False, False, True]
@@ -207,7 +208,7 @@ def test_every_call_of_a_device_is_guarded(monkeypatch: pytest.MonkeyPatch) -> N
         return real(device, step, limit_s, function, computed=computed)
 
     monkeypatch.setattr(calls, "make", make)
-    rig = guarded(Rig("bench", {"cam0": camera}, projector, {}), calls)
+    rig = guarded(Rig("bench", {"cam0": camera}, projector, {}), calls, {})
     eye = rig.cameras["cam0"]
     assert (eye.info, rig.projector.info) == (camera.info, projector.info)
     assert eye.configure(CameraSettings(0.01)).exposure_s == 0.01
@@ -228,6 +229,49 @@ def test_every_call_of_a_device_is_guarded(monkeypatch: pytest.MonkeyPatch) -> N
     assert [step for step in made if "camera" in step] == [f"camera 'cam0' {step}" for step in [*steps, "close"]]
     shown = ["show", "play", "stop", "blank", "close"]
     assert [step for step in made if "projector" in step] == [f"projector 'projector' {step}" for step in shown]
+
+
+def test_settings_are_kept_as_applied_with_what_was_refused_or_bent() -> None:
+    camera, kept = TameCamera(), dict[str, SettingsInUse]()
+    eye = guarded(Rig("bench", {"cam0": camera}, TameProjector(), {}), Calls(), kept).cameras["cam0"]
+    refusal = failing(UnsupportedByDeviceError("asked for gain 9, it takes 1 only"))
+
+    def refuse(settings: CameraSettings) -> AppliedSettings:
+        refusal()
+        raise AssertionError(settings)
+
+    def bend(settings: CameraSettings) -> AppliedSettings:
+        return AppliedSettings(0.9 * settings.exposure_s, 2.0)
+
+    camera.configure, usual = refuse, camera.configure  # type: ignore[method-assign]
+    for taken in (False, True):
+        with pytest.raises(UnsupportedByDeviceError):
+            eye.configure(CameraSettings(0.02, 9.0))
+        found = kept["cam0"]
+        assert found.applied == (AppliedSettings(0.01, 1.0) if taken else None)
+        assert found.words == (
+            "It refused what it was asked for last: asked for gain 9, it takes 1 only (camera 'cam0', in configure)",
+        )
+        camera.configure = usual  # type: ignore[method-assign]
+        eye.configure(CameraSettings(0.01))
+        assert (kept["cam0"].applied, kept["cam0"].words) == (AppliedSettings(0.01, 1.0), ())
+        camera.configure = refuse  # type: ignore[method-assign]
+    camera.configure = bend  # type: ignore[method-assign]
+    eye.configure(CameraSettings(0.01))
+    assert kept["cam0"].words == (
+        "It was asked for an exposure of 10 ms, and uses 9 ms: write a value that it can use into the rig file.",
+        "It was asked for a gain of 1, and uses 2: write a value that it can use into the rig file.",
+    )
+
+
+def test_settings_of_a_rig_that_is_opened_afresh_are_not_those_of_before() -> None:
+    bench = TameBench()
+    held = RigSession("bench", bench.open_rig)
+    next(iter(held.open().cameras.values())).configure(CameraSettings(0.01))
+    assert [each.asked.exposure_s for each in held.settings.values()] == [0.01]
+    held.let_go()
+    held.open()
+    assert held.settings == {}
 
 
 def test_rig_with_a_failure_that_nobody_was_told_of_is_opened_afresh() -> None:

@@ -27,7 +27,8 @@ TRIANGLE = Mesh(
     vertices_mm=np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0]], dtype=np.float32),
     faces=np.array([[0, 1, 2]], dtype=np.int32),
     normals=np.array([[0, 0, 1]] * 3, dtype=np.float32),
-    grey=np.array([10, 100, 200], dtype=np.uint8),
+    colour=np.array([[10, 20, 30], [100, 90, 80], [200, 210, 220]], dtype=np.uint8),
+    mark=np.array([0, 1, 2], dtype=np.uint8),
     sigma_mm=np.full(3, 0.01, dtype=np.float32),
     stripe=np.array([3, 4, 5], dtype=np.int32),
 )

@@ -42,7 +42,8 @@ def example_mesh(seed: int = 0) -> Mesh:
         vertices_mm=(random.normal(size=(5, 3)) * 100).astype(np.float32),
         faces=np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32),
         normals=(normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
-        grey=np.array([0, 10, 100, 200, 255], dtype=np.uint8),
+        colour=np.array([[0, 1, 2], [10, 9, 8], [100, 50, 25], [200, 0, 7], [255, 255, 254]], dtype=np.uint8),
+        mark=np.array([0, 1, 2, 3, 5], dtype=np.uint8),
         sigma_mm=np.array([0.01, 0.02, np.nan, 0.04, 0.05], dtype=np.float32),
         stripe=np.array([7, 8, 9, 10, 1023], dtype=np.int32),
     )
@@ -56,7 +57,8 @@ def example_curves() -> PointCurves:
         sigma_mm=np.array([0.1, 0.2, 0.3, 0.4, np.nan]),
         bridge_after=np.array([True, False, False, False, True]),
         source=np.array([0, 1, 2, 0, 1], dtype=np.uint8),
-        grey=np.array([1, 2, 3, 4, 255], dtype=np.uint8),
+        colour=np.array([[1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 5, 6], [255, 0, 9]], dtype=np.uint8),
+        mark=np.array([0, 0, 4, 1, 2], dtype=np.uint8),
     )
 
 
@@ -73,8 +75,9 @@ def test_ply_holds_every_property_of_the_mesh(tmp_path: Path) -> None:
     assert np.array_equal(found.faces, mesh.faces)
     for axis, name in enumerate(("nx", "ny", "nz")):
         assert np.array_equal(data[name].ravel(), mesh.normals[:, axis])
-    for name in ("red", "green", "blue"):
-        assert np.array_equal(data[name].ravel(), mesh.grey)
+    for channel, name in enumerate(("red", "green", "blue")):
+        assert np.array_equal(data[name].ravel(), mesh.colour[:, channel])
+    assert np.array_equal(data["albedo_mark"].ravel(), mesh.mark)
     assert np.array_equal(data["sigma_mm"].ravel(), mesh.sigma_mm, equal_nan=True)
     assert np.array_equal(data["stripe"].ravel(), mesh.stripe)
 
@@ -87,7 +90,7 @@ def test_ply_header_names_the_unit_and_the_layout() -> None:
     assert header[-2:] == ["element face 4", "property list uchar int vertex_indices"]
     assert [line.split()[1:] for line in header if line.startswith("property") and "list" not in line] == [
         *(["float", name] for name in ("x", "y", "z", "nx", "ny", "nz")),
-        *(["uchar", name] for name in ("red", "green", "blue")),
+        *(["uchar", name] for name in ("red", "green", "blue", "albedo_mark")),
         ["float", "sigma_mm"],
         ["int", "stripe"],
     ]
@@ -96,7 +99,7 @@ def test_ply_header_names_the_unit_and_the_layout() -> None:
 def test_ply_is_read_again_as_it_was_written() -> None:
     mesh = example_mesh()
     found = decode_mesh_ply(encode_mesh_ply(mesh))
-    for name in ("vertices_mm", "faces", "normals", "grey", "sigma_mm", "stripe"):
+    for name in ("vertices_mm", "faces", "normals", "colour", "mark", "sigma_mm", "stripe"):
         before, after = getattr(mesh, name), getattr(found, name)
         assert after.dtype == before.dtype
         assert np.array_equal(after, before, equal_nan=after.dtype.kind == "f")
@@ -130,7 +133,7 @@ def test_a_ply_that_was_cut_is_refused() -> None:
     for end in (0, 10, len(data) // 2, len(data) - 1):
         with pytest.raises(InvalidInputError, match="reconstruct the bundle again"):
             decode_mesh_ply(data[:end])
-    with pytest.raises(InvalidInputError, match=r"expected .* 227 bytes after it, found 228 bytes"):
+    with pytest.raises(InvalidInputError, match=r"expected .* 232 bytes after it, found 233 bytes"):
         decode_mesh_ply(data + b"x")
 
 
@@ -158,7 +161,9 @@ def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:
     assert data["stripe"].ravel().tolist() == [4, 4, 4, 7, 7]
     assert data["source"].ravel().tolist() == curves.source.tolist()
     assert data["bridge_after"].ravel().tolist() == [1, 0, 0, 0, 1]
-    assert data["green"].ravel().tolist() == curves.grey.tolist()
+    for channel, name in enumerate(("red", "green", "blue")):
+        assert data[name].ravel().tolist() == curves.colour[:, channel].tolist()
+    assert data["albedo_mark"].ravel().tolist() == curves.mark.tolist()
     assert data["sigma_mm"].ravel() == pytest.approx(curves.sigma_mm, nan_ok=True)
 
 

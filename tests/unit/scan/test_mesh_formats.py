@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,8 @@ def half_ball(rows: int = 12, columns: int = 20) -> Mesh:
         vertices_mm=50 * normals + np.array([3, -4, 500], dtype=np.float32),
         faces=faces.astype(np.int32),
         normals=normals,
-        grey=(np.arange(count) % 256).astype(np.uint8),
+        colour=(np.arange(count)[:, None] * (1, 3, 7) % 256).astype(np.uint8),
+        mark=np.zeros(count, dtype=np.uint8),
         sigma_mm=np.linspace(0.01, 0.02, count, dtype=np.float32),
         stripe=np.arange(count, dtype=np.int32),
     )
@@ -75,8 +76,11 @@ def test_normals_and_colours_of_vertices_come_back(kind: str) -> None:
     corners, wanted = np.asarray(found.faces).ravel(), mesh.faces.ravel()
     np.testing.assert_allclose(found.vertex_normals[corners], mesh.normals[wanted], atol=1e-4)
     colours = found.visual.vertex_attributes["color"] if kind == "glb" else found.visual.vertex_colors
-    colours = np.asarray(colours)[corners]
-    np.testing.assert_array_equal(colours[:, :3], np.repeat(mesh.grey[wanted][:, None], 3, axis=1))
+    colours = np.asarray(colours)[corners, :3]
+    # Other programs take the numbers of PLY and OBJ as sRGB; glTF has light, by the curve of IEC 61966-2-1.
+    share = mesh.colour[wanted] / 255
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_array_equal(colours, np.rint(65535 * light) if kind == "glb" else mesh.colour[wanted])
 
 
 def glb_tree(data: bytes) -> Any:
@@ -149,10 +153,9 @@ def test_obj_leaves_unknown_normals_out() -> None:
 def test_obj_is_the_plain_text_that_formatting_gives() -> None:
     mesh = half_ball(200, 200)
     lines = ["# slrig mesh, millimetres; v x y z red green blue", "o scan"]
-    for point, grey in zip(mesh.vertices_mm.astype(np.float64), mesh.grey.tolist(), strict=True):
+    for point, colour in zip(mesh.vertices_mm.astype(np.float64), mesh.colour.tolist(), strict=True):
         x, y, z = (unsigned_zero(f"{value:.5f}") for value in np.rint(point * 1e5) / 1e5)
-        shade = f"{grey / 255:.4f}"
-        lines.append(f"v {x} {y} {z} {shade} {shade} {shade}")
+        lines.append(" ".join(["v", x, y, z, *(f"{value / 255:.4f}" for value in colour)]))
     lines += [
         " ".join(["vn", *(unsigned_zero(f"{value:.4f}") for value in np.rint(normal * 1e4) / 1e4)])
         for normal in mesh.normals.astype(np.float64)
@@ -203,8 +206,6 @@ def test_a_mesh_without_triangles_can_be_written(kind: str) -> None:
 
 def test_a_glb_of_nothing_has_no_empty_buffer() -> None:
     mesh = example_mesh()
-    nothing = Mesh(
-        *(getattr(mesh, name)[:0] for name in ("vertices_mm", "faces", "normals", "grey", "sigma_mm", "stripe"))
-    )
+    nothing = Mesh(*(getattr(mesh, each.name)[:0] for each in fields(Mesh)))
     tree = glb_tree(encode_mesh_glb(nothing))
     assert not {"buffers", "accessors", "meshes"} & tree.keys()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from slrig.bundle import read_bundle, write_bundle
-from slrig.bundle.images import read_pages as read_frame_pages
+from slrig.bundle.images import read_with_colour as read_frame_pages
 from slrig.bundle.reading import MOST_READERS, open_bundle
 from slrig.capture.evidence import check_capture
 from slrig.config import read_rig
@@ -122,11 +122,11 @@ def test_axes_of_two_exposures_wait_for_one_another(both_axes: Path, tmp_path: P
 def test_frames_are_read_a_few_ahead(both_axes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
 
-    def read_pages(path: Path, *rest: Any) -> Any:
+    def read_pages(path: Path, *rest: Any, **options: Any) -> Any:
         read.append(path)
-        return read_frame_pages(path, *rest)
+        return read_frame_pages(path, *rest, **options)
 
-    monkeypatch.setattr("slrig.bundle.reading.read_pages", read_pages)
+    monkeypatch.setattr("slrig.bundle.reading.read_with_colour", read_pages)
     files = open_bundle(both_axes)
     assert not read
     whole = read_bundle(both_axes).capture

@@ -56,7 +56,8 @@ def seen(name: str, device: Pinhole, ensemble: StripeEnsemble) -> CameraResult:
         refined=True,
         disagreement_px=np.zeros(0),
     )
-    return CameraResult(name, device, curves, np.zeros(device.size.shape, dtype=np.uint16), 1.0, 255.0)
+    white, contrast, clipped = (np.zeros(device.size.shape, dtype=kind) for kind in (np.uint16, np.float32, np.bool_))
+    return CameraResult(name, device, curves, white, contrast, clipped, 255.0)
 
 
 FEW, MANY = np.arange(100.0, 140.0, 1.5), np.arange(80.0, 160.0, 1.5)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,8 @@ def sheet(rows: int = 400, columns: int = 500) -> Mesh:
         vertices_mm=np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32),
         faces=np.concatenate([np.stack(each, axis=-1).reshape(-1, 3) for each in ((a, c, b), (b, c, d))]),
         normals=normals.reshape(3, -1).T.astype(np.float32),
-        grey=(index.ravel() % 251).astype(np.uint8),
+        colour=np.stack([index.ravel() % each for each in (251, 241, 239)], axis=1).astype(np.uint8),
+        mark=np.zeros(index.size, dtype=np.uint8),
         sigma_mm=np.linspace(0.001, 0.05, index.size, dtype=np.float32),
         stripe=(index.ravel() // rows).astype(np.int32),
     )
@@ -86,7 +87,7 @@ def sheet(rows: int = 400, columns: int = 500) -> Mesh:
 
 def only(mesh: Mesh, count: int) -> Mesh:
     """Its first vertices, and no triangle."""
-    values = {name: getattr(mesh, name)[:count] for name in ("vertices_mm", "normals", "grey", "sigma_mm", "stripe")}
+    values = {each.name: getattr(mesh, each.name)[:count] for each in fields(mesh) if each.name != "faces"}
     return replace(mesh, faces=mesh.faces[:0], **values)
 
 
@@ -122,8 +123,11 @@ def test_normals_colours_deviations_and_stripes_come_back() -> None:
         0: False, 1: True, 2: True, 3: False, 4: False,
     }  # fmt: skip
     assert np.abs(found.stored["NORMAL"] / 127 - mesh.normals).max() <= 0.501 / 127
-    colours = np.column_stack([*[mesh.grey] * 3, np.full(len(mesh.grey), 255)])
-    np.testing.assert_array_equal(found.stored["COLOR_0"], colours)
+    # Light, as IEC 61966-2-1 has it of sRGB.
+    value = mesh.colour / 255
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    assert np.abs(found.stored["COLOR_0"][:, :3] - 65535 * light).max() <= 0.501
+    assert (found.stored["COLOR_0"][:, 3] == 65535).all()
     assert found.extras["sigma_step_mm"] == 1e-4
     assert np.abs(1e-4 * found.stored["_SIGMA"] - mesh.sigma_mm).max() <= 0.501 * 1e-4
     np.testing.assert_array_equal(found.stored["_STRIPE"], mesh.stripe)
@@ -184,7 +188,7 @@ def test_a_coarse_mesh_has_vertices_of_the_mesh_and_its_orientation(axis: int) -
     coarse = coarse_mesh(fine)
     assert 20_000 <= len(coarse.faces) <= 40_000
     assert coarse.faces.dtype == np.int32
-    for name in ("vertices_mm", "normals", "grey", "sigma_mm"):
+    for name in ("vertices_mm", "normals", "colour", "sigma_mm"):
         np.testing.assert_array_equal(getattr(coarse, name), getattr(fine, name)[coarse.stripe])
     normals = normal_of(coarse)
     assert (np.linalg.norm(normals, axis=1) > 0).all()

@@ -6,12 +6,14 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import pytest
 
 from slrig.errors import (
     DeviceError,
     PoseRefusedError,
+    ScanStateError,
     ScheduleError,
     ScheduleNotFoundError,
     SlrigError,
@@ -53,6 +55,27 @@ def test_a_run_on_time(desk: Desk) -> None:
     desk.look(minutes=1)
     assert len(desk.done) == 1
     assert desk.store.get(daily.id).next_due == START + timedelta(hours=25)
+
+
+def test_a_run_that_a_person_asks_for_waits_as_others_do_and_has_no_twin(desk: Desk) -> None:
+    daily = desk.daily(enabled=False)
+    desk.busy = "a scan"
+    asked = desk.store.run_now(daily.id, desk.now)
+    desk.look(seconds=1)
+    assert (desk.run(daily).state, desk.run(daily).reason) == (RunState.WAITING, "rig busy: a scan")
+    with pytest.raises(ScanStateError, match="has a run that is waiting already"):
+        desk.store.run_now(daily.id, desk.now)
+    desk.busy = None
+    desk.look(minutes=10)
+    run = desk.run(daily)
+    assert (run.number, run.state, run.due) == (asked.number, RunState.SUCCEEDED, START)
+    # The order's own times are as they were.
+    assert desk.store.get(daily.id).next_due == daily.next_due
+    desk.store.run_now(daily.id, desk.now)
+    desk.look(seconds=1)
+    assert (len(desk.done), desk.run(daily).reason) == (2, "asked for by a person, not by the clock")
+    with pytest.raises(ScheduleNotFoundError):
+        desk.store.run_now(UUID(int=1), desk.now)
 
 
 def test_a_run_within_its_grace_is_late_and_says_nothing(desk: Desk) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from uuid import UUID
 from xml.etree import ElementTree
 
@@ -69,6 +70,14 @@ def test_thresholds_and_the_recalibration_are_named() -> None:
 def test_one_verification_and_none_are_drawn_too() -> None:
     assert len(list(parsed(health_svg(warm_up()[:1])).iter(f"{_SVG}circle"))) >= 1
     assert "Nothing was verified yet" in health_svg([])
+
+
+def test_a_calibration_that_states_no_error_has_no_axis_of_it() -> None:
+    record = warm_up()[0]
+    silent = replace(record, found=replace(record.found, expected_mm=0.0, stated_mm=None))
+    assert "No verification tells an expected error" in health_svg([silent])
+    assert "Expected error of a scan, mm" not in health_svg([silent])
+    assert "No verification tells an expected error" not in health_svg([silent, record])
 
 
 def test_words_in_the_picture_are_escaped() -> None:

@@ -315,6 +315,9 @@ class FakeSensor(Node):  # type: ignore[misc]
         frame.setStride(stride)
         planes = np.zeros((rows * (3 if self._kind == dai.ImgFrame.Type.NV12 else 2) // 2, stride), np.uint8)
         planes[:rows, :columns] = image
+        # Grey of NV12, and a little red in the lower half.
+        planes[rows:] = 128
+        planes[rows + rows // 4 :, 1:columns:2] = 148
         frame.setData(self._damaged(frame, planes) if self._rng.random() < fault.damaged else planes.ravel())
         stamp = timedelta(microseconds=end_ns // 1_000) + timedelta(seconds=fault.stamped_ahead_s)
         frame.setTimestamp(stamp)

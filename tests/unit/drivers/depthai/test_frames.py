@@ -139,7 +139,16 @@ def test_a_colour_camera_gives_its_luminance(head: Opens) -> None:
         camera.configure(CameraSettings(0.005))
     for camera in pair.cameras.values():
         camera.arm(1, Trigger.FREE)
-        assert np.abs(camera.read(time.monotonic_ns(), PATIENCE_S).image.astype(int) - expected).mean() < 1
+        frame = camera.read(time.monotonic_ns(), PATIENCE_S)
+        assert np.abs(frame.image.astype(int) - expected).mean() < 1
+        # The stand-in's colour is grey, with a little red in its lower half.
+        assert (frame.colour is not None) == camera.info.colour == (camera is pair.cameras["left"])
+        if frame.colour is not None:
+            blue, green, red = (frame.colour()[..., each].astype(int) - frame.image for each in range(3))
+            assert max(np.abs(each[:24]).max() for each in (blue, green, red)) <= 1
+            assert np.median(red[24:]) == pytest.approx(1.402 * 20, abs=1)
+            assert np.median(green[24:]) == pytest.approx(-0.714 * 20, abs=1)
+            assert np.median(blue[24:]) == pytest.approx(0, abs=1)
 
 
 def test_the_rows_of_a_rolling_shutter_have_all_ended_at_the_frames_end(head: Opens) -> None:

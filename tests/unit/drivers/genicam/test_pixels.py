@@ -43,6 +43,10 @@ def test_a_mosaic_is_weighted_as_luma(mosaic: str, kind: str) -> None:
         assert got.shape == size.shape
         assert got.dtype == image.dtype
         np.testing.assert_allclose(got[2:-2, 2:-2], weight * full, atol=0.01 * full)
+        seen = grey(encoded(image, form.name), form, size, in_colour=True)
+        assert seen.dtype == image.dtype
+        expected = np.broadcast_to(full * (np.array(list("BGR")) == colour), (8, 12, 3))
+        np.testing.assert_array_equal(seen[2:-2, 2:-2], expected)
 
 
 @pytest.mark.parametrize(("name", "first"), [("RGB8", 0.299), ("BGR8", 0.114)])
@@ -50,6 +54,7 @@ def test_colour_is_weighted_as_luma(name: str, first: float) -> None:
     size = Size(3, 2)
     data = (np.array([[[200, 0, 0]] * 3] * 2, np.uint8)).tobytes()
     np.testing.assert_allclose(grey(data, FORMATS[name], size), 200 * first, atol=1)
+    assert grey(data, FORMATS[name], size, in_colour=True)[1, 2].tolist() == [0, 0, 200][:: 1 if name == "RGB8" else -1]
 
 
 def test_padding_after_rows_is_cut_off() -> None:

@@ -41,7 +41,7 @@ def test_luma_is_taken_from_two_channels() -> None:
 
 def test_decoded_colour_becomes_grey_without_loss() -> None:
     picture = decoded_picture(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR), None)
-    assert picture == Picture(None, CameraFormat(SIZE, 8))
+    assert picture == Picture(None, CameraFormat(SIZE, 8), has_colour=True)
     assert np.array_equal(picture.grey(cv2.cvtColor(RAMP, cv2.COLOR_GRAY2BGR)), RAMP)
     deep = decoded_picture(RAMP.astype(np.uint16) * 8, 10)
     assert deep.format.bit_depth == 10
@@ -89,3 +89,15 @@ def test_samples_beyond_the_depth_are_refused() -> None:
 def test_too_few_bytes_are_refused() -> None:
     with pytest.raises(CorruptFrameError, match="bytes"):
         raw_picture("RG10", SIZE, None).grey(np.zeros((1, 200), np.uint8))
+
+
+def test_colour_comes_of_what_has_it() -> None:
+    bgr = np.dstack([RAMP, RAMP // 2, 255 - RAMP])
+    assert np.array_equal(decoded_picture(bgr, None).colour(bgr), bgr)
+    assert raw_picture(None, SIZE, None).has_colour
+    assert not decoded_picture(RAMP, None).has_colour
+    assert not raw_picture("GREY", SIZE, None).has_colour
+    for code, sent in (("MJPG", jpeg()), ("YUYV", np.dstack([RAMP, np.full(SIZE.shape, 128, np.uint8)]))):
+        picture = raw_picture(code, SIZE, None)
+        assert picture.has_colour
+        assert np.array_equal(picture.colour(sent), cv2.cvtColor(picture.grey(sent), cv2.COLOR_GRAY2BGR))

@@ -152,6 +152,15 @@ def test_every_pixel_format_gives_the_scene(plugged: Plug, code: str) -> None:
     tolerance = {"MJPG": 6.0, "RG10": 12.0}.get(code, 0.0)
     assert np.abs(frame.image[2:-2, 2:-2].astype(float) - expected[2:-2, 2:-2]).max() <= tolerance
     assert camera.info.format == stage.format
+    assert (frame.colour is not None) == camera.info.colour == (code in {"YUYV", "UYVY", "MJPG", "RG10"})
+    if frame.colour is not None:
+        # The scene is grey, and later frames change nothing.
+        stage.show(np.zeros((1, 1), np.uint8))
+        for _ in range(8):
+            camera.read(time.monotonic_ns(), 2)
+        colour = frame.colour()
+        assert colour.dtype == frame.image.dtype
+        assert np.abs(colour[2:-2, 2:-2].astype(float) - expected[2:-2, 2:-2, None]).max() <= 2 * tolerance + 1
     camera.close()
 
 

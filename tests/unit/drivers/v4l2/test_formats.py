@@ -8,7 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.v4l2.formats import LAYOUTS, PREFERRED, CorruptFrameError, Layout, Packing, grey_image, least_stride_bytes
+from drivers.v4l2.formats import (
+    LAYOUTS,
+    PREFERRED,
+    CorruptFrameError,
+    Layout,
+    Packing,
+    colour_image,
+    grey_image,
+    least_stride_bytes,
+)
 from slrig.model import Pixels, Size
 from tests.contract.v4l2_sensor import BIT_DEPTHS, encoded
 
@@ -119,3 +128,53 @@ def test_a_jpeg_of_another_size_or_none_at_all_is_corrupt() -> None:
         grey_image(other, LAYOUTS["MJPG"], size, stride_bytes=0)
     with pytest.raises(CorruptFrameError, match="begin"):
         grey_image(np.full(3000, 7, np.uint8), LAYOUTS["MJPG"], size, stride_bytes=0)
+
+
+def plain_colour(code: str, size: Size) -> tuple[bytes, int, Pixels]:
+    """A buffer of a colour camera whose picture is a ramp of one hue, the bytes of a row, and the picture."""
+    ramp_ = np.linspace(0.2, 0.9, size.height_px)[:, None, None] * np.array([40.0, 120.0, 200.0])
+    colour = np.rint(np.broadcast_to(ramp_, (*size.shape, 3))).astype(np.uint8)
+    layout = LAYOUTS[code]
+    if layout.packing is Packing.JPEG:
+        done, data = cv2.imencode(".jpg", colour, [cv2.IMWRITE_JPEG_QUALITY, 100])
+        assert done
+        return data.tobytes(), 0, colour
+    if layout.bayer is not None:
+        scale = 2 ** (layout.bit_depth - 8)
+        mosaic = np.zeros(size.shape, "<u2" if layout.bit_depth > 8 else np.uint8)
+        for (y, x), name in zip(itertools.product((0, 1), (0, 1)), layout.bayer, strict=True):
+            mosaic[y::2, x::2] = colour[y::2, x::2, "BGR".index(name)].astype(mosaic.dtype) * scale
+        return mosaic.tobytes(), mosaic.strides[0], colour.astype(np.uint16) * scale if scale > 1 else colour
+    luma, red, blue = cv2.split(cv2.cvtColor(colour, cv2.COLOR_BGR2YCrCb))
+    rows = np.zeros((size.height_px, 2 * size.width_px), np.uint8)
+    places = {"YUYV": (0, 1, 3), "YVYU": (0, 3, 1), "UYVY": (1, 0, 2), "VYUY": (1, 2, 0)}[code]
+    rows[:, places[0] :: 2] = luma
+    rows[:, places[1] :: 4], rows[:, places[2] :: 4] = blue[:, ::2], red[:, ::2]
+    return rows.tobytes(), rows.shape[1], colour
+
+
+@pytest.mark.parametrize("code", ["YUYV", "YVYU", "UYVY", "VYUY", "MJPG", "RGGB", "BA81", "GB10", "BA12", "BYR2"])
+def test_colour_formats_give_blue_green_and_red(code: str) -> None:
+    size, layout = Size(32, 24), LAYOUTS[code]
+    data, stride, colour = plain_colour(code, size)
+    sent = np.frombuffer(data, np.uint8)
+    seen = colour_image(sent, layout, size, stride_bytes=stride)
+    assert layout.has_colour
+    assert (seen.shape, seen.dtype) == ((24, 32, 3), colour.dtype)
+    full = 2**layout.bit_depth - 1
+    # Interpolation of a mosaic follows the ramp but at its ends; JPEG halves the columns of colour, and rounds.
+    np.testing.assert_allclose(seen[2:-2, 2:-2].astype(float), colour[2:-2, 2:-2], atol=0.013 * full)
+    # Its grey is the one that stripes are found in.
+    grey = grey_image(sent, layout, size, stride_bytes=stride)
+    np.testing.assert_allclose(cv2.cvtColor(seen, cv2.COLOR_BGR2GRAY).astype(float), grey, atol=0.008 * full)
+    assert cv2.cvtColor(seen, cv2.COLOR_BGR2GRAY).dtype == grey.dtype
+
+
+def test_colour_of_limited_luma_is_spread() -> None:
+    rows = np.array([16, 128, 235, 128, 126, 128, 126, 128], np.uint8)
+    seen = colour_image(rows, LAYOUTS["YUYV"], Size(4, 1), stride_bytes=8, limited_luma=True)
+    assert seen.tolist() == [[[0] * 3, [255] * 3, [128] * 3, [128] * 3]]
+
+
+def test_grey_formats_have_no_colour() -> None:
+    assert not any(LAYOUTS[code].has_colour for code in ("GREY", "Y10 ", "Y12P", "Y16 "))

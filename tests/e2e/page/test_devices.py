@@ -1,0 +1,71 @@
+"""Devices: the rig as it is set, what examinations found, who is logged in, and what was done."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import Scope
+from slrig.config import ServiceSettings
+from slrig.conformance import Outcome, Report
+from slrig.conformance.expectation import Failure
+from slrig.conformance.running import Result
+from slrig.doctor.doctor import Diagnosis
+from slrig.doctor.findings import fault, ok
+from slrig.jobs.examinations import keep
+from tests.e2e.conftest import Start, write_rig
+from tests.e2e.page.conftest import PHONE, Visit, violations
+
+pytestmark = pytest.mark.slow
+
+
+def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, visit: Visit) -> None:
+    rig = write_rig(tmp_path / "rig")
+    service = start(rig)
+    page = visit(service, "devices")
+    camera = page.get_by_role("listitem").filter(has=page.get_by_role("heading", name="Camera left"))
+    camera.get_by_text("not set yet").first.wait_for()
+    page.get_by_text("Not examined yet.").first.wait_for()
+    page.get_by_role("region", name="Plugged in").get_by_text("Installed drivers").wait_for()
+    assert violations(page) == []
+    with service.client() as client:
+        client.start({"exposure_s": 0.012})
+    camera.get_by_text("12 ms", exact=True).wait_for()
+    page.get_by_role("row").filter(has_text="POST /scan").get_by_text("202").wait_for()
+    page.get_by_text("Logged in as environment").wait_for()
+
+    findings = (
+        fault("light.dark", "camera 'left'", "it is too dark", "open the iris"),
+        ok("focus.sharp", "camera 'left'", "it is sharp"),
+    )
+    keep(service.data, "doctor", Diagnosis("small", findings, {}, None, None, None, ()).document())
+    page.get_by_text("it is too dark").wait_for()
+    page.get_by_text("open the iris").wait_for()
+    page.get_by_text("What is well: 1").click()
+    page.get_by_text("it is sharp").wait_for()
+    assert violations(page) == []
+    page.screenshot(path=str(tmp_path / "devices.png"), full_page=True)
+
+
+def test_devices_on_a_phone_by_a_key_for_looking(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    failure = Failure("every frame shows its own pattern", "light of another one", "wait for it", "camera 'left'")
+    results = (
+        Result("frames", "Every frame shows its pattern", Outcome.FAILED, 1.0, failure),
+        Result("wires", "Wires trigger", Outcome.NOT_APPLICABLE, 0.0, None, "it needs a wire"),
+        *(Result(f"check {number}", "All is well", Outcome.PASSED, 0.1) for number in range(2)),
+    )
+    keep(service.data, "conform", Report("small", results, 1.2).document())
+    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    page = visit(service, "devices", key=secret, size=PHONE, dark=True)
+    page.get_by_text("66 %").wait_for()
+    page.get_by_text("2 of 3 checks that apply passed.").wait_for()
+    page.get_by_text("Every frame shows its pattern").wait_for()
+    page.get_by_text("Logged in as Ann").wait_for()
+    page.get_by_text("You may look.").wait_for()
+    assert page.get_by_role("table", name="Who did what last").count() == 0
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+    page.screenshot(path=str(tmp_path / "phone.png"), full_page=True)

@@ -1,0 +1,211 @@
+"""The colours of a mesh against what the rendered scene is painted with.
+
+`pytest tests/golden/test_albedo.py -s -m ""` prints the figures, and those of brightness in the white frame.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simulated_rig.casting import caster
+from simulated_rig.options import HeadOptions
+from simulated_rig.scene import read_scene, surface_of
+from simulated_rig.transport import trace
+from slrig.bundle import read_bundle
+from slrig.model import AlbedoMark, FloatArray, Pinhole, White
+from slrig.scan.artefacts import decode_mesh_ply
+from slrig.scan.plan import ScanPlan
+from tests.golden.test_bracketing import captured, reconstructed
+
+CONFIG = Path(__file__).parents[2] / "config"
+SMALL = {
+    "size_px = [480, 384]": "size_px = [240, 192]",
+    "principal_px = [241.4, 189.7]": "principal_px = [121.4, 93.7]",
+}
+MOTTLED = 'texture = { kind = "noise", contrast = 0.99, scale_mm = 9.0 }'
+
+
+@dataclass(frozen=True)
+class Painted:
+    """A scan's vertices. found, truth : (V,), albedo, with one scale between them; brightness : of the white frame.
+
+    mark : (V,) uint8; report : of the scan.
+    """
+
+    found: FloatArray
+    truth: FloatArray
+    brightness: FloatArray
+    mark: NDArray[np.uint8]
+    report: Mapping[str, Any]
+
+    @property
+    def sound(self) -> NDArray[np.bool_]:
+        """(V,): vertices without a mark whose truth is known."""
+        return np.asarray((self.mark == AlbedoMark.NONE) & (self.truth > 0))
+
+    def told(self, name: str, values: FloatArray) -> tuple[float, float]:
+        """Relative rms after one scale, and the correlation with the truth; printed, too."""
+        values, truth = values[self.sound], self.truth[self.sound]
+        scale = (values * truth).sum() / (values**2).sum()
+        rms = float(np.sqrt(((scale * values / truth - 1) ** 2).mean()))
+        correlation = float(np.corrcoef(values, truth)[0, 1])
+        sys.stdout.write(f"\n{name:24} {len(truth):7} vertices, rms {rms:6.1%}, correlation {correlation:.3f}")
+        return rms, correlation
+
+    def off(self, where: NDArray[np.bool_]) -> FloatArray:
+        """Found over true albedo, the median of the sound ones as 1."""
+        usual = np.median(self.found[self.sound] / self.truth[self.sound])
+        return np.asarray(self.found[where] / self.truth[where] / usual)
+
+
+def rig_file(folder: Path, rig: str, *, scene: Mapping[str, str], head: Mapping[str, str]) -> Path:
+    """A rig of `config` and its scene in a folder, each with some of its text replaced."""
+    text = (CONFIG / "rigs" / f"{rig}.toml").read_text(encoding="utf-8")
+    name = tomllib.loads(text)["head"]["scene"]
+    painted = (CONFIG / "rigs" / name).read_text(encoding="utf-8")
+    (folder / "scene.toml").write_text(replaced(painted, scene))
+    path = folder / "rig.toml"
+    path.write_text(replaced(text, {name: "scene.toml", **head}))
+    return path
+
+
+def replaced(text: str, changes: Mapping[str, str]) -> str:
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    return text
+
+
+def painted(rig: Path, work: Path, plan: ScanPlan | None = None) -> Painted:
+    """Scan, and ask the renderer what each vertex is painted with: along the ray of a camera that meets it."""
+    (grey,) = channels(rig, work, plan)
+    return grey
+
+
+def channels(rig: Path, work: Path, plan: ScanPlan | None = None) -> list[Painted]:
+    """`painted` in each channel that a camera of the rig has: one, or red, green and blue."""
+    bundle = captured(rig, plan or ScanPlan(), work / "bundle")
+    report = reconstructed(bundle, work / "out")
+    mesh = decode_mesh_ply((work / "out" / "mesh.ply").read_bytes())
+    table = tomllib.loads(rig.read_text())["head"]
+    options = HeadOptions.model_validate({key: value for key, value in table.items() if key != "driver"})
+    surface = surface_of(read_scene(rig.parent / options.scene), rig.parent)
+    rays, lamp = caster(surface.vertices_mm, surface.faces), options.projector.pinhole()
+    truth, brightness = np.zeros((len(mesh.vertices_mm), 3)), np.zeros(len(mesh.vertices_mm))
+    vertices = mesh.vertices_mm.astype(np.float64)
+    for eye in options.camera:
+        pixels = opencv_pixels(eye.pinhole(), vertices)
+        columns, rows = pixels.T.copy()
+        met = trace(columns, rows, eye.pinhole(), lamp, surface, rays, working_distance_mm=600.0)
+        mine = (truth == 0).all(axis=1) & (np.linalg.norm(met.points_mm - vertices, axis=1) < 0.3)
+        truth[mine] = met.albedo[mine, None] * met.hue[mine, ::-1]
+        nearest = np.rint(np.clip(pixels[mine], 0, np.array(eye.size_px) - 1)).astype(int)
+        brightness[mine] = white_frame(bundle, eye.name)[nearest[:, 1], nearest[:, 0]]
+    share = mesh.colour / 255
+    count = report["albedo"]["channels"]
+    assert count == 3 or (mesh.colour == mesh.colour[:, :1]).all()
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    assert (truth > 0).mean() > 0.99
+    return [Painted(light[:, each], truth[:, each], brightness, mesh.mark, report) for each in range(count)]
+
+
+def opencv_pixels(device: Pinhole, points_mm: FloatArray) -> FloatArray:
+    turn, _ = cv2.Rodrigues(device.rotation)
+    pixels, _ = cv2.projectPoints(points_mm, turn, device.translation_mm, device.matrix, device.distortion)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+
+
+def white_frame(bundle: Path, camera: str) -> FloatArray:
+    capture = read_bundle(bundle).capture
+    white = capture.patterns.index(White())
+    return next(shot.image for shot in capture.shots if shot.camera == camera and shot.pattern == white).astype(float)
+
+
+@pytest.mark.parametrize("rig", ["relief", pytest.param("demo", marks=pytest.mark.slow)])
+def test_colours_are_what_the_scene_is_painted_with(rig: str, tmp_path: Path) -> None:
+    seen = painted(rig_file(tmp_path, rig, scene={}, head=SMALL if rig == "relief" else {}), tmp_path)
+    rms, correlation = seen.told(rig, seen.found)
+    assert rms <= 0.03
+    assert correlation >= 0.85
+    shading = seen.told("  its brightness", seen.brightness)
+    assert shading[0] > 3 * rms
+    assert shading[1] < 0.5
+    assert seen.sound.mean() > 0.985
+    assert seen.report["albedo"]["brighter_than_white"] < 0.01
+
+
+@pytest.mark.slow
+def test_light_of_the_room_and_dark_paint_change_little(tmp_path: Path) -> None:
+    scene = {'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': MOTTLED}
+    seen = painted(
+        rig_file(tmp_path, "relief", scene=scene, head={**SMALL, "ambient = 0.01": "ambient = 0.15"}), tmp_path
+    )
+    rms, correlation = seen.told("mottled, lit room", seen.found)
+    assert seen.truth[seen.sound].max() > 5 * seen.truth[seen.sound].min()
+    assert rms <= 0.05
+    assert correlation >= 0.98
+    assert seen.told("  its brightness", seen.brightness)[0] > 3 * rms
+
+
+@pytest.mark.slow
+def test_two_cameras_of_different_gain_give_one_picture(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, "two_cameras", scene={}, head={})
+    first, second = path.read_text().split('name = "right"')
+    path.write_text(first + 'name = "right"' + second.replace("saturation_s = 0.02", "saturation_s = 0.05"))
+    seen = painted(path, tmp_path)
+    rms, correlation = seen.told("two gains", seen.found)
+    assert rms <= 0.05
+    assert correlation >= 0.85
+    gains = seen.report["albedo"]["camera_gains"]
+    assert gains["right"]["gain"][0] == pytest.approx(2.5, rel=0.01)
+    assert gains["right"]["points"] > 1000
+    # Where the projector's image ends, blur has taken light: these vertices are marked, and no dark rim is left.
+    border = (seen.mark == AlbedoMark.BORDER) & (seen.truth > 0)
+    assert border.sum() > 500
+    assert np.median(seen.off(border)) < 0.97
+    assert np.percentile(seen.off(seen.sound), 1) > 0.93
+
+
+@pytest.mark.slow
+def test_saturated_paint_is_marked_and_a_bracket_needs_no_mark(tmp_path: Path) -> None:
+    scene = {'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': MOTTLED}
+    rig = rig_file(tmp_path, "relief", scene=scene, head=SMALL)
+    long = painted(rig, tmp_path / "long", ScanPlan(exposure_s=0.05))
+    assert long.told("overexposed", long.found)[0] <= 0.05
+    saturated = (long.mark == AlbedoMark.SATURATED) & (long.truth > 0)
+    assert 0.05 < saturated.mean() < 0.8
+    assert np.median(long.off(saturated)) < 0.95
+    assert long.report["albedo"]["marked_vertices"]["saturated"] == (long.mark == AlbedoMark.SATURATED).sum()
+    bracket = painted(rig, tmp_path / "bracket", ScanPlan(exposures_s=(0.01, 0.05)))
+    rms, correlation = bracket.told("bracket", bracket.found)
+    assert rms <= 0.04
+    assert correlation >= 0.98
+    assert not (bracket.mark == AlbedoMark.SATURATED).any()
+
+
+@pytest.mark.slow
+def test_a_camera_that_has_colour_gives_each_channel_as_it_is_painted(tmp_path: Path) -> None:
+    scene = {
+        'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': "colour = [0.25, 0.6, 0.95]\n"
+        'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0, colour = [0.9, 0.5, 0.3] }'
+    }
+    sees = {'name = "left"': 'name = "left"\ncolour = [0.7, 1.0, 0.8]'}
+    seen = channels(rig_file(tmp_path, "relief", scene=scene, head={**SMALL, **sees}), tmp_path)
+    assert len(seen) == 3
+    for name, channel in zip(("red", "green", "blue"), seen, strict=True):
+        rms, correlation = channel.told(name, channel.found)
+        assert rms <= 0.05
+        assert correlation >= 0.85
+    # Between channels there is one scale: how strongly the camera sees each, and no more.
+    red, blue = (np.median(each.found[each.sound] / each.truth[each.sound]) for each in (seen[0], seen[2]))
+    assert red / blue == pytest.approx(0.8 / 0.7, rel=0.02)
