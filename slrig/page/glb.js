@@ -11,13 +11,9 @@ const UNKNOWN = 65535;
 
 /** Fetch a mesh; `told` gets the share that is here. Throws Problem, and AbortError when `signal` says so. */
 export async function fetchMesh(path, signal, told = () => {}) {
-  let response;
-  try {
-    response = await fetch(path, {signal});
-  } catch (error) {
-    if (signal.aborted) throw error;
-    throw new Problem(0, {title: "No answer", detail: "The mesh did not come: the service does not answer."});
-  }
+  const response = await fetch(path, {signal}).catch((error) => {
+    throw signal.aborted ? error : new Problem(0, {title: "No answer", detail: "The mesh did not come. Load the page again when the service answers."});
+  });
   if (!response.ok) throw new Problem(response.status, await response.json().catch(() => ({})));
   return readMesh(await bytesOf(response, told));
 }

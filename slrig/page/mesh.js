@@ -9,6 +9,13 @@ const SIGMA_STEP_MM = 1e-4;
 const PLAIN = ["#b9c2c8", "#e69f00"];
 const TURN_DEG = 10;
 
+/** The part that draws is large: whoever will need it has it loaded before there is something to draw. */
+let drawing = null;
+export const loadDrawing = () => {
+  drawing ??= import("./view.js");
+  return drawing;
+};
+
 /** `other`: a scan shown in the same view, or null. `report` may come later. */
 export function Mesh({scan, other, report}) {
   const canvas = useRef();
@@ -17,13 +24,14 @@ export function Mesh({scan, other, report}) {
   const [, setDrawn] = useState(0);
   const [problem, setProblem] = useState(null);
   const [mode, setMode] = useState("shaded");
-  const [shown, setShown] = useState([true, true]);
+  const [wanted, setShown] = useState([true, true]);
+  const shown = other ? wanted : [true, true];
   const [measuring, setMeasuring] = useState(false);
   const [points, setPoints] = useState([]);
   useEffect(() => {
     let made = null;
     let left = false;
-    import("./view.js").then(({View, SCALE_CSS}) => {
+    loadDrawing().then(({View, SCALE_CSS}) => {
       if (left) return;
       made = new View(canvas.current, () => setDrawn((before) => before + 1));
       setScale(SCALE_CSS);
@@ -86,14 +94,18 @@ export function Mesh({scan, other, report}) {
 /** Show a scan's mesh in a slot of the view, coarse first. Returns how far it is, in words. */
 function useLevels(view, slot, scan, setProblem) {
   const [words, setWords] = useState("");
+  const [meshes, setMeshes] = useState({});
   useEffect(() => {
-    if (!view || !scan) return undefined;
+    view?.hold(slot, meshes, PLAIN[slot]);
+  }, [view, meshes]);
+  useEffect(() => {
+    if (!scan) return undefined;
     const ending = new AbortController();
     const load = async () => {
       setWords("The picture comes.");
       for (const [level, path] of [["coarse", "coarse.glb"], ["full", "view.glb"]]) {
         const mesh = await fetchMesh(`${scan.links.self}/${path}`, ending.signal, (share) => level === "full" && setWords(`A coarse picture; ${percent(Math.round(20 * share) / 20)} of the whole is here.`));
-        view.add(slot, level, mesh, PLAIN[slot]);
+        setMeshes((before) => ({...before, [level]: mesh}));
         if (level === "full") setWords(`${count(mesh.triangles)} triangles.`);
       }
     };
@@ -102,9 +114,9 @@ function useLevels(view, slot, scan, setProblem) {
     });
     return () => {
       ending.abort();
-      view.remove(slot);
+      setMeshes({});
     };
-  }, [view, scan?.id]);
+  }, [scan?.id]);
   return words;
 }
 

@@ -1,6 +1,6 @@
 // A scan's result: its mesh, its figures, why pixels are missing, its files, and another scan beside it.
 import {Causes} from "./causes.js";
-import {Mesh} from "./mesh.js";
+import {Mesh, loadDrawing} from "./mesh.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Confirm, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
@@ -21,6 +21,9 @@ const purpose = (name) => PURPOSES[name] ?? (name.startsWith("causes-") ? "cause
 
 export function ResultScreen({id, may}) {
   const [scan, problem, again] = useValue(`/scan/${encodeURIComponent(id)}`, LOOK_AGAIN_S);
+  useEffect(() => {
+    loadDrawing().catch(() => {});
+  }, []);
   if (problem?.status === 404 || problem?.status === 422)
     return html`<${Back} /><${Refusal} problem=${{document: {title: "This scan is not there"}, message: "It was deleted, or the address is not right."}} />`;
   if (!scan) return html`<${Back} /><${Refusal} problem=${problem} />${!problem && html`<p class="wait">Asking for the scan …</p>`}`;

@@ -65,7 +65,7 @@ export class View {
   constructor(canvas, drawn) {
     this.canvas = canvas;
     this.drawn = drawn;
-    this.renderer = new WebGLRenderer({canvas, antialias: false});
+    this.renderer = new WebGLRenderer({canvas, antialias: false, alpha: true});
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(FIELD_DEG, 1, 1, 1000);
     this.controls = new OrbitControls(this.camera, canvas);
@@ -78,29 +78,27 @@ export class View {
     this.sizes = new ResizeObserver(() => this.fitCanvas());
     this.sizes.observe(canvas);
     this.fitCanvas();
-    this.ground();
-    this.scheme = matchMedia("(prefers-color-scheme: dark)");
-    this.scheme.onchange = () => this.ground();
   }
 
   dispose() {
     cancelAnimationFrame(this.frame);
     clearTimeout(this.timer);
     this.sizes.disconnect();
-    this.scheme.onchange = null;
     this.controls.dispose();
-    [0, 1].forEach((slot) => this.remove(slot));
+    [0, 1].forEach((slot) => this.hold(slot, {}));
     this.renderer.dispose();
     this.renderer.forceContextLoss();
     this.gone = true;
   }
 
-  ground() {
-    this.scene.background = new Color(getComputedStyle(this.canvas).backgroundColor);
+  /** Have in slot 0 (this scan) or 1 (the one beside it) these meshes: `coarse`, `full`, both or none. */
+  hold(slot, meshes, plain) {
+    const held = this.slots[slot] ?? {};
+    for (const [level, {mesh, object}] of Object.entries(held)) if (meshes[level] !== mesh) this.drop(slot, level, object);
+    for (const [level, mesh] of Object.entries(meshes)) if (held[level]?.mesh !== mesh) this.add(slot, level, mesh, plain);
     this.redraw();
   }
 
-  /** Put a mesh into slot 0 (this scan) or 1 (the one beside it); `level` is "coarse" or "full". */
   add(slot, level, mesh, plain) {
     const geometry = new BufferGeometry();
     for (const [name, {array, width, normalized}] of Object.entries(mesh.attributes))
@@ -120,17 +118,14 @@ export class View {
     const first = this.slots.length === 0;
     this.slots[slot] = {...this.slots[slot], [level]: {mesh, object}};
     if (first) this.front();
-    this.redraw();
   }
 
-  remove(slot) {
-    for (const {object} of Object.values(this.slots[slot] ?? {})) {
-      this.scene.remove(object);
-      object.geometry.dispose();
-      object.material.dispose();
-    }
-    delete this.slots[slot];
-    this.redraw();
+  drop(slot, level, object) {
+    this.scene.remove(object);
+    object.geometry.dispose();
+    object.material.dispose();
+    delete this.slots[slot][level];
+    if (Object.keys(this.slots[slot]).length === 0) delete this.slots[slot];
   }
 
   /** Colour by one of MODES; `range` in stored units of sigma or stripe; `shown`: is each slot's mesh shown. */
@@ -181,7 +176,6 @@ export class View {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     const held = this.slots.find((each) => each)?.[level];
     if (held?.drawn) this.fullMs = performance.now() - began;
-    else if (held) this.redraw();
     if (held) held.drawn = true;
     const {triangles} = this.renderer.info.render;
     Object.assign(this.canvas.dataset, {level: held ? level : "coarse", triangles, ms: Math.round(performance.now() - began)});
@@ -283,18 +277,15 @@ export class View {
   /** Call `clicked(x, y)` for a press that is let go where it began: turning is no click. Returns what ends it. */
   clicks(clicked) {
     let began = null;
-    const down = (event) => {
+    const ending = new AbortController();
+    const on = (kind, told) => this.canvas.addEventListener(kind, told, {signal: ending.signal});
+    on("pointerdown", (event) => {
       began = event.isPrimary ? event : null;
-    };
-    const up = (event) => {
+    });
+    on("pointerup", (event) => {
       if (began && Math.hypot(event.clientX - began.clientX, event.clientY - began.clientY) < CLICK_PX) clicked(event.offsetX, event.offsetY);
       began = null;
-    };
-    this.canvas.addEventListener("pointerdown", down);
-    this.canvas.addEventListener("pointerup", up);
-    return () => {
-      this.canvas.removeEventListener("pointerdown", down);
-      this.canvas.removeEventListener("pointerup", up);
-    };
+    });
+    return () => ending.abort();
   }
 }
