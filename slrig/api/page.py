@@ -1,4 +1,4 @@
-"""/: the page of the service, `slrig.page`, as files of the package. It asks for a key itself, so it needs none."""
+"""/: the page of the service, the files of the folder slrig/page. It asks for a key itself, so it needs none."""
 
 from __future__ import annotations
 

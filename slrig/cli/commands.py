@@ -17,17 +17,7 @@ import typer.core
 
 from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
-from slrig.cli.options import (
-    AcceptanceOptions,
-    AsJson,
-    BoardOptions,
-    MeshOptions,
-    RigFile,
-    Service,
-    ShownData,
-    given,
-    grouped,
-)
+from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
 from slrig.errors import SlrigError
 
@@ -103,9 +93,7 @@ def demo(
 @app.command()
 def serve(
     rig: RigFile,
-    host: Annotated[
-        str | None, typer.Option(help="Address to listen on. Default 127.0.0.1: this machine only.")
-    ] = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on. Default 127.0.0.1: this machine.")] = None,
     port: Annotated[int | None, typer.Option(help="Port; 0 takes any free one. Default 8731.")] = None,
     data: Annotated[
         Path | None, typer.Option(help="Folder for scans and records. Default: ~/.local/share/slrig.")
@@ -293,11 +281,7 @@ def warm() -> None:
 
 
 @app.command()
-def conform(
-    rig: RigFile,
-    data: ShownData = None,
-    as_json: AsJson = False,
-) -> None:
+def conform(rig: RigFile, data: key.Data = None, as_json: AsJson = False) -> None:
     """Examine a rig by the driver contract, and score it.
 
     Exit code 1 unless every check that applies passes.
@@ -337,7 +321,7 @@ def doctor(
     output: Annotated[Path | None, typer.Option(help="Write a rig file with the values that were found.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file of --output.")] = False,
     search_s: Annotated[float, typer.Option(min=0.01, max=10, help="How late light may be, seconds.")] = 0.5,
-    data: ShownData = None,
+    data: key.Data = None,
     as_json: AsJson = False,
 ) -> None:
     """Examine a rig before a still object: what is wrong?

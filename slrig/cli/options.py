@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from slrig.cli.client import ServiceClient
 
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
-ShownData = Annotated[
-    Path | None, typer.Option(help="Data folder of a service, which shows the result. Default: that of slrig serve.")
-]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 

@@ -26,7 +26,7 @@ class Examination(BaseModel):
 
     rig: str
     at: datetime
-    found: dict[str, Any] = Field(description="as the command prints it with --json")
+    found: dict[str, Any] = Field(description="as the command prints it as JSON")
 
 
 def keep(data: Path, command: ExaminedBy, found: Mapping[str, Any]) -> bool:

@@ -20,7 +20,7 @@ function Page() {
   const [lost, setLost] = useState(false);
   useEffect(() => watchProblems((problem) => {
     setLost(problem?.status === 0);
-    if (problem?.status === 401) setSession("none");
+    if (problem?.status === 401) setSession((before) => (before === null || before === "none" ? "none" : "over"));
   }), []);
   const look = () => ask("GET", "/session").then(setSession, () => {});
   useEffect(() => {
@@ -33,10 +33,10 @@ function Page() {
   }, [lost]);
   return html`
     ${lost && html`<div class="lost" role="alert">The service does not answer. The page tries again by itself; nothing that the service has begun is lost.</div>`}
-    ${session === "none" ? html`<${LogIn} entered=${setSession} />` : session ? html`<${Rooms} session=${session} left=${() => setSession("none")} />` : html`<p class="wait">Asking the service …</p>`}`;
+    ${["none", "over"].includes(session) ? html`<${LogIn} over=${session === "over"} entered=${setSession} />` : session ? html`<${Rooms} session=${session} left=${() => setSession("none")} />` : html`<p class="wait">Asking the service …</p>`}`;
 }
 
-function LogIn({entered}) {
+function LogIn({over, entered}) {
   const [key, setKey] = useState("");
   const [enter, busy, problem] = useAction(async () => entered(await ask("POST", "/session", {headers: {Authorization: `Bearer ${key.trim()}`}})));
   const submit = (event) => {
@@ -44,6 +44,7 @@ function LogIn({entered}) {
     enter();
   };
   return html`<main class="login"><h1>slrig</h1>
+    ${over && html`<p class="warning" role="alert">Your session is over: its time is up, its key has ended, or the service was started anew. Enter a key to go on where you were.</p>`}
     <form onSubmit=${submit}>
       <label for="key">Key</label>
       <input id="key" type="password" autocomplete="current-password" value=${key} onInput=${(event) => setKey(event.target.value)} required />

@@ -66,13 +66,14 @@ def write_rig(folder: Path, *, scene: str = SCENE, head: str = "", faults: str =
 class ServiceProcess:
     """A running `slrig serve`; `url` is where it said that it is.
 
-    fresh : in a Python of its own, for tests of what its start loads, and of limits that it inherits.
+    fresh : in a Python of its own, for tests of what its start loads, and of limits that it inherits. port : any free
+    one unless one is named.
     """
 
-    def __init__(self, rig: Path, data: Path, *, fresh: bool = False) -> None:
+    def __init__(self, rig: Path, data: Path, *, fresh: bool = False, port: int = 0) -> None:
         self.data = data
         self.log = data.with_suffix(".log")
-        command = ["serve", str(rig), "--port", "0", "--data", str(data)]
+        command = ["serve", str(rig), "--port", str(port), "--data", str(data)]
         environment = {
             # Tests ask as fast as they can.
             "SLRIG_REQUESTS_PER_S": "100000",
@@ -132,8 +133,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
     """Start a service on a rig and a data folder; whatever still runs at the end of the test is killed."""
     running: list[ServiceProcess] = []
 
-    def started(rig: Path, data: Path = tmp_path / "data", *, fresh: bool = False) -> ServiceProcess:
-        service = ServiceProcess(rig, data, fresh=fresh)
+    def started(rig: Path, data: Path = tmp_path / "data", *, fresh: bool = False, port: int = 0) -> ServiceProcess:
+        service = ServiceProcess(rig, data, fresh=fresh, port=port)
         running.append(service)
         return service
 

@@ -1,0 +1,91 @@
+"""What happens to a page that is open: its key ends, the service goes and comes back, a camera is unplugged."""
+
+from __future__ import annotations
+
+import json
+from datetime import timedelta
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from slrig.api.keys import KeyRing
+from slrig.api.scopes import Scope
+from slrig.config import ServiceSettings
+from slrig.jobs.records import utc_now
+from tests.e2e.conftest import KEY, Start, write_rig
+from tests.e2e.page.conftest import Visit, violations
+
+pytestmark = pytest.mark.slow
+
+COMPLAINT = "Failed to load resource"
+"""What Chromium itself says of a request that is refused, or not answered."""
+
+
+def test_a_key_that_expires_leads_to_the_form_and_back_to_the_screen(
+    start: Start, tmp_path: Path, visit: Visit
+) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    keys = ServiceSettings(data_dir=service.data).key_path
+    secret = KeyRing(keys).add("Ann", [Scope.SCAN], life=timedelta(hours=1))
+    page = visit(service, "devices", key=secret, ignored=COMPLAINT)
+    page.get_by_text("Logged in as Ann").wait_for()
+    kept = json.loads(keys.read_text())
+    kept["keys"][-1]["expires_at"] = (utc_now() - timedelta(seconds=1)).isoformat()
+    keys.write_text(json.dumps(kept))
+    page.get_by_role("alert").get_by_text("Your session is over").wait_for()
+    assert violations(page) == []
+    page.get_by_label("Key").fill(secret)
+    page.get_by_role("button", name="Enter").click()
+    page.get_by_role("alert").get_by_text("one that expired on").wait_for()
+    page.get_by_label("Key").fill(KEY)
+    page.get_by_role("button", name="Enter").click()
+    page.get_by_text("Logged in as environment").wait_for()
+    assert page.url.endswith("#/devices")
+
+
+def test_a_service_that_goes_and_comes_back(start: Start, tmp_path: Path, visit: Visit) -> None:
+    rig = write_rig(tmp_path / "rig", head="carries_calibration = false")
+    service = start(rig)
+    page = visit(service, "health", ignored=COMPLAINT)
+    page.get_by_text("The rig has no calibration that could be verified.").wait_for()
+    service.stop()
+    banner = page.get_by_role("alert").get_by_text("The service does not answer.")
+    banner.wait_for()
+    # What was known is still there to be read.
+    assert page.get_by_text("The rig has no calibration that could be verified.").is_visible()
+    assert violations(page) == []
+    start(rig, port=urlsplit(service.url).port)
+    # Sessions live as long as the service.
+    page.get_by_role("alert").get_by_text("Your session is over").wait_for()
+    banner.wait_for(state="detached")
+    page.get_by_label("Key").fill(KEY)
+    page.keyboard.press("Enter")
+    page.get_by_text("The rig has no calibration that could be verified.").wait_for()
+
+
+def test_a_camera_that_is_unplugged_is_told_in_words(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig", faults="[head.faults]\nunplug_camera_at_frame = 5"))
+    page = visit(service, "scan")
+    page.get_by_text("None yet.").wait_for()
+    page.get_by_role("button", name="Scan", exact=True).click()
+    told = page.get_by_role("alert").filter(has_text="The last scan failed")
+    told.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
+    page.get_by_role("listitem").get_by_text("failed").wait_for()
+    assert violations(page) == []
+
+
+def test_a_page_that_is_loaded_anew_in_the_middle_of_a_scan_loses_nothing(
+    start: Start, tmp_path: Path, visit: Visit
+) -> None:
+    service = start(write_rig(tmp_path / "rig", head="realtime = true"))
+    page = visit(service, "scan")
+    page.get_by_text("None yet.").wait_for()
+    page.get_by_role("button", name="Scan", exact=True).click()
+    page.get_by_role("progressbar").wait_for()
+    page.reload()
+    page.get_by_role("progressbar").wait_for()
+    # It is still the page that asked for it, and so leads to the mesh.
+    page.wait_for_url("**/#/scan/*-*")
+    with service.client() as client:
+        assert len(client.get("/scan")["scans"]) == 1
