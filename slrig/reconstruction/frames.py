@@ -55,7 +55,7 @@ def at_rows(values: Any, rows: slice) -> Any:
 
 
 def straight(image: NDArray[Any], gamma: float, full_scale: float) -> Image:
-    """As the image, float32: values in proportion to light, of a camera whose values are light to the power of 1/gamma."""
+    """The image in proportion to light, float32, of a camera whose values are light to the power of 1/gamma."""
     if gamma == 1:
         return np.asarray(image, dtype=np.float32)
     share = np.maximum(image, 0).astype(np.float32) / np.float32(full_scale)
