@@ -15,7 +15,7 @@ from tests.npm import lacking, npm_package
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-LIMIT_MS = 30_000
+LIMIT_MS = 60_000
 DESK, PHONE = (1280, 800), (390, 844)
 _AXE = "axe-core@4.14.1"
 _OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
