@@ -100,7 +100,7 @@ def test_a_rig_file_may_ask_for_a_bracket(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "asked"),
     [
-        ([], {"exposure_s": None}),
+        ([], {}),
         (["--exposure-s", "0.02"], {"exposure_s": 0.02}),
         (["--exposure-s", "0.02", "--exposure-s", "0.08"], {"exposures_s": [0.02, 0.08]}),
     ],
