@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from slrig.scan.artefacts import encode_mesh_ply
-from tests.e2e.conftest import Start, write_rig
-from tests.e2e.page.conftest import Visit, browser, visit
+from tests.e2e.conftest import Start, browser, write_rig
+from tests.e2e.page.conftest import Visit, visit
 from tests.e2e.test_browser import scanned
 from tests.unit.scan.test_view_format import sheet
 

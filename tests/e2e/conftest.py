@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from slrig.cli.client import ServiceClient
 from tests.e2e.forking import ForkedCommand
+from tests.npm import lacking
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 KEY = "the key of the tests"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+_BROWSER_OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
 STOP_LIMIT_S = 30.0
 """How long a test waits for the service to end after SIGTERM: 1 to 2 s on a quiet machine, 4 beside six busy ones."""
 
@@ -142,3 +150,20 @@ def start(tmp_path: Path) -> Iterator[Start]:
     for service in running:
         if service.process.poll() is None:
             service.kill()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Chromium. Playwright does not start twice at a time in a process, and others' event loops not beside it."""
+    path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if path is None:
+        lacking("needs Chromium: apt install chromium")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        lacking("needs Playwright, to drive a browser: pip install -e '.[browser]'")
+    with sync_playwright() as driver:
+        # Drawn by the processor, as on a laptop without a GPU.
+        opened = driver.chromium.launch(executable_path=path, args=list(_BROWSER_OPTIONS))
+        yield opened
+        opened.close()

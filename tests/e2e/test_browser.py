@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,11 +14,9 @@ import pytest
 
 from tests.e2e.conftest import KEY, ServiceProcess, Start, write_rig
 from tests.e2e.test_survival import ended
-from tests.e2e.viewers.three_js import BROWSERS
-from tests.npm import lacking
 
 if TYPE_CHECKING:
-    from playwright.sync_api import BrowserContext, Page
+    from playwright.sync_api import Browser, BrowserContext, Page
 
 pytestmark = pytest.mark.slow
 
@@ -123,21 +120,12 @@ def elsewhere() -> Iterator[int]:
 
 
 @pytest.fixture
-def context() -> Iterator[BrowserContext]:
+def context(browser: Browser) -> Iterator[BrowserContext]:
     """A browser with an empty profile."""
-    browser_path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser_path is None:
-        lacking("needs Chromium: apt install chromium")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        lacking("needs Playwright, to drive a browser: pip install -e '.[browser]'")
-    with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=browser_path, args=["--no-sandbox", "--disable-gpu"])
-        made = browser.new_context()
-        made.set_default_timeout(_LIMIT_MS)
-        yield made
-        browser.close()
+    made = browser.new_context()
+    made.set_default_timeout(_LIMIT_MS)
+    yield made
+    made.close()
 
 
 def log_in(page: Page, service: ServiceProcess) -> None:

@@ -1,16 +1,14 @@
-"""A browser with an empty profile, and a look at a page that must not complain."""
+"""A page that is looked at in a browser, and must not complain."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from tests.e2e.conftest import KEY, ServiceProcess
-from tests.e2e.viewers.three_js import BROWSERS
-from tests.npm import lacking, npm_package
+from tests.npm import npm_package
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -18,25 +16,8 @@ if TYPE_CHECKING:
 LIMIT_MS = 60_000
 DESK, PHONE = (1280, 800), (390, 844)
 _AXE = "axe-core@4.14.1"
-_OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
 
 Visit = Callable[..., "Page"]
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    path = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if path is None:
-        lacking("needs Chromium: apt install chromium")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        lacking("needs Playwright, to drive a browser: pip install -e '.[browser]'")
-    with sync_playwright() as driver:
-        # Drawn by the processor, as on a laptop without a GPU.
-        opened = driver.chromium.launch(executable_path=path, args=list(_OPTIONS))
-        yield opened
-        opened.close()
 
 
 @pytest.fixture

@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.e2e.conftest import BROWSERS
 from tests.npm import lacking, npm_package
 
 PACKAGE = "three@0.187.0"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 _LIMIT_S = 120.0
 # Drawn by the processor; nothing is looked for on the network.
 _OPTIONS = (
