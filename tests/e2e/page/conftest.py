@@ -11,7 +11,7 @@ from tests.e2e.conftest import KEY, ServiceProcess
 from tests.npm import npm_package
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 LIMIT_MS = 60_000
 DESK, PHONE = (1280, 800), (390, 844)
@@ -72,3 +72,17 @@ def violations(page: Page) -> list[str]:
     page.evaluate(axe.read_text(encoding="utf-8"))
     found: list[dict[str, Any]] = page.evaluate("() => axe.run().then((found) => found.violations)")
     return [f"{each['id']}: {node['html'][:200]}" for each in found for node in each["nodes"]]
+
+
+def count(found: Locator, number: int) -> None:
+    """Wait until so many are there: what a page shows comes by more than one answer."""
+    from playwright.sync_api import expect
+
+    expect(found).to_have_count(number, timeout=LIMIT_MS)
+
+
+def disabled(button: Locator) -> None:
+    """Wait until a button cannot be pressed."""
+    from playwright.sync_api import expect
+
+    expect(button).to_be_disabled(timeout=LIMIT_MS)

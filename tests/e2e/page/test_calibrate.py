@@ -12,7 +12,7 @@ from slrig.api.keys import KeyRing
 from slrig.api.scopes import Scope
 from slrig.config import read_settings
 from tests.e2e.conftest import Start
-from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
 from tests.e2e.test_calibration_walk import SLOW, Caller, write_rig
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Pat
     page.reload()
     page.get_by_role("heading", name="What the solve says").wait_for(timeout=_SOLVED_MS)
     page.get_by_text(re.compile("✓ good: a scanned point is expected within")).wait_for()
-    assert page.get_by_role("row", name="left").get_by_text(re.compile(r"0\.0\d\d px")).count() == 3
+    count(page.get_by_role("row", name="left").get_by_text(re.compile(r"0\.0\d\d px")), 3)
     page.get_by_role("button", name="Use it").click()
     page.get_by_role("banner").get_by_text("ready").wait_for()
     assert violations(page) == []
@@ -97,7 +97,7 @@ def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Pat
     assert violations(page) == []
     page.get_by_role("alertdialog").get_by_role("button", name="Delete").click()
     page.get_by_text("Scans use walk.").wait_for()
-    assert page.get_by_role("listitem").count() == 1
+    count(page.get_by_role("listitem"), 1)
 
 
 def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, visit: Visit) -> None:
@@ -150,5 +150,5 @@ def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, vi
     page.get_by_text("Your key is for looking").wait_for()
     page.get_by_text("Pose 4 stopped").wait_for()
     for name in ("Shoot (space bar)", "Solve", "Delete pose 3", "Delete this calibration"):
-        assert page.get_by_role("button", name=name).is_disabled()
+        disabled(page.get_by_role("button", name=name))
     assert violations(page) == []

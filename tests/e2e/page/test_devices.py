@@ -16,7 +16,7 @@ from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.findings import fault, ok
 from slrig.jobs.examinations import keep
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, violations
 
 pytestmark = pytest.mark.slow
 
@@ -65,7 +65,7 @@ def test_devices_on_a_phone_by_a_key_for_looking(start: Start, tmp_path: Path, v
     page.get_by_text("Every frame shows its pattern").wait_for()
     page.get_by_text("Logged in as Ann").wait_for()
     page.get_by_text("You may look.").wait_for()
-    assert page.get_by_role("table", name="Who did what last").count() == 0
+    count(page.get_by_role("table", name="Who did what last"), 0)
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert violations(page) == []
     page.screenshot(path=str(tmp_path / "phone.png"), full_page=True)

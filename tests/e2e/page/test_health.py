@@ -11,7 +11,7 @@ from slrig.api.keys import KeyRing
 from slrig.api.scopes import Scope
 from slrig.config import ServiceSettings
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
 from tests.e2e.test_calibration_walk import SLOW
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 
@@ -49,7 +49,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     state = page.get_by_role("region", name="State")
     state.get_by_role("status").get_by_text("Good").wait_for()
     state.get_by_text("just now").wait_for()
-    assert page.get_by_role("table", name="Last verifications").get_by_role("row").count() == 2
+    count(page.get_by_role("table", name="Last verifications").get_by_role("row"), 2)
     picture = page.get_by_role("img", name="Expected error of a scan")
     assert picture.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 0
     assert violations(page) == []
@@ -71,7 +71,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     nights.get_by_text("paused: nothing becomes due").wait_for()
     nights.get_by_role("button", name="Run now").click()
     nights.get_by_text("under way").first.wait_for()
-    assert nights.get_by_role("button", name="Run now").is_disabled()
+    disabled(nights.get_by_role("button", name="Run now"))
     nights.get_by_text("The calibration is good").wait_for()
     nights.get_by_text("asked for by a person, not by the clock").wait_for()
     assert violations(page) == []
@@ -98,7 +98,7 @@ def test_health_of_an_uncalibrated_rig_on_a_phone_by_a_key_for_looking(
     page.get_by_text("The rig has no calibration that could be verified.").wait_for()
     page.get_by_text("Your key is not for calibrations.").wait_for()
     page.get_by_text("Changing the schedule takes a key that may administer.").wait_for()
-    assert page.get_by_role("button", name="Verify now").is_disabled()
+    disabled(page.get_by_role("button", name="Verify now"))
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert violations(page) == []
     page.screenshot(path=str(tmp_path / "phone.png"), full_page=True)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray, Refusal
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, violations
 from tests.e2e.test_browser import scanned
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Pa
     page = visit(service, scan[1:], size=PHONE, dark=True)
     page.get_by_role("button", name="Stop it").click()
     page.get_by_text("The scan was stopped").wait_for()
-    assert page.get_by_text("Download the mesh").count() == 0
+    count(page.get_by_text("Download the mesh"), 0)
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert violations(page) == []
     page.get_by_role("button", name="Scan again").click()

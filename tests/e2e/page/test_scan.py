@@ -10,7 +10,7 @@ from slrig.api.keys import KeyRing
 from slrig.api.scopes import Scope
 from slrig.config import ServiceSettings
 from tests.e2e.conftest import KEY, Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, violations
+from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +47,7 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     page.reload()
     page.get_by_text("succeeded").wait_for()
     page.get_by_text("triangles, σ").wait_for()
-    assert page.get_by_role("list").get_by_role("link").count() == 1
+    count(page.get_by_role("list").get_by_role("link"), 1)
     assert violations(page) == []
 
 
@@ -56,7 +56,7 @@ def test_a_phone_a_dark_room_and_a_key_for_looking(start: Start, tmp_path: Path,
     secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
     page = visit(service, key=secret, size=PHONE, dark=True, ignored="401")
     page.get_by_text("Your key is for looking only.").wait_for()
-    assert page.get_by_role("button", name="Scan", exact=True).is_disabled()
+    disabled(page.get_by_role("button", name="Scan", exact=True))
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert violations(page) == []
     page.screenshot(path=str(tmp_path / "phone.png"))
