@@ -13,6 +13,9 @@ from slrig.conformance.bench import usual_settings
 from slrig.devices import Camera, CameraSettings, Head, KeepsTime, Rig, SystemClock
 from slrig.model import PatternSequence
 
+COLOUR = "frames_come_in_colour_where_it_is_declared"
+"""The check that a mono camera has nothing to show for."""
+
 
 @dataclass(frozen=True)
 class Bench:
