@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated, Any
 from uuid import UUID
@@ -47,10 +47,13 @@ router = APIRouter()
 
 @dataclass(slots=True)
 class OpenStreams:
-    """How many streams are open, and may be. Lives on the event loop's thread."""
+    """How many streams are open, and may be; and what each job or calibration is that is followed. Lives on the event
+    loop's thread.
+    """
 
     limit: int
     count: int = 0
+    followed: dict[UUID, SharedLooks] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -107,6 +110,58 @@ def _answers(events: str, nothing: str) -> dict[int | str, dict[str, Any]]:
     }
 
 
+class SharedLooks:
+    """Looks for new events, made once for all who have seen as much: twenty who follow a scan cost what one does.
+
+    Lives on the event loop's thread.
+    """
+
+    def __init__(self, followed: Followed) -> None:
+        self.last = followed.last
+        self._followed = followed
+        self._followers: set[asyncio.Event] = set()
+        self._looks: dict[int, asyncio.Future[tuple[Sequence[JobEvent], bool]]] = {}
+        self._unwatch: Callable[[], None] = lambda: None
+
+    @property
+    def unused(self) -> bool:
+        """Whether nobody follows."""
+        return not self._followers
+
+    def join(self) -> asyncio.Event:
+        """Begin to follow: what is returned is set after each new event."""
+        if self.unused:
+            loop = asyncio.get_running_loop()
+
+            def wake() -> None:
+                loop.call_soon_threadsafe(self._wake)
+
+            self._unwatch = self._followed.watch(wake)
+        news = asyncio.Event()
+        self._followers.add(news)
+        return news
+
+    def leave(self, news: asyncio.Event) -> None:
+        """End what `join` began."""
+        self._followers.remove(news)
+        if self.unused:
+            self._unwatch()
+            self._looks.clear()
+
+    def _wake(self) -> None:
+        # A look that has begun may lack the newest event: nobody else is given it.
+        self._looks.clear()
+        for news in self._followers:
+            news.set()
+
+    async def look(self, after: int) -> tuple[Sequence[JobEvent], bool]:
+        """See `Followed.look`."""
+        if after not in self._looks:
+            self._looks[after] = asyncio.ensure_future(run_in_threadpool(self._followed.look, after))
+        # One who goes away ends it for nobody else.
+        return await asyncio.shield(self._looks[after])
+
+
 _JOB = _answers(
     "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
     "frames are brought to disk and computed with then; `file` events with the name of a file that can be fetched from "
@@ -150,13 +205,13 @@ async def follow_calibration(
         partial(register.jobs.watch, calibration_id),
         partial(register.jobs.last_event_of, calibration_id),
     )
-    return await _stream(place, service.settings, followed, last_event_id)
+    return await _stream(place, service.settings, calibration_id, followed, last_event_id)
 
 
 async def _follow_job(place: Place, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
     await run_in_threadpool(jobs.get, job_id)
-    return await _stream(place, service.settings, followed_job(jobs, job_id), after)
+    return await _stream(place, service.settings, job_id, followed_job(jobs, job_id), after)
 
 
 def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
@@ -203,7 +258,7 @@ def _of_calibration(event: JobEvent, pose: int | None) -> JobEvent:
     return replace(event, data={**event.data, "state": _SOLVES[event.data["state"]]})
 
 
-async def _stream(place: Place, settings: ServiceSettings, followed: Followed, after: int) -> Response:
+async def _stream(place: Place, settings: ServiceSettings, key: UUID, followed: Followed, after: int) -> Response:
     """The events after one, and those that follow until no more will come. Raises HTTPException 429."""
     events, over = await run_in_threadpool(followed.look, after)
     if over and not events:
@@ -211,7 +266,7 @@ async def _stream(place: Place, settings: ServiceSettings, followed: Followed, a
         return Response(status_code=204)
     place.take()
     return EventSourceResponse(
-        told(followed, after),
+        told(place.streams, key, followed, after),
         ping=settings.keepalive_s,
         sep="\n",
         # At the end of the service all work ends, and its stream by that; without this the stream would end first.
@@ -219,29 +274,26 @@ async def _stream(place: Place, settings: ServiceSettings, followed: Followed, a
     )
 
 
-async def told(followed: Followed, after: int) -> AsyncIterator[ServerSentEvent]:
-    """Each event after one, as it comes, until no more will."""
-    loop = asyncio.get_running_loop()
-    news = asyncio.Event()
-
-    def wake() -> None:
-        loop.call_soon_threadsafe(news.set)
-
-    unwatch = followed.watch(wake)
+async def told(streams: OpenStreams, key: UUID, followed: Followed, after: int) -> AsyncIterator[ServerSentEvent]:
+    """Each event after one, as it comes, until no more will. key : the same for all who follow the same."""
+    shared = streams.followed.setdefault(key, SharedLooks(followed))
+    news = shared.join()
     try:
         # A client that names an event that has not come yet would never be told that it has.
-        after = min(after, await run_in_threadpool(followed.last))
+        after = min(after, await run_in_threadpool(shared.last))
         over = False
         while not over:
             news.clear()
-            events, over = await run_in_threadpool(followed.look, after)
+            events, over = await shared.look(after)
             for event in events:
                 after = event.number
                 yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(after), sep="\n")
             if not over:
                 await news.wait()
     finally:
-        unwatch()
+        shared.leave(news)
+        if shared.unused:
+            streams.followed.pop(key, None)
 
 
 def _data(event: JobEvent) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, MutableMapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -13,7 +14,7 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from sse_starlette import ServerSentEvent
 
-from slrig.api.events import followed_job
+from slrig.api.events import OpenStreams, followed_job
 from slrig.api.events import told as stream_of
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobEvent, JobKind, JobProgress, JobRecord, JobState
@@ -61,7 +62,33 @@ def test_stream_ahead_of_its_scan_is_told_what_comes_next(store: ActingStore) ->
         store.finish(scan.id, JobState.SUCCEEDED)
 
     store.act = go_on
-    assert asyncio.run(told(stream_of(followed_job(store, scan.id), 1000))) == ["2", "3"]
+    assert asyncio.run(told(stream_of(OpenStreams(1), scan.id, followed_job(store, scan.id), 1000))) == ["2", "3"]
+
+
+def test_twenty_who_follow_a_scan_see_all_of_it_and_cost_little_more_than_one(store: ActingStore) -> None:
+    scan, streams, looks = made(store), OpenStreams(99), 0
+    followed = followed_job(store, scan.id)
+
+    def counted(after: int) -> tuple[Sequence[JobEvent], bool]:
+        nonlocal looks
+        looks += 1
+        return followed.look(after)
+
+    async def follow() -> list[list[str | None]]:
+        everyone = [
+            asyncio.ensure_future(told(stream_of(streams, scan.id, replace(followed, look=counted), 0)))
+            for _ in range(20)
+        ]
+        for step in range(10):
+            await asyncio.to_thread(store.progress, scan.id, JobProgress("capture", step / 10, ""))
+        await asyncio.to_thread(store.finish, scan.id, JobState.SUCCEEDED)
+        return await asyncio.gather(*everyone)
+
+    everything = [str(number) for number in range(1, 13)]
+    assert asyncio.run(follow()) == 20 * [everything]
+    # Each alone would look for each event, 240 times in all.
+    assert looks <= 48
+    assert streams.followed == {}
 
 
 @pytest.mark.parametrize("final", [True, False])
@@ -69,7 +96,7 @@ def test_stream_of_a_scan_that_is_deleted_ends(store: ActingStore, final: bool) 
     scan = made(store)
 
     async def follow() -> list[str | None]:
-        stream = stream_of(followed_job(store, scan.id), 0)
+        stream = stream_of(OpenStreams(1), scan.id, followed_job(store, scan.id), 0)
         assert (await anext(stream)).id == "1"
         if final:
             # It is woken by the last event, and finds it gone.
