@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,9 +54,11 @@ def verify_bundle(
     pose = used.read(folder, board, folder.name)
     for name, figures in pose.figures.items():
         if figures.moved_px > _STILL_PX:
+            lost = math.isinf(figures.moved_px)
+            how = "is not in every frame" if lost else f"moved by {figures.moved_px:.2f} px while it was shot"
             message = (
-                f"camera '{name}': the board moved by {figures.moved_px:.2f} px while it was shot, and more than "
-                f"{_STILL_PX} px would be taken for a change of the rig; put it on a stand, and shoot it again"
+                f"camera '{name}': the board {how}, and a movement of more than {_STILL_PX} px would be taken for "
+                "a change of the rig; put it on a stand, and shoot it again"
             )
             raise PoseRefusedError(message)
     return used.judge([pose.observation], board, calibration)

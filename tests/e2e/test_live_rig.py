@@ -107,6 +107,19 @@ def test_one_flash_of_the_box_serves_from_the_doctor_to_a_verification(
     assert not world.profiles[-1].any()
 
 
+def shoot(caller: Caller, made: dict[str, Any]) -> None:
+    """Shoot a pose, and do as a refusal says: once more. A busy machine may hold a frame's light back."""
+    shot: dict[str, Any] = {}
+    for _ in range(2):
+        caller.post(made["links"]["pose"], 202)
+        shot = caller.settled(made)["shot"][-1]
+        if shot["state"] == "succeeded":
+            return
+        sys.stdout.write(f"{shot['error']}\n")
+        assert shot["error"]["detail"].endswith("shoot again") or "shoot again;" in shot["error"]["detail"]
+    pytest.fail(str(shot["error"]))
+
+
 def walk(start: Start, rig: Path, world: World, box: Box) -> None:
     """Everything from the empty box to the verdict; what is expected of each step is asserted on the way."""
     told = slrig("patterns", str(rig))
@@ -126,9 +139,7 @@ def walk(start: Start, rig: Path, world: World, box: Box) -> None:
         made = caller.post("/calibration", 201, board=BOARD)
         for pose in SHOT:
             world.move(pose)
-            caller.post(made["links"]["pose"], 202)
-            shot = caller.settled(made)["shot"][-1]
-            assert shot["state"] == "succeeded", shot["error"]
+            shoot(caller, made)
         caller.post(made["links"]["solve"], 202)
         solved = caller.settled(made)
         assert solved["state"] == "solved", solved["error"]

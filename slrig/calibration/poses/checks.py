@@ -202,6 +202,10 @@ class _Judging:
         limits, blur_px, moved_px = LIMITS, figures.sharpness_px, figures.moved_px
         still = f"at most {limits.moved_px[1]:g} px: rest the board on something, let go of it, and shoot again"
         what = f"saw the board move by {moved_px:.2g} px while the pose was shot"
+        if np.isinf(moved_px):
+            # A frame of late light shows two patterns at once, and no board.
+            what = "saw the board in the first frame and not in a later one, where it moved or the light came late"
+            still = "rest the board on something, let go of it, and shoot again; slrig doctor measures the light"
         self.judge(moved_px, limits.moved_px, camera, what, still)
         self.judge(
             figures.saturated, limits.saturated, camera, f"has {figures.saturated:.1%} of the board's pixels saturated",

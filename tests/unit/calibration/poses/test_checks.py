@@ -77,6 +77,7 @@ def test_the_first_pose_has_no_distance_while_the_focal_length_is_unknown(shooti
     ("figures", "cause", "cure"),
     [
         (replace(SHARP, moved_px=1.3), "saw the board move by 1.3 px", "let go of it"),
+        (replace(SHARP, moved_px=float("inf")), "in the first frame and not in a later one", "shoot again"),
         (replace(SHARP, sharpness_px=4.0), "too blurred, 4.0 px", "focus"),
         (replace(SHARP, saturated=0.2), "20.0% of the board's pixels saturated", "shorter time"),
         (replace(SHARP, contrast=0.04), "too little light on the board, 4%", "longer time"),
