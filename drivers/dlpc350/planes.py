@@ -59,7 +59,5 @@ def planes_in(picture: bytes, name: str) -> tuple[Plane, ...]:
         raise ConfigError(message)
     pixels = np.frombuffer(picture, np.uint8, size, offset).reshape(rows, columns, 3)
     upright: NDArray[Any] = pixels[::-1] if height > 0 else pixels
-    return tuple(
-        (upright[..., _CHANNELS[number // 8]] >> np.uint8(number % 8) & np.uint8(1)).astype(np.bool_)
-        for number in range(PLANES)
-    )
+    channels = [np.ascontiguousarray(upright[..., channel]) for channel in _CHANNELS]
+    return tuple(channels[number // 8] & np.uint8(1 << number % 8) != 0 for number in range(PLANES))

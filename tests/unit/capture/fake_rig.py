@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from slrig.capture.evidence import Evidence
 from slrig.devices import AppliedSettings, CameraInfo, CameraSettings, ProjectorInfo, Rig, Shown, Trigger
@@ -96,11 +95,9 @@ class Scene:
         sent = np.broadcast_to(profile.ravel(), (extent_px,)) if profile.size == 1 else profile.ravel()
         values = sent.astype(np.float64) / 255
         if self.scaler_px:
-            values = gaussian_filter1d(values, self.scaler_px, mode="nearest") ** 2.2
+            values = _blurred(values, self.scaler_px, reach=round(4 * self.scaler_px)) ** 2.2
         steps = np.repeat(values, fine)
-        reach = np.arange(-6 * fine, 6 * fine + 1)
-        kernel = np.exp(-0.5 * (reach / (self.blur_px * fine)) ** 2)
-        blurred = np.convolve(np.pad(steps, 6 * fine, mode="edge"), kernel / kernel.sum(), mode="valid")
+        blurred = _blurred(steps, self.blur_px * fine, reach=6 * fine)
         centres_px = (np.arange(len(steps)) + 0.5) / fine - 0.5
         seen = np.interp(position_px, centres_px, blurred, left=0.0, right=0.0)
         on_projector = (np.abs(self.column_px - (self.projector.width_px - 1) / 2) <= self.projector.width_px / 2) & (
@@ -123,6 +120,16 @@ class Scene:
     def shots(self, patterns: Sequence[Pattern], camera: str = "left") -> list[Shot]:
         sequence = encode(patterns, self.projector)
         return [Shot(i, camera, self.image(profile)) for i, profile in enumerate(sequence.profiles)]
+
+
+def _blurred(values: NDArray[np.float64], sigma: float, *, reach: int) -> NDArray[np.float64]:
+    """Values under a Gaussian, (n,) float64; beyond their ends they go on as they end.
+
+    By numpy: an emulated guest takes ten seconds and more to load scipy.ndimage.
+    """
+    offsets = np.arange(-reach, reach + 1)
+    kernel = np.exp(-0.5 * (offsets / sigma) ** 2)
+    return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
 
 
 @dataclass
