@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-
 from fastapi import APIRouter, Response
 from pydantic import BaseModel
 
-from slrig.api.schemas import filled
 from slrig.api.service import Cursor, PageLength, Serving, paged
+from slrig.jobs.audit import AuditEntry
 
 router = APIRouter(tags=["system"])
-
-
-class AuditEntryBody(BaseModel):
-    """One request that changed something, or tried to. `made` is the path of what it made."""
-
-    at: datetime
-    who: str
-    address: str
-    method: str
-    path: str
-    status: int
-    made: str
 
 
 class AuditPage(BaseModel):
     """Entries from new to old. `next` asks for the page after this one, null on the last."""
 
-    entries: list[AuditEntryBody]
+    entries: list[AuditEntry]
     next: str | None
 
 
@@ -40,4 +26,4 @@ def list_audit(service: Serving, response: Response, cursor: Cursor = None, limi
     shown, following = paged(
         lambda most: service.audit.page(before=cursor, limit=most), limit, "/audit", service, response
     )
-    return AuditPage(entries=[filled(AuditEntryBody, entry) for entry in shown], next=following)
+    return AuditPage(entries=list(shown), next=following)

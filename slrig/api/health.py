@@ -17,36 +17,13 @@ from slrig.api.service import Service, Serving
 from slrig.bundle.faults import Strict
 from slrig.bundle.moments import AwareMoment
 from slrig.calibration.board import Board
-from slrig.calibration.health.verdict import THRESHOLDS, HealthState
+from slrig.calibration.health.verdict import THRESHOLDS, HealthState, Thresholds
+from slrig.calibration.health.verification import Drift, PairFigures
 from slrig.errors import CalibrationError
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.verify.plot import health_svg
 
 router = APIRouter(prefix="/rig", tags=["health"])
-
-
-class DriftBody(BaseModel):
-    """One explanation of what is seen: the device, what happened to it in words, and how likely that is."""
-
-    device: str
-    kind: str
-    significance: float = Field(description="in standard deviations")
-    weight: float = Field(description="its probability among all explanations tried")
-    words: str
-
-
-class PairBody(BaseModel):
-    """The spare equation of two devices, px of the second one's image. Maps have 6 x 6 cells over the first one's."""
-
-    first: str
-    second: str
-    count: int
-    mean_px: float
-    rms_px: float
-    predicted_px: float
-    map_mean_px: list[list[float | None]]
-    map_rms_px: list[list[float | None]]
-    map_count: list[list[int]]
 
 
 class VerificationFigures(BaseModel):
@@ -59,27 +36,16 @@ class VerificationFigures(BaseModel):
     state: HealthState
     reasons: list[str]
     remedy: str | None
-    pairs: list[PairBody]
+    pairs: list[PairFigures]
     scale_percent: float | None
     scale_sigma_percent: float | None
     scale_mm: float | None
     expected_mm: float | None
     stated_mm: float | None
     drift_mm: float | None
-    drifts: list[DriftBody]
+    drifts: list[Drift]
     open: str | None = Field(description="what the geometry leaves open")
     unseen: list[str] = Field(description="devices that took no part, of which nothing was learned")
-
-
-class ThresholdsBody(BaseModel):
-    """From where on a rig is to be watched, and from where its calibration is stale. mean: of a pair's spare equation;
-    error_ratio: of the expected error over the stated one, where a device has changed.
-    """
-
-    watch_mean_px: float
-    stale_mean_px: float
-    watch_error_ratio: float
-    stale_error_ratio: float
 
 
 class HealthBody(BaseModel):
@@ -91,7 +57,7 @@ class HealthBody(BaseModel):
     calibration: str | None
     calibration_age_s: float | None
     refuses_scans_when_stale: bool
-    thresholds: ThresholdsBody
+    thresholds: Thresholds
     latest: VerificationFigures | None
     links: dict[str, str]
 
@@ -136,7 +102,7 @@ def look_at_health(service: Serving) -> HealthBody:
         calibration=None if calibration is None else calibration.solve_id,
         calibration_age_s=age_s,
         refuses_scans_when_stale=service.refuse_when_stale,
-        thresholds=filled(ThresholdsBody, THRESHOLDS),
+        thresholds=THRESHOLDS,
         latest=None if latest is None else VerificationFigures.model_validate(latest.document()),
         links={"history": "/rig/health/history", "plot": "/rig/health.svg", "verify": "/rig/verification"},
     )

@@ -18,10 +18,10 @@ from starlette.responses import StreamingResponse
 
 from slrig.api.events import StreamPlace
 from slrig.api.openapi import problems
-from slrig.api.schemas import CalibrationInUse, CameraBody, DeviceList, ProjectorBody, RigBody, filled
+from slrig.api.schemas import CalibrationInUse, CameraBody, ProjectorBody, RigBody, filled
 from slrig.api.service import Serving
-from slrig.devices import CameraInfo
-from slrig.discovery import found_devices, installed_drivers
+from slrig.devices import CameraInfo, FoundDevice
+from slrig.discovery import InstalledDriver, MissingLibrary, OtherSystem, found_devices, installed_drivers
 from slrig.errors import SlrigError
 from slrig.jobs.examinations import Examination, last_examination
 from slrig.jobs.records import utc_now
@@ -69,6 +69,16 @@ def look_at_rig(service: Serving) -> RigBody:
         projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
     )
+
+
+class DeviceList(BaseModel):
+    """What is installed, what is plugged in, and what is missing."""
+
+    drivers: tuple[InstalledDriver, ...]
+    devices: tuple[FoundDevice, ...]
+    missing: tuple[MissingLibrary, ...]
+    elsewhere: tuple[OtherSystem, ...]
+    faults: list[str]
 
 
 @router.get("/device")

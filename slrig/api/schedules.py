@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
@@ -15,7 +16,7 @@ from slrig.api.service import Cursor, PageLength, Serving, paged
 from slrig.bundle.faults import Strict
 from slrig.bundle.free_text import FreeText
 from slrig.jobs.records import utc_now
-from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Order, RunState, Schedule, TaskKind
+from slrig.schedule.records import LEAST_RETRY_S, MOST_GRACE_S, Cron, Order, Run, Schedule, TaskKind
 
 router = APIRouter(prefix="/schedule", tags=["schedule"])
 
@@ -94,25 +95,12 @@ class ScheduleList(BaseModel):
     schedules: list[ScheduleBody]
 
 
-class RunBody(BaseModel):
-    """One due time, and what became of it."""
-
-    number: int
-    due: datetime = Field(description="as clocks in the schedule's time zone show it")
-    state: RunState
-    reason: str | None = Field(description="in words, where it did not simply succeed")
-    count: int = Field(description="how many due times this row stands for")
-    attempts: int
-    next_attempt: datetime | None
-    started_at: datetime | None
-    finished_at: datetime | None
-    result: dict[str, Any] | None
-
-
 class RunPage(BaseModel):
-    """Runs from new to old. `next` asks for the page after this one, null on the last."""
+    """Runs from new to old, each due as clocks in the schedule's time zone show it. `next` asks for the page after this
+    one, null on the last.
+    """
 
-    runs: list[RunBody]
+    runs: list[Run]
     next: str | None
 
 
@@ -172,18 +160,18 @@ def list_runs(
         service,
         response,
     )
-    return RunPage(runs=[filled(RunBody, run, due=cron.local(run.due)) for run in shown], next=following)
+    return RunPage(runs=[replace(run, due=cron.local(run.due)) for run in shown], next=following)
 
 
 @router.post("/{schedule_id}/run", status_code=202, responses=problems(409))
-def run_now(service: Serving, schedule_id: UUID) -> RunBody:
+def run_now(service: Serving, schedule_id: UUID) -> Run:
     """Do what a schedule does now, once, though it is not due, or paused. It waits for the rig as every run does, and
     is listed with the others. The answer comes at once.
     """
     cron = service.schedules.get(schedule_id).order.cron
     run = service.schedules.run_now(schedule_id, utc_now())
     service.scheduler.wake()
-    return filled(RunBody, run, due=cron.local(run.due))
+    return replace(run, due=cron.local(run.due))
 
 
 @router.post("/{schedule_id}/pause")

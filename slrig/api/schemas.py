@@ -318,49 +318,6 @@ class RigBody(BaseModel):
     scan_defaults: dict[str, Any] = Field(description="what the rig file says; a request may say otherwise")
 
 
-class DriverBody(BaseModel):
-    """A driver that an installed package declares."""
-
-    kind: str
-    name: str
-    package: str
-    version: str
-    fault: str | None = Field(description="why it cannot be loaded")
-
-
-class DeviceBody(BaseModel):
-    """A device that is plugged in."""
-
-    driver: str
-    device: str = Field(description="what to write into a rig file")
-    label: str
-
-
-class MissingLibraryBody(BaseModel):
-    """A driver that lacks the library of its devices."""
-
-    driver: str
-    install: str = Field(description="the command that installs it")
-    message: str
-
-
-class OtherSystemBody(BaseModel):
-    """A driver that works on another operating system only."""
-
-    driver: str
-    message: str
-
-
-class DeviceList(BaseModel):
-    """What is installed, what is plugged in, and what is missing."""
-
-    drivers: list[DriverBody]
-    devices: list[DeviceBody]
-    missing: list[MissingLibraryBody]
-    elsewhere: list[OtherSystemBody]
-    faults: list[str]
-
-
 class Probe(BaseModel):
     """The answer of a probe: each thing that was looked at, "ok" or what is wrong or not done yet."""
 

@@ -27,7 +27,7 @@ from slrig.doctor.doctor import Diagnosis, examine
 from slrig.doctor.findings import Severity
 from slrig.doctor.rig_file import refuse_existing, write_rig_file
 from slrig.errors import StorageError
-from slrig.jobs.examinations import ExaminedBy, keep
+from slrig.jobs.examinations import keep
 from slrig.logs import set_up_logs_for_a_person
 from slrig.model import PatternSequence
 from slrig.scan.plan import PatternPlan
@@ -102,7 +102,7 @@ def conform(rig: Path, *, data: Path | None, as_json: bool) -> bool:
     return report.conforms
 
 
-def _keep(data: Path | None, command: ExaminedBy, found: Mapping[str, Any]) -> None:
+def _keep(data: Path | None, command: str, found: Mapping[str, Any]) -> None:
     """Keep what was found where a service shows it. An examination that cannot be kept is told all the same."""
     folder = read_settings(None, **given(data_dir=data)).data_dir
     try:

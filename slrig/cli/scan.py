@@ -15,7 +15,7 @@ from slrig.cli.client import ServiceClient
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
-from slrig.scan.offered import BUNDLE_ZIP, CAMERA_PICTURES, MEDIA_TYPES, not_offered
+from slrig.scan.offered import CAMERA_PICTURES, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -143,14 +143,14 @@ def _completed(
 
 def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
-    unknown, cameras = not_offered(files, None), None
-    if not unknown and not_offered(files, ()):
+    unknown, cameras = [name for name in files if name not in offered(())], []
+    pictures = tuple(named("").partition(".")[0] for named in CAMERA_PICTURES)
+    if unknown and all(name.startswith(pictures) for name in unknown):
         # A picture per camera: which there are is known once the rig is open.
-        cameras = [each["name"] for each in client.get("/rig")["cameras"]] or None
-        unknown = not_offered(files, cameras)
+        cameras = [each["name"] for each in client.get("/rig")["cameras"]]
+        unknown = [name for name in unknown if cameras and name not in offered(cameras)]
     if unknown:
-        pictures = [named(name) for name in cameras or ("CAMERA",) for named in CAMERA_PICTURES]
-        there_are = ", ".join([*MEDIA_TYPES, *pictures, BUNDLE_ZIP])
+        there_are = ", ".join(offered(cameras or ["CAMERA"]))
         message = f"--file: a scan has no {', '.join(unknown)}. There are: {there_are}."
         raise ConfigError(message)
 

@@ -121,13 +121,12 @@ def frames_come_in_colour_where_it_is_declared(view: View) -> None:
     """A camera that declares colour gives the same picture in blue, green and red, and another gives none."""
     lit = view.learn().lit
     info, frames = view.camera.info, [view.expose(index) for index in (0, 1)]
-    asked = (
-        f"CameraInfo.colour is {info.colour}, and frames have a function that makes their colour, or none, accordingly"
+    expect(
+        all((frame.colour is not None) == info.colour for frame in frames),
+        asked=f"CameraInfo.colour is {info.colour}, and frames have a function that makes their colour, or none",
+        found=[frame.colour for frame in frames],
+        do="declare what frames have",
     )
-    for frame in frames:
-        expect(
-            (frame.colour is not None) == info.colour, asked=asked, found=frame.colour, do="declare what frames have"
-        )
     if not info.colour:
         raise NotApplicableError("has no colour")
     for _ in range(8):
@@ -140,11 +139,9 @@ def frames_come_in_colour_where_it_is_declared(view: View) -> None:
         found=f"{white.shape} {white.dtype}, up to {white.max()}",
         do="return blue, green and red along the last axis, in the units of the image",
     )
-    brighter = [
-        float(np.mean(white[lit, each], dtype=float) - np.mean(black[lit, each], dtype=float)) for each in range(3)
-    ]
+    brighter = white[lit].mean(axis=0) - black[lit].mean(axis=0)
     expect(
-        max(brighter) > 0 and min(brighter) >= -0.1 * max(brighter),
+        brighter.max() > 0 and brighter.min() >= -0.1 * brighter.max(),
         asked="eight frames later, white is still brighter than black in colour, too",
         found=f"by {', '.join(f'{each:.1f}' for each in brighter)} DN of blue, green and red",
         do="make colour of a copy of what the camera sent, not of the driver's buffer",

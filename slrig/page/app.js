@@ -11,7 +11,7 @@ import {Action, Badge, Refusal, usePlace} from "./ui.js";
 const SCREENS = [
   ["scan", "Scan"],
   ["calibrate", "Calibrate"],
-  ["health", "Health and schedule"],
+  ["health", "Health", " and schedule"],
   ["devices", "Devices"],
 ];
 
@@ -77,7 +77,7 @@ function Rooms({session, left}) {
     <a class="skip" href="#content">Skip to the content</a>
     <header>
       <h1>${rig?.name ?? "slrig"}</h1><${RigState} rig=${rig} />
-      <nav aria-label="Screens">${SCREENS.map(([name, words]) => html`<a href=${`#/${name}`} aria-current=${name === room ? "page" : null}>${words}</a>`)}</nav>
+      <nav aria-label="Screens">${SCREENS.map(([name, words, more]) => html`<a href=${`#/${name}`} aria-current=${name === room ? "page" : null}>${words}${more && html`<span>${more}</span>`}</a>`)}</nav>
       ${session.name !== "anyone" && html`<span class="who quiet">${session.name}</span><${Action} kind="plain" onClick=${leave}>Log out<//>`}
     </header>
     <main id="content" tabindex="-1">${screens[room] ?? html`<p>There is no such screen. <a href="#/scan">Scan</a></p>`}</main>`;

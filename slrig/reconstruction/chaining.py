@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.kernels import kernel, kernel_part
 from slrig.model import FloatArray, IntArray
 
 _SHARPEST_TURN = np.pi / 3  # chosen; π/6 and π/2 give the same figures of a rendered vase
@@ -27,123 +27,75 @@ _SAME_LINE_ALIGNED = np.cos(_SAME_LINE_ANGLE)
 _HALF_OCTANT = np.tan(np.pi / 8)  # slope of the border between two octants
 
 
-def chain_frames(
+def chain_points(
     points_px: FloatArray,
     normals: FloatArray,
     strength: FloatArray,
     strong: NDArray[np.bool_],
-    borders: NDArray[np.int64],
     shape: tuple[int, int],
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Link the points of several frames, each by itself: frame k holds the points borders[k]:borders[k + 1].
+) -> tuple[IntArray, IntArray]:
+    """Link the points of one frame.
 
     points_px : (n, 2) float64 (x, y); normals : (n, 2) float64; strength : (n,) float64;
     strong : (n,) bool, points at which a chain may start; shape : (rows, columns) of the image.
-    Returns, frame by frame, order, the indices of the points chain by chain, offsets (chains + 1,), and the frame of
-    each chain (chains,). A chain has two points or more.
+    Returns order, the indices of the points chain by chain, and offsets (chains + 1,). A chain has two points or more.
     """
     # Positive numbers sort as their bits do; complemented, from the largest to the smallest.
     keys = ~strength.astype(np.float32).view(np.uint32)
-    by_strength = np.zeros(len(keys), dtype=np.int32)
-    in_bands(_order_kernel, len(borders) - 1, keys, borders, by_strength)
+    # With the index below them no two are equal: this sort takes a third of the time of a stable one.
+    by_strength = np.sort(keys.astype(np.uint64) << np.uint64(32) | np.arange(len(keys), dtype=np.uint64))
     placed = np.concatenate([points_px, normals], axis=1)
-    frames = len(borders) - 1
-    order, ends = np.zeros(len(placed), dtype=np.int32), np.zeros(len(placed), dtype=np.int32)
-    filled, chains = np.zeros(frames, dtype=np.int64), np.zeros(frames, dtype=np.int64)
-    in_bands(_chain_kernel, frames, placed, keys, strong, by_strength, borders, shape, order, ends, filled, chains)
-    none = np.zeros(0, dtype=np.int32)
-    parts = list(zip(borders, filled, chains, strict=False))
-    lengths = np.concatenate([none, *(np.diff(ends[a : a + count], prepend=0) for a, _, count in parts)])
-    return (
-        np.concatenate([none, *(order[a : a + count] for a, count, _ in parts)]),
-        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
-        np.repeat(np.arange(len(chains), dtype=np.int32), chains),
-    )
-
-
-@kernel
-def _order_kernel(begin: int, end: int, keys: Any, borders: Any, order: Any) -> None:
-    """For each frame the order of its rising keys, ties by index (radix sort, eleven bits at a time)."""
-    for frame in range(begin, end):
-        first, last = borders[frame], borders[frame + 1]
-        now = np.zeros(last - first, dtype=np.int32)
-        for k in range(last - first):
-            now[k] = k
-        following = np.zeros(last - first, dtype=np.int32)
-        for shift in (0, 11, 22):
-            place = np.zeros(2049, dtype=np.int64)
-            for i in range(first, last):
-                place[((keys[i] >> shift) & 2047) + 1] += 1
-            for digit in range(2048):
-                place[digit + 1] += place[digit]
-            for at in range(last - first):
-                k = now[at]
-                digit = (keys[first + k] >> shift) & 2047
-                following[place[digit]] = k
-                place[digit] += 1
-            now, following = following, now
-        for at in range(last - first):
-            order[first + at] = now[at]
+    order, ends = np.zeros(len(placed), dtype=np.int32), np.zeros(len(placed) + 1, dtype=np.int32)
+    count = _chain_kernel(placed, keys, strong, by_strength.astype(np.int32), shape, order, ends)
+    return order[: ends[count]], ends[: count + 1]
 
 
 @kernel
 def _chain_kernel(
-    begin: int, end: int, placed: Any, keys: Any, strong: Any, by_strength: Any, borders: Any, shape: Any,
-    order: Any, ends: Any, filled: Any, chains: Any,
-) -> None:  # fmt: skip
-    """Chain each frame into its own part of the results.
+    placed: Any, keys: Any, strong: Any, by_strength: Any, shape: Any, order: Any, offsets: Any
+) -> int:  # fmt: skip
+    """Fill in order and offsets, and return the number of chains.
 
-    placed : (n, 4) x, y and normal of each point; keys : (n,) uint32, rising from the strongest. Fills in order, the
-    ends of the chains within each frame's part, and how much of either each frame has filled.
+    placed : (n, 4) x, y and normal of each point; keys : (n,) uint32, rising from the strongest.
     """
     height, width = shape
-    most = np.int64(0)
-    for frame in range(begin, end):
-        most = max(most, borders[frame + 1] - borders[frame])
     # at : one more than the point that a pixel holds and no chain has used; 0 for none. In tiles, see `_place`.
     at = np.zeros(-(-height // 4) * -(-width // 4) * 16, dtype=np.int32)
     # Whether a chain may begin at a point: to ask that takes less memory, and so less time, than to look at its pixel.
-    may_start = np.zeros(most, dtype=np.bool_)
-    ahead = np.zeros(most, dtype=np.int32)
-    behind = np.zeros(most, dtype=np.int32)
-    for frame in range(begin, end):
-        first, last = borders[frame], borders[frame + 1]
-        for i in range(first, last):
-            may_start[i - first] = False
-            row, column = _pixel(placed, i, height, width)
-            here = _place(row, column, width)
-            # Where two points fall into one pixel the stronger is kept, the first of equals.
-            other = at[here] - 1
-            if other < 0 or keys[i] < keys[other]:
-                at[here] = i + 1
-                may_start[i - first] = strong[i]
-                if other >= 0:
-                    may_start[other - first] = False
-        place = first
-        for k in range(first, last):
-            if not may_start[by_strength[k]]:
-                continue
-            start = first + by_strength[k]
-            row, column = _pixel(placed, start, height, width)
-            at[_place(row, column, width)] = 0
-            forward = _trace(start, 1.0, at, height, width, placed, first, may_start, ahead)
-            backward = _trace(start, -1.0, at, height, width, placed, first, may_start, behind)
-            if forward + backward == 0:
-                continue
-            for j in range(backward - 1, -1, -1):
-                order[place] = behind[j]
-                place += 1
-            order[place] = start
+    may_start = np.zeros(len(placed), dtype=np.bool_)
+    ahead = np.zeros(len(placed), dtype=np.int32)
+    behind = np.zeros(len(placed), dtype=np.int32)
+    for i in range(len(placed)):
+        row, column = _pixel(placed, i, height, width)
+        here = _place(row, column, width)
+        # Where two points fall into one pixel the stronger is kept, the first of equals.
+        other = at[here] - 1
+        if other < 0 or keys[i] < keys[other]:
+            at[here] = i + 1
+            may_start[i] = strong[i]
+            if other >= 0:
+                may_start[other] = False
+    place, chains = 0, 0
+    for start in by_strength:
+        if not may_start[start]:
+            continue
+        row, column = _pixel(placed, start, height, width)
+        at[_place(row, column, width)] = 0
+        forward = _trace(start, 1.0, at, height, width, placed, may_start, ahead)
+        backward = _trace(start, -1.0, at, height, width, placed, may_start, behind)
+        if forward + backward == 0:
+            continue
+        for j in range(backward - 1, -1, -1):
+            order[place] = behind[j]
             place += 1
-            for j in range(forward):
-                order[place] = ahead[j]
-                place += 1
-            ends[first + chains[frame]] = place - first
-            chains[frame] += 1
-        filled[frame] = place - first
-        for i in range(first, last):
-            row, column = _pixel(placed, i, height, width)
-            at[_place(row, column, width)] = 0
+        order[place] = start
+        place += 1
+        for j in range(forward):
+            order[place] = ahead[j]
+            place += 1
+        chains += 1
+        offsets[chains] = place
+    return chains
 
 
 @kernel_part(inline="always")
@@ -162,7 +114,7 @@ def _place(row: int, column: int, width: int) -> Any:
 
 @kernel_part
 def _trace(
-    start: int, sign: float, at: Any, height: int, width: int, placed: Any, first: int, may_start: Any, out: Any
+    start: int, sign: float, at: Any, height: int, width: int, placed: Any, may_start: Any, out: Any
 ) -> int:  # fmt: skip
     current = start
     row, column = _pixel(placed, current, height, width)
@@ -179,7 +131,7 @@ def _trace(
             double = at[here] - 1
             if double >= 0 and _is_double(current, double, placed):
                 at[here] = 0
-                may_start[double - first] = False
+                may_start[double] = False
         best = -1
         best_cost = np.nan
         best_distance = 0.0
@@ -210,7 +162,7 @@ def _trace(
             return count
         row, column = best_row, best_column
         at[_place(row, column, width)] = 0
-        may_start[best - first] = False
+        may_start[best] = False
         out[count] = best
         count += 1
         tangent_x, tangent_y = -placed[best, 3], placed[best, 2]

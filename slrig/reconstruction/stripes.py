@@ -8,7 +8,7 @@ minus its inverse, found along its gradient by the same two steps. Both give poi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.model import FloatArray, IntArray
-from slrig.reconstruction.chaining import chain_frames
+from slrig.reconstruction.chaining import chain_points
 from slrig.reconstruction.steger import EDGE, RIDGE, kernels, newton_step, taylor_step
 
 
@@ -83,21 +83,16 @@ def chained(frames: Sequence[LinePoints], shape: tuple[int, int], /) -> Stripes:
         found = []
         for index in range(first, last):
             points, normals, strength, strong, sigma_px = frames[index]
-            borders = np.array([0, len(points)], dtype=np.int64)
-            order, offsets, frame = chain_frames(points, normals, strength, strong, borders, shape)
-            found.append(Stripes(offsets, frame + np.int32(index), *gathered(order, points, normals, sigma_px)))
+            order, offsets = chain_points(points, normals, strength, strong, shape)
+            frame = np.full(len(offsets) - 1, index, dtype=np.int32)
+            found.append(Stripes(offsets, frame, *gathered(order, points, normals, sigma_px)))
         return found
 
     none = Stripes(np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     parts = [none, *(each for band in in_bands(chain, len(frames)) for each in band)]
     lengths = np.concatenate([np.diff(each.offsets) for each in parts])
-    return Stripes(
-        np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32),
-        np.concatenate([each.frame for each in parts]),
-        np.concatenate([each.points_px for each in parts]),
-        np.concatenate([each.normals for each in parts]),
-        np.concatenate([each.sigma_px for each in parts]),
-    )
+    joined = (np.concatenate([getattr(each, field.name) for each in parts]) for field in fields(Stripes)[1:])
+    return Stripes(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32), *joined)
 
 
 def gathered(

@@ -45,18 +45,10 @@ def causes_picture(camera: str) -> str:
 CAMERA_PICTURES = (rejected_picture, causes_picture)
 
 
-def not_offered(names: Iterable[str], cameras: Iterable[str] | None) -> tuple[str, ...]:
-    """The names that no scan has, in the order given. cameras : of the rig; None takes any.
+def offered(cameras: Iterable[str]) -> tuple[str, ...]:
+    """The names of a scan's files. cameras : of the rig.
 
-    >>> not_offered(["mesh.ply", "mesh.e57", "rejected-left.png"], ["right"])
-    ('mesh.e57', 'rejected-left.png')
+    >>> offered(["left"])[-3:]
+    ('rejected-left.png', 'causes-left.png', 'bundle.zip')
     """
-    pictures = None if cameras is None else {named(camera) for camera in cameras for named in CAMERA_PICTURES}
-    ends = [named("\0").split("\0") for named in CAMERA_PICTURES]
-
-    def is_picture(name: str) -> bool:
-        if pictures is not None:
-            return name in pictures
-        return any(name.startswith(before) and name.endswith(after) for before, after in ends)
-
-    return tuple(name for name in names if name not in MEDIA_TYPES and name != BUNDLE_ZIP and not is_picture(name))
+    return *MEDIA_TYPES, *(named(camera) for camera in cameras for named in CAMERA_PICTURES), BUNDLE_ZIP

@@ -43,39 +43,25 @@ _REJECTION_WIDTH_PX = 1600 - _LEGEND_PX
 _LEGEND_ROW_PX = 30
 _LEAST_ROWS = (len(Refusal) + 2) * _LEGEND_ROW_PX
 
-# After Okabe and Ito, "Color universal design": told apart by colour-blind readers too. Blue, green, red.
-_COLOURS: dict[Refusal, tuple[int, int, int]] = {
-    Refusal.NONE: (200, 200, 200),
-    Refusal.NOT_LIT: (30, 26, 24),
-    Refusal.SATURATED: (66, 228, 240),
-    Refusal.AMBIGUOUS_BIT: (0, 159, 230),
-    Refusal.BEYOND_PROJECTOR: (178, 114, 0),
-    Refusal.AMBIGUOUS_LINE: (233, 180, 86),
-    Refusal.STRAY_CODE: (0, 94, 213),
-    Refusal.SHORT_STRIPE: (167, 121, 204),
-    Refusal.SHADOW_EDGE: (115, 158, 0),
-    Refusal.DEPTH_EDGE: (255, 0, 170),
-    Refusal.OFF_PROJECTOR: (60, 90, 140),
-    Refusal.BEHIND_DEVICE: (150, 150, 0),
-    Refusal.NO_INTERSECTION: (120, 40, 120),
-    Refusal.SHEET_SEEN_ALONG: (90, 90, 200),
-}
-
-_WORDS: Mapping[Refusal, str] = {
-    Refusal.NONE: "measured",
-    Refusal.NOT_LIT: "no light, or too little: in shadow, or too dark",
-    Refusal.SATURATED: "too bright: the camera is at its limit",
-    Refusal.AMBIGUOUS_BIT: "the code cannot be read: its light and dark frames differ too little",
-    Refusal.BEYOND_PROJECTOR: "the code names a place that the projector has not, or a line that its border cuts",
-    Refusal.AMBIGUOUS_LINE: "on the boundary of two codes that mean different lines",
-    Refusal.STRAY_CODE: "the code differs from that of the rest of its stripe",
-    Refusal.SHORT_STRIPE: "the stripe is too short to be trusted",
-    Refusal.SHADOW_EDGE: "at the edge of a shadow, which displaces the stripe",
-    Refusal.DEPTH_EDGE: "two surfaces in one pixel: a step in depth is near",
-    Refusal.OFF_PROJECTOR: "its ray meets the light where the projector has no pixel",
-    Refusal.BEHIND_DEVICE: "its ray meets the light behind the camera or the projector",
-    Refusal.NO_INTERSECTION: "its ray does not meet the light",
-    Refusal.SHEET_SEEN_ALONG: "its ray runs along the light, so there is no depth",
+# Colours, blue, green, red, after Okabe and Ito, "Color universal design": told apart by colour-blind readers too.
+_CAUSES: Mapping[Refusal, tuple[tuple[int, int, int], str]] = {
+    Refusal.NONE: ((200, 200, 200), "measured"),
+    Refusal.NOT_LIT: ((30, 26, 24), "no light, or too little: in shadow, or too dark"),
+    Refusal.SATURATED: ((66, 228, 240), "too bright: the camera is at its limit"),
+    Refusal.AMBIGUOUS_BIT: ((0, 159, 230), "the code cannot be read: its light and dark frames differ too little"),
+    Refusal.BEYOND_PROJECTOR: (
+        (178, 114, 0),
+        "the code names a place that the projector has not, or a line that its border cuts",
+    ),
+    Refusal.AMBIGUOUS_LINE: ((233, 180, 86), "on the boundary of two codes that mean different lines"),
+    Refusal.STRAY_CODE: ((0, 94, 213), "the code differs from that of the rest of its stripe"),
+    Refusal.SHORT_STRIPE: ((167, 121, 204), "the stripe is too short to be trusted"),
+    Refusal.SHADOW_EDGE: ((115, 158, 0), "at the edge of a shadow, which displaces the stripe"),
+    Refusal.DEPTH_EDGE: ((255, 0, 170), "two surfaces in one pixel: a step in depth is near"),
+    Refusal.OFF_PROJECTOR: ((60, 90, 140), "its ray meets the light where the projector has no pixel"),
+    Refusal.BEHIND_DEVICE: ((150, 150, 0), "its ray meets the light behind the camera or the projector"),
+    Refusal.NO_INTERSECTION: ((120, 40, 120), "its ray does not meet the light"),
+    Refusal.SHEET_SEEN_ALONG: ((90, 90, 200), "its ray runs along the light, so there is no depth"),
 }
 
 
@@ -117,7 +103,7 @@ def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, 
     refusals : (H, W) uint8, `Refusal`.
     white : (H, W) the white frame, shown where a pixel was not refused; `full_scale` its saturated value.
     """
-    palette = np.array([_COLOURS[cause] for cause in Refusal], dtype=np.uint8)
+    palette = np.array([_CAUSES[cause][0] for cause in Refusal], dtype=np.uint8)
     picture = np.take(palette, refusals, axis=0)
     if white is not None:
         grey, _ = _displayed(white, full_scale, Size(white.shape[1], white.shape[0]))
@@ -145,12 +131,8 @@ def described_causes() -> list[dict[str, str]]:
     '#f0e442'
     """
     return [
-        {
-            "name": cause.name.lower(),
-            "words": _WORDS[cause],
-            "colour": "#{2:02x}{1:02x}{0:02x}".format(*_COLOURS[cause]),
-        }
-        for cause in Refusal
+        {"name": cause.name.lower(), "words": words, "colour": f"#{red:02x}{green:02x}{blue:02x}"}
+        for cause, ((blue, green, red), words) in sorted(_CAUSES.items())
     ]
 
 
@@ -255,7 +237,7 @@ def _draw_legend(page: Picture, left: int, counts: NDArray[np.int64]) -> None:
     for line, cause in enumerate(Refusal, start=1):
         row = 24 + line * _LEGEND_ROW_PX
         name = "measured" if cause is Refusal.NONE else cause.name.lower().replace("_", " ")
-        cv2.rectangle(page, (left, row - 13), (left + 16, row + 3), _COLOURS[cause], cv2.FILLED)
+        cv2.rectangle(page, (left, row - 13), (left + 16, row + 3), _CAUSES[cause][0], cv2.FILLED)
         cv2.rectangle(page, (left, row - 13), (left + 16, row + 3), _INK, 1)
         _text(page, name, (left + 26, row))
         for figure, right in ((f"{counts[cause]:,}", 248), (f"{counts[cause] / total:.1%}", 306)):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from slrig.model import Axis, FloatArray, Gray, IntArray, LineShift, Pinhole, Refusal, Size
 from slrig.patterns.gray import gray_bits
 from slrig.patterns.positions import LEAST_FROM_BORDER_PX, cell_count, edge_positions, index_of_word, line_positions
-from slrig.reconstruction.chaining import _LONGEST_STEP_PX, chain_frames
+from slrig.reconstruction.chaining import _LONGEST_STEP_PX, chain_points
 from slrig.reconstruction.decoding import CodeMap, DecodingLimits, decode
 from slrig.reconstruction.identification import CodedStripes, identify
 from slrig.reconstruction.linking import link
@@ -110,7 +110,7 @@ def test_chains_use_points_once_in_short_steps(seed: int, count: int) -> None:
     strength = rng.uniform(0, 1, count)
     strong = rng.random(count) < 0.5
     before = points.copy(), normals.copy(), strength.copy()
-    order, offsets, _ = chain_frames(points, normals, strength, strong, np.array([0, len(points)]), (30, 40))
+    order, offsets = chain_points(points, normals, strength, strong, (30, 40))
     assert len(set(order.tolist())) == len(order) == offsets[-1]
     assert offsets[0] == 0
     assert (np.diff(offsets) >= 2).all()

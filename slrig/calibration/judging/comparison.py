@@ -23,6 +23,7 @@ SAME_SIGMA = 3.0
 _GRID = 4
 _TURNS = 10
 _STEP_MM = 1e-3
+_DECIMALS = 6  # a nanometre, a millionth of a degree or a percent: what is less is rounding, and told as 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +93,7 @@ def comparison(first: Calibration, second: Calibration) -> Comparison:
     }
     moved_mm, motion = _moves(here, there, names, _volume(first, second, origin))
     rms, most = (float(np.sqrt((moved_mm**2).mean())), float(moved_mm.max())) if len(moved_mm) else (np.nan, np.nan)
+    rms, most = _told(rms), _told(most)
     missing = tuple(sorted(set(devices_of(first)) ^ set(devices_of(second))))
     words = [_move_words(rms, most, motion, shared=len(names))]
     words += [f"Only one of them has {name}; it is not compared." for name in missing]
@@ -167,12 +169,18 @@ def _device(name: str, here: Pinhole, there: Pinhole, spread: FloatArray, is_ori
 
 
 def _difference(value: float, sigma: float, text: str) -> Difference:
+    value = _told(value)
     told = text.format(value=value)
     if not sigma > 0:
         return Difference(value, sigma, f"{told}; how sure that is, is not known.")
     sigmas = abs(value) / sigma
     judged = "no more than chance" if sigmas <= SAME_SIGMA else "a real change"
     return Difference(value, sigma, f"{told}, {sigmas:.1f} σ: {judged}.")
+
+
+def _told(value: float) -> float:
+    """A figure without the rounding of its computation. Zero has no sign."""
+    return round(value, _DECIMALS) + 0.0
 
 
 def _direction(vector: FloatArray) -> FloatArray:
@@ -223,7 +231,7 @@ def _moves(
     if not np.isfinite(found).all():
         return np.full(len(found), np.nan), nowhere
     left, motion = without_rigid_motion(points_mm, found)
-    return np.asarray(np.linalg.norm(left, axis=1), dtype=np.float64), motion
+    return np.asarray(np.linalg.norm(left, axis=1), dtype=np.float64), RigidMotion(*map(_told, motion))
 
 
 def _pixels(devices: Mapping[str, Pinhole], names: list[str], points_mm: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from slrig.api.scopes import Scope
 from slrig.config import read_settings
 from tests.e2e.conftest import Start
 from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
+from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_calibration_walk import SLOW, Caller, write_rig
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Pat
     page.get_by_text("10 poses accepted. Still wanted:").wait_for()
     page.get_by_text("40 of 40 corners").first.wait_for()
     page.get_by_role("img", name="left: 78 % of the image covered").wait_for()
-    page.screenshot(path=str(tmp_path / "poses.png"), full_page=True)
+    looks_as_kept(page, "calibrate-poses")
 
     page.get_by_role("button", name="Solve").click()
     page.get_by_text("Solving …").wait_for()
@@ -76,7 +77,7 @@ def test_a_rig_is_calibrated_from_a_board_to_its_use(start: Start, tmp_path: Pat
     page.get_by_role("button", name="Use it").click()
     page.get_by_role("banner").get_by_text("ready").wait_for()
     assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "solved.png"), full_page=True)
+    looks_as_kept(page, "calibrate-solved")
     with page.context.expect_page() as report:
         page.get_by_role("link", name="Report with pictures").click()
     report.value.get_by_role("heading", name="walk").first.wait_for()
@@ -111,7 +112,7 @@ def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, vi
         picture = page.get_by_role("img", name="Live picture of camera left")
         page.wait_for_function("image => image.naturalWidth > 0", arg=picture.element_handle())
         page.get_by_text("the board goes here").wait_for()
-        page.screenshot(path=str(tmp_path / "live.png"), full_page=True)
+        looks_as_kept(page, "calibrate-phone-dark")
 
         # The space bar presses what has the focus, and shoots otherwise. The board did not move.
         page.get_by_role("heading", name="walk").click()
@@ -123,14 +124,12 @@ def test_one_person_shoots_from_two_metres_away(start: Start, tmp_path: Path, vi
         page.get_by_text("the same as pose 1").first.wait_for()
         assert violations(page) == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        page.screenshot(path=str(tmp_path / "refused.png"), full_page=True)
 
         page.get_by_role("button", name="Delete pose 1").click()
         page.get_by_text("0 poses accepted.").wait_for()
         page.get_by_role("button", name="3 s", exact=True).click()
         page.get_by_role("button", name="Shoot every 3 s").click()
         page.get_by_role("timer").get_by_text("2").wait_for()
-        page.screenshot(path=str(tmp_path / "timer.png"))
         page.get_by_text("✓ Pose 3 accepted").wait_for()
         page.get_by_role("timer").wait_for()
         assert violations(page) == []

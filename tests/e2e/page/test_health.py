@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from slrig.api.keys import KeyRing
-from slrig.api.scopes import Scope
-from slrig.config import ServiceSettings
-from tests.e2e.conftest import Start, write_rig
-from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
+from tests.e2e.conftest import Start
+from tests.e2e.page.conftest import Visit, count, disabled, violations
+from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_calibration_walk import SLOW
 from tests.e2e.test_calibration_walk import write_rig as write_board_rig
 
@@ -53,6 +51,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     picture = page.get_by_role("img", name="Expected error of a scan")
     assert picture.evaluate("(image) => image.decode().then(() => image.naturalWidth)") > 0
     assert violations(page) == []
+    looks_as_kept(page, "health")
 
     form = page.get_by_role("form", name="Add to the schedule")
     form.get_by_label("Minute, hour").fill("0 26 * * *")
@@ -75,7 +74,7 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     nights.get_by_text("The calibration is good").wait_for()
     nights.get_by_text("asked for by a person, not by the clock").wait_for()
     assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "health.png"), full_page=True)
+    looks_as_kept(page, "schedule", part=nights)
     nights.get_by_role("button", name="Remove").click()
     page.get_by_role("alertdialog").get_by_role("button", name="Remove it").click()
     page.get_by_text("Nothing is done by the clock yet.").wait_for()
@@ -86,19 +85,3 @@ def test_a_person_verifies_and_has_it_done_each_night(start: Start, tmp_path: Pa
     verify.get_by_text("What to do: check the projector's mount, and calibrate again.").wait_for()
     page.get_by_role("table", name="Last verifications").get_by_role("cell", name="Watch").wait_for()
     assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "drifted.png"), full_page=True)
-
-
-def test_health_of_an_uncalibrated_rig_on_a_phone_by_a_key_for_looking(
-    start: Start, tmp_path: Path, visit: Visit
-) -> None:
-    service = start(write_rig(tmp_path / "rig", head="carries_calibration = false"))
-    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
-    page = visit(service, "health", key=secret, size=PHONE, dark=True)
-    page.get_by_text("The rig has no calibration that could be verified.").wait_for()
-    page.get_by_text("Your key is not for calibrations.").wait_for()
-    page.get_by_text("Changing the schedule takes a key that may administer.").wait_for()
-    disabled(page.get_by_role("button", name="Verify now"))
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "phone.png"), full_page=True)

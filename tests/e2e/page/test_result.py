@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from slrig.model import FloatArray, Refusal
 from tests.e2e.conftest import Start, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, violations
+from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_browser import scanned
 
 if TYPE_CHECKING:
@@ -71,11 +72,12 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tm
     plain = picture(page)
     page.get_by_text(f"{report['mesh']['figures']['triangles']:,} triangles.").wait_for()
     assert (plain != plain[20, 20]).any(axis=2).mean() > 0.3
-    page.screenshot(path=str(tmp_path / "result.png"), full_page=True)
+    looks_as_kept(page, "result")
 
     page.get_by_role("button", name="Stripe").click()
     page.get_by_text(f"{report['frames']['projector_px'][0]} px").wait_for()
     coloured = picture(page)
+    looks_as_kept(page, "result-stripe")
     row = coloured[len(coloured) // 2]
     shown = np.flatnonzero((row != coloured[20, 20]).any(axis=1))[10:-10]
     greens = [float(part.mean()) for part in np.array_split(row[shown, 1].astype(float), 6)]

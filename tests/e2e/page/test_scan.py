@@ -11,6 +11,7 @@ from slrig.api.scopes import Scope
 from slrig.config import ServiceSettings
 from tests.e2e.conftest import KEY, Start, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, disabled, violations
+from tests.e2e.page.golden import looks_as_kept
 
 pytestmark = pytest.mark.slow
 
@@ -33,15 +34,16 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     # Told by the picture itself, so it is there.
     page.get_by_text("% saturated").wait_for()
     assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "live.png"))
+    looks_as_kept(page, "scan")
     page.get_by_role("button", name="Off").click()
 
     page.get_by_role("button", name="Scan", exact=True).click()
     progress = page.get_by_role("progressbar")
     progress.wait_for()
     assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "progress.png"))
-    # Whoever asked for it is led to the mesh; a page that is loaded anew still shows what is under way.
+    # A page that is loaded anew shows what is under way; it is still the one that asked for it, and is led to the mesh.
+    page.reload()
+    progress.wait_for()
     page.wait_for_url("**/#/scan/*-*")
     page.goto(f"{service.url}/#/scan")
     page.reload()
@@ -50,16 +52,16 @@ def test_a_new_user_logs_in_looks_and_scans(start: Start, tmp_path: Path, visit:
     count(page.get_by_role("list").get_by_role("link"), 1)
     assert violations(page) == []
 
-
-def test_a_phone_a_dark_room_and_a_key_for_looking(start: Start, tmp_path: Path, visit: Visit) -> None:
-    service = start(write_rig(tmp_path / "rig"))
+    # A phone, a dark room, and a key for looking.
     secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
     page = visit(service, key=secret, size=PHONE, dark=True, ignored="401")
     page.get_by_text("Your key is for looking only.").wait_for()
     disabled(page.get_by_role("button", name="Scan", exact=True))
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     assert violations(page) == []
-    page.screenshot(path=str(tmp_path / "phone.png"))
+    page.get_by_role("banner").get_by_text("ready").wait_for()
+    page.get_by_text("triangles, σ").wait_for()
+    looks_as_kept(page, "scan-phone-dark")
     page.get_by_role("button", name="Log out").click()
     page.get_by_label("Key").wait_for()
     assert page.evaluate("fetch('/scan').then((answer) => answer.status)") == 401

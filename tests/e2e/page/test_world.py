@@ -14,7 +14,8 @@ from slrig.api.scopes import Scope
 from slrig.config import ServiceSettings
 from slrig.jobs.records import utc_now
 from tests.e2e.conftest import KEY, Start, write_rig
-from tests.e2e.page.conftest import Visit, violations
+from tests.e2e.page.conftest import PHONE, Visit, disabled, violations
+from tests.e2e.page.golden import looks_as_kept
 
 pytestmark = pytest.mark.slow
 
@@ -22,10 +23,17 @@ COMPLAINT = "Failed to load resource"
 """What Chromium itself says of a request that is refused, or not answered."""
 
 
-def test_a_key_that_expires_leads_to_the_form_and_back_to_the_screen(
-    start: Start, tmp_path: Path, visit: Visit
-) -> None:
-    service = start(write_rig(tmp_path / "rig"))
+def test_a_camera_is_unplugged_and_a_key_expires(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig", faults="[head.faults]\nunplug_camera_at_frame = 5"))
+    page = visit(service, "scan")
+    page.get_by_text("None yet.").wait_for()
+    page.get_by_role("button", name="Scan", exact=True).click()
+    told = page.get_by_role("alert").filter(has_text="The last scan failed")
+    told.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
+    page.get_by_role("listitem").get_by_text("failed").wait_for()
+    assert violations(page) == []
+
+    # The form, and back to the screen.
     keys = ServiceSettings(data_dir=service.data).key_path
     secret = KeyRing(keys).add("Ann", [Scope.SCAN], life=timedelta(hours=1))
     page = visit(service, "devices", key=secret, ignored=COMPLAINT)
@@ -44,11 +52,21 @@ def test_a_key_that_expires_leads_to_the_form_and_back_to_the_screen(
     assert page.url.endswith("#/devices")
 
 
-def test_a_service_that_goes_and_comes_back(start: Start, tmp_path: Path, visit: Visit) -> None:
+def test_health_without_a_calibration_while_the_service_goes_and_comes_back(
+    start: Start, tmp_path: Path, visit: Visit
+) -> None:
     rig = write_rig(tmp_path / "rig", head="carries_calibration = false")
     service = start(rig)
-    page = visit(service, "health", ignored=COMPLAINT)
+    secret = KeyRing(ServiceSettings(data_dir=service.data).key_path).add("Ann", [Scope.LOOK])
+    page = visit(service, "health", key=secret, size=PHONE, dark=True, ignored=COMPLAINT)
     page.get_by_text("The rig has no calibration that could be verified.").wait_for()
+    page.get_by_text("Your key is not for calibrations.").wait_for()
+    page.get_by_text("Changing the schedule takes a key that may administer.").wait_for()
+    disabled(page.get_by_role("button", name="Verify now"))
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert violations(page) == []
+    page.get_by_role("banner").get_by_text("not calibrated").wait_for()
+    looks_as_kept(page, "health-phone-dark")
     service.stop()
     banner = page.get_by_role("alert").get_by_text("The service does not answer.")
     banner.wait_for()
@@ -62,30 +80,3 @@ def test_a_service_that_goes_and_comes_back(start: Start, tmp_path: Path, visit:
     page.get_by_label("Key").fill(KEY)
     page.keyboard.press("Enter")
     page.get_by_text("The rig has no calibration that could be verified.").wait_for()
-
-
-def test_a_camera_that_is_unplugged_is_told_in_words(start: Start, tmp_path: Path, visit: Visit) -> None:
-    service = start(write_rig(tmp_path / "rig", faults="[head.faults]\nunplug_camera_at_frame = 5"))
-    page = visit(service, "scan")
-    page.get_by_text("None yet.").wait_for()
-    page.get_by_role("button", name="Scan", exact=True).click()
-    told = page.get_by_role("alert").filter(has_text="The last scan failed")
-    told.get_by_text("camera 'left' is gone (unplugged or powered off); plug it in").wait_for()
-    page.get_by_role("listitem").get_by_text("failed").wait_for()
-    assert violations(page) == []
-
-
-def test_a_page_that_is_loaded_anew_in_the_middle_of_a_scan_loses_nothing(
-    start: Start, tmp_path: Path, visit: Visit
-) -> None:
-    service = start(write_rig(tmp_path / "rig", head="realtime = true"))
-    page = visit(service, "scan")
-    page.get_by_text("None yet.").wait_for()
-    page.get_by_role("button", name="Scan", exact=True).click()
-    page.get_by_role("progressbar").wait_for()
-    page.reload()
-    page.get_by_role("progressbar").wait_for()
-    # It is still the page that asked for it, and so leads to the mesh.
-    page.wait_for_url("**/#/scan/*-*")
-    with service.client() as client:
-        assert len(client.get("/scan")["scans"]) == 1

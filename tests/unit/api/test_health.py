@@ -56,9 +56,8 @@ def test_a_verification_changes_the_health(client: TestClient) -> None:
     assert before["state"] == "unknown"
     assert before["calibration"] == "0123456789ab"
     assert before["refuses_scans_when_stale"] is True
-    assert before["thresholds"] == {
-        "watch_mean_px": 0.1, "stale_mean_px": 0.3, "watch_error_ratio": 1.4, "stale_error_ratio": 3.0,
-    }  # fmt: skip
+    told = {"watch_mean_px": 0.1, "stale_mean_px": 0.3, "watch_error_ratio": 1.4, "stale_error_ratio": 3.0}
+    assert before["thresholds"].items() >= told.items()
     answer = client.post("/rig/verification", json={"board": BOARD}, headers={"Idempotency-Key": "k"})
     assert answer.status_code == 202
     again = client.post("/rig/verification", json={"board": BOARD}, headers={"Idempotency-Key": "k"})

@@ -16,7 +16,7 @@ from slrig.reconstruction.chaining import (
     _SAME_LINE_ANGLE,
     _SAME_LINE_PX,
     _SHARPEST_TURN,
-    chain_frames,
+    chain_points,
 )
 
 SHAPE = (60, 80)
@@ -36,8 +36,7 @@ class Found(NamedTuple):
     def chained(self, *, strong: NDArray[np.bool_] | None = None) -> list[list[int]]:
         """The chains as lists of indices."""
         may_start = np.ones(len(self.points_px), dtype=np.bool_) if strong is None else strong
-        borders = np.array([0, len(self.points_px)])
-        order, offsets, _ = chain_frames(self.points_px, self.normals, self.strength, may_start, borders, SHAPE)
+        order, offsets = chain_points(self.points_px, self.normals, self.strength, may_start, SHAPE)
         return [order[a:b].tolist() for a, b in pairwise(offsets)]
 
 

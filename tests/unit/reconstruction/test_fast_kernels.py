@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import cv2
 import numpy as np
 import pytest
 
-from slrig.kernels import in_bands
 from slrig.model import FloatArray
-from slrig.reconstruction.chaining import _order_kernel, chain_frames
+from slrig.reconstruction.chaining import chain_points
 from slrig.reconstruction.sheet_curves import SheetCurves
 from slrig.reconstruction.steger import (
     _TAYLOR_BOX,
@@ -21,7 +18,7 @@ from slrig.reconstruction.steger import (
     newton_step,
     taylor_step,
 )
-from slrig.reconstruction.stripes import gathered
+from slrig.reconstruction.stripes import LinePoints, chained, gathered
 
 KINDS = pytest.mark.parametrize("kind", [RIDGE, EDGE])
 
@@ -152,37 +149,26 @@ def test_second_step_is_taken_from_kernels_centred_on_the_first(kind: int) -> No
     assert 20 < kept.sum() < 280
 
 
-@pytest.mark.parametrize("counts", [[0], [1, 0, 700], [2500, 3]])
-def test_keys_are_ordered_frame_by_frame_with_ties_by_index(counts: list[int]) -> None:
-    rng = np.random.default_rng(3)
-    borders = np.cumsum([0, *counts])
-    keys = rng.integers(0, 2**32, borders[-1], dtype=np.uint32)
-    keys[::3] = keys[: len(keys[::3])] & np.uint32(0xFFC00003)
-    order = np.zeros(len(keys), dtype=np.int32)
-    in_bands(_order_kernel, len(counts), keys, borders, order)
-    for a, b in pairwise(borders):
-        np.testing.assert_array_equal(order[a:b], np.argsort(keys[a:b], kind="stable"))
-
-
 def test_frames_are_chained_each_by_itself() -> None:
     rng = np.random.default_rng(6)
     y = np.arange(3.0, 40)
     lines = [np.stack([20 + shift + 0.2 * y + rng.normal(0, 0.05, len(y)), y], axis=1) for shift in (0.0, 4.0, 0.4)]
-    points = np.concatenate([lines[0], lines[1], lines[0], lines[2]])
-    normals = np.tile([1.0, -0.2] / np.hypot(1.0, 0.2), (len(points), 1))
-    strength, strong = rng.uniform(1, 2, len(points)), rng.uniform(0, 1, len(points)) > 0.3
-    borders = np.array([0, 2 * len(y), 2 * len(y), 4 * len(y)])
-    order, offsets, frame = chain_frames(points, normals, strength, strong, borders, (50, 60))
-    parts = [slice(a, b) for a, b in pairwise(borders)]
-    alone = []
-    for p in parts:
-        whole = np.array([0, len(points[p])])
-        alone.append(chain_frames(points[p], normals[p], strength[p], strong[p], whole, (50, 60))[:2])
-    assert order.tolist() == [int(i + b) for (each, _), b in zip(alone, borders, strict=False) for i in each]
-    lengths = [int(n) for _, each in alone for n in np.diff(each)]
-    assert np.diff(offsets).tolist() == lengths
-    assert frame.tolist() == [k for k, (_, each) in enumerate(alone) for _ in range(len(each) - 1)]
-    assert set(frame.tolist()) == {0, 2}
+    normals = np.tile([1.0, -0.2] / np.hypot(1.0, 0.2), (2 * len(y), 1))
+
+    def frame(*points: FloatArray) -> LinePoints:
+        count = len(y) * len(points)
+        strength, strong = rng.uniform(1, 2, count), rng.uniform(0, 1, count) > 0.3
+        placed = np.concatenate([np.zeros((0, 2)), *points])
+        return LinePoints(placed, normals[:count], strength, strong, rng.uniform(0.1, 0.2, count))
+
+    frames = [frame(lines[0], lines[1]), frame(), frame(lines[0], lines[2])]
+    stripes = chained(frames, (50, 60))
+    alone = [chained([each], (50, 60)) for each in frames]
+    assert set(stripes.frame.tolist()) == {0, 2}
+    assert stripes.frame.tolist() == [k for k, each in enumerate(alone) for _ in range(len(each))]
+    assert np.diff(stripes.offsets).tolist() == [int(n) for each in alone for n in np.diff(each.offsets)]
+    for name in ("points_px", "normals", "sigma_px"):
+        np.testing.assert_array_equal(getattr(stripes, name), np.concatenate([getattr(each, name) for each in alone]))
 
 
 @pytest.mark.parametrize("strengths", [(1.0, 2.0), (2.0, 1.0), (2.0, 2.0)])
@@ -192,7 +178,7 @@ def test_of_two_points_in_one_pixel_the_stronger_is_chained(strengths: tuple[flo
     strength = np.full(10, 3.0)
     strength[4:6] = strengths
     normals, strong = np.tile([1.0, 0.0], (10, 1)), np.ones(10, dtype=np.bool_)
-    order, offsets, _ = chain_frames(points, normals, strength, strong, np.array([0, 10]), (41, 43))
+    order, offsets = chain_points(points, normals, strength, strong, (41, 43))
     left_out = 4 if strengths[1] > strengths[0] else 5
     assert sorted(order.tolist()) == [i for i in range(10) if i != left_out]
     assert offsets.tolist() == [0, 9]

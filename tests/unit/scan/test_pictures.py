@@ -14,7 +14,7 @@ from slrig.errors import StorageError
 from slrig.meshing import rasteriser
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import pictures
-from slrig.scan.pictures import _COLOURS, described_causes, encode_png, preview, rejection_picture
+from slrig.scan.pictures import _CAUSES, described_causes, encode_png, preview, rejection_picture
 
 SIZE = Size(640, 480)
 PANEL = Size(520, 390)
@@ -230,8 +230,8 @@ def test_pictures_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Mon
 
 
 def test_every_cause_has_a_colour_of_its_own() -> None:
-    assert set(_COLOURS) == set(Refusal)
-    assert len(set(_COLOURS.values())) == len(Refusal)
+    assert set(_CAUSES) == set(Refusal)
+    assert len({colour for colour, _ in _CAUSES.values()}) == len(Refusal)
     described = described_causes()
     assert [each["name"].upper() for each in described] == [cause.name for cause in Refusal]
     assert len({each["words"] for each in described}) == len(Refusal)
@@ -244,10 +244,10 @@ def test_refused_pixels_have_their_cause_in_colour_and_legend() -> None:
     picture = rejection_picture(refusals, np.full((600, 800), 180, dtype=np.uint8), 255)
     legend = picture[:, 800:]
     for cause in Refusal:
-        swatch = (legend == np.array(_COLOURS[cause], dtype=np.uint8)).all(axis=2)
+        swatch = (legend == np.array(_CAUSES[cause][0], dtype=np.uint8)).all(axis=2)
         assert swatch.sum() >= 100, cause.name
         if cause is not Refusal.NONE:
-            assert tuple(picture[40 * cause + 20, 200]) == _COLOURS[cause]
+            assert tuple(picture[40 * cause + 20, 200]) == _CAUSES[cause][0]
     assert tuple(picture[599, 799]) == (180, 180, 180)
 
 
@@ -262,7 +262,7 @@ def test_a_rejection_picture_of_any_camera_is_legible(shape: tuple[int, int]) ->
     picture = rejection_picture(np.full(shape, Refusal.SHADOW_EDGE, dtype=np.uint8))
     assert 330 < picture.shape[1] <= 1600
     assert picture.shape[0] >= 30 * len(Refusal)
-    assert tuple(picture[0, 0]) == _COLOURS[Refusal.SHADOW_EDGE]
+    assert tuple(picture[0, 0]) == _CAUSES[Refusal.SHADOW_EDGE][0]
 
 
 def test_a_png_is_read_back_as_it_was() -> None:
