@@ -135,6 +135,9 @@ class ProjectorOptions(Device):
     flicker_depth: Fraction = 0.0
     """How far it swings, as a fraction of the mean."""
 
+    lights: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)] | None = (1 / 3, 1 / 3, 1 / 3)
+    """How bright grey is in its blue, green and red light alone, of what it is in white."""
+
     max_patterns: Annotated[int, Field(ge=1)] = 1024
     """The longest sequence that it takes."""
 

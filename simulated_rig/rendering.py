@@ -181,6 +181,8 @@ class View:
                 1 if ambient is None else ambient
             )
             for fraction, light in lights:
+                if light.channel not in (None, number):
+                    continue
                 total = total + np.asarray(fraction, np.float32) * self._lit(seen, paths, light)
             return total
 
@@ -200,7 +202,9 @@ class View:
         return seen.last[1]
 
     def _lit(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
-        image = self._defocused(seen, paths, light)
+        if light.channel is not None:
+            paths = paths.in_light(light.channel)
+        image = self._defocused(seen, paths, light) * np.float32(light.power)
         if light.glow > 0:
             image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
         return image

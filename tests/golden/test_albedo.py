@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,8 @@ from simulated_rig.options import HeadOptions
 from simulated_rig.scene import read_scene, surface_of
 from simulated_rig.transport import trace
 from slrig.bundle import read_bundle
-from slrig.model import AlbedoMark, FloatArray, Pinhole, White
+from slrig.capture.evidence import check_capture
+from slrig.model import AlbedoMark, Black, Capture, FloatArray, Pinhole, Primary, White
 from slrig.scan.artefacts import decode_mesh_ply
 from slrig.scan.plan import ScanPlan
 from tests.golden.test_bracketing import captured, reconstructed
@@ -219,3 +221,53 @@ def test_a_camera_that_has_colour_gives_each_channel_as_it_is_painted(tmp_path: 
     # Between channels there is one scale: how strongly the camera sees each, and no more.
     red, blue = (np.median(each.found[each.sound] / each.truth[each.sound]) for each in (seen[0], seen[2]))
     assert red / blue == pytest.approx(0.8 / 0.7, rel=0.02)
+
+
+TINTED = {
+    'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': "colour = [0.25, 0.6, 0.95]\n"
+    'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0, colour = [0.9, 0.5, 0.3] }'
+}
+
+
+def old_frames_are_told(capture: Capture) -> None:
+    """A frame in coloured light that shows the pattern before, or lends its picture to the one after."""
+    shown = {shot.pattern: shot.image for shot in capture.shots}
+    for index in (i for i, pattern in enumerate(capture.patterns) if isinstance(pattern, Primary)):
+        for old, at in ((index - 1, index), (index, index + 1)):
+            shots = (replace(shot, image=shown[old]) if shot.pattern == at else shot for shot in capture.shots)
+            faults = check_capture(replace(capture, shots=tuple(shots))).faults
+            assert any(f"pattern {at} " in fault for fault in faults), (old, at)
+        for end in (White(), Black()):
+            image = shown[capture.patterns.index(end)]
+            shots = (replace(shot, image=image) if shot.pattern == index else shot for shot in capture.shots)
+            assert check_capture(replace(capture, shots=tuple(shots))).verified == len(capture.patterns) - 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exposures_s", [None, (0.01, 0.03)])
+def test_lights_of_the_projector_give_a_mono_camera_colour(
+    exposures_s: tuple[float, ...] | None, tmp_path: Path
+) -> None:
+    plan = ScanPlan(coloured_light=True, exposures_s=exposures_s)
+    seen = channels(rig_file(tmp_path, "relief", scene=TINTED, head=SMALL), tmp_path, plan)
+    assert len(seen) == 3
+    for name, channel in zip(("red", "green", "blue"), seen, strict=True):
+        rms, correlation = channel.told(f"{name} light", channel.found)
+        assert rms <= 0.05
+        assert correlation >= 0.85
+    assert seen[0].report["evidence"]["contradictions"] == []
+    count = len(read_bundle(tmp_path / "bundle").capture.patterns)
+    assert seen[0].report["evidence"]["patterns_verified"] == f"{count}/{count}"
+    if exposures_s is None:
+        old_frames_are_told(read_bundle(tmp_path / "bundle").capture)
+    # Without these frames, the same surface to the last bit.
+    description = tmp_path / "bundle" / "bundle.json"
+    told = json.loads(description.read_text())
+    kinds = [pattern["kind"] for pattern in told["patterns"]]
+    told["frames"] = [frame for frame in told["frames"] if kinds[frame["pattern"]] != "primary"]
+    description.write_text(json.dumps(told))
+    report = reconstructed(tmp_path / "bundle", tmp_path / "grey")
+    assert report["albedo"]["channels"] == 1
+    with_light, without = (decode_mesh_ply((tmp_path / each / "mesh.ply").read_bytes()) for each in ("out", "grey"))
+    for name in ("vertices_mm", "faces", "normals", "sigma_mm"):
+        assert getattr(with_light, name).tobytes() == getattr(without, name).tobytes(), name
