@@ -22,10 +22,12 @@ from simulated_rig.casting import caster
 from simulated_rig.options import HeadOptions
 from simulated_rig.scene import read_scene, surface_of
 from simulated_rig.transport import trace
-from slrig.bundle import read_bundle
+from slrig.bundle import read_bundle, read_calibration, write_calibration
 from slrig.capture.evidence import check_capture
-from slrig.model import AlbedoMark, Black, Capture, FloatArray, Pinhole, Primary, White
+from slrig.errors import CalibrationError
+from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Pinhole, Primary, White
 from slrig.scan.artefacts import decode_mesh_ply
+from slrig.scan.light_board import with_light_map
 from slrig.scan.plan import ScanPlan
 from tests.golden.test_bracketing import captured, reconstructed
 
@@ -94,9 +96,12 @@ def painted(rig: Path, work: Path, plan: ScanPlan | None = None) -> Painted:
     return grey
 
 
-def channels(rig: Path, work: Path, plan: ScanPlan | None = None) -> list[Painted]:
+def channels(rig: Path, work: Path, plan: ScanPlan | None = None, *, mapped: LightMap | None = None) -> list[Painted]:
     """`painted` in each channel that a camera of the rig has: one, or red, green and blue."""
     bundle = captured(rig, plan or ScanPlan(), work / "bundle")
+    if mapped is not None:
+        known = read_calibration(bundle / "calibration.json")
+        write_calibration(bundle / "calibration.json", replace(known, light=mapped))
     report = reconstructed(bundle, work / "out")
     mesh = decode_mesh_ply((work / "out" / "mesh.ply").read_bytes())
     table = tomllib.loads(rig.read_text())["head"]
@@ -271,3 +276,70 @@ def test_lights_of_the_projector_give_a_mono_camera_colour(
     with_light, without = (decode_mesh_ply((tmp_path / each / "mesh.ply").read_bytes()) for each in ("out", "grey"))
     for name in ("vertices_mm", "faces", "normals", "sigma_mm"):
         assert getattr(with_light, name).tobytes() == getattr(without, name).tobytes(), name
+
+
+FALLS_OFF = {"gamma = 1.8": "gamma = 1.8\nfall_off = [4.0, 0.9]\nlights = [0.25, 0.5, 0.35]"}
+BOARD = """name = "board"
+
+[[object]]
+name = "board"
+shape = "plane"
+size_mm = [220.0, 180.0]
+rotation_deg = [4.0, -6.0, 0.0]
+albedo = 0.85
+"""
+
+
+def board(folder: Path, text: str, plan: ScanPlan) -> Path:
+    """The bundle of a scan of a board by a projector whose light falls off."""
+    folder.mkdir()
+    rig = rig_file(folder, "relief", scene={}, head={**SMALL, **FALLS_OFF})
+    (folder / "scene.toml").write_text(text)
+    return captured(rig, plan, folder / "bundle")
+
+
+@pytest.mark.slow
+def test_a_white_board_takes_the_projectors_fall_off_out_and_tells_what_is_white(tmp_path: Path) -> None:
+    plan = ScanPlan(coloured_light=True)
+    light = with_light_map(board(tmp_path / "board", BOARD, plan), lambda *_: None).light
+    assert light is not None
+    (tmp_path / "scan").mkdir()
+    rig = rig_file(tmp_path / "scan", "relief", scene=TINTED, head={**SMALL, **FALLS_OFF})
+    plain = channels(rig, tmp_path / "plain", plan)
+    seen = channels(rig, tmp_path / "mapped", plan, mapped=light)
+    for name, before, after in zip(("red", "green", "blue"), plain, seen, strict=True):
+        rms, correlation = after.told(f"{name}, with the map", after.found)
+        assert before.told("  without", before.found)[0] > 2 * rms
+        assert rms <= 0.05
+        assert correlation >= 0.85
+    # The board is white: one scale for all channels.
+    scales = [np.median(each.found[each.sound] / each.truth[each.sound]) for each in seen]
+    assert max(scales) / min(scales) < 1.02
+    assert seen[0].report["albedo"]["projector_light"] == "as measured on a white board"
+    assert plain[0].report["albedo"]["projector_light"].startswith("taken as even")
+    (tmp_path / "unpainted").mkdir()
+    rig = rig_file(tmp_path / "unpainted", "relief", scene={}, head={**SMALL, **FALLS_OFF})
+    (grey,) = channels(rig, tmp_path / "grey", mapped=light)
+    assert grey.told("grey, with the map", grey.found)[0] <= 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "exposure_s", "words"),
+    [
+        (
+            {"albedo = 0.85": 'albedo = 0.85\ntexture = { kind = "noise", contrast = 0.6, scale_mm = 9.0 }'},
+            None,
+            "smooth",
+        ),
+        ({"[220.0, 180.0]": "[40.0, 30.0]"}, None, "shows no board"),
+        ({}, 0.024, "is saturated"),
+        ({'shape = "plane"': 'shape = "sphere"', "size_mm = [220.0, 180.0]": "radius_mm = 60.0"}, None, "flat board"),
+    ],
+)
+def test_what_is_no_even_white_board_is_refused_in_words(
+    changes: Mapping[str, str], exposure_s: float | None, words: str, tmp_path: Path
+) -> None:
+    bundle = board(tmp_path / "board", replaced(BOARD, changes), ScanPlan(exposure_s=exposure_s))
+    with pytest.raises(CalibrationError, match=words):
+        with_light_map(bundle, lambda *_: None)
