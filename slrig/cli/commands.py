@@ -17,18 +17,9 @@ import typer.core
 
 from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
-from slrig.cli.options import (
-    AcceptanceOptions,
-    AsJson,
-    BoardOptions,
-    ColourOptions,
-    MeshOptions,
-    RigFile,
-    Service,
-    given,
-    grouped,
-)
+from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
+from slrig.cli.scan_options import ColourOptions
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130

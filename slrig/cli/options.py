@@ -100,21 +100,6 @@ class MeshOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class ColourOptions:
-    """What the command line says of a scan's colour; None where it says nothing."""
-
-    colour: Annotated[
-        bool | None, typer.Option(help="Keep white and black frames in colour. Default: where a camera has it.")
-    ] = None
-    coloured_light: Annotated[
-        bool | None,
-        typer.Option(
-            help="Play white in red, green and blue too, for cameras without colour. Default: the rig file's."
-        ),
-    ] = None
-
-
-@dataclass(frozen=True, slots=True)
 class AcceptanceOptions:
     """What the command line says of artefacts and limits; None where it says nothing. Lengths in mm."""
 

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
 from simulated_rig.casting import caster
 from simulated_rig.options import HeadOptions
@@ -24,6 +25,7 @@ from simulated_rig.scene import read_scene, surface_of
 from simulated_rig.transport import trace
 from slrig.bundle import read_bundle, read_calibration, write_calibration
 from slrig.capture.evidence import check_capture
+from slrig.cli.commands import app
 from slrig.errors import CalibrationError
 from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Pinhole, Primary, White
 from slrig.scan.artefacts import decode_mesh_ply
@@ -301,7 +303,11 @@ def board(folder: Path, text: str, plan: ScanPlan) -> Path:
 @pytest.mark.slow
 def test_a_white_board_takes_the_projectors_fall_off_out_and_tells_what_is_white(tmp_path: Path) -> None:
     plan = ScanPlan(coloured_light=True)
-    light = with_light_map(board(tmp_path / "board", BOARD, plan), lambda *_: None).light
+    output = tmp_path / "lit.json"
+    shot = board(tmp_path / "board", BOARD, plan)
+    told = CliRunner().invoke(app, ["calibrate", "light", str(shot), "--output", str(output)])
+    assert told.exit_code == 0, told.output
+    light = read_calibration(output).light
     assert light is not None
     (tmp_path / "scan").mkdir()
     rig = rig_file(tmp_path / "scan", "relief", scene=TINTED, head={**SMALL, **FALLS_OFF})
