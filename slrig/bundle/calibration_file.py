@@ -24,8 +24,6 @@ MOST_DEVICES = 16
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
 Distortion = Annotated[list[float], Field(min_length=5, max_length=5, description="k1, k2, p1, p2, k3")]
-
-
 Five, Two = Field(min_length=5, max_length=5), Field(min_length=2, max_length=2)
 
 
