@@ -35,6 +35,7 @@ class SimulatedHead:
             script.surface(0),
             lens,
             working_distance_mm=options.projector.working_distance_mm or float(np.linalg.norm(lens.centre_mm)),
+            fall_off=options.projector.fall_off,
         )
         swing = None
         if options.ambient_flicker_depth > 0:

@@ -60,7 +60,8 @@ class LightTable:
 
     columns, rows : (n,) float32; node i lies at the projector coordinate i / NODES_PER_PX - margin_px. glow : light
     that falls on everything alike, from elsewhere. softer : the same out of focus, for each of `defocus.LEVELS_PX` but
-    the first; none where the projector is sharp at every distance.
+    the first; none where the projector is sharp at every distance. channel, power : of one light alone, 0 blue, 1
+    green, 2 red, and how bright it is; None of white.
     """
 
     columns: Float32Array
@@ -68,6 +69,8 @@ class LightTable:
     margin_px: int
     glow: float = 0.0
     softer: tuple[LightTable, ...] = ()
+    channel: int | None = None
+    power: float = 1.0
 
     @property
     def peak(self) -> float:

@@ -135,6 +135,13 @@ class ProjectorOptions(Device):
     flicker_depth: Fraction = 0.0
     """How far it swings, as a fraction of the mean."""
 
+    fall_off: Annotated[tuple[NotNegative, Fraction], Field(strict=False)] = (0.0, 0.0)
+    """Light off its axis falls with the cosine to the power of the first, 4 of a simple lens; and in the corners by the
+    share of the second, elsewhere as the square of the distance from the axis."""
+
+    lights: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)] | None = (1 / 3, 1 / 3, 1 / 3)
+    """How bright grey is in its blue, green and red light alone, of what it is in white."""
+
     max_patterns: Annotated[int, Field(ge=1)] = 1024
     """The longest sequence that it takes."""
 

@@ -12,9 +12,10 @@ from simulated_rig.staging import Staging
 from simulated_rig.world import NS_PER_S, Flicker, Lamp, nanoseconds
 from slrig.devices import COMPUTED, Clock, ProjectorInfo, ProjectorState, Shown
 from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
-from slrig.model import PatternSequence
+from slrig.model import PatternSequence, Primary
 
 NAME = "projector"
+CHANNELS = ("blue", "green", "red")
 
 
 class SimulatedProjector:
@@ -50,6 +51,7 @@ class SimulatedProjector:
             latency_s=self._options.latency_s,
             refresh_s=None if self._options.refresh_hz is None else 1 / self._options.refresh_hz,
             limits=COMPUTED,
+            lights=self._options.lights is not None,
         )
 
     @property
@@ -96,7 +98,11 @@ class SimulatedProjector:
         if self._staging is not None:
             self._staging.shown()
         if index not in self._tables:
-            self._tables[index] = self._table(sequence.profiles[index])
+            table, pattern = self._table(sequence.profiles[index]), sequence.patterns[index]
+            if isinstance(pattern, Primary) and self._options.lights is not None:
+                channel = CHANNELS.index(pattern.colour)
+                table = replace(table, channel=channel, power=self._options.lights[channel])
+            self._tables[index] = table
         error_s = self._options.visible_error_s
         t_visible_ns = self._at_refresh(self._clock.now_ns() + nanoseconds(self._options.latency_s))
         off_s = float(self._rng.uniform(-error_s, error_s)) + self._faults.light_delay_s

@@ -43,8 +43,16 @@ class Setting:
 class Stage:
     """What stands before the cameras now, and the projector: exchanged as a whole when something moves."""
 
-    def __init__(self, surface: SceneSurface, projector: Pinhole, *, working_distance_mm: float) -> None:
+    def __init__(
+        self,
+        surface: SceneSurface,
+        projector: Pinhole,
+        *,
+        working_distance_mm: float,
+        fall_off: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
         self.setting = Setting(surface, projector)
+        self.fall_off = fall_off
         self.working_distance_mm = working_distance_mm
 
     @property
@@ -149,7 +157,18 @@ class View:
                 workers=self._workers,
                 told=told,
             )
+            if any(self._stage.fall_off):
+                self._let_fall_off(seen.paths, seen.setting.projector)
         return seen.paths
+
+    def _let_fall_off(self, paths: Paths, projector: Pinhole) -> None:
+        """Take from the light what the projector's lens takes: see `ProjectorOptions.fall_off`."""
+        power, corner = self._stage.fall_off
+        (fx, _, cx), (_, fy, cy), _ = projector.matrix
+        square = ((paths.column_px - cx) / fx) ** 2 + ((paths.row_px - cy) / fy) ** 2
+        width, height = projector.size.width_px, projector.size.height_px
+        farthest = (max(cx, width - cx) / fx) ** 2 + (max(cy, height - cy) / fy) ** 2
+        paths.weight[:] *= (1 + square) ** (-power / 2) * np.maximum(1 - corner * square / farthest, 0)
 
     def image(
         self, lights: Sequence[tuple[float | Float32Array, LightTable]], *, ambient: Float32Array | None = None
@@ -181,6 +200,8 @@ class View:
                 1 if ambient is None else ambient
             )
             for fraction, light in lights:
+                if light.channel not in (None, number):
+                    continue
                 total = total + np.asarray(fraction, np.float32) * self._lit(seen, paths, light)
             return total
 
@@ -200,7 +221,9 @@ class View:
         return seen.last[1]
 
     def _lit(self, seen: _Seen, paths: Paths, light: LightTable) -> Float32Array:
-        image = self._defocused(seen, paths, light)
+        if light.channel is not None:
+            paths = paths.in_light(light.channel)
+        image = self._defocused(seen, paths, light) * np.float32(light.power)
         if light.glow > 0:
             image += blurred(paths.albedo * np.float32(light.glow), self._blur_px)
         return image

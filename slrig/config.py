@@ -65,6 +65,9 @@ class ScanDefaults(Strict):
     colour: bool | None = Field(
         default=None, description="keep white and black frames in colour. Default: where a camera has it"
     )
+    coloured_light: bool | None = Field(
+        default=None, description="play white in red, green and blue too, for cameras without colour. Default: false"
+    )
 
 
 class DriverTable(Strict, use_attribute_docstrings=True):

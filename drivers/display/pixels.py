@@ -6,16 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import UnsupportedByDeviceError
-from slrig.model import Pixels
+from slrig.model import Pattern, Pixels, Primary
+
+_LIGHTS = {"red": 0x010000, "green": 0x000100, "blue": 0x000001}
 
 
-def coloured(levels: Pixels) -> NDArray[np.uint32]:
-    """Grey levels as pixels: (H, W) uint8 to (H, W) uint32, 0x00RRGGBB.
+def coloured(levels: Pixels, pattern: Pattern | None = None) -> NDArray[np.uint32]:
+    """Grey levels as pixels: (H, W) uint8 to (H, W) uint32, 0x00RRGGBB; in its light, of a `Primary`.
 
     >>> [hex(word) for word in coloured(np.array([[0, 255, 7]], np.uint8))[0]]
     ['0x0', '0xffffff', '0x70707']
     """
-    return np.asarray(levels.astype("<u4") * np.uint32(0x010101))
+    light = _LIGHTS[pattern.colour] if isinstance(pattern, Primary) else 0x010101
+    return np.asarray(levels.astype("<u4") * np.uint32(light))
 
 
 def require_same(output: str, wanted: NDArray[np.uint32], found: NDArray[np.uint32], remedy: str) -> None:

@@ -13,7 +13,7 @@ from drivers.display.timing import Presented, whole_light
 from drivers.display.working import OwnThread
 from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceError, DeviceStateError
-from slrig.model import PatternSequence
+from slrig.model import PatternSequence, Primary
 
 Result = TypeVar("Result")
 
@@ -61,6 +61,7 @@ class DisplayProjector:
             plays=False,
             latency_s=self._latency_s + self._latency_error_s + _USUAL_WAIT * self.refresh_s,
             refresh_s=self.refresh_s,
+            lights=True,
         )
         self._state = ProjectorState(f"the projector on output {options.output}")
         self._unchecked = False
@@ -134,7 +135,8 @@ class DisplayProjector:
         self._darkened.clear()
         presented = self._thread.do(lambda: self._stage.show(index), timeout_s=_SHOWS_IN_S)
         t_visible_ns, t_err_ns = self._light(presented)
-        if self._unchecked and not self._darkened.is_set():
+        grey = not isinstance(sequence.patterns[index], Primary)
+        if self._unchecked and grey and not self._darkened.is_set():
             self._thread.do(lambda: self._stage.compare(sequence.image(index)), timeout_s=_SHOWS_IN_S)
             self._unchecked = False
         if self._darkened.is_set():

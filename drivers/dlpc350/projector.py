@@ -12,6 +12,7 @@ from drivers.dlpc350.tables import Tables, tables_of
 from drivers.dlpc350.timing import DARK_US, MOST_PATTERNS, check_loading, check_timing, lit
 from drivers.pattern_engine.engine import Command as Shared
 from drivers.pattern_engine.link import Kind, Link
+from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
 from slrig.devices import ProjectorInfo, Shown
@@ -48,6 +49,7 @@ class LightEngine(PatternEngine[Engine]):
         self._flash = flash
         self._serial = serial
         self._places: tuple[Place, ...] = ()
+        self._colours: tuple[Colour, ...] = ()
         # What the engine was told last, and which picture it shows; None where that is not known.
         self._told: tuple[Timing, Tables] | None = None
         self._picture: int | None = None
@@ -71,6 +73,7 @@ class LightEngine(PatternEngine[Engine]):
             )
             raise UnsupportedByDeviceError(message)
         self._places = self._flash.places(sequence)
+        self._colours = tuple(map(self._options.colour_of, sequence.patterns))
         self._state.loaded = sequence
 
     def show(self, index: int) -> Shown:
@@ -90,7 +93,7 @@ class LightEngine(PatternEngine[Engine]):
             timing, count = Timing(alone_us - DARK_US, alone_us), 1
         check_timing(timing)
         with self._lock:
-            earliest_ns, running_ns = self._run((place,) * count, timing)
+            earliest_ns, running_ns = self._run((place,) * count, (self._colours[index],) * count, timing)
             self._begin_holding(alone_us / 1e6, again_s=(LEFT_ALONE_S - self._options.image_load_s) / 2)
         return self._shown(index, earliest_ns, running_ns + round(load_s * 1e9))
 
@@ -100,13 +103,13 @@ class LightEngine(PatternEngine[Engine]):
         self._require_proven()
         options = self._options
         timing = lit(exposure_s, period_s, margin_s=options.light_margin_s, duty_limit=options.duty_limit)
-        counts = tables_of(self._places, options.colour, dark_between=timing.dark_between).counts
+        counts = tables_of(self._places, self._colours, dark_between=timing.dark_between).counts
         check_loading(counts, timing.period_us, options.image_load_s)
-        self._run(self._places, timing)
+        self._run(self._places, self._colours, timing)
 
-    def _run(self, places: tuple[Place, ...], timing: Timing) -> tuple[int, int]:
+    def _run(self, places: tuple[Place, ...], colours: tuple[Colour, ...], timing: Timing) -> tuple[int, int]:
         """Stop, set, validate, start. Return when the command to start was sent, and when the engine said it runs."""
-        tables = tables_of(places, self._options.colour, dark_between=timing.dark_between)
+        tables = tables_of(places, colours, dark_between=timing.dark_between)
         engine = self._engine
         with self._lock:
             self._state.require_open()
@@ -149,6 +152,7 @@ class LightEngine(PatternEngine[Engine]):
             latency_s=options.load_s(kept=True) + COMMANDS_S,
             gap_s=options.light_margin_s,
             duty=options.duty_limit,
+            lights=options.colour is Colour.WHITE,
         )
 
     def _check_flash(self) -> None:

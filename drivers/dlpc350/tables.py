@@ -42,11 +42,11 @@ class Tables:
         return sum(self.counts)
 
 
-def tables_of(places: Sequence[Place], colour: Colour, *, dark_between: bool) -> Tables:
-    """Return the tables that show these places one after the other."""
+def tables_of(places: Sequence[Place], colours: Sequence[Colour], *, dark_between: bool) -> Tables:
+    """Return the tables that show these places one after the other, each lit by LEDs of its own."""
     words: list[int] = []
     previous: int | None = None
-    for place in places:
+    for place, colour in zip(places, colours, strict=True):
         words.append(
             INTERNAL
             | place.plane << 2

@@ -10,6 +10,7 @@ from drivers.dlpc900.pictures import Place, memory_of, packed
 from drivers.dlpc900.timing import lit
 from drivers.pattern_engine.engine import Command
 from drivers.pattern_engine.link import Kind, Link
+from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.projector import COMMANDS_S, DIM, RUNNING_S, PatternEngine
 from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing
 from slrig.devices import ProjectorInfo, Shown
@@ -48,6 +49,7 @@ class LightEngine(PatternEngine[Engine]):
         self._serial = serial
         self._mirrors: Mirrors
         self._places: tuple[Place, ...] = ()
+        self._leds: tuple[int, ...] = ()
         # The pattern table, as far as the engine has it.
         self._table: dict[int, bytes] = {}
         self._take_over()
@@ -64,6 +66,7 @@ class LightEngine(PatternEngine[Engine]):
             self._state.require_open()
             self._table.clear()
             self._places = memory.places
+            self._leds = (*map(self._options.colour_of, sequence.patterns), 0)
             # The table first: pictures are lost when its length changes (DLPU018 section 2.4.4.4.2).
             for index in range(len(memory.places)):
                 self._define(index, DIM)
@@ -131,9 +134,10 @@ class LightEngine(PatternEngine[Engine]):
 
     def _define(self, index: int, timing: Timing) -> None:
         """Set an entry of the pattern table, unless the engine has it."""
-        leds = 0 if index == len(self._places) - 1 else int(self._options.colour)
         dark_us = timing.period_us - timing.exposure_us
-        entry = definition(index, self._places[index], exposure_us=timing.exposure_us, dark_us=dark_us, leds=leds)
+        entry = definition(
+            index, self._places[index], exposure_us=timing.exposure_us, dark_us=dark_us, leds=self._leds[index]
+        )
         if self._table.get(index) != entry:
             self._table.pop(index, None)
             self._engine.define(entry)
@@ -172,4 +176,5 @@ class LightEngine(PatternEngine[Engine]):
             latency_s=options.start_s + COMMANDS_S,
             gap_s=options.light_margin_s + mirrors.least_us / 1e6,
             duty=options.duty_limit,
+            lights=options.colour is Colour.WHITE,
         )

@@ -106,7 +106,7 @@ class KmsStage:
         if index is not None and self._sequence is not None:
             self._require_plugged()
             turn = _TURNS[self._shown]
-            self._pictures[turn].pixels[:] = coloured(self._sequence.profiles[index])
+            self._pictures[turn].pixels[:] = coloured(self._sequence.profiles[index], self._sequence.patterns[index])
         asked_ns = time.monotonic_ns()
         stamp_ns = self._kernel(lambda: self._flipped(self._pictures[turn]))
         returned_ns = time.monotonic_ns()

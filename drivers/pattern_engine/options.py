@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from slrig.bundle.faults import Strict
+from slrig.model import Pattern, Primary
 
 Share = Annotated[float, Field(gt=0, le=1)]
 
@@ -70,6 +71,10 @@ class LightOptions(Strict, use_attribute_docstrings=True):
     def colour(self) -> Colour:
         """The LEDs that patterns are lit with."""
         return Colour[self.led.upper()]
+
+    def colour_of(self, pattern: Pattern) -> Colour:
+        """The LEDs that a pattern is lit with."""
+        return Colour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
 
     @property
     def current_byte(self) -> int:

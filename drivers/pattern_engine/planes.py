@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import UnsupportedByDeviceError
-from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, White
+from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
 
 Plane = NDArray[np.bool_]
 """(H, W) bool: which mirrors send light."""
@@ -38,6 +38,8 @@ def words(pattern: Pattern) -> str:
     match pattern:
         case White() | Black():
             return pattern.kind
+        case Primary():
+            return f"white in {pattern.colour} light"
         case Gray():
             inverse = ", inverted" if pattern.inverted else ""
             return f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}, cell {pattern.cell_px} px{inverse}"

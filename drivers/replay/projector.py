@@ -9,7 +9,7 @@ from drivers.replay.clock import ReplayClock
 from slrig.bundle import Bundle
 from slrig.devices import COMPUTED, ProjectorInfo, ProjectorState, Shown
 from slrig.errors import UnsupportedByDeviceError, setting
-from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, White
+from slrig.model import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
 
 
 class ReplayProjector:
@@ -29,6 +29,7 @@ class ReplayProjector:
                 for pattern in bundle.capture.patterns
                 if all(camera.frames_of(pattern) for camera in cameras.values())
             ),
+            lights=any(isinstance(pattern, Primary) for pattern in bundle.capture.patterns),
         )
         self._recorded = tuple(dict.fromkeys(bundle.capture.patterns))
         self._cameras = cameras
@@ -110,6 +111,8 @@ def _family(pattern: Pattern) -> str:
     match pattern:
         case White() | Black():
             return pattern.kind
+        case Primary():
+            return f"white in {pattern.colour} light"
         case Gray():
             inverse = ", inverted" if pattern.inverted else ""
             offset = f", offset {pattern.offset_px} px" if pattern.offset_px else ""

@@ -9,10 +9,10 @@ from itertools import count
 import numpy as np
 
 from drivers.display.timing import Presented, copied, flipped
-from drivers.screen.requests import fill_tiled, free_pixmap, graphics_context, pixmap, put_grey
+from drivers.screen.requests import fill_tiled, free_pixmap, graphics_context, pixmap, put_levels
 from drivers.screen.station import Station
 from slrig.errors import DeviceError, UnsupportedByDeviceError
-from slrig.model import PatternSequence, Pixels, Size
+from slrig.model import Pattern, PatternSequence, Pixels, Size
 
 EXTENSION = "Present"
 
@@ -51,7 +51,7 @@ class PresentSurface:
         tiles, self._tiles = self._tiles, ()
         for tile in tiles:
             free_pixmap(self._station.connection, tile)
-        self._tiles = tuple(self._tile(profile) for profile in sequence.profiles)
+        self._tiles = tuple(map(self._tile, sequence.profiles, sequence.patterns))
 
     def show(self, index: int | None) -> Presented:
         """Show a pattern of the sequence, None the dark, and return when that happened.
@@ -80,10 +80,10 @@ class PresentSurface:
     def close(self) -> None:
         """Nothing remains: the server forgets all of it with the station's connection."""
 
-    def _tile(self, profile: Pixels) -> int:
+    def _tile(self, profile: Pixels, pattern: Pattern | None = None) -> int:
         connection = self._station.connection
         tile = pixmap(connection, Size(profile.shape[1], profile.shape[0]))
-        put_grey(connection, tile, self._context, profile)
+        put_levels(connection, tile, self._context, profile, pattern)
         return tile
 
     def _completed(self, serial: int) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.display.pixels import coloured
 from drivers.screen.connection import Connection
-from slrig.model import Pixels, Size
+from slrig.model import Pattern, Pixels, Size
 
 CARDINAL, WINDOW = 6, 33
 ABOVE = 0
@@ -113,12 +113,14 @@ def graphics_context(connection: Connection, drawable: int) -> int:
     return number
 
 
-def put_grey(connection: Connection, drawable: int, context: int, levels: Pixels) -> None:
-    """Write grey levels, (H, W) uint8, into a picture of 24 bits in 32, at its upper left corner."""
+def put_levels(
+    connection: Connection, drawable: int, context: int, levels: Pixels, pattern: Pattern | None = None
+) -> None:
+    """Write a pattern's levels, (H, W) uint8, in its light into a picture of 24 bits in 32, at its upper left."""
     height_px, width_px = levels.shape
     rows = max(1, (connection.most_bytes - 64) // (4 * width_px))
     for first in range(0, height_px, rows):
-        part = coloured(levels[first : first + rows])
+        part = coloured(levels[first : first + rows], pattern)
         head = struct.pack(
             "<IIHHhhBBxx", drawable, context, width_px, part.shape[0], 0, first, 0, connection.screen.depth
         )

@@ -181,7 +181,7 @@ class _Canvas:
         if index is None or self.sequence is None:
             words: NDArray[np.uint32] = np.full(self.size.shape, _OPAQUE, np.uint32)
         else:
-            words = np.ascontiguousarray(coloured(self.sequence.image(index)) | _OPAQUE)
+            words = np.ascontiguousarray(coloured(self.sequence.image(index), self.sequence.patterns[index]) | _OPAQUE)
         sdl.SDL_PumpEvents()
         self._done(sdl.SDL_UpdateTexture(self._texture, None, words.ctypes.data, words.strides[0]), "take a picture")
         asked_ns = time.monotonic_ns()

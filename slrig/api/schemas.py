@@ -96,6 +96,12 @@ class ScanRequest(Strict):
         description="true: keep white and black frames in colour, and refuse where a camera has none. false: in grey. "
         "Default: as the rig file says, else in colour where a camera has it",
     )
+    coloured_light: bool | None = Field(
+        default=None,
+        description="true: play white in red, green and blue as well, so that cameras without colour give it, and "
+        "refuse where the projector has no such lights or every camera has colour. Default: as the rig file says, else "
+        "false",
+    )
     if_busy: Literal["reject", "queue"] = Field(
         default="reject", description="what to do while the rig is held: answer 409, or wait in line"
     )
@@ -150,6 +156,7 @@ def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
         exposure_s=request.exposure_s,
         exposures_s=request.exposures_s if request.exposures_s is not None else usual,
         colour=request.colour if request.colour is not None else defaults.colour,
+        coloured_light=bool(defaults.coloured_light if request.coloured_light is None else request.coloured_light),
     )
 
 

@@ -16,7 +16,7 @@ from slrig.bundle.moments import AwareMoment
 from slrig.bundle.opencv_calibration import read_opencv_calibration
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.errors import CalibrationError
-from slrig.model import DEVICE_PARAMETERS, Calibration, Pinhole, Size, Solved
+from slrig.model import DEVICE_PARAMETERS, Calibration, LightMap, Pinhole, Size, Solved
 
 MOST_CALIBRATION_BYTES = 4 * 2**20
 MOST_DEVICES = 16
@@ -24,6 +24,7 @@ MOST_DEVICES = 16
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
 Distortion = Annotated[list[float], Field(min_length=5, max_length=5, description="k1, k2, p1, p2, k3")]
+Five, Two = Field(min_length=5, max_length=5), Field(min_length=2, max_length=2)
 
 
 class DeviceEntry(Strict):
@@ -56,6 +57,16 @@ class SolvedEntry(Strict):
     ] = 0.0
 
 
+class LightEntry(Strict):
+    """The projector's light over its image, measured on a white board: see `slrig.model.LightMap`."""
+
+    coefficients: Annotated[
+        list[Annotated[list[Annotated[list[float], Five]], Five]],
+        Field(min_length=1, max_length=3, description="c_ij of white, or of red, green and blue"),
+    ]
+    covered_px: Annotated[list[Annotated[list[float], Two]], Two]
+
+
 class CalibrationEntry(Strict):
     """The whole of calibration.json. Without a projector only cameras can be triangulated with each other."""
 
@@ -64,6 +75,7 @@ class CalibrationEntry(Strict):
     cameras: Annotated[dict[CameraName, DeviceEntry], Field(min_length=1)]
     projector: DeviceEntry | None = None
     solved: SolvedEntry | None = None
+    light: LightEntry | None = None
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -79,7 +91,8 @@ def read_calibration(path: Path) -> Calibration:
     cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
     projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
     try:
-        return Calibration(cameras, projector, _solved(entry.solved))
+        light = None if entry.light is None else LightMap(*map(np.array, entry.light.model_dump().values()))
+        return Calibration(cameras, projector, _solved(entry.solved), light)
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: solved.{cause}") from cause
 
@@ -93,9 +106,9 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
     }
     if calibration.projector is not None:
         data["projector"] = _device(calibration.projector)
-    if calibration.solved is not None:
-        solved = asdict(calibration.solved)
-        data["solved"] = {key: each.tolist() if isinstance(each, np.ndarray) else each for key, each in solved.items()}
+    for name, known in (("solved", calibration.solved), ("light", calibration.light)):
+        if known is not None:
+            data[name] = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(known).items()}
     write_file(path, json_bytes(data))
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import Black, Gray, LineShift, Pattern, White
+from slrig.model import Black, Gray, LineShift, Pattern, Primary, White
 
 Samples = NDArray[np.float32]
 Chosen = NDArray[np.bool_]
@@ -66,6 +66,8 @@ def named(index: int, pattern: Pattern) -> str:
     match pattern:
         case White() | Black():
             words = pattern.kind
+        case Primary():
+            words = f"white in {pattern.colour} light"
         case Gray():
             words = f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}{', inverse' if pattern.inverted else ''}"
         case LineShift():
@@ -213,6 +215,12 @@ def range_fault(frame: Samples, ref: Reference, *, noise: float | None) -> str |
         f"room's light changed, the projector's light comes later than it says, or {contrast_words(ref)}; check the "
         "cable, the light and the projector's latency, and scan again"
     )
+
+
+def dimmed(frame: Samples, ref: Reference) -> bool:
+    """Whether a frame is neither as dark as black nor as bright as white, all in all."""
+    u = ref.relative(frame)
+    return bool(0.005 < np.average(u, weights=ref.contrast[ref.judged]) < 0.985)
 
 
 def variation(frame: Samples, ref: Reference) -> float:

@@ -12,7 +12,7 @@ from slrig.capture import checks, code_checks
 from slrig.capture.checks import Contradiction, Lighting, Reference, Samples, named, place
 from slrig.capture.code_checks import Code
 from slrig.capture.sampling import Sampler
-from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Shot, White
+from slrig.model import Axis, Black, CameraFormat, Gray, LineShift, Pattern, Pixels, Primary, Shot, White
 
 
 @dataclass(slots=True)
@@ -194,6 +194,9 @@ class FrameVerifier:
             found += self._repetition(index, pattern, ref)
         if not found and isinstance(pattern, LineShift):
             found += self._line(index, pattern, ref)
+        # One light from another is told by times alone: an object may send back as much of both.
+        if not found and isinstance(pattern, Primary) and checks.dimmed(self._frames[index], ref):
+            self.found.verified.add(index)
         return found
 
     def _again(self, index: int, first: int, ref: Reference) -> list[Contradiction]:
@@ -285,7 +288,11 @@ class FrameVerifier:
 
     def _repetition(self, index: int, pattern: Pattern, ref: Reference) -> list[Contradiction]:
         own = {pattern, White(), Black()}
-        earlier = [i for i in self._frames if i != index and self._patterns[i] not in own]
+        kin = Primary if isinstance(pattern, Primary) else ()
+        earlier = [
+            i for i in self._frames
+            if i != index and self._patterns[i] not in own and not isinstance(self._patterns[i], kin)
+        ]  # fmt: skip
         # Wide lines move by a small part of their width: tell neighbours apart only where noise leaves room for it.
         factor = max(40.0, 4.0 * pattern.line_width_px) if isinstance(pattern, LineShift) else 40.0
         frames = [self._frames[i] for i in earlier]

@@ -18,7 +18,7 @@ from slrig.capture.retry_policy import RetryPolicy, in_words
 from slrig.capture.session import Session
 from slrig.devices import Trigger
 from slrig.errors import FrameTimeoutError, ScanEvidenceError, UnsupportedByDeviceError
-from slrig.model import Frame, Gray, PatternSequence, Shot
+from slrig.model import Frame, Gray, PatternSequence, Primary, Shot
 
 MOST_PLAYS = 3
 
@@ -212,7 +212,7 @@ def frame_shift(levels: Sequence[float], sequence: PatternSequence) -> int:
     on which part of the pattern a camera sees.
     """
     expected = np.array([profile.mean() for profile in sequence.profiles])
-    telling = np.array([not isinstance(pattern, Gray) for pattern in sequence.patterns])
+    telling = np.array([not isinstance(pattern, Gray | Primary) for pattern in sequence.patterns])
     agreement: dict[int, float] = {}
     for shift in (0, 1, -1):
         frames, shown = np.asarray(levels[max(-shift, 0) :]), expected[max(shift, 0) :]

@@ -250,6 +250,28 @@ def compare(
 
 @app.command()
 @grouped
+def light(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="Scan of a plain white board: its bundle.")],
+    output: Annotated[Path, typer.Option(help="File for the calibration with the light: .json.")],
+) -> None:
+    """Measure the projector's light over its image, for colours.
+
+    The board is flat, white and dull, fills the image, and is scanned alone. Import the result, and activate it.
+    """
+    from slrig.bundle import write_calibration
+    from slrig.cli.display import progress_shown
+    from slrig.cli.reconstruct import prepare_kernels
+    from slrig.scan.light_board import with_light_map
+
+    with progress_shown() as display:
+        prepare_kernels(display)
+        found = with_light_map(bundle, display)
+    write_calibration(output, found)
+    typer.echo(f"{'written':<10}{output}")
+
+
+@app.command()
+@grouped
 def activate(calibration: CalibrationId, service: Service) -> None:
     """Have scans use a calibration from now on."""
     with service.client() as client:

@@ -19,6 +19,7 @@ from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
+from slrig.cli.scan_options import ColourOptions
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -145,9 +146,7 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
-    colour: Annotated[
-        bool | None, typer.Option(help="Keep white and black frames in colour. Default: where a camera has it.")
-    ] = None,
+    colour: ColourOptions,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
     repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
@@ -162,7 +161,7 @@ def scan(
         exposure_s=exposure_s[0] if exposure_s and len(exposure_s) == 1 else None,
         exposures_s=exposure_s if exposure_s and len(exposure_s) > 1 else None,
         if_busy="queue" if queue else "reject",
-        colour=colour,
+        **asdict(colour),
         repeat=repeat if repeat > 1 else None,
         every_s=every_s,
         patterns=given(

@@ -20,7 +20,8 @@ class ProjectorInfo:
     `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
     is steady over whole ones only; None where exposures may have any length. `limits` say how long its calls may take.
     `recorded` are the patterns of a recording, in its order: a scan that asks for none plays them. Empty where any
-    pattern can be shown.
+    pattern can be shown. `lights` says whether it has lights of its own for red, green and
+    blue, and shows `Primary`.
     """
 
     name: str
@@ -34,6 +35,7 @@ class ProjectorInfo:
     recorded: tuple[Pattern, ...] = ()
     gap_s: float = 0.0005
     duty: float = 1.0
+    lights: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,8 @@ from slrig.model.frames import (
 )
 from slrig.model.light_axis import LEAST_SHARE, share_across, told_depth, triangulated_axis
 from slrig.model.missing_bits import without_missing_bits
-from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, White
-from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, Pinhole, Size, Solved
+from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
+from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
 from slrig.model.surfaces import (
     AlbedoMark,
     CameraTruth,
@@ -48,6 +48,7 @@ __all__ = [
     "Frame",
     "Gray",
     "IntArray",
+    "LightMap",
     "LineShift",
     "Mesh",
     "Pattern",
@@ -55,6 +56,7 @@ __all__ = [
     "Pinhole",
     "Pixels",
     "PointCurves",
+    "Primary",
     "Refusal",
     "Shot",
     "Size",

@@ -27,6 +27,14 @@ class Black:
 
 
 @dataclass(frozen=True, slots=True)
+class Primary:
+    """Every projector pixel lit, by one of the projector's own lights alone: its white in red, green or blue."""
+
+    colour: Literal["red", "green", "blue"]
+    kind: Literal["primary"] = "primary"
+
+
+@dataclass(frozen=True, slots=True)
 class Gray:
     """One bit of a Gray code: lights position c when bit `bits - 1 - bit` of gray(⌊(c + offset_px)/cell_px⌋) is 1."""
 
@@ -69,7 +77,7 @@ class LineShift:
         return self.shift + (self.line_width_px - 1) / 2
 
 
-Pattern = White | Black | Gray | LineShift
+Pattern = White | Black | Primary | Gray | LineShift
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,17 +122,48 @@ class Solved:
             raise CalibrationError(message)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LightMap:
+    """How bright the projector's light is over its image, at one distance and on one white, as shares of any one light:
+    exp(Σ c_ij x^i y^j), with x and y from -1 to 1 over the image's columns and rows.
+
+    coefficients : (C, n, n) float64, c_ij of white alone, or of red, green and blue as the cameras see them.
+    covered_px : (2, 2) float64, the least and the greatest (column, row) at which it was measured; beyond, light counts
+    as there.
+    """
+
+    coefficients: FloatArray
+    covered_px: FloatArray
+
+    def __post_init__(self) -> None:
+        require(self.coefficients, "light.coefficients", (None, None, None), "f")
+        require(self.covered_px, "light.covered_px", (2, 2), "f")
+
+    def light(self, places_px: FloatArray, size: Size, channels: int) -> FloatArray:
+        """(n, C) float64 at (n, 2) places, (column, row); (n, 1) for channels that it was not measured in."""
+        x, y = light_axes(np.clip(places_px, *self.covered_px), size)
+        shares = np.exp([np.polynomial.polynomial.polyval2d(x, y, each) for each in self.coefficients]).T
+        return np.asarray(shares if channels == shares.shape[1] else shares.mean(axis=1, keepdims=True))
+
+
+def light_axes(places_px: FloatArray, size: Size) -> FloatArray:
+    """(2, n) float64: x and y of `LightMap` at (n, 2) places, (column, row)."""
+    return np.asarray((2 * places_px / (np.array([size.width_px, size.height_px]) - 1) - 1).T)
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """The devices of a rig in one world frame. `projector` is None when only the cameras were calibrated.
 
-    `solved` is None for a calibration that says nothing of its own error: written by hand, imported, or exact.
+    `solved` is None for a calibration that says nothing of its own error: written by hand, imported, or exact. `light`
+    is None where the projector's light was not measured.
     Raises CalibrationError: the covariance is for another number of devices.
     """
 
     cameras: Mapping[str, Pinhole]
     projector: Pinhole | None
     solved: Solved | None = None
+    light: LightMap | None = None
 
     def __post_init__(self) -> None:
         devices = len(self.cameras) + (self.projector is not None)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Size, White
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, PatternSequence, Primary, Size, White
 from slrig.patterns.gray import gray_bits, gray_profile
 from slrig.patterns.line_shift import line_profile
 
@@ -28,6 +28,7 @@ def scan_patterns(
     gray_offset_px: int,
     rows: bool,
     columns: bool = True,
+    coloured_light: bool = False,
 ) -> tuple[Pattern, ...]:
     """List the patterns of one scan in the order of play.
 
@@ -38,7 +39,8 @@ def scan_patterns(
     size : the projector. line_shift : False leaves the line frames out: a Gray-only scan. period_px, line_width_px : n
     and the width of a line. gray_cell_px : None stands for ⌊n/2⌋, or `GRAY_ONLY_CELL_PX` without line shift.
     gray_offset_px : added to a position before it is cut into cells: moves the cell edges. rows, columns : the axes to
-    play.
+    play. coloured_light : white in red, green and blue as well, each before one of the last three frames of code: so
+    an old frame in the place of any of them, or of the one after it, does not pass for it.
 
     Raises PatternError: a code that cannot tell the lines of one frame apart, or a pattern that does not fit the
     projector.
@@ -60,6 +62,10 @@ def scan_patterns(
         middle.extend(_gray_patterns(axis, size.along(axis), cell_px, gray_offset_px))
         if line_shift:
             middle.extend(LineShift(axis, shift, period_px, line_width_px) for shift in range(period_px))
+    if coloured_light:
+        codes = [at for at, pattern in enumerate(middle) if isinstance(pattern, Gray)]
+        for light, at in zip((Primary("blue"), Primary("green"), Primary("red")), codes[:-4:-1], strict=False):
+            middle.insert(at, light)
     return (*bracket, *middle, *bracket)
 
 
@@ -88,7 +94,7 @@ def united(sequences: Sequence[PatternSequence]) -> PatternSequence:
 def profile(pattern: Pattern, size: Size) -> NDArray[np.uint8]:
     """Light of one pattern: (1, 1), (1, Wp) or (Hp, 1) uint8. Raises PatternError when it does not fit."""
     match pattern:
-        case White():
+        case White() | Primary():
             return np.full((1, 1), 255, dtype=np.uint8)
         case Black():
             return np.zeros((1, 1), dtype=np.uint8)

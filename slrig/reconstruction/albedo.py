@@ -9,7 +9,8 @@ frames and cancels. What this leaves out: gloss, light from one part of the obje
 from the corners: the camera's always, the projector's where nobody states it.
 
 Albedo has no scale of its own here: g and L are not known. Cameras are brought to one gain by the points that two of
-them saw, and the whole to a usual albedo of bright surfaces.
+them saw, and the whole to a usual albedo of bright surfaces. Nor is it known how L and g differ between red, green and
+blue: what is white has their tint, unless a white board has told (`slrig.model.LightMap`).
 """
 
 from __future__ import annotations
@@ -93,8 +94,8 @@ def albedo(
     """The relative albedo of points, and marks where it is not to be relied on.
 
     centre_mm : (3,) float64, the projector's centre. None where it is not known: then the value is white minus black
-    alone, and every point is marked. light : (n,) float64, the projector's in the direction of each point, as a share
-    of any one; None where it is the same in all.
+    alone, and every point is marked. light : (n, C) or (n, 1) float64, the projector's in the direction of each
+    point, as a share of any one; None where it is the same in all.
     """
     count = len(points.camera)
     channels = max(view.contrast.shape[2] for view in views)
@@ -108,13 +109,12 @@ def albedo(
     else:
         mark = np.where(points.border, AlbedoMark.BORDER, AlbedoMark.NONE).astype(np.uint8)
         in_bands(_incidence_kernel, count, points.points_mm, points.normals, centre_mm, mark, fallen)
-        if light is not None:
-            fallen *= light.astype(np.float32)
+    fell = fallen[:, None] if light is None or centre_mm is None else fallen[:, None] * light.astype(np.float32)
     mark[clipped] = AlbedoMark.SATURATED
     mark[np.isnan(fallen)] = AlbedoMark.UNKNOWN
     sound = (mark == AlbedoMark.NONE) | (mark == AlbedoMark.SHADED)
-    value: Light = np.divide(seen, fallen[:, None], dtype=np.float32)
-    gains, shared = _gains(points, views, value, fallen, sound)
+    value: Light = np.divide(seen, fell, dtype=np.float32)
+    gains, shared = _gains(points, views, value, fell, sound)
     if len(views) > 1:
         value *= gains.astype(np.float32)[points.camera]
     value *= _scale(value[sound if sound.any() else mark != AlbedoMark.UNKNOWN])
@@ -163,11 +163,12 @@ def _incidence_kernel(first: int, last: int, points: Any, normals: Any, centre: 
 
 
 def _gains(
-    points: LitPoints, views: Sequence[LitView], value: Light, fallen: NDArray[np.float32], sound: NDArray[np.bool_]
+    points: LitPoints, views: Sequence[LitView], value: Light, fell: Light, sound: NDArray[np.bool_]
 ) -> tuple[FloatArray, tuple[int, ...]]:
     """`Albedo.gains` and `Albedo.shared`: of each camera by those before it.
 
-    value : (n, C), before any gain; fallen : (n,), the light that fell on each point; sound : (n,), to be relied on.
+    value : (n, C), before any gain; fell : (n, C) or (n, 1), the light that fell on each point; sound : (n,), to
+    be relied on.
     """
     gains = np.ones((len(views), value.shape[1]))
     shared = [0] * len(views)
@@ -180,7 +181,7 @@ def _gains(
         both, (other, _) = both[there], sampled(view, pixels[there])
         if len(both) >= _LEAST_SHARED:
             shared[index] = len(both)
-            there_gains = gains[points.camera[both]] * fallen[both, None]
+            there_gains = gains[points.camera[both]] * fell[both]
             gains[index] = np.median(value[both] * there_gains / other, axis=0)
         elif before.any() and mine.any():
             known = value[before] * gains[points.camera[before]]

@@ -160,7 +160,7 @@ def capture_frames(
     PatternError
         The plan does not fit the projector, or its patterns tell no depth by the rig's calibration.
     DeviceError
-        The rig failed, or has no colour where the plan asks for it.
+        The rig failed, or has no colour, or coloured light, where the plan asks for it.
     ScanCancelledError
         `cancelled()` became true.
     StorageError
@@ -173,6 +173,7 @@ def capture_frames(
         rig.cameras,
         axis=plan.reconstruction.axis,
         recorded=rig.projector.info.recorded,
+        coloured_light=plan.coloured_light,
     )
     rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
     told += _of_the_rig(rig)
@@ -180,7 +181,7 @@ def capture_frames(
         _log.info(words, rig=rig.name)
         progress("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
-    colour = in_colour(plan, {name: camera.info for name, camera in rig.cameras.items()})
+    colour = in_colour(plan, {name: camera.info for name, camera in rig.cameras.items()}, rig.projector.info)
     writer = BundleWriter(
         folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.model import AlbedoMark, Axis, Mesh, Pinhole, Refusal, Source
+from slrig.model import AlbedoMark, Axis, LightMap, Mesh, Pinhole, Refusal, Source
 from slrig.model.srgb import srgb_of
 from slrig.reconstruction.albedo import BRIGHT_ALBEDO, BRIGHT_PERCENT, Albedo, LitPoints, LitView, albedo
 from slrig.reconstruction.merging import MergedCurves
@@ -35,6 +35,7 @@ def coloured(
     projector: Pinhole | None,
     axis: Axis,
     /,
+    light: LightMap | None = None,
 ) -> Coloured:
     """Colour each point by the camera that it counts as seen by. normals : (n, 3), unit, NaN where not known."""
     curves, nowhere = joined.curves, np.zeros(len(joined.camera), dtype=np.bool_)
@@ -43,10 +44,21 @@ def coloured(
         curves.points_mm, normals, curves.pixels_px, joined.camera, curves.source == Source.ALL, border
     )  # fmt: skip
     views = [LitView(seen.device, seen.contrast, seen.clipped, seen.curves.refusal == Refusal.NONE) for seen in cameras]
-    found = albedo(points, views, None if projector is None else projector.centre_mm)
+    if projector is None:
+        found = albedo(points, views, None)
+    else:
+        channels = max(view.contrast.shape[2] for view in views)
+        shares = None if light is None else light.light(places_px(curves, axis), projector.size, channels)
+        found = albedo(points, views, projector.centre_mm, light=shares)
     colour = srgb_of(found.value)
     colour[found.mark == AlbedoMark.UNKNOWN] = _NEUTRAL
     return Coloured(np.repeat(colour, 3, axis=1) if colour.shape[1] == 1 else colour, found.mark, found)
+
+
+def places_px(curves: SheetCurves, axis: Axis) -> NDArray[np.float64]:
+    """(n, 2) float64: (column, row) of the projector's image that lights each point."""
+    pair = np.repeat(curves.position_px, np.diff(curves.offsets)), curves.along_px
+    return np.stack(pair if axis is Axis.COLUMN else pair[::-1], axis=1)
 
 
 def _at_border(curves: SheetCurves, projector: Pinhole, axis: Axis) -> NDArray[np.bool_]:
@@ -60,11 +72,14 @@ def _within(place_px: NDArray[np.float64], length_px: int) -> NDArray[np.bool_]:
     return np.asarray((place_px < _BORDER_PX) | (place_px > length_px - 1 - _BORDER_PX))
 
 
-def albedo_report(coloured: Coloured, mesh: Mesh, cameras: Sequence[CameraResult], *, lit: bool) -> dict[str, object]:
+def albedo_report(
+    coloured: Coloured, mesh: Mesh, cameras: Sequence[CameraResult], *, lit: bool, mapped: bool
+) -> dict[str, object]:
     """The report's section on colours: what they are, their scale, and the vertices whose colour is in doubt, by cause.
 
     `camera_gains` are by which the first camera sees light larger, and how many points told so; 0: none did, and the
-    cameras were brought to the same median. lit : whether the projector's place is known.
+    cameras were brought to the same median. lit : whether the projector's place is known; mapped : its light over its
+    image, too.
     """
     counts = np.bincount(mesh.mark, minlength=len(AlbedoMark))
     known = coloured.mark != AlbedoMark.UNKNOWN
@@ -73,6 +88,9 @@ def albedo_report(coloured: Coloured, mesh: Mesh, cameras: Sequence[CameraResult
         "is": "albedo: (white - black) * distance^2 / cosine of incidence at the projector"
         if lit
         else "brightness: white - black, because the projector is not calibrated",
+        "projector_light": "as measured on a white board"
+        if mapped
+        else "taken as even over its image; what is white in colour is not known",
         "scale": {"percentile": BRIGHT_PERCENT, "albedo": BRIGHT_ALBEDO},
         "brighter_than_white": round(float((coloured.found.value[known] > 1).any(axis=1).mean()), 4),
         "marked_vertices": {mark.name.lower(): int(counts[mark]) for mark in AlbedoMark if mark is not AlbedoMark.NONE},

@@ -110,7 +110,8 @@ class ScanPlan:
     these exposure times, and the frames are fused. They are times and not multiples of what each camera has, like
     `exposure_s`: so every one can be a whole number of a projector's refreshes (of 1/60 s, say), and is checked against
     what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order. colour : keep white
-    and black frames in colour, None where a camera has it. series : None for a scan alone.
+    and black frames in colour, None where a camera has it. coloured_light : play white in red, green and blue as well,
+    for the cameras that have no colour. series : None for a scan alone.
 
     Raises
     ------
@@ -123,6 +124,7 @@ class ScanPlan:
     exposure_s: float | None = None
     exposures_s: tuple[float, ...] | None = None
     colour: bool | None = None
+    coloured_light: bool = False
     series: SeriesPlace | None = None
 
     def __post_init__(self) -> None:

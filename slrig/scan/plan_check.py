@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from slrig.bundle.description import MOST_CAPTURE_BYTES
-from slrig.devices import CameraInfo
+from slrig.devices import CameraInfo, ProjectorInfo
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import Axis, Black, Calibration, Pattern, PatternSequence, Size, White
 from slrig.patterns.sequence import encode, scan_patterns
@@ -22,11 +22,12 @@ def pattern_sequence(
     *,
     axis: Axis | None = None,
     recorded: tuple[Pattern, ...] = (),
+    coloured_light: bool = False,
 ) -> PatternSequence:
     """The patterns that a plan means on a projector of this size, with these cameras. Raises PatternError.
 
     axis : the one to triangulate by, if that was asked for. recorded : of `ProjectorInfo`; they are played unless the
-    plan asks for patterns of its own.
+    plan asks for patterns of its own. coloured_light : of `ScanPlan`.
     """
     if recorded and plan == PatternPlan():
         return encode(recorded, size)
@@ -40,13 +41,15 @@ def pattern_sequence(
         gray_offset_px=plan.gray_offset_px,
         rows=plan.codes and Axis.ROW in axes,
         columns=plan.codes and Axis.COLUMN in axes,
+        coloured_light=coloured_light,
     )
     return encode(patterns, size)
 
 
-def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo]) -> frozenset[str]:
+def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo], projector: ProjectorInfo) -> frozenset[str]:
     """The cameras whose white and black frames a plan keeps in colour.
-    Raises UnsupportedByDeviceError: it asks for colour, and a camera has none.
+    Raises UnsupportedByDeviceError: it asks for colour, and a camera has none; or for coloured light, and the projector
+    has none, or no camera needs it.
     """
     mono = [name for name, camera in cameras.items() if not camera.colour]
     if plan.colour and mono:
@@ -55,7 +58,17 @@ def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo]) -> frozenset[st
             "it out, and the cameras that have colour give it."
         )
         raise UnsupportedByDeviceError(message)
-    return frozenset(cameras if plan.colour is not False else ()).difference(mono)
+    kept = frozenset(cameras if plan.colour is not False else ()).difference(mono)
+    if plan.coloured_light and not projector.lights:
+        message = (
+            f"{setting('coloured_light')}: asked for, and the projector '{projector.model}' has no lights of its own "
+            "for red, green and blue that its driver could switch. Leave it out; a camera that has colour gives it."
+        )
+        raise UnsupportedByDeviceError(message)
+    if plan.coloured_light and len(kept) == len(cameras):
+        message = f"{setting('coloured_light')}: asked for, and every camera has colour already. Leave it out."
+        raise UnsupportedByDeviceError(message)
+    return kept
 
 
 def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
@@ -72,9 +85,10 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
     axis = plan.reconstruction.axis
     projector = facts.projector
     sequence = pattern_sequence(
-        plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded
-    )
-    count, coloured = len(sequence) * max(len(exposures_s), 1), in_colour(plan, facts.cameras)
+        plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded,
+        coloured_light=plan.coloured_light,
+    )  # fmt: skip
+    count, coloured = len(sequence) * max(len(exposures_s), 1), in_colour(plan, facts.cameras, projector)
     ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * max(len(exposures_s), 1)
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0

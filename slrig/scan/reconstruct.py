@@ -242,7 +242,8 @@ def _meshed(
     apart = disagreement(joined_curves, share)
     if apart is not None:
         sigma = np.hypot(sigma, apart.sigma_mm)
-    colours = coloured(cameras, joined_curves, surface.normals, projector, axis)
+    light = walked.devices.light
+    colours = coloured(cameras, joined_curves, surface.normals, projector, axis, light)
     curves = PointCurves(
         offsets=points.offsets,
         column_px=points.position_px,
@@ -266,7 +267,7 @@ def _meshed(
         stages=surface.stages,
         figures=mesh_report(surface, mesh, curves),
         redundancy=redundancy_report(joined_curves, points.source, found.spare),
-        albedo=albedo_report(colours, mesh, cameras, lit=projector is not None),
+        albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
         notes=() if apart is None else (str(apart),),
     )
 

@@ -25,6 +25,7 @@ from slrig.model import (
     Pattern,
     Pinhole,
     Pixels,
+    Primary,
     Refusal,
     Shot,
     Size,
@@ -166,6 +167,7 @@ class _CameraFrames:
         self._kept: list[Shot] = []
         self._repeats: dict[Pattern, list[Pixels]] = {}
         self._colours: defaultdict[Pattern, list[tuple[float | None, Pixels]]] = defaultdict(list)
+        self._lights: defaultdict[Pattern, list[Shot]] = defaultdict(list)
         listed = [index for index, camera in header.frames if camera == name]
         shown = [header.patterns[index] for index in listed]
         tells = telling(shown, [None] * len(shown))
@@ -222,12 +224,15 @@ class _CameraFrames:
         return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
 
     def _keep_colour(self, shot: Shot) -> None:
+        pattern = self._header.patterns[shot.pattern]
         if shot.colour is not None:
-            self._colours[self._header.patterns[shot.pattern]].append((shot.exposure_s, shot.colour))
+            self._colours[pattern].append((shot.exposure_s, shot.colour))
+        elif isinstance(pattern, Black | Primary) and Primary("red") in self._wanted:
+            self._lights[pattern].append(shot)
 
     def colour(self, pattern: White | Black, fused: FusedFrames | None) -> NDArray[Any] | None:
         """(H, W, 3): a pattern in colour, in the units of its grey image; None where not every exposure has colour."""
-        found = self._colours.pop(pattern, [])
+        found = self._colours.pop(pattern, []) or self._by_lights(pattern)
         if fused is None:
             return mean_image([image for _, image in found]) if found else None
         alike = exposure_groups(each for each, _ in found)
@@ -236,6 +241,15 @@ class _CameraFrames:
             return None
         images = [[image for each, image in found if alike[each] == time_s] for time_s in groups]
         return fused_colour(images, fused, float(self._header.cameras[self._name].full_scale))
+
+    def _by_lights(self, pattern: White | Black) -> list[tuple[float | None, Pixels]]:
+        """Frames in colour, of grey ones: white is one in each of the projector's lights, black is dark in all."""
+        lights: list[Pattern] = [Primary("blue"), Primary("green"), Primary("red")]
+        of_each = [self._lights[light if isinstance(pattern, White) else pattern] for light in lights]
+        return [
+            (shots[0].exposure_s, np.stack([shot.image for shot in shots], axis=2))
+            for shots in zip(*of_each, strict=False)
+        ]
 
 
 class LiveScan(ScanStream):

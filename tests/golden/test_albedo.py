@@ -5,10 +5,11 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,19 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
 from simulated_rig.casting import caster
 from simulated_rig.options import HeadOptions
 from simulated_rig.scene import read_scene, surface_of
 from simulated_rig.transport import trace
-from slrig.bundle import read_bundle
-from slrig.model import AlbedoMark, FloatArray, Pinhole, White
+from slrig.bundle import read_bundle, read_calibration, write_calibration
+from slrig.capture.evidence import check_capture
+from slrig.cli.commands import app
+from slrig.errors import CalibrationError
+from slrig.model import AlbedoMark, Black, Capture, FloatArray, LightMap, Pinhole, Primary, White
 from slrig.scan.artefacts import decode_mesh_ply
+from slrig.scan.light_board import with_light_map
 from slrig.scan.plan import ScanPlan
 from tests.golden.test_bracketing import captured, reconstructed
 
@@ -92,9 +98,12 @@ def painted(rig: Path, work: Path, plan: ScanPlan | None = None) -> Painted:
     return grey
 
 
-def channels(rig: Path, work: Path, plan: ScanPlan | None = None) -> list[Painted]:
+def channels(rig: Path, work: Path, plan: ScanPlan | None = None, *, mapped: LightMap | None = None) -> list[Painted]:
     """`painted` in each channel that a camera of the rig has: one, or red, green and blue."""
     bundle = captured(rig, plan or ScanPlan(), work / "bundle")
+    if mapped is not None:
+        known = read_calibration(bundle / "calibration.json")
+        write_calibration(bundle / "calibration.json", replace(known, light=mapped))
     report = reconstructed(bundle, work / "out")
     mesh = decode_mesh_ply((work / "out" / "mesh.ply").read_bytes())
     table = tomllib.loads(rig.read_text())["head"]
@@ -219,3 +228,124 @@ def test_a_camera_that_has_colour_gives_each_channel_as_it_is_painted(tmp_path: 
     # Between channels there is one scale: how strongly the camera sees each, and no more.
     red, blue = (np.median(each.found[each.sound] / each.truth[each.sound]) for each in (seen[0], seen[2]))
     assert red / blue == pytest.approx(0.8 / 0.7, rel=0.02)
+
+
+TINTED = {
+    'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0 }': "colour = [0.25, 0.6, 0.95]\n"
+    'texture = { kind = "noise", contrast = 0.25, scale_mm = 6.0, colour = [0.9, 0.5, 0.3] }'
+}
+
+
+def old_frames_are_told(capture: Capture) -> None:
+    """A frame in coloured light that shows the pattern before, or lends its picture to the one after."""
+    shown = {shot.pattern: shot.image for shot in capture.shots}
+    for index in (i for i, pattern in enumerate(capture.patterns) if isinstance(pattern, Primary)):
+        for old, at in ((index - 1, index), (index, index + 1)):
+            shots = (replace(shot, image=shown[old]) if shot.pattern == at else shot for shot in capture.shots)
+            faults = check_capture(replace(capture, shots=tuple(shots))).faults
+            assert any(f"pattern {at} " in fault for fault in faults), (old, at)
+        for end in (White(), Black()):
+            image = shown[capture.patterns.index(end)]
+            shots = (replace(shot, image=image) if shot.pattern == index else shot for shot in capture.shots)
+            assert check_capture(replace(capture, shots=tuple(shots))).verified == len(capture.patterns) - 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exposures_s", [None, (0.01, 0.03)])
+def test_lights_of_the_projector_give_a_mono_camera_colour(
+    exposures_s: tuple[float, ...] | None, tmp_path: Path
+) -> None:
+    plan = ScanPlan(coloured_light=True, exposures_s=exposures_s)
+    seen = channels(rig_file(tmp_path, "relief", scene=TINTED, head=SMALL), tmp_path, plan)
+    assert len(seen) == 3
+    for name, channel in zip(("red", "green", "blue"), seen, strict=True):
+        rms, correlation = channel.told(f"{name} light", channel.found)
+        assert rms <= 0.05
+        assert correlation >= 0.85
+    assert seen[0].report["evidence"]["contradictions"] == []
+    count = len(read_bundle(tmp_path / "bundle").capture.patterns)
+    assert seen[0].report["evidence"]["patterns_verified"] == f"{count}/{count}"
+    if exposures_s is None:
+        old_frames_are_told(read_bundle(tmp_path / "bundle").capture)
+    # Without these frames, the same surface to the last bit.
+    description = tmp_path / "bundle" / "bundle.json"
+    told = json.loads(description.read_text())
+    kinds = [pattern["kind"] for pattern in told["patterns"]]
+    told["frames"] = [frame for frame in told["frames"] if kinds[frame["pattern"]] != "primary"]
+    description.write_text(json.dumps(told))
+    report = reconstructed(tmp_path / "bundle", tmp_path / "grey")
+    assert report["albedo"]["channels"] == 1
+    with_light, without = (decode_mesh_ply((tmp_path / each / "mesh.ply").read_bytes()) for each in ("out", "grey"))
+    for name in ("vertices_mm", "faces", "normals", "sigma_mm"):
+        assert getattr(with_light, name).tobytes() == getattr(without, name).tobytes(), name
+
+
+FALLS_OFF = {"gamma = 1.8": "gamma = 1.8\nfall_off = [4.0, 0.9]\nlights = [0.25, 0.5, 0.35]"}
+BOARD = """name = "board"
+
+[[object]]
+name = "board"
+shape = "plane"
+size_mm = [220.0, 180.0]
+rotation_deg = [4.0, -6.0, 0.0]
+albedo = 0.85
+"""
+
+
+def board(folder: Path, text: str, plan: ScanPlan) -> Path:
+    """The bundle of a scan of a board by a projector whose light falls off."""
+    folder.mkdir()
+    rig = rig_file(folder, "relief", scene={}, head={**SMALL, **FALLS_OFF})
+    (folder / "scene.toml").write_text(text)
+    return captured(rig, plan, folder / "bundle")
+
+
+@pytest.mark.slow
+def test_a_white_board_takes_the_projectors_fall_off_out_and_tells_what_is_white(tmp_path: Path) -> None:
+    plan = ScanPlan(coloured_light=True)
+    output = tmp_path / "lit.json"
+    shot = board(tmp_path / "board", BOARD, plan)
+    told = CliRunner().invoke(app, ["calibrate", "light", str(shot), "--output", str(output)])
+    assert told.exit_code == 0, told.output
+    light = read_calibration(output).light
+    assert light is not None
+    (tmp_path / "scan").mkdir()
+    rig = rig_file(tmp_path / "scan", "relief", scene=TINTED, head={**SMALL, **FALLS_OFF})
+    plain = channels(rig, tmp_path / "plain", plan)
+    seen = channels(rig, tmp_path / "mapped", plan, mapped=light)
+    for name, before, after in zip(("red", "green", "blue"), plain, seen, strict=True):
+        rms, correlation = after.told(f"{name}, with the map", after.found)
+        assert before.told("  without", before.found)[0] > 2 * rms
+        assert rms <= 0.05
+        assert correlation >= 0.85
+    # The board is white: one scale for all channels.
+    scales = [np.median(each.found[each.sound] / each.truth[each.sound]) for each in seen]
+    assert max(scales) / min(scales) < 1.02
+    assert seen[0].report["albedo"]["projector_light"] == "as measured on a white board"
+    assert plain[0].report["albedo"]["projector_light"].startswith("taken as even")
+    (tmp_path / "unpainted").mkdir()
+    rig = rig_file(tmp_path / "unpainted", "relief", scene={}, head={**SMALL, **FALLS_OFF})
+    (grey,) = channels(rig, tmp_path / "grey", mapped=light)
+    assert grey.told("grey, with the map", grey.found)[0] <= 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "exposure_s", "words"),
+    [
+        (
+            {"albedo = 0.85": 'albedo = 0.85\ntexture = { kind = "noise", contrast = 0.6, scale_mm = 9.0 }'},
+            None,
+            "smooth",
+        ),
+        ({"[220.0, 180.0]": "[40.0, 30.0]"}, None, "shows no board"),
+        ({}, 0.024, "is saturated"),
+        ({'shape = "plane"': 'shape = "sphere"', "size_mm = [220.0, 180.0]": "radius_mm = 60.0"}, None, "flat board"),
+    ],
+)
+def test_what_is_no_even_white_board_is_refused_in_words(
+    changes: Mapping[str, str], exposure_s: float | None, words: str, tmp_path: Path
+) -> None:
+    bundle = board(tmp_path / "board", replaced(BOARD, changes), ScanPlan(exposure_s=exposure_s))
+    with pytest.raises(CalibrationError, match=words):
+        with_light_map(bundle, lambda *_: None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,16 @@ import pytest
 
 from slrig.bundle import (
     check_calibration,
+    read_bundle,
     read_calibration,
     read_opencv_calibration,
+    write_bundle,
     write_calibration,
     write_opencv_calibration,
 )
 from slrig.errors import CalibrationError
-from slrig.model import Calibration, Size
-from tests.samples import CAMERA, PROJECTOR, pinhole, sample_calibration
+from slrig.model import Calibration, LightMap, Size
+from tests.samples import CAMERA, PROJECTOR, pinhole, sample_calibration, sample_capture
 
 Edit = Callable[[dict[str, Any]], object]
 DEVICE = (
@@ -178,3 +181,47 @@ def test_what_opencv_cannot_hold_is_refused(tmp_path: Path, name: str, file: str
     with pytest.raises(CalibrationError, match=r"rig.*expected"):
         write_opencv_calibration(tmp_path / file, Calibration({name: pinhole()}, None))
     assert list(tmp_path.iterdir()) == []
+
+
+def light_map(*middles: float) -> LightMap:
+    """Light of so much in the middle of each channel, e times as much at the right end."""
+    coefficients = np.zeros((len(middles), 5, 5))
+    coefficients[:, 0, 0], coefficients[:, 1, 0] = np.log(middles), 1
+    return LightMap(coefficients, np.array([[0.0, 0.0], [PROJECTOR.width_px - 1.0, PROJECTOR.height_px - 1.0]]))
+
+
+def test_the_projectors_light_travels_with_the_calibration_and_with_every_bundle(tmp_path: Path) -> None:
+    sent = replace(sample_calibration(), light=light_map(1.0, 2.0, 0.5))
+    write_calibration(tmp_path / "calibration.json", sent)
+    write_bundle(tmp_path / "bundle", sample_capture(), calibration=read_calibration(tmp_path / "calibration.json"))
+    found = read_bundle(tmp_path / "bundle").calibration
+    assert found is not None
+    assert found.light is not None
+    np.testing.assert_array_equal(found.light.coefficients, light_map(1.0, 2.0, 0.5).coefficients)
+    np.testing.assert_array_equal(found.light.covered_px, light_map(1.0).covered_px)
+    # What is known of its devices is the same calibration.
+    assert found.solve_id == sample_calibration().solve_id
+    write_calibration(tmp_path / "older.json", sample_calibration())
+    assert "light" not in json.loads((tmp_path / "older.json").read_text())
+    assert read_calibration(tmp_path / "older.json").light is None
+
+
+def test_a_light_map_of_another_form_is_refused_with_its_place(path: Path) -> None:
+    data = json.loads(path.read_text())
+    data["light"] = {"coefficients": [[[0.0] * 4] * 5], "covered_px": [[0, 0]]}
+    path.write_text(json.dumps(data))
+    with pytest.raises(CalibrationError) as told:
+        read_calibration(path)
+    assert "light.coefficients" in str(told.value)
+    assert "light.covered_px" in str(told.value)
+
+
+def test_light_is_told_in_the_channels_that_are_asked_for_and_no_further_than_it_was_measured() -> None:
+    end, middle_row = PROJECTOR.width_px - 1.0, (PROJECTOR.height_px - 1) / 2
+    places = np.array([[end / 2, middle_row], [end, 0.0], [2 * end, middle_row]])
+    whole = light_map(1.0, 2.0, 0.6).light(places, PROJECTOR, 3)
+    np.testing.assert_allclose(whole, np.outer([1, np.e, np.e], [1.0, 2.0, 0.6]))
+    np.testing.assert_allclose(
+        light_map(1.0, 2.0, 0.6).light(places, PROJECTOR, 1), [[1.2], [1.2 * np.e], [1.2 * np.e]]
+    )
+    assert light_map(1.5).light(places, PROJECTOR, 3).shape == (3, 1)

@@ -16,9 +16,9 @@ from drivers.replay import ReplayHead
 from slrig.bundle import read_bundle, read_capture, write_bundle
 from slrig.bundle.reading import open_bundle
 from slrig.capture.evidence import EvidenceSummary
-from slrig.devices import Rig
+from slrig.devices import ProjectorInfo, Rig
 from slrig.errors import BundleError, UnsupportedByDeviceError
-from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Shot, White
+from slrig.model import Axis, Black, CameraFormat, Capture, Gray, PatternSequence, Pixels, Primary, Shot, Size, White
 from slrig.model.header import CaptureHeader
 from slrig.patterns.sequence import encode
 from slrig.reconstruction.fusion import FusedFrames, fused_colour
@@ -31,6 +31,7 @@ from tests.samples import CAMERA, noise, sample_calibration, sample_capture
 from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig
 
 ENDS = White | Black
+PROJECTOR = ProjectorInfo("projector", "plain", "1", Size(64, 48), plays=False, latency_s=0.0)
 
 
 def is_end(capture: Capture, shot: Shot) -> bool:
@@ -197,7 +198,33 @@ def test_colour_is_left_out_or_refused_as_was_asked(tmp_path: Path) -> None:
         captured(coloured_rig(), tmp_path / "refused", ScanPlan(colour=True))
     assert not (tmp_path / "refused").exists()
     infos = {name: camera.info for name, camera in coloured_rig().cameras.items() if name == "left"}
-    assert in_colour(ScanPlan(colour=True), infos) == {"left"}
+    assert in_colour(ScanPlan(colour=True), infos, PROJECTOR) == {"left"}
+
+
+def test_coloured_light_is_refused_in_words_before_there_is_any(tmp_path: Path) -> None:
+    asked = ScanPlan(coloured_light=True)
+    with pytest.raises(UnsupportedByDeviceError, match=r"coloured_light \(--coloured-light\): .* no lights of its own"):
+        captured(fake := fake_rig(), tmp_path / "refused", asked)
+    assert fake.projector.shows == 0
+    assert not (tmp_path / "refused").exists()
+    cameras = {name: camera.info for name, camera in coloured_rig().cameras.items()}
+    lit = replace(PROJECTOR, lights=True)
+    assert in_colour(asked, cameras, lit) == {"left"}
+    with pytest.raises(UnsupportedByDeviceError, match="every camera has colour already"):
+        in_colour(asked, {"left": cameras["left"]}, lit)
+    assert in_colour(replace(asked, colour=False), {"left": cameras["left"]}, lit) == set()
+
+
+def test_a_recording_in_coloured_light_is_replayed_and_its_patterns_have_names(tmp_path: Path) -> None:
+    whole = replace(capture := coloured_capture(), patterns=(*capture.patterns, Primary("green")))
+    shot = replace(whole.shots[0], pattern=len(capture.patterns), colour=None)
+    write_bundle(tmp_path / "lit", replace(whole, shots=(*whole.shots, shot)))
+    listed = json.loads((tmp_path / "lit" / "bundle.json").read_text())["patterns"]
+    assert listed[-1] == {"colour": "green", "kind": "primary"}
+    assert read_bundle(tmp_path / "lit").capture.patterns == whole.patterns
+    assert ReplayHead(read_bundle(tmp_path / "lit")).projector.info.lights
+    write_bundle(tmp_path / "grey", capture)
+    assert not ReplayHead(read_bundle(tmp_path / "grey")).projector.info.lights
 
 
 def test_a_replayed_recording_has_the_colour_that_was_recorded(tmp_path: Path) -> None:

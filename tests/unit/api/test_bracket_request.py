@@ -125,6 +125,24 @@ def test_the_command_asks_for_one_exposure_or_for_a_bracket(
 SMALL = Size(200, 100)
 
 
+def test_coloured_light_is_asked_for_by_request_rig_file_or_not_at_all() -> None:
+    def asked(request: dict[str, Any], **defaults: Any) -> bool:
+        return scan_plan(ScanRequest.model_validate(request), ScanDefaults(**defaults)).coloured_light
+
+    assert not asked({})
+    assert asked({}, coloured_light=True)
+    assert asked({"coloured_light": True}, coloured_light=False)
+    assert not asked({"coloured_light": False}, coloured_light=True)
+
+
+def test_coloured_light_takes_three_frames_of_a_projector_that_has_lights() -> None:
+    plan, plain = ScanPlan(coloured_light=True), facts()
+    with pytest.raises(UnsupportedByDeviceError, match="no lights of its own"):
+        check_plan(plan, plain)
+    lit = replace(plain, projector=replace(plain.projector, lights=True))
+    assert check_plan(plan, lit) == check_plan(ScanPlan(), plain) + 2 * 3 * 200 * 100
+
+
 def facts(size: Size = SMALL, bit_depth: int = 8) -> RigFacts:
     info = CameraInfo(
         "left", "", "", CameraFormat(size, bit_depth), frozenset({Trigger.SOFTWARE}), (0.001, 0.1), (1.0, 1.0)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from slrig.errors import PatternError
-from slrig.model import Axis, Black, Gray, LineShift, Pattern, Size, White
+from slrig.model import Axis, Black, Gray, LineShift, Pattern, Primary, Size, White
 from slrig.patterns.sequence import encode, scan_patterns, united
 
 
 def patterns_of(
-    size: Size, *, line_shift: bool = True, period_px: int = 8, gray_cell_px: int | None = None, rows: bool = False
+    size: Size,
+    *,
+    line_shift: bool = True,
+    period_px: int = 8,
+    gray_cell_px: int | None = None,
+    rows: bool = False,
+    coloured_light: bool = False,
 ) -> tuple[Pattern, ...]:
     return scan_patterns(
         size,
@@ -21,6 +29,7 @@ def patterns_of(
         gray_cell_px=gray_cell_px,
         gray_offset_px=0,
         rows=rows,
+        coloured_light=coloured_light,
     )
 
 
@@ -49,6 +58,18 @@ def test_gray_only_has_cells_of_two_pixels_and_no_lines() -> None:
 def test_rows_follow_columns_with_bits_of_their_own() -> None:
     axes = [pattern.axis for pattern in patterns_of(Size(64, 30), rows=True) if isinstance(pattern, Gray | LineShift)]
     assert axes == [Axis.COLUMN] * (2 * 4 + 8) + [Axis.ROW] * (2 * 3 + 8)
+
+
+@pytest.mark.parametrize("options", [{}, {"line_shift": False}])
+def test_white_in_each_light_stands_before_a_pattern_that_tells_an_old_frame_and_after_one(options: Any) -> None:
+    patterns = patterns_of(Size(64, 48), coloured_light=True, **options)
+    at = [index for index, pattern in enumerate(patterns) if isinstance(pattern, Primary)]
+    assert [patterns[index] for index in at] == [Primary("red"), Primary("green"), Primary("blue")]
+    for index in at:
+        assert all(isinstance(patterns[index + step], Gray) for step in (-1, 1))
+    rest = tuple(pattern for pattern in patterns if not isinstance(pattern, Primary))
+    assert rest == patterns_of(Size(64, 48), **options)
+    assert encode([Primary("red")], Size(64, 48)).profiles[0].tolist() == [[255]]
 
 
 def test_a_cell_wider_than_half_a_period_is_refused() -> None:

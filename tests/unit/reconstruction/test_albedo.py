@@ -210,4 +210,4 @@ def test_an_uneven_projector_is_made_up_for() -> None:
     light = 1 + points.pixels_px[:, 1] / SHAPE[0]
     truth = tint(points.points_mm)
     assert relative_error(albedo(points, [uneven], PROJECTOR.centre_mm), truth) > 0.05
-    assert relative_error(albedo(points, [uneven], PROJECTOR.centre_mm, light=light), truth) < 0.003
+    assert relative_error(albedo(points, [uneven], PROJECTOR.centre_mm, light=light[:, None]), truth) < 0.003

@@ -52,7 +52,7 @@ def test_what_is_as_bright_and_farther_away_has_the_lighter_colour() -> None:
     srgb = 255 * (1.055 * np.minimum(expected, 1) ** (1 / 2.4) - 0.055)
     assert np.abs(made.colour - srgb[:, None]).max() < 0.6
     assert not made.mark.any()
-    report = albedo_report(made, mesh_of(made, found), [camera], lit=True)
+    report = albedo_report(made, mesh_of(made, found), [camera], lit=True, mapped=True)
     assert str(report["is"]).startswith("albedo")
     assert report["marked_vertices"] == {"saturated": 0, "grazing": 0, "border": 0, "unknown": 0, "shaded": 0}
     assert report["camera_gains"] == {"camera": {"gain": [1.0], "points": 0}}
@@ -63,7 +63,7 @@ def test_without_a_calibrated_projector_the_colour_is_brightness_and_says_so() -
     made, found = colours_of(cameras, None)
     assert (made.mark == AlbedoMark.SHADED).all()
     assert (made.colour == made.colour[0]).all()
-    report = albedo_report(made, mesh_of(made, found), cameras, lit=False)
+    report = albedo_report(made, mesh_of(made, found), cameras, lit=False, mapped=False)
     assert str(report["is"]).startswith("brightness")
     assert report["marked_vertices"] == {
         "saturated": 0, "grazing": 0, "border": 0, "unknown": 0, "shaded": len(made.mark) - len(made.mark) % 3

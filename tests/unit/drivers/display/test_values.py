@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import threading
 
+import numpy as np
 import pytest
 
 from drivers.display.edid import parse
+from drivers.display.pixels import coloured
 from drivers.display.timing import copied, flipped, queued, whole_light
 from drivers.display.working import OwnThread
 from slrig.errors import DeviceError, DeviceGoneError
+from slrig.model import Pattern, Primary, White
 
 SECOND_NS = 10**9
+LIGHTS: tuple[Pattern, ...] = (Primary("red"), Primary("green"), Primary("blue"), White())
 
 
 def edid(*, maker: str = "EPS", name: str = "PJ 720", serial: str = "X1234", number: int = 0) -> bytes:
@@ -92,3 +96,8 @@ def test_a_hanging_thread_is_told_of_and_goes_on_later() -> None:
 def _fail() -> None:
     message = "the cable was pulled"
     raise DeviceGoneError(message)
+
+
+def test_white_in_one_light_has_pixels_of_that_colour() -> None:
+    words = [int(coloured(np.full((1, 1), 255, np.uint8), pattern)[0, 0]) for pattern in LIGHTS]
+    assert words == [0xFF0000, 0x00FF00, 0x0000FF, 0xFFFFFF]

@@ -14,6 +14,7 @@ from drivers.pattern_engine.options import Colour
 from drivers.pattern_engine.timing import Timing
 from slrig.bundle.faults import checked
 from slrig.errors import ConfigError, UnsupportedByDeviceError
+from slrig.model import Primary, White
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def test_pictures_beyond_the_buffers_need_time() -> None:
 
 def test_table_entries_are_laid_out_as_the_manual_says() -> None:
     places = (Place(3, 0, inverted=False), Place(3, 23, inverted=True), Place(3, 9, inverted=False))
-    tables = tables_of(places, Colour.WHITE, dark_between=True)
+    tables = tables_of(places, (Colour.WHITE,) * len(places), dark_between=True)
     words = [int.from_bytes(tables.patterns[3 * i : 3 * i + 3], "little") for i in range(3)]
     assert words == [
         0b0110_0111_0001_000000_00,
@@ -94,19 +95,29 @@ def test_table_entries_are_laid_out_as_the_manual_says() -> None:
 
 
 def test_colour_and_a_pattern_without_dark_between() -> None:
-    tables = tables_of((Place(0, 1, inverted=False),), Colour.BLUE, dark_between=False)
+    tables = tables_of((Place(0, 1, inverted=False),), (Colour.BLUE,), dark_between=False)
     assert int.from_bytes(tables.patterns, "little") == 0b0100_0100_0001_000001_00
+
+
+def test_white_in_one_light_is_lit_by_that_led_alone() -> None:
+    options = EngineOptions(patterns="p")
+    colours = [options.colour_of(pattern) for pattern in (White(), Primary("green"), Primary("blue"))]
+    tables = tables_of([Place(0, 1, inverted=False)] * 3, colours, dark_between=False)
+    words = [int.from_bytes(tables.patterns[3 * i : 3 * i + 3], "little") for i in range(3)]
+    assert [word >> 12 & 7 for word in words] == [0b111, 0b010, 0b100]
 
 
 def test_each_change_of_picture_swaps_the_buffer() -> None:
     places = [Place(image, 0, inverted=False) for image in (5, 5, 2, 5)]
-    tables = tables_of(places, Colour.RED, dark_between=False)
+    tables = tables_of(places, (Colour.RED,) * len(places), dark_between=False)
     assert [tables.patterns[3 * i + 2] >> 2 & 1 for i in range(4)] == [1, 0, 1, 1]
     assert (tables.images, tables.counts) == (bytes([5, 2, 5]), (2, 1, 1))
 
 
 def test_a_table_of_two_pictures_is_sent_the_other_way_round() -> None:
-    tables = tables_of([Place(7, 0, inverted=False), Place(4, 0, inverted=False)], Colour.RED, dark_between=False)
+    tables = tables_of(
+        [Place(7, 0, inverted=False), Place(4, 0, inverted=False)], (Colour.RED, Colour.RED), dark_between=False
+    )
     assert tables.images == bytes([4, 7])
     assert tables.counts == (1, 1)
 
