@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from slrig.cli.client import ServiceClient
-from tests.e2e.forking import ForkedCommand
+from tests.e2e.forking import ForkedCommand, worker_of
 from tests.npm import lacking
 
 if TYPE_CHECKING:
@@ -109,6 +109,8 @@ class ServiceProcess:
 
     def worker_id(self) -> int:
         """The process id of the reconstruction process."""
+        if (forked := worker_of(self.process.pid)) is not None:
+            return forked
         for line in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
             for child in line.read_text().split():
                 if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():

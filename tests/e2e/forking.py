@@ -1,8 +1,9 @@
-"""The service in a process that is forked from one that has loaded it, and so loads nothing anew.
+"""The service, and its worker, in processes that are forked from one that has loaded them, and so load nothing anew.
 
-Most tests of the service are about what it does once it runs, and start it dozens of times; loading FastAPI,
-SQLAlchemy and the rest takes three to four seconds of processor time each. What is forked is the same command with the
-same arguments, environment, output and signals; it loads the rig's driver and its worker by itself.
+Most tests of the service are about what it does once it runs, and start it dozens of times; loading FastAPI, the
+rendered rig, the mathematics and its kernels takes ten seconds of processor time each. What is forked is the same
+command with the same arguments, environment, output and signals; its worker does the same as one that is spawned. What
+such processes load by themselves is seen by tests that start them afresh.
 """
 
 from __future__ import annotations
@@ -14,15 +15,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
-_LOADED = ("slrig.cli.commands", "slrig.api.server")
-"""What every service loads, whatever its rig is."""
+_LOADED = ("slrig.cli.commands", "slrig.api.server", "simulated_rig.device", "slrig.scan.reconstruct")
+"""What a service of a rendered rig and its worker load; before the last one, so that it finds their kernels."""
 
 
 _ENVIRONMENT = dict(os.environ)
@@ -72,15 +75,62 @@ class ForkedCommand:
 @cache
 def _context() -> ForkServerContext:
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(list(_LOADED))
+    context.set_forkserver_preload([*_LOADED, "tests.e2e.kept_kernels"])
     # What a test has set by now, as where its plug-ins lie, is for the services of that test.
     with mock.patch.dict(os.environ, _ENVIRONMENT, clear=True):
         forkserver.ensure_running()
     return context
 
 
+def worker_of(service: int) -> int | None:
+    """The process id of the worker that a forked service has; None if it has none."""
+    for comm in Path("/proc").glob("[0-9]*/comm"):
+        with suppress(OSError):  # one that has just ended
+            if comm.read_text().strip() == _worker_name(service):
+                return int(comm.parent.name)
+    return None
+
+
+def _worker_name(service: int) -> str:
+    return f"worker {service}"
+
+
+class _Workers(ForkServerContext):
+    """In a forked service: has its worker forked, too. log : where the service's standard error goes."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__()
+        self._log = log
+
+    def Process(self, *, target: Any, args: tuple[Any, ...], **options: Any) -> Any:  # type: ignore[override] # noqa: N802
+        """A process that is forked where another context would spawn one."""
+        given = dict(os.environ), self._log, os.getpid(), target, args
+        return super().Process(target=_work, args=given, **options)
+
+
+def _work(environment: dict[str, str], log: str, service: int, target: Any, args: tuple[Any, ...]) -> None:
+    """Become the worker of a service, in the process that was forked."""
+    _become(environment, log)
+    Path("/proc/self/comm").write_text(_worker_name(service))
+    target(*args)
+
+
 def _run(args: list[str], environment: dict[str, str], log: str, output: Connection) -> None:
     """Become the command, in the process that was forked."""
+    _become(environment, log)
+    os.dup2(output.fileno(), 1)
+    output.close()
+    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
+    sys.argv = ["slrig", *args]
+
+    from slrig.cli.commands import main
+
+    with mock.patch.object(multiprocessing, "get_context", return_value=_Workers(log)):
+        main()
+
+
+def _become(environment: dict[str, str], log: str) -> None:
+    """Take an environment and a standard error."""
     os.environ.clear()
     os.environ.update(environment)
     # As Python does at its start.
@@ -89,14 +139,6 @@ def _run(args: list[str], environment: dict[str, str], log: str, output: Connect
     errors = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     os.dup2(errors, 2)
     os.close(errors)
-    os.dup2(output.fileno(), 1)
-    output.close()
-    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
     sys.stderr = os.fdopen(2, "w", buffering=1, closefd=False)
     if environment.get("PYTHONFAULTHANDLER"):
         faulthandler.enable()
-    sys.argv = ["slrig", *args]
-
-    from slrig.cli.commands import main
-
-    main()

@@ -126,6 +126,7 @@ def test_told_to_end_at_every_step(serve: Callable[[], ServiceProcess], desk: De
         print(f"SIGTERM at {step!s:16} exit {code} in {took_s:.1f} s, {follower.last():12}", end="")  # noqa: T201
         print(f"projector {'lit' if desk.lit else 'dark'}")  # noqa: T201
         assert code == 0
+        assert not (service.data / "service.json").exists()
         assert not desk.lit, desk.light
         assert {device for device, name, _ in desk.steps if name == "close"} >= _opened(desk)
         last = follower.last()

@@ -41,11 +41,20 @@ def test_the_commands_work_in_order_in_a_fresh_folder(tmp_path: Path) -> None:
     failed: list[str] = []
     with Person(tmp_path / "fresh") as person:
         lay_out_rigs(person.folder)
-        for command in COMMANDS:
+        for command in _different():
             why_not = _tried(command, person)
             if why_not is not None:
                 failed.append(f"{command}\n  {why_not}")
     assert not failed, "\n".join(failed)
+
+
+def _different() -> list[Command]:
+    """The commands without those that have been there word for word, except where the word stands for another one."""
+    found: list[Command] = []
+    for command in COMMANDS:
+        if any(each.word in command.text for each in WORDS) or command.text not in {each.text for each in found}:
+            found.append(command)
+    return found
 
 
 def _tried(command: Command, person: Person) -> str | None:

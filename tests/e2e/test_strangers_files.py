@@ -22,8 +22,8 @@ from tests.strangers import good_bundle, good_frames, harm_bundle, harmed_calibr
 from tests.unit.test_file_storage import REFUSED
 
 pytestmark = pytest.mark.slow
-FILES = int(os.environ.get("SLRIG_FUZZ_FILES") or 500)
-BUNDLES = int(os.environ.get("SLRIG_FUZZ_BUNDLES") or 200)
+FILES = int(os.environ.get("SLRIG_FUZZ_FILES") or 200)
+BUNDLES = int(os.environ.get("SLRIG_FUZZ_BUNDLES") or 100)
 SEED = int(os.environ.get("SLRIG_FUZZ_SEED") or 16)
 KINDS = {".json": "application/json", ".yml": "application/yaml", ".xml": "application/xml"}
 

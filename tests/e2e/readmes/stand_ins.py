@@ -186,12 +186,14 @@ def _halved(extent: re.Match[str]) -> str:
 def lay_out_rigs(folder: Path) -> None:
     """Write the rendered rig of the stand-ins, and make the one whose calibration takes minutes as small as it.
 
-    The others that are scanned and examined have pictures of half their width and height, and a ray a pixel.
+    The others that are scanned and examined have pictures as small as those of the tests' small rig, and a ray a pixel.
     """
-    for each in ("demo", "plane"):
+    for each, halvings in (("demo", 2), ("plane", 1)):
         rig = folder / "config" / "rigs" / f"{each}.toml"
-        smaller, count = _EXTENTS.subn(_halved, rig.read_text(encoding="utf-8"))
-        assert count == 6, smaller
+        smaller = rig.read_text(encoding="utf-8")
+        for _ in range(halvings):
+            smaller, count = _EXTENTS.subn(_halved, smaller)
+            assert count == 6, smaller
         rig.write_text(re.sub(r"samples_per_axis = \d", "samples_per_axis = 1", smaller), encoding="utf-8")
     for rig, scene, square_mm in (
         (folder / RENDERED, folder / "board.toml", 12.0),
