@@ -31,8 +31,8 @@ _DAMAGED = 0.15
 Expected = Callable[[str, int], Pixels]
 """What a camera sees of a pattern of the sequence: (H, W), in its own units, with little noise or none."""
 
-FRAMES = int(os.environ.get("SLRIG_PAIRING_FRAMES", "500"))
-"""How many frames a slow test of pairing counts. 500 find a fault of one frame in a hundred with 99 %; campaigns, run
+FRAMES = int(os.environ.get("SLRIG_PAIRING_FRAMES", "300"))
+"""How many frames a slow test of pairing counts. 300 find a fault of one frame in a hundred with 95 %; campaigns, run
 when a driver or the evidence changes, ask for 2000 or more."""
 
 

@@ -90,12 +90,15 @@ def counted(
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", LIGHTS.values(), ids=LIGHTS)
 def test_real_light_is_no_alarm_and_hides_no_fault(tmp_path: Path, scene: dict[str, Any]) -> None:
-    """2000 of each were counted when this was written, three seeds."""
-    frames = FRAMES
+    """Half of FRAMES for each of nine: 2000 of each were counted when this was written, three seeds.
+
+    What light does to clean frames it does to every scan alike: a few scans show it.
+    """
+    frames = FRAMES // 2
     (tmp_path / "sound").mkdir()
     (tmp_path / "disturbed").mkdir()
     sound = simulated(tmp_path / "sound", **scene)
-    clean = counted(sound, sound, frames=frames)
+    clean = counted(sound, sound, frames=frames // 2)
     assert (clean.wrong, clean.examples, clean.shot_again, clean.refused_scans) == (0, (), 0, 0)
     for seed in SEEDS:
         disturbed = simulated(tmp_path / "disturbed", faults=DISTURBED, seed=seed, **scene)

@@ -17,7 +17,7 @@ from tests.contract.screen_server import DummyServer, OutputPixels
 pytestmark = pytest.mark.slow
 
 OUTPUTS = ("DUMMY0", "DUMMY1")
-SIZES = (Size(1280, 800), Size(854, 480), Size(102, 77))
+SHOWN = (("DUMMY0", Size(1280, 800)), ("DUMMY1", Size(854, 480)), ("DUMMY0", Size(102, 77)), ("DUMMY1", Size(102, 77)))
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +30,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DummyServer]:
 
 
 @pytest.mark.parametrize("backend", ["x11", "sdl"])
-@pytest.mark.parametrize("output", OUTPUTS)
-@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize(("output", "size"), SHOWN, ids=str)
 def test_every_pixel_of_every_pattern_is_on_its_output(
     server: DummyServer, backend: str, output: str, size: Size
 ) -> None:

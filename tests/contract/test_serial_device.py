@@ -133,17 +133,13 @@ def play_session(seed: int, engine: Engine, scene: Scene, tallied: Tallied, *, r
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("interpreter", "sessions"), [("CPython", 8), ("MicroPython", 3)])
-def test_sessions_over_a_bad_line_are_exact(interpreter: str, sessions: int) -> None:
-    tallied = Tallied()
+def test_sessions_of_micropython_over_a_bad_line_are_exact() -> None:
+    tallied, sessions = Tallied(), 3
     for seed in range(sessions):
         scene = Scene()
-        if interpreter == "CPython":
-            play_session(seed, CoreEngine(scene, description(CRC32)), scene, tallied)
-        else:
-            # Its process takes a quarter of a second to start again, and longer beside other work.
-            engine = MicroPythonEngine(scene, description(CRC32), micropython_package())
-            play_session(seed, engine, scene, tallied, reply_s=0.25)
+        # Its process takes a quarter of a second to start again, and longer beside other work.
+        engine = MicroPythonEngine(scene, description(CRC32), micropython_package())
+        play_session(seed, engine, scene, tallied, reply_s=0.25)
     assert (tallied.exact, tallied.twice) == (sessions, 0), tallied.wrong
     assert tallied.restarts == sessions
     assert tallied.lost > 0

@@ -23,7 +23,7 @@ from slrig.model import Calibration
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "ball_bar.toml"
 """Small: the demonstration's resolution over half its view."""
 
-SEEDS = 3
+SEEDS = 2
 
 FORM_SIGMAS = 7.5
 """Noise alone gives a form of 5.9 standard deviations; the rim of a ball in a half-size picture adds of its own."""
@@ -100,7 +100,7 @@ def test_a_position_without_its_artefact_is_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_reported_errors_agree_with_truth_whatever_the_noise(tmp_path: Path) -> None:
     config = read_rig(RIG)
-    plan, _ = plan_of(config, "sphere-1", "sphere-5", "bar-1", "bar-7", "plane-5")
+    plan, _ = plan_of(config, "sphere-1", "sphere-5", "bar-1", "bar-7")
     spacings: list[float] = []
     forms: list[float] = []
     for seed in range(1, SEEDS + 1):

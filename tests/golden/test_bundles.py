@@ -52,7 +52,7 @@ def test_a_line_shift_bundle_meets_its_figures(shared: Path, tmp_path: Path, sce
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", ["vase", "gauge"], ids=["one camera", "two cameras"])
 def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
     shared: Path, tmp_path: Path, scene: str
 ) -> None:
@@ -78,7 +78,10 @@ def test_without_its_line_frames_a_bundle_is_reconstructed_from_code_edges(
 
 @pytest.mark.slow
 def test_one_bundle_gives_the_same_bytes_of_mesh_twice(shared: Path, tmp_path: Path) -> None:
+    # To compare with the truth takes as long as all the rest, and the mesh knows nothing of it.
+    bundle = tmp_path / "vase"
+    shutil.copytree(shared / "bundles" / "vase", bundle, ignore=shutil.ignore_patterns("truth*", "visible_points.npy"))
     for run in ("first", "second"):
-        reconstructed(shared / "bundles" / "vase", tmp_path / run)
+        reconstructed(bundle, tmp_path / run)
     for name in ("mesh.ply", "mesh.glb", "points.ply"):
         assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes(), name

@@ -76,7 +76,7 @@ def test_a_change_is_stale_and_its_device_named(
 
 def test_a_rig_that_did_not_change_is_good_in_every_pose(tmp_path: Path, calibration: Calibration) -> None:
     options = board_options(cameras=2) | {"seed": 77}
-    for bundle in rendered_poses(tmp_path, options, poses=[1, 6, 11]):
+    for bundle in rendered_poses(tmp_path, options, poses=[1, 11]):
         found = verify_bundle(bundle, BOARD, calibration)
         assert judged([found]).state is HealthState.GOOD
         assert max(abs(pair.mean_px) for pair in found.pairs) < 0.02

@@ -125,24 +125,34 @@ def test_latency_and_shutter_are_those_of_the_rig_file(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("trigger", [Trigger.FREE, Trigger.SOFTWARE])
-@pytest.mark.parametrize("bit_depth", [8, 12])
-@pytest.mark.parametrize("exposure_s", [0.005, 0.010, 0.020])
-@pytest.mark.parametrize("line_s", SHUTTERS_S)
-def test_latency_and_shutter_for_every_exposure_depth_and_trigger(
-    tmp_path: Path, exposure_s: float, line_s: float, bit_depth: int, trigger: Trigger
+@pytest.mark.parametrize(
+    ("exposure_s", "line_s", "latency_s", "bit_depth", "trigger"),
+    [
+        (0.005, SHUTTERS_S[0], 0.012, 12, Trigger.FREE),
+        (0.005, SHUTTERS_S[1], 0.047, 12, Trigger.FREE),
+        (0.005, SHUTTERS_S[2], 0.083, 8, Trigger.SOFTWARE),
+        (0.010, SHUTTERS_S[0], 0.047, 8, Trigger.SOFTWARE),
+        (0.010, SHUTTERS_S[1], 0.083, 8, Trigger.FREE),
+        (0.010, SHUTTERS_S[2], 0.012, 12, Trigger.FREE),
+        (0.020, SHUTTERS_S[0], 0.083, 12, Trigger.SOFTWARE),
+        (0.020, SHUTTERS_S[1], 0.012, 8, Trigger.SOFTWARE),
+        (0.020, SHUTTERS_S[2], 0.047, 8, Trigger.FREE),
+    ],
+)
+def test_latency_and_shutter_in_a_bright_room(
+    tmp_path: Path, exposure_s: float, line_s: float, latency_s: float, bit_depth: int, trigger: Trigger
 ) -> None:
-    for seed, latency_s in enumerate((0.012, 0.047, 0.083)):
-        path = written(
-            tmp_path,
-            latency_s=latency_s,
-            exposure_s=exposure_s,
-            line_s=line_s,
-            bit_depth=bit_depth,
-            seed=seed,
-            ambient=0.2,
-        )
-        require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
+    """Each value of each column stands beside each value of every other one."""
+    path = written(
+        tmp_path,
+        latency_s=latency_s,
+        exposure_s=exposure_s,
+        line_s=line_s,
+        bit_depth=bit_depth,
+        seed=2,
+        ambient=0.2,
+    )
+    require_truth(found_on(path, trigger), latency_s=latency_s, line_s=line_s)
 
 
 def test_an_honest_projector_has_no_latency_beyond_its_word(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from slrig.bundle import write_calibration
 from slrig.cli.commands import app
 from slrig.model import Calibration, Pinhole, Size
-from tests.e2e.conftest import KEY, Start, start, write_rig
+from tests.e2e.conftest import KEY, Start, start
 from tests.plugin.conftest import path_with, slrig
 
 __all__ = ["start"]
@@ -163,10 +163,10 @@ def test_the_example_conforms(example_site: Path, tmp_path: Path) -> None:
     assert report["passed"] >= 30
 
 
-def test_a_scan_with_the_example_is_a_plane_at_its_distance(
-    start: Start, example_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_scan_with_the_example_beside_broken_plug_ins_is_a_plane_at_its_distance(
+    start: Start, example_site: Path, broken_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", path_with(example_site))
+    monkeypatch.setenv("PYTHONPATH", path_with(example_site, broken_site))
     monkeypatch.setenv("SLRIG_API_KEY", KEY)
     service = start(chart_rig(tmp_path / "rig"))
     output = tmp_path / "scan"
@@ -186,21 +186,6 @@ def test_a_scan_with_the_example_is_a_plane_at_its_distance(
     assert rig["projector"]["model"] == "test chart lamp"
     assert "example_chart" in {driver["name"] for driver in device["drivers"]}
     assert "chart-0" in {found["device"] for found in device["devices"]}
-    assert service.stop() == 0
-
-
-def test_the_service_scans_beside_broken_plug_ins(
-    start: Start, broken_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PYTHONPATH", path_with(broken_site))
-    monkeypatch.setenv("SLRIG_API_KEY", KEY)
-    service = start(write_rig(tmp_path / "rig"))
-    output = tmp_path / "scan"
-    result = CliRunner().invoke(app, ["scan", "--url", service.url, "--output", str(output)])
-    assert result.exit_code == 0, result.output
-    assert (output / "mesh.ply").is_file()
-    with service.client() as client:
-        device = client.get("/device")
     faults = {driver["name"]: driver["fault"] for driver in device["drivers"] if driver["kind"] == "camera"}
     assert "firmware [2.x]" in faults["broken_import"]
     assert any("the bus does not answer" in fault for fault in device["faults"])

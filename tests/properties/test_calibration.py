@@ -50,7 +50,7 @@ def test_a_step_changes_residuals_by_its_derivative(seed: int, bend: list[float]
 
 
 @pytest.mark.slow
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(seed=st.integers(0, 1000))
 def test_the_order_of_poses_does_not_matter(seed: int) -> None:
     observations, _ = made(replace(QUICK, seed=seed))
@@ -67,7 +67,7 @@ def test_the_order_of_poses_does_not_matter(seed: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(share=st.floats(0.2, 5.0))
 def test_the_board_s_unit_scales_lengths_and_nothing_else(share: float) -> None:
     observations, _ = made(replace(QUICK, seed=1))

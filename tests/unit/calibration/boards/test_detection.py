@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import cv2
@@ -401,20 +403,33 @@ def reference_s() -> float:
     return min(taken)
 
 
+def takes_less(limit_s: float, action: Callable[[], object]) -> bool:
+    """Whether it takes less processor time, at the third attempt at the latest: a busy machine only ever adds to it."""
+    for _ in range(3):
+        started = time.process_time()
+        action()
+        if time.process_time() - started < limit_s:
+            return True
+    return False
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("board", ALL, ids=title)
 def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
     """It took 0.13 to 0.22 s when it was measured."""
     seen_by = eye(board, width=1280, height=1024, focal_px=1600.0)
     image = shot(board, seen_by)
-    find_board(image, board, full_scale=255)
-    taken = []
-    for _ in range(3):
-        started = time.process_time()
-        view = find_board(image, board, full_scale=255)
-        taken.append(time.process_time() - started)
-    assert len(view.corner) == board.corner_count
-    assert min(taken) < 4 * reference_s()
+    assert len(find_board(image, board, full_scale=255).corner) == board.corner_count
+    assert takes_less(4 * reference_s(), lambda: find_board(image, board, full_scale=255))
+
+
+@cache
+def large(there: Board | None) -> NDArray[np.uint8]:
+    """An image of 1280 x 1024 pixels of nothing, or of a board of this kind with two lines more each way."""
+    if there is None:
+        return as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
+    other = Board(there.kind, there.columns + 2, there.rows + 2, 0.8 * there.square_mm)
+    return shot(other, eye(other, width=1280, height=1024, focal_px=1600.0))
 
 
 @pytest.mark.slow
@@ -422,16 +437,10 @@ def test_a_board_is_found_in_half_a_second_of_one_core(board: Board) -> None:
 @pytest.mark.parametrize("there", [*ALL, None], ids=title)
 def test_another_board_is_refused_within_two_seconds_of_one_core(asked: Board, there: Board | None) -> None:
     """A pose is answered within two seconds. It took 0.2 to 1.3 s when it was measured."""
-    if there is None:
-        image = as_8_bit(np.random.default_rng(3).normal(0.4, 0.02, (1024, 1280)))
-    else:
-        # A larger or smaller one of its kind, too.
-        other = Board(there.kind, there.columns + 2, there.rows + 2, 0.8 * there.square_mm)
-        image = shot(other, eye(other, width=1280, height=1024, focal_px=1600.0))
-    taken = []
-    for _ in range(2):
-        started = time.process_time()
+    image = large(there)
+
+    def refusal() -> None:
         with pytest.raises(PoseRefusedError):
             find_board(image, asked, full_scale=255)
-        taken.append(time.process_time() - started)
-    assert min(taken) < 15 * reference_s()
+
+    assert takes_less(15 * reference_s(), refusal)

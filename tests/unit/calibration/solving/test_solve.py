@@ -217,10 +217,11 @@ def test_a_bowed_board_is_found_and_does_no_harm(bow_mm: float) -> None:
     "recipe",
     [
         replace(SMALL, poses=4, seed=508),
-        *(pytest.param(replace(SMALL, poses=5, seed=600 + seed), marks=pytest.mark.slow) for seed in range(12)),
+        *(pytest.param(replace(SMALL, poses=5, seed=seed), marks=pytest.mark.slow) for seed in (600, 603, 604, 609)),
     ],
 )
 def test_a_flat_board_stays_flat(recipe: Recipe) -> None:
+    """Of twelve seeds from 600 on, those of the largest bow, of the least sure one, and of the largest error."""
     solution, truth = solved(recipe)
     assert solution.board_shape_mm is None
     assert solution.bow is not None
@@ -249,7 +250,7 @@ def test_corners_that_lie_off_their_printed_places_are_found() -> None:
 @pytest.mark.slow
 def test_nearly_all_numbers_of_many_rigs_are_within_three_deviations() -> None:
     """95 % is asked for, of 40 rigs (SLRIG_RIGS=40); and deviations that are far too large would be no use either."""
-    found, rigs = [], int(os.environ.get("SLRIG_RIGS", "12"))
+    found, rigs = [], int(os.environ.get("SLRIG_RIGS", "6"))
     for seed in range(rigs):
         solution, truth = solved(Recipe(seed=100 + seed, poses=10, side=12))
         found.append(list(in_deviations(solution, truth).values()))

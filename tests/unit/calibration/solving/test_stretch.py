@@ -60,7 +60,7 @@ def test_a_board_that_is_as_it_says_has_no_stretch() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("wide", "high"), [(1.002, 1.0), (0.998, 1.0), (1.0, 1.004), (0.9995, 1.0005)])
+@pytest.mark.parametrize(("wide", "high"), [(1.002, 1.0), (1.0, 1.004), (0.9995, 1.0005)])
 def test_a_stretched_print_is_found_and_its_error_stated(wide: float, high: float) -> None:
     solution, expected, truth = solved(printed(wide, high))
     size, stretch = solution.size, wide / high - 1
@@ -85,7 +85,7 @@ def test_a_stretched_board_may_be_bowed_as_well() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.01, 0.009, -0.005])
+@pytest.mark.parametrize("share", [0.01, -0.005])
 def test_a_wrong_square_is_told_against_an_earlier_calibration_only(share: float) -> None:
     observations, truth = made(printed(1 / (1 + share), 1 / (1 + share)))
     wrong = solve(observations)

@@ -106,7 +106,7 @@ def test_triggered_frames_show_what_they_are_paired_with(peer: FakeGigE, disturb
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("latched", "count"), [(True, 400), (False, 150)])
+@pytest.mark.parametrize(("latched", "count"), [(True, FRAMES), (False, FRAMES // 2)])
 def test_free_running_frames_show_what_they_are_paired_with(
     peer: FakeGigE, disturbed: Disturbed, opened: Opened, latched: bool, count: int
 ) -> None:

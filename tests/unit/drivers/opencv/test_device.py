@@ -44,7 +44,7 @@ def plugged(tmp_path: Path) -> Iterator[Plug]:
         yield plug
 
 
-def follows(camera: Camera, device: FakeDevice, *, exposure_s: float, most_dn: float = 8, turns: int = 12) -> None:
+def follows(camera: Camera, device: FakeDevice, *, exposure_s: float, most_dn: float = 8, turns: int = 6) -> None:
     """Expect that each pattern that is shown is the one that is seen."""
     shown, light = sequence(), device.stage
     projector, rng, idle = StagedProjector(light), np.random.default_rng(2), threading.Event()
@@ -78,7 +78,7 @@ def test_whatever_the_stamp_names_no_frame_is_stale(plugged: Plug, stamp: str) -
     device = plugged(stamp=stamp, jitter_s=0.003, lost=0.1)
     camera = device.open_camera(**GREY)
     assert camera.configure(CameraSettings(0.01)).exposure_s == pytest.approx(0.01)
-    follows(camera, device, exposure_s=0.01, turns=20)
+    follows(camera, device, exposure_s=0.01, turns=10)
     # Set while it was not streaming, and in effect when it streams again.
     camera.configure(CameraSettings(0.005))
     follows(camera, device, exposure_s=0.005)
@@ -91,7 +91,7 @@ def test_raw_formats_come_through_opencv(plugged: Plug, code: str, bit_depth: in
     camera = device.open_camera(**{**GREY, "fourcc": code.strip()})
     assert camera.info.format.bit_depth == bit_depth
     camera.configure(CameraSettings(0.01))
-    follows(camera, device, exposure_s=0.01, most_dn=0.05 * 2**bit_depth, turns=6)
+    follows(camera, device, exposure_s=0.01, most_dn=0.05 * 2**bit_depth)
     camera.close()
 
 

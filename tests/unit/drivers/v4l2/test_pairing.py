@@ -18,7 +18,6 @@ from tests.contract.v4l2_sensor import GAIN_UNITS
 pytestmark = pytest.mark.slow
 
 EXPOSURE_S, GAIN = 0.0008, 8.0
-SOME_FRAMES = 150
 
 
 def wrongly_paired(plugged: Callable[..., FakeDevice], stamp: str, frames: int) -> tuple[int, int]:
@@ -57,19 +56,12 @@ def wrongly_paired(plugged: Callable[..., FakeDevice], stamp: str, frames: int) 
     return wrong, number
 
 
-STAMPS = ["start", "first packet", "end", "none", "other clock"]
-
-
-@pytest.mark.parametrize("stamp", STAMPS)
-def test_no_frame_is_paired_wrongly(plugged: Callable[..., FakeDevice], stamp: str) -> None:
-    wrong, made = wrongly_paired(plugged, stamp, SOME_FRAMES)
+@pytest.mark.parametrize(
+    ("stamp", "frames"),
+    [("start", FRAMES), ("first packet", FRAMES), ("end", FRAMES), ("none", FRAMES // 2), ("other clock", FRAMES // 2)],
+)
+def test_no_frame_is_paired_wrongly(plugged: Callable[..., FakeDevice], stamp: str, frames: int) -> None:
+    """Without a stamp of the kernel's clock the driver goes by when a frame came, the same way for both of these."""
+    wrong, made = wrongly_paired(plugged, stamp, frames)
     assert wrong == 0
-    assert made > 2 * SOME_FRAMES
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stamp", ["start", "first packet", "end"])
-def test_no_frame_is_paired_wrongly_over_thousands(plugged: Callable[..., FakeDevice], stamp: str) -> None:
-    wrong, made = wrongly_paired(plugged, stamp, FRAMES)
-    assert wrong == 0
-    assert made > 2 * FRAMES
+    assert made > 2 * frames
