@@ -70,6 +70,7 @@ class Plate:
             return np.full(SHAPE, float(isinstance(pattern, White)))
         if isinstance(pattern, LineShift):
             return np.asarray(self.line * (1 + np.cos(2 * np.pi * (x - pattern.centre_px) / PERIOD)))
+        assert isinstance(pattern, Gray)
         cell = np.floor((x + 0.5) / pattern.cell_px).astype(np.int64)
         lit = (cell ^ cell >> 1) >> (pattern.bits - 1 - pattern.bit) & 1
         return np.asarray(1 - lit if pattern.inverted else lit, dtype=np.float64)
