@@ -146,7 +146,7 @@ def fetch_board(
     rows: CornerCount = USUAL_BOARD.rows,
     square_mm: Millimetres = USUAL_BOARD.square_mm,
     marker_mm: Millimetres | None = None,
-    dictionary: Annotated[SafeText | None, Query(max_length=64)] = None,
+    dictionary: Annotated[SafeText, Query(min_length=1, max_length=64)] | None = None,
     page: Annotated[
         str,
         Query(max_length=32, description="A4, A3, letter; fit, as large as the board needs; or WIDTHxHEIGHT in mm"),

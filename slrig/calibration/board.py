@@ -32,6 +32,9 @@ _LONGEST_RULER_MM = 300
 _MOST_OFF = 0.05
 """A scale that is read as further off its print was not read at its ends."""
 
+_LEAST_MARKER, _MOST_MARKER = 0.1, 0.99
+"""Of a square's side. Smaller ones no camera reads; larger ones touch, and to OpenCV's 32 bits are the square."""
+
 _FEWEST, _MOST = 3, 60
 _LEAST_MM, _MOST_MM = 0.1, 1000.0
 
@@ -95,8 +98,11 @@ class Board:
             )
         if not abs(self.aspect - 1) <= 2 * _MOST_OFF:
             faults.append(f"aspect: expected a square's height over its width, about 1, found {self.aspect:g}")
-        if charuco and not 0 < (self.marker_mm or 0) < self.square_mm:
-            faults.append(f"marker_mm: expected less than the square's {self.square_mm:g} mm, found {self.marker_mm:g}")
+        if charuco and not _LEAST_MARKER <= (self.marker_mm or 0) / self.square_mm <= _MOST_MARKER:
+            faults.append(
+                f"marker_mm: expected {_LEAST_MARKER:g} to {_MOST_MARKER:g} of the square's {self.square_mm:g} mm, "
+                f"found {self.marker_mm:g}"
+            )
         if not charuco and (self.marker_mm is not None or self.dictionary is not None):
             faults.append(f"marker_mm and dictionary belong to a ChArUco board, and this is a board of {self.kind}")
         if faults:
