@@ -126,6 +126,16 @@ STAND_INS = (
         None,
         "29 captures take as long as all other commands together; tests/e2e/test_acceptance_walk.py makes smaller ones",
     ),
+    StandIn(
+        "slrig scan --coloured-light --file bundle.zip --output board",
+        "slrig demo config/rigs/plane.toml --output board",
+        "a person puts a white board before a calibrated rig; a rendered plate takes its place",
+    ),
+    StandIn(
+        "python3 -m zipfile -e board/bundle.zip board/bundle",
+        "cp -r board/service/scans/*/bundle board/bundle",
+        "the demonstration keeps its bundle as a folder",
+    ),
     StandIn("pip install -e '.[test,bench]'", None, "would change the environment of the tests"),
     StandIn("pytest tests/bench/test_pipeline_speed.py -s", None, "measures speed: nothing else may run beside it"),
     StandIn("pytest tests/bench -s", None, "takes an hour, on a machine that does nothing else"),
