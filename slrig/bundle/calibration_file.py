@@ -91,8 +91,7 @@ def read_calibration(path: Path) -> Calibration:
     cameras = {name: _pinhole(device, path, f"cameras.{name}") for name, device in entry.cameras.items()}
     projector = None if entry.projector is None else _pinhole(entry.projector, path, "projector")
     try:
-        light = None if entry.light is None else LightMap(*map(np.array, entry.light.model_dump().values()))
-        return Calibration(cameras, projector, _solved(entry.solved), light)
+        return Calibration(cameras, projector, _solved(entry.solved), _light(entry.light))
     except (CalibrationError, ValueError) as cause:
         raise CalibrationError(f"{path}: solved.{cause}") from cause
 
@@ -152,6 +151,12 @@ def _solved(entry: SolvedEntry | None) -> Solved | None:
     return Solved(
         entry.id, entry.solved_at.isoformat(), covariance, volume_mm, entry.expected_error_mm, entry.scale_sigma
     )
+
+
+def _light(entry: LightEntry | None) -> LightMap | None:
+    if entry is None:
+        return None
+    return LightMap(*(np.array(each, dtype=np.float64) for each in (entry.coefficients, entry.covered_px)))
 
 
 def _pinhole(device: DeviceEntry, path: Path, place: str) -> Pinhole:

@@ -20,8 +20,7 @@ class ProjectorInfo:
     `latency_s` is the typical time from `show` to light. `refresh_s` is one refresh period of a projector whose light
     is steady over whole ones only; None where exposures may have any length. `limits` say how long its calls may take.
     `recorded` are the patterns of a recording, in its order: a scan that asks for none plays them. Empty where any
-    pattern can be shown. `lights` says whether it has lights of its own for red, green and
-    blue, and shows `Primary`.
+    pattern can be shown. `lights` says whether it has lights of its own for red, green and blue, and shows `Primary`.
     """
 
     name: str
