@@ -39,7 +39,7 @@ def words(pattern: Pattern) -> str:
         case White() | Black():
             return pattern.kind
         case Primary():
-            return f"white in {pattern.colour} light"
+            return pattern.words
         case Gray():
             inverse = ", inverted" if pattern.inverted else ""
             return f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}, cell {pattern.cell_px} px{inverse}"

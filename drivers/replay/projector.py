@@ -112,7 +112,7 @@ def _family(pattern: Pattern) -> str:
         case White() | Black():
             return pattern.kind
         case Primary():
-            return f"white in {pattern.colour} light"
+            return pattern.words
         case Gray():
             inverse = ", inverted" if pattern.inverted else ""
             offset = f", offset {pattern.offset_px} px" if pattern.offset_px else ""

@@ -67,7 +67,7 @@ def named(index: int, pattern: Pattern) -> str:
         case White() | Black():
             words = pattern.kind
         case Primary():
-            words = f"white in {pattern.colour} light"
+            words = pattern.words
         case Gray():
             words = f"{pattern.axis} Gray bit {pattern.bit} of {pattern.bits}{', inverse' if pattern.inverted else ''}"
         case LineShift():

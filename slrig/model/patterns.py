@@ -33,6 +33,11 @@ class Primary:
     colour: Literal["red", "green", "blue"]
     kind: Literal["primary"] = "primary"
 
+    @property
+    def words(self) -> str:
+        """What a person calls it."""
+        return f"white in {self.colour} light"
+
 
 @dataclass(frozen=True, slots=True)
 class Gray:
