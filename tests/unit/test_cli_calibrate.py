@@ -355,7 +355,7 @@ def test_board_that_is_none_is_refused(poses: Path, tmp_path: Path) -> None:
         (["--board", "chessboard", "--corners", "11x8"], "Missing: --square-mm."),
         (["--board", "circles"], "Missing: --corners, --square-mm."),
         (["--corners", "9x6"], "Missing: --board, --square-mm."),
-        (["--square-mm", "12", "--marker-mm", "13"], "less than the square's 12 mm"),
+        (["--square-mm", "12", "--marker-mm", "13"], "0.1 to 0.99 of the square's 12 mm, found 13"),
         (["--dictionary", "DICT_4X4_50"], "needs 54 markers and DICT_4X4_50 has 50"),
     ):
         assert words in refused(run("solve", poses, *options, "--output", tmp_path / "rig.json"))
