@@ -45,10 +45,10 @@ def test_backup_while_scans_run_restores_every_finished_scan(start: Start, tmp_p
         for scan in reversed(scans):
             if client.get(scan["links"]["self"])["state"] in {"queued", "capturing"}:
                 client.post(scan["links"]["cancel"], None)
-        states = [ended(client, scan)["state"] for scan in scans]
-        assert states[0] == "succeeded"
-        assert states[-1] == "cancelled"
-        assert set(states) == {"succeeded", "cancelled"}
+        ends = [ended(client, scan)["state"] for scan in scans]
+        assert ends[0] == "succeeded"
+        assert ends[-1] == "cancelled"
+        assert set(ends) == {"succeeded", "cancelled"}
     assert first.stop() == 0
 
     assert slrig("restore", tmp_path / "backup", "--data", tmp_path / "elsewhere").returncode == 0
