@@ -16,6 +16,7 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, Setting
 
 from slrig.bundle.description import CameraName
 from slrig.bundle.faults import Strict, checked, explain, read_toml
+from slrig.bundle.region_file import RegionTable
 from slrig.errors import ConfigError
 from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, bracket_fault
 
@@ -56,6 +57,7 @@ class ScanDefaults(Strict):
     flip_rule: Annotated[FlipRule, Field(strict=False)] | None = None
     smooth_boundary: bool | None = None
     axis: Annotated[Axis, Field(strict=False)] | None = None
+    region: RegionTable | None = None
     exposure_s: ExposureSeconds | None = None
     exposures_s: BracketSeconds | None = Field(
         default=None,

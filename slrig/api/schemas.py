@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, Validati
 from slrig.api.problems import fault_problem
 from slrig.bundle.faults import Strict
 from slrig.bundle.free_text import FreeText
+from slrig.bundle.region_file import RegionTable
 from slrig.config import BracketSeconds, ScanDefaults
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
@@ -74,6 +75,7 @@ class ReconstructionRequest(Strict):
         description="of the light to triangulate by; it is played. Default: the one that crosses the baseline more "
         "steeply",
     )
+    region: RegionTable | None = Field(default=None, description="what of the scene is measured. Default: all of it")
 
 
 class ScanRequest(Strict):
@@ -172,7 +174,7 @@ def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict
         asked = getattr(request, field.name, None)
         value = asked if asked is not None else getattr(defaults, field.name, None)
         if value is not None:
-            chosen[field.name] = value
+            chosen[field.name] = value.region() if isinstance(value, RegionTable) else value
     return chosen
 
 

@@ -168,7 +168,7 @@ def scan(
             line_shift_period_px=period_px, line_width_px=line_width_px, gray_cell_px=gray_cell_px,
             line_shift=False if gray_only else None, rows=rows or None,
         ),
-        reconstruction=given(**asdict(mesh)),
+        reconstruction=mesh.asked(),
     )  # fmt: skip
     files = tuple(file or FILES)
     with service.client() as client:
@@ -208,8 +208,7 @@ def reconstruct(
     if decode_only:
         decode_and_tell(bundles, output)
         return
-    options = given(**asdict(mesh))
-    reconstruct_and_tell(bundles, output, calibration=calibration, formats=mesh_format or (), options=options)
+    reconstruct_and_tell(bundles, output, calibration=calibration, formats=mesh_format or (), options=mesh.chosen())
 
 
 @app.command()

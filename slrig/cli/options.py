@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -97,6 +97,23 @@ class MeshOptions:
     axis: Annotated[
         str | None, typer.Option(help="Triangulate by column or row. Default: what crosses the baseline.")
     ] = None
+    region: Annotated[
+        Path | None,
+        typer.Option(help="TOML file of what is measured: box_mm, depth_mm, polygons_px, masks, least_contrast, …"),
+    ] = None
+
+    def asked(self) -> dict[str, Any]:
+        """What was given, as a request says it. Raises ConfigError: the file of the region is wrong."""
+        from slrig.bundle.region_file import read_region
+
+        region = None if self.region is None else read_region(self.region).model_dump(mode="json", exclude_unset=True)
+        return given(**{**asdict(self), "region": region})
+
+    def chosen(self) -> dict[str, Any]:
+        """What was given, as a plan has it. Raises ConfigError: the file of the region is wrong."""
+        from slrig.bundle.region_file import read_region
+
+        return given(**{**asdict(self), "region": None if self.region is None else read_region(self.region).region()})
 
 
 @dataclass(frozen=True, slots=True)

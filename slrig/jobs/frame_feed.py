@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import structlog
 
 from slrig.capture.evidence import EvidenceSummary
-from slrig.model import Calibration, Shot
+from slrig.model import Calibration, Region, Shot
 from slrig.model.header import CaptureHeader
 
 LEAST_WAITING_BYTES, MOST_WAITING_BYTES = 128 * 2**20, 512 * 2**20
@@ -39,10 +39,11 @@ def most_waiting_bytes() -> int:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Frames of this header will come, and then what they have proven."""
+    """Frames of this header will come, and then what they have proven. region : what of the scene is asked for."""
 
     header: CaptureHeader
     calibration: Calibration
+    region: Region | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +71,8 @@ class FrameFeed:
     """Sends the frames of one capture to the reconstruction process, on a thread of its own.
 
     send : sends one message, and returns False when nobody receives it any more; it may block. number : of the task
-    that will use the frames. receiver : what they are sent to, by which the task's process is known.
+    that will use the frames. receiver : what they are sent to, by which the task's process is known. region : what of
+    the scene is asked for.
     """
 
     def __init__(
@@ -79,11 +81,13 @@ class FrameFeed:
         *,
         number: int = 0,
         receiver: object = None,
+        region: Region | None = None,
         most_bytes: int | None = None,
     ) -> None:
         self.number = number
         self.receiver = receiver
         self._send = send
+        self._region = region
         self._most_bytes = most_waiting_bytes() if most_bytes is None else most_bytes
         self._waiting: queue.Queue[Begin | Shot | EvidenceSummary | Abandon] = queue.Queue()
         self._taken: set[tuple[int, str, float | None]] = set()
@@ -96,7 +100,7 @@ class FrameFeed:
         if calibration is None:
             self.abandon()
             return
-        self._waiting.put(Begin(header, calibration))
+        self._waiting.put(Begin(header, calibration, self._region))
         self._thread = threading.Thread(target=self._carry, name="slrig-feed", daemon=True)
         self._thread.start()
 
@@ -163,8 +167,8 @@ class FedFrames:
         """Take a message of a feed. Frames that cannot be used are forgotten: reading the bundle will tell why."""
         try:
             match message:
-                case Begin(header, calibration):
-                    self._live = self._begin(header, calibration)
+                case Begin(header, calibration, region):
+                    self._live = self._begin(header, calibration, region)
                 case Shot() if self._live is not None:
                     self._live.take(message)
                 case EvidenceSummary() if self._live is not None:

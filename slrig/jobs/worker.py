@@ -29,6 +29,7 @@ from slrig.failure import errors_by_code, interruption
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, Run, Task, Unloadable, received, sent, serve
 from slrig.jobs.worker_wait import POLL_S, PREPARING, JobWait, Made, Told
+from slrig.model import Region
 
 SILENCE_TOLD_S = 5.0
 """From when on `condition` tells that the process shows no sign of life."""
@@ -154,8 +155,9 @@ class Worker:
             far_end.close()
             stops.close()
 
-    def feed(self) -> FrameFeed:
+    def feed(self, region: Region | None = None) -> FrameFeed:
         """A way for the frames of a capture to reach the process while they are taken; give it to `run` afterwards.
+        region : what of the scene is asked for.
 
         While those of an earlier capture still wait to be sent, it is abandoned from the start: the process is busy,
         and frames of one capture are enough to be kept in memory.
@@ -170,7 +172,7 @@ class Worker:
             with self._sending:
                 return pipe is not None and sent(pipe, Fed(number, message))
 
-        earlier, self._feeding = self._feeding, FrameFeed(send, number=number, receiver=pipe)
+        earlier, self._feeding = self._feeding, FrameFeed(send, number=number, receiver=pipe, region=region)
         if earlier is not None and earlier.receiver is pipe and not earlier.settled(0.0):
             self._feeding.abandon()
         return self._feeding

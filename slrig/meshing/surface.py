@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,12 @@ class FinishedMesh:
     normals: NDArray[np.float32]
     stages: tuple[Stage, ...]
     steps: Mapping[str, Mapping[str, object]]
+
+    def of_points(self, kept: NDArray[np.bool_], step: str, /) -> FinishedMesh:
+        """The triangles all of whose points are kept, (n,) bool; `step` names this one among `steps`."""
+        faces = self.faces[kept[self.faces].all(axis=1)]
+        dropped = {"points": int(np.count_nonzero(~kept)), "triangles": len(self.faces) - len(faces)}
+        return replace(self, faces=faces, steps={**self.steps, step: dropped})
 
 
 def finished_mesh(

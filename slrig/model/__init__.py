@@ -18,6 +18,7 @@ from slrig.model.frames import (
 from slrig.model.light_axis import LEAST_SHARE, share_across, told_depth, triangulated_axis
 from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
+from slrig.model.region import Region
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
 from slrig.model.surfaces import (
     AlbedoMark,
@@ -58,6 +59,7 @@ __all__ = [
     "PointCurves",
     "Primary",
     "Refusal",
+    "Region",
     "Shot",
     "Size",
     "Solved",

@@ -54,8 +54,9 @@ class Truth:
 class Refusal(IntEnum):
     """Why a camera pixel gave no surface point, one cause each: the first in the walk that refused it.
 
-    The last four say what became of a ray on its way to the light sheet: they meet where the projector has no pixel,
-    behind the camera or the projector, or nowhere that Newton's method finds; or the sheet holds the camera, too.
+    10 to 13 say what became of a ray on its way to the light sheet: they meet where the projector has no pixel, behind
+    the camera or the projector, or nowhere that Newton's method finds; or the sheet holds the camera, too. The last one
+    is none of the world's: the scan was not asked for it.
     """
 
     NONE = 0
@@ -72,6 +73,7 @@ class Refusal(IntEnum):
     BEHIND_DEVICE = 11
     NO_INTERSECTION = 12
     SHEET_SEEN_ALONG = 13
+    OUTSIDE_REGION = 14
 
 
 class FlipRule(StrEnum):

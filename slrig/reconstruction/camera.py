@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slrig.errors import PatternError
 from slrig.model import FloatArray, IntArray, Pattern, Refusal
+from slrig.reconstruction.asked import AskedPixels, without_others
 from slrig.reconstruction.centroid import at_pixel_centres
 from slrig.reconstruction.coded import Coded, cell_width_px, code_edge_points, line_image
 from slrig.reconstruction.correlation import edge_sum, phase_sum
@@ -104,6 +105,7 @@ class CameraStream:
     result to the bit.
 
     noise : where it is known already; it is estimated otherwise. entered : told the name of each stage as it begins.
+    asked : the pixels that count.
     """
 
     def __init__(
@@ -115,8 +117,10 @@ class CameraStream:
         *,
         entered: Callable[[str], None],
         noise: NoiseModel | None = None,
+        asked: AskedPixels | None = None,
     ) -> None:
         self._stacks = stacks
+        self._asked = asked
         self._noise = noise
         self._tables = tables
         self._limits = limits
@@ -178,7 +182,11 @@ class CameraStream:
         near_shadow = near_shadows(np.asarray(code.refusal == Refusal.NOT_LIT), self._limits.edges)
         ends = noise.variance(frames.white) + noise.variance(frames.black)
         deviation = np.sqrt(ends / np.float32(frames.ends_repeats))
-        return Coded(frames, noise, code, near_shadow, deviation, unresolved, gamma=gamma)
+        asked = None
+        if self._asked is not None:
+            asked = self._asked.told(frames, code, tables.cell_position)
+            code = without_others(code, asked)
+        return Coded(frames, noise, code, near_shadow, deviation, unresolved, gamma=gamma, asked=asked)
 
     def _locate(self, coded: Coded) -> Coded:
         if self._scales is None and not self._stacks.patterns.lines:
@@ -198,7 +206,7 @@ class CameraStream:
                     coded.frames.lines[:1], phase_sum(coded.frames, coded.code, self._tables.cell_position)
                 )
             image, deviation = line_image(coded, len(self._points))
-            lit = ~coded.unlit
+            lit = coded.searched
             if self._scales is None:
                 blur_px = measured_sigma_px(image, deviation, lit)
                 self._scales = _Scales(self._limits.stripes.sigma_px or _matched_scale_px(blur_px), blur_px)
@@ -215,9 +223,10 @@ def camera_curves(
     *,
     entered: Callable[[str], None],
     noise: NoiseModel | None = None,
+    asked: AskedPixels | None = None,
 ) -> CameraCurves:
-    """Reconstruct the curves of one camera; `entered` and `noise` as for `CameraStream`."""
-    stream = CameraStream(FrameStacks.of(frames), tables, limits, entered=entered, noise=noise)
+    """Reconstruct the curves of one camera; `entered`, `noise` and `asked` as for `CameraStream`."""
+    stream = CameraStream(FrameStacks.of(frames), tables, limits, entered=entered, noise=noise, asked=asked)
     return stream.finish()[0]
 
 
@@ -311,13 +320,17 @@ def _curves(
             shortest_points=shortest,
         )  # fmt: skip
     let_go()
+    decoded = coded.code.refusal == Refusal.NONE
+    if coded.asked is not None:
+        decoded &= coded.asked
+        refusal[~coded.asked] = Refusal.OUTSIDE_REGION
     entered("link stripes")
     return CameraCurves(
         ensemble=link(numbered),
         refusal=refusal,
         noise=coded.noise,
         scale_px=scales.filter_px,
-        decoded_pixels=int((coded.code.refusal == Refusal.NONE).sum()),
+        decoded_pixels=int(decoded.sum()),
         stripe_points=len(stripes.points_px),
         stripe_count=len(numbered.stripes),
         refined=placed.refined,

@@ -34,6 +34,7 @@ class Coded:
     finds positions, camera units squared. It bends stripes and edges, but turns no bit over: reading the code with it
     refused a tenth of a vase at quality 50, and saved it from no wrong point. shared : how much more variance sums of
     pixels have than independent noise would give them, as of `correlation.shared_noise`. gamma : as of `CameraCurves`.
+    asked : (H, W) bool, pixels that the scan is asked for; None for all.
     """
 
     frames: AxisFrames
@@ -45,6 +46,7 @@ class Coded:
     loss_variance: float = 0.0
     shared: float = 1.0
     gamma: float = 1.0
+    asked: NDArray[np.bool_] | None = None
 
     def rows(self, rows: slice) -> Coded:
         """Some rows of all of it."""
@@ -56,6 +58,7 @@ class Coded:
             near_shadow=self.near_shadow[rows],
             contrast_deviation=self.contrast_deviation[rows],
             unresolved=at_rows(self.unresolved, rows),
+            asked=at_rows(self.asked, rows),
         )
 
     @property
@@ -74,6 +77,11 @@ class Coded:
     def unlit(self) -> NDArray[np.bool_]:
         """(H, W) bool: the pixels that the projector does not light."""
         return np.asarray(self.code.refusal == Refusal.NOT_LIT)
+
+    @property
+    def searched(self) -> NDArray[np.bool_]:
+        """(H, W) bool: the lit pixels in which points are looked for."""
+        return ~self.unlit if self.asked is None else ~self.unlit & (self.code.refusal != Refusal.OUTSIDE_REGION)
 
 
 def cell_width_px(coded: Coded) -> float | NDArray[np.float32]:
@@ -102,7 +110,7 @@ def code_edge_points(
     coded: Coded, limits: StripeLimits, scale_px: float, *, within: NDArray[np.bool_] | None = None
 ) -> list[LinePoints]:
     """Points of each code bit's edges, where the bit resolves. within : (H, W) bool, to look for them nowhere else."""
-    frames, lit = coded.frames, ~coded.unlit
+    frames, lit = coded.frames, coded.searched
     parts = []
     for index in range(len(frames.bits)):
         read = lit if coded.unresolved is None else lit & (index < len(frames.bits) - coded.unresolved)

@@ -9,6 +9,7 @@ from slrig.errors import NothingToReconstructError, setting
 from slrig.meshing.rasteriser import rasterised
 from slrig.model import Mesh, Refusal, Size
 from slrig.scan.placing import placed_vertices, resampled
+from slrig.scan.report import lit_pixels
 from slrig.scan.stream import CameraResult
 
 FAIR_SHARE = 0.6
@@ -51,8 +52,8 @@ def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[Came
         return
     figures = "; ".join(
         f"camera '{seen.name}': white {seen.white.mean():.0f} of {seen.full_scale:.0f} on average, at most "
-        f"{seen.contrast.max():.0f} above black, {(seen.curves.refusal != Refusal.NOT_LIT).mean():.1%} of the image "
-        f"lit, {seen.curves.decoded_pixels} pixels decoded"
+        f"{seen.contrast.max():.0f} above black, {lit_pixels(seen.curves).mean():.1%} of the image lit, "
+        f"{seen.curves.decoded_pixels} pixels decoded{_outside(seen)}"
         for seen in cameras
     )
     message = (
@@ -60,3 +61,8 @@ def require_surface(holds: bool, folder: Path, what: str, cameras: Sequence[Came
         "exposure leaves white below full scale and well above black"
     )
     raise NothingToReconstructError(message)
+
+
+def _outside(seen: CameraResult) -> str:
+    share = float((seen.curves.refusal == Refusal.OUTSIDE_REGION).mean())
+    return f", {share:.1%} of the image outside the region that was asked for" if share else ""

@@ -138,7 +138,7 @@ class _Scan:
             frame_bytes = check_plan(self.plan, held.facts, rig.calibration)
             tools.folder.require_space(2 * frame_bytes + tools.spare_bytes)
         stamp = None if tools.health is None else tools.health.stamp()
-        self._feed, folder = tools.worker.feed(), tools.folder.recording(self._id)
+        self._feed, folder = tools.worker.feed(self.plan.reconstruction.region), tools.folder.recording(self._id)
         recording = tools.capture(
             rig, self.plan, folder, progress=progress, cancelled=job.stop.is_set, frames=self._feed
         )

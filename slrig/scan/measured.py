@@ -21,13 +21,13 @@ from slrig.bundle.refused import read_refused
 from slrig.capture.evidence import Evidence, EvidenceSummary, judged_frames
 from slrig.capture.exposure import check_exposures
 from slrig.errors import CalibrationError, NothingToReconstructError, PatternError, setting
-from slrig.model import LEAST_SHARE, Axis, Calibration, Refusal, Shot, without_missing_bits
+from slrig.model import LEAST_SHARE, Axis, Calibration, Region, Shot, without_missing_bits
 from slrig.model.header import CaptureHeader
 from slrig.reconstruction.frames import exposure_count
 from slrig.scan.coverage import FAIR_SHARE as FAIR_DECODED
 from slrig.scan.coverage import require_surface
 from slrig.scan.light_axis import FAIR_SHARE, left_out_notes, weakness
-from slrig.scan.report import capture_notes, capture_report
+from slrig.scan.report import capture_notes, capture_report, lit_pixels
 from slrig.scan.stream import CameraResult, LiveScan, ScanStream, cell_px, step_px
 from slrig.scan.triangulated import Triangulated, camera_notes, triangulated, unresolved_notes
 
@@ -55,11 +55,17 @@ class Walked:
 
 
 def measured(
-    folder: Path, calibration_file: Path | None, live: LiveScan | None, entered: Entered, *, axis: Axis | None
+    folder: Path,
+    calibration_file: Path | None,
+    live: LiveScan | None,
+    entered: Entered,
+    *,
+    axis: Axis | None,
+    region: Region | None = None,
 ) -> tuple[Walked, Triangulated]:
     """The points of a recorded bundle: of the frames that came while it was captured, or else of its files.
 
-    axis : the one that was asked for; None for that which tells most of depth.
+    axis : the one that was asked for; None for that which tells most of depth. region : what of the scene is asked for.
 
     Raises
     ------
@@ -68,12 +74,13 @@ def measured(
     NothingToReconstructError
         No pixel could be decoded, no stripe be found, or the light tells no depth.
     """
-    walked = _walked(folder, calibration_file, live, entered, axis=axis)
-    tries = [_tried(walked, folder, entered)]
+    walked = _walked(folder, calibration_file, live, entered, axis=axis, region=region)
+    tries = [_tried(walked, folder, entered, region)]
     others = walked.shown - {walked.axis} if axis is None else frozenset()
     for other in others:
         if _is_weak(tries[0]):
-            tries.append(_tried(_walked(folder, calibration_file, None, entered, axis=other), folder, entered))
+            again = _walked(folder, calibration_file, None, entered, axis=other, region=region)
+            tries.append(_tried(again, folder, entered, region))
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
         raise next(each for each in tries if isinstance(each, NothingToReconstructError))
@@ -89,7 +96,9 @@ def measured(
     return best, found
 
 
-def _tried(walked: Walked, folder: Path, entered: Entered) -> tuple[Walked, Triangulated] | NothingToReconstructError:
+def _tried(
+    walked: Walked, folder: Path, entered: Entered, region: Region | None
+) -> tuple[Walked, Triangulated] | NothingToReconstructError:
     """The points along one axis, or why there are none."""
     seen = walked.seen
     try:
@@ -98,7 +107,7 @@ def _tried(walked: Walked, folder: Path, entered: Entered) -> tuple[Walked, Tria
     except NothingToReconstructError as error:
         return error
     entered("triangulate", 0.6, "")
-    return walked, triangulated(seen, walked.devices.projector, walked.axis)
+    return walked, triangulated(seen, walked.devices.projector, walked.axis, region)
 
 
 def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> bool:
@@ -111,7 +120,7 @@ def _is_weak(tried: tuple[Walked, Triangulated] | NothingToReconstructError) -> 
 
 def _decoded_share(cameras: Sequence[CameraResult]) -> float:
     """Of the pixels that are lit."""
-    lit = sum(np.count_nonzero(seen.curves.refusal != Refusal.NOT_LIT) for seen in cameras)
+    lit = sum(np.count_nonzero(lit_pixels(seen.curves)) for seen in cameras)
     return sum(seen.curves.decoded_pixels for seen in cameras) / max(lit, 1)
 
 
@@ -161,7 +170,8 @@ def _walked(
     live: LiveScan | None,
     entered: Entered,
     *,
-    axis: Axis | None = None,
+    axis: Axis | None,
+    region: Region | None,
 ) -> Walked:
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
@@ -181,6 +191,7 @@ def _walked(
         and live.evidence is not None
         and live.one_exposure
         and axis in (None, live.axis)
+        and live.region == region
         and _is_of(live, folder, calibration_file)
     ):
         names += live.header.cameras
@@ -193,7 +204,7 @@ def _walked(
         names += files.outline.cameras
         devices = _require_calibration(folder, names, files.calibration)
         try:
-            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis)
+            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis, region)
             seen = stream.finish()
         except PatternError as cause:
             message = f"{folder}: {cause}"
@@ -210,7 +221,11 @@ def _walked(
 
 
 def _streamed(
-    files: BundleFiles, devices: Calibration, entered: Callable[[str, str], None], axis: Axis | None
+    files: BundleFiles,
+    devices: Calibration,
+    entered: Callable[[str, str], None],
+    axis: Axis | None,
+    region: Region | None,
 ) -> tuple[ScanStream, EvidenceSummary, tuple[str, ...]]:
     """The frames of a bundle in a stream, what they prove, and words for each code that was cut short.
 
@@ -231,7 +246,7 @@ def _streamed(
     else:
         shots = files.shots(order)
     stream = ScanStream(
-        CaptureHeader.of(capture), devices, entered=entered, axis=axis, one_exposure=one_exposure
+        CaptureHeader.of(capture), devices, entered=entered, axis=axis, one_exposure=one_exposure, region=region
     )  # fmt: skip
     evidence = Evidence(capture.patterns, capture.cameras, refused)
     for index, shot in zip(order, shots, strict=True):

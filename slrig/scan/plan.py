@@ -9,7 +9,7 @@ from typing import Protocol
 from uuid import UUID
 
 from slrig.errors import ConfigError
-from slrig.model import Axis, FlipRule, bracket_fault
+from slrig.model import Axis, FlipRule, Region, bracket_fault
 
 
 class Progress(Protocol):
@@ -50,6 +50,7 @@ class ReconstructionPlan:
     flip_rule : when an edge is exchanged for the other diagonal of its two triangles; `FlipRule` or its value.
     smooth_boundary : shrink and smooth the boundary of the mesh (paper, section 3.4).
     axis : of the light to triangulate by, `Axis` or its value; None the one that crosses the baseline more steeply.
+    region : what of the scene is measured; None for all that the devices see.
 
     Raises
     ------
@@ -64,6 +65,7 @@ class ReconstructionPlan:
     flip_rule: FlipRule = FlipRule.CONSTRAINED
     smooth_boundary: bool = True
     axis: Axis | None = None
+    region: Region | None = None
 
     def __post_init__(self) -> None:
         if not 1 < self.depth_edge_ratio < math.inf:

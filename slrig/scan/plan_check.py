@@ -78,10 +78,14 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
     ------
     PatternError
         The patterns do not fit the projector, or by the calibration they tell no depth.
+    ConfigError
+        The region names a camera that is not there, or a mask of another extent.
     UnsupportedByDeviceError
         A camera cannot expose that long, or that briefly, or has no colour, or the frames are more than a bundle holds.
     """
     exposures_s = plan.rising_exposures_s
+    if plan.reconstruction.region is not None:
+        plan.reconstruction.region.require_fits({name: each.format.size for name, each in facts.cameras.items()})
     axis = plan.reconstruction.axis
     projector = facts.projector
     sequence = pattern_sequence(

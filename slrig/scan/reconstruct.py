@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,13 +24,16 @@ from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
 from slrig.meshing.vertices import compact_mesh
-from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, Pinhole, PointCurves
+from slrig.model import Axis, Calibration, FloatArray, IntArray, Mesh, PointCurves, Region
 from slrig.reconstruction.agreement import disagreement
 from slrig.reconstruction.calibration_share import calibration_modes, calibration_sigma, stripe_tangents
+from slrig.reconstruction.merging import MergedCurves
+from slrig.reconstruction.optics import project
 from slrig.reconstruction.uncertainty import sampling_mm, sigma_along_normal
 from slrig.scan.artefacts import MESH, REPORT, encode_mesh_ply, encode_points_ply, encode_report, staged_folder
 from slrig.scan.colouring import albedo_report, coloured
 from slrig.scan.coverage import coverage_notes, covered_share, require_surface
+from slrig.scan.limited import marked, within
 from slrig.scan.measured import Walked, measured
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.offered import causes_picture, rejected_picture
@@ -149,7 +152,7 @@ def reconstruct_into(
 
     with compilations_told(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
-        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis)
+        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")
@@ -164,7 +167,7 @@ def reconstruct_into(
         entered("pictures", 0.85, "")
         for name, picture in pictures.result().items():
             place(name, picture)
-        known = _compared_with_truth(bundle, mesh, cameras[0].device, entered)
+        known = _compared_with_truth(bundle, mesh, cameras[0], plan.region, entered)
         entered("write report", 0.98, "")
         seconds = watch.finished()
         report = {
@@ -242,6 +245,12 @@ def _meshed(
     apart = disagreement(joined_curves, share)
     if apart is not None:
         sigma = np.hypot(sigma, apart.sigma_mm)
+    limit_mm = None if plan.region is None else plan.region.most_sigma_mm
+    if limit_mm is not None:
+        known = sigma <= limit_mm
+        surface = surface.of_points(known, "sigma_limit")
+        cameras = [_where_known(seen, joined_curves, index, known) for index, seen in enumerate(cameras)]
+        require_surface(len(surface.faces) > 0, folder, f"no surface is known to {limit_mm:g} mm", cameras)
     light = walked.devices.light
     colours = coloured(cameras, joined_curves, surface.normals, projector, axis, light)
     curves = PointCurves(
@@ -270,6 +279,13 @@ def _meshed(
         albedo=albedo_report(colours, mesh, cameras, lit=projector is not None, mapped=light is not None),
         notes=() if apart is None else (str(apart),),
     )
+
+
+def _where_known(seen: CameraResult, joined: MergedCurves, index: int, known: NDArray[np.bool_]) -> CameraResult:
+    """A camera with those of its points among its refusals that are not `known`, (n,) bool, well enough."""
+    mine = joined.camera == index
+    refusal = marked(seen.curves.refusal, joined.curves.pixels_px[mine], known[mine])
+    return replace(seen, curves=replace(seen.curves, refusal=refusal))
 
 
 def _used(faces: IntArray, count: int) -> NDArray[np.bool_]:
@@ -303,11 +319,16 @@ def _encoded_pictures(mesh: Mesh, cameras: list[CameraResult]) -> dict[str, byte
 
 
 def _compared_with_truth(
-    bundle: Path, mesh: Mesh, camera: Pinhole, entered: Callable[[str, float, str], None]
+    bundle: Path, mesh: Mesh, seen: CameraResult, region: Region | None, entered: Callable[[str, float, str], None]
 ) -> dict[str, object]:
-    """The report's section on truth, for bundles that bring it."""
+    """The report's section on truth, for bundles that bring it. seen : the first camera."""
     truth = read_truth(bundle)
     if truth is None:
         return {}
     entered("compare with truth", 0.9, "")
-    return {"truth": score(mesh, truth.surface, truth.visible_points_mm, camera.centre_mm).as_dict()}
+    visible = truth.visible_points_mm
+    if region is not None:
+        # What nobody asked for is not missing.
+        pixels = np.clip(project(seen.device, visible), 0, np.array(seen.curves.refusal.shape[::-1]) - 1)
+        visible = visible[within(region, visible, pixels, seen.curves.refusal, seen.device)]
+    return {"truth": score(mesh, truth.surface, visible, seen.device.centre_mm).as_dict()}

@@ -108,15 +108,20 @@ def share_by_bits(curves: CameraCurves) -> list[float] | None:
     """
     if curves.unresolved is None:
         return None
-    counts = np.bincount(curves.unresolved[curves.refusal != Refusal.NOT_LIT], minlength=1)
+    counts = np.bincount(curves.unresolved[lit_pixels(curves)], minlength=1)
     return [round(float(each), 4) for each in counts / max(counts.sum(), 1)]
+
+
+def lit_pixels(curves: CameraCurves) -> NDArray[np.bool_]:
+    """(H, W) bool: the pixels that are lit, of those that the scan was asked for."""
+    return np.asarray((curves.refusal != Refusal.NOT_LIT) & (curves.refusal != Refusal.OUTSIDE_REGION))
 
 
 def lit_share(curves: CameraCurves, where: NDArray[np.bool_] | None) -> float:
     """The share of the lit pixels that `where`, (H, W), marks; None marks none."""
     if where is None:
         return 0.0
-    lit = curves.refusal != Refusal.NOT_LIT
+    lit = lit_pixels(curves)
     return float((lit & where).sum() / max(lit.sum(), 1))
 
 

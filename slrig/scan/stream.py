@@ -27,6 +27,7 @@ from slrig.model import (
     Pixels,
     Primary,
     Refusal,
+    Region,
     Shot,
     Size,
     White,
@@ -34,6 +35,7 @@ from slrig.model import (
 )
 from slrig.model.header import CaptureHeader
 from slrig.patterns.positions import cell_positions, edge_positions, index_of_word, line_positions
+from slrig.reconstruction.asked import AskedPixels
 from slrig.reconstruction.camera import CameraCurves, CameraStream, CodeTables, Limits, camera_curves
 from slrig.reconstruction.frames import (
     NEARLY_FULL,
@@ -51,6 +53,7 @@ from slrig.reconstruction.frames import (
 )
 from slrig.reconstruction.fusion import ExposureUse, FusedFrames, exposure_use, fused_colour, fused_frames
 from slrig.scan.light_axis import chosen_axis
+from slrig.scan.limited import FramePart, frame_part
 from slrig.scan.report import Stopwatch
 
 Entered = Callable[[str, str], None]
@@ -86,12 +89,14 @@ class ScanStream:
     """Reconstructs the curves of every camera while frames come, along `axis` or the one that `chosen_axis` chooses.
 
     Frames that are not needed are let go. one_exposure : every camera takes all frames with one; otherwise all wait for
-    the end.
+    the end. region : what of the scene is asked for; None for all.
 
     Raises
     ------
     PatternError
         The frames announced cannot be decoded, or tell no depth.
+    ConfigError
+        Nothing of the region is in a camera's image.
     """
 
     def __init__(
@@ -102,14 +107,20 @@ class ScanStream:
         entered: Entered,
         axis: Axis | None = None,
         one_exposure: bool = True,
+        region: Region | None = None,
     ) -> None:
         self.header = header
+        self.region = region
         devices = [calibration.cameras[name] for name in header.cameras]
         self.axis = axis or chosen_axis(header.axes, devices, calibration.projector)
         self.calibration = calibration
-        self._cameras = {
-            name: _CameraFrames(name, header, self.axis, entered, one_exposure=one_exposure) for name in header.cameras
-        }
+        self._cameras = {}
+        for name, form in header.cameras.items():
+            part = None
+            if region is not None:
+                device, projector = calibration.cameras[name], calibration.projector
+                part = frame_part(region, name, form, device, projector, self.axis)
+            self._cameras[name] = _CameraFrames(name, header, self.axis, entered, part, one_exposure=one_exposure)
 
     def take(self, shot: Shot) -> None:
         """Take one frame."""
@@ -128,7 +139,7 @@ class ScanStream:
             # What it held of its frames is not needed any more, and the memory is.
             camera = self._cameras.pop(name)
             curves, frames, fused = camera.finish()
-            used = curves.refusal == Refusal.NONE
+            part, used = camera.part, curves.refusal == Refusal.NONE
             white, black = (camera.colour(each, fused) for each in (White(), Black()))
             clipped = frames.white >= NEARLY_FULL * frames.clipped_at
             if white is None or black is None:
@@ -137,13 +148,21 @@ class ScanStream:
                 clipped |= white.max(axis=2) >= NEARLY_FULL * frames.full_scale
             # They are as the camera gave them.
             white, black = (straight(each[..., ::-1], curves.gamma, frames.full_scale) for each in (white, black))
+            contrast, shown = (
+                white - black,
+                np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
+            )
+            if part is not None:
+                curves, contrast, clipped = part.curves(curves), part.placed(contrast), part.placed(clipped)
+                # Round what was asked for, the white frame as it came.
+                shown = part.placed(shown, beyond=camera.whole_white)
             seen.append(
                 CameraResult(
                     name=name,
                     device=self.calibration.cameras[name],
                     curves=curves,
-                    white=np.clip(np.rint(frames.white), 0, np.iinfo(np.uint16).max).astype(np.uint16),
-                    contrast=white - black,
+                    white=shown,
+                    contrast=contrast,
                     clipped=clipped,
                     full_scale=frames.full_scale if fused is None else _shown_white(frames, used),
                     exposures=() if fused is None else exposure_use(fused, used),
@@ -157,9 +176,24 @@ class _CameraFrames:
 
     Frames of a sequence that shows each pattern once are used as they come. Repeats and exposure brackets tell nothing
     before all of them are in, so they wait for `finish`.
+
+    part : what of the frames is looked at; None for all. whole_white : (H, W), a white frame as it came.
     """
 
-    def __init__(self, name: str, header: CaptureHeader, axis: Axis, entered: Entered, *, one_exposure: bool) -> None:
+    def __init__(
+        self,
+        name: str,
+        header: CaptureHeader,
+        axis: Axis,
+        entered: Entered,
+        part: FramePart | None = None,
+        *,
+        one_exposure: bool,
+    ) -> None:
+        self.part = part
+        self.whole_white: Pixels | int = 0
+        if part is not None:
+            header = replace(header, cameras={**header.cameras, name: part.form})
         self._name = name
         self._axis = axis
         self._header = header
@@ -185,7 +219,11 @@ class _CameraFrames:
                 ends_repeats=ends_repeats(used, axis),
             )
             tables = _tables(patterns.gray, patterns.lines, header.projector)
-            self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered)
+            self._stream = CameraStream(stacks, tables, Limits(), entered=self._entered, asked=self._asked)
+
+    @property
+    def _asked(self) -> AskedPixels | None:
+        return None if self.part is None else self.part.asked
 
     @property
     def waits(self) -> bool:
@@ -194,6 +232,10 @@ class _CameraFrames:
 
     def take(self, shot: Shot) -> None:
         """Take one frame of this camera."""
+        if self.part is not None:
+            if isinstance(self._header.patterns[shot.pattern], White):
+                self.whole_white = shot.image
+            shot = self.part.of(shot)
         if self._stream is None:
             self._kept.append(shot)
             return
@@ -221,7 +263,8 @@ class _CameraFrames:
         else:
             frames, noise = axis_frames(capture, self._name, self._axis), None
         tables = _tables(frames.gray, frames.line_patterns, self._header.projector)
-        return camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise), frames, fused
+        curves = camera_curves(frames, tables, Limits(), entered=self._entered, noise=noise, asked=self._asked)
+        return curves, frames, fused
 
     def _keep_colour(self, shot: Shot) -> None:
         pattern = self._header.patterns[shot.pattern]
@@ -255,13 +298,13 @@ class _CameraFrames:
 class LiveScan(ScanStream):
     """A stream that is fed while the scan is captured, with the seconds it took so far."""
 
-    def __init__(self, header: CaptureHeader, calibration: Calibration) -> None:
+    def __init__(self, header: CaptureHeader, calibration: Calibration, region: Region | None = None) -> None:
         self.evidence: EvidenceSummary | None = None
         self.watch = Stopwatch()
         self._frames: list[tuple[int, str]] = []
         self._exposures_s: defaultdict[str, set[float | None]] = defaultdict(set)
         self._told: Entered = lambda stage, _camera: self.watch.enter(stage)
-        super().__init__(header, calibration, entered=lambda stage, camera: self._told(stage, camera))
+        super().__init__(header, calibration, entered=lambda stage, camera: self._told(stage, camera), region=region)
         self.watch.enter(WAITING)
 
     def take(self, shot: Shot) -> None:

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 
 from slrig.errors import setting
 from slrig.meshing.runs import parts_of_curves
-from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, share_across, told_depth
+from slrig.model import Axis, FloatArray, IntArray, Pinhole, Refusal, Region, share_across, told_depth
 from slrig.reconstruction.camera import CameraCurves
 from slrig.reconstruction.epipolar import stripe_crossing
 from slrig.reconstruction.merging import MergedCurves, merged
 from slrig.reconstruction.redundancy import Redundancy, redundancy
 from slrig.reconstruction.sheet_curves import selected
 from slrig.reconstruction.triangulation import SheetCurves, camera_camera, camera_projector
+from slrig.scan.limited import limited
 from slrig.scan.report import lit_share
 from slrig.scan.stream import CameraResult
 
@@ -43,8 +44,10 @@ class Triangulated:
     second: int = 1
 
 
-def triangulated(cameras: list[CameraResult], projector: Pinhole | None, axis: Axis) -> Triangulated:
-    """Triangulate the curves of an axis; without a projector, of at least two cameras.
+def triangulated(
+    cameras: list[CameraResult], projector: Pinhole | None, axis: Axis, region: Region | None = None
+) -> Triangulated:
+    """Triangulate the curves of an axis; without a projector, of at least two cameras. region : what of it counts.
 
     With a projector, a camera is left out whose baseline lies along the stripes: it sees them edge on, and where others
     measure, its errors of depth are no use.
@@ -63,6 +66,9 @@ def triangulated(cameras: list[CameraResult], projector: Pinhole | None, axis: A
             for seen, (part, cause) in zip(cameras, met, strict=True)
         ]
         parts = [part for part, _ in met]
+        if region is not None:
+            for index, seen in enumerate(told):
+                parts[index], told[index] = _limited(region, seen, parts[index])
         gap = widest_gap_px(projector, axis)
         spare = redundancy(parts, devices, axis, widest_gap_px=gap)
         joined = merged(parts, projector.centre_mm, widest_gap_px=gap)
@@ -74,6 +80,9 @@ def triangulated(cameras: list[CameraResult], projector: Pinhole | None, axis: A
     pairs = {i: camera_camera(mine, others[i].curves.ensemble, first.device, others[i].device) for i in steep}
     second = max(pairs, key=lambda index: len(pairs[index].points_mm))
     best = pairs[second]
+    if region is not None:
+        best, first = _limited(region, first, best)
+        cameras = [first, *others]
     gap = widest_gap_px(None, axis)
     spare = redundancy([best], devices, axis, widest_gap_px=gap)
     joined = merged([best], first.device.centre_mm, widest_gap_px=gap)
@@ -103,6 +112,12 @@ def _on_sheets(
         selected(part, np.zeros(len(part.points_mm), dtype=np.bool_)),
         np.where(cause == Refusal.NONE, np.uint8(Refusal.SHEET_SEEN_ALONG), cause),
     )
+
+
+def _limited(region: Region, seen: CameraResult, part: SheetCurves) -> tuple[SheetCurves, CameraResult]:
+    """The points of a camera that a region holds, and the camera with the others among its refusals."""
+    part, refusal = limited(region, part, seen.curves.refusal, seen.device)
+    return part, replace(seen, curves=replace(seen.curves, refusal=refusal))
 
 
 def _with_left_out(curves: CameraCurves, triangulated: SheetCurves, cause: NDArray[np.uint8]) -> NDArray[np.uint8]:
