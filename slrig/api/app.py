@@ -88,7 +88,10 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
     app.state.sessions = None if ring is None else Sessions(ring, cookie=cookie)
     # The last one added is the outermost: every refusal becomes a problem, Host comes first, then page and key, then
     # the body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
-    longer = {IMPORT_PATH: max(MOST_IMPORT_BYTES, settings.max_body_bytes)}
+    longer = {
+        IMPORT_PATH: max(MOST_IMPORT_BYTES, settings.max_body_bytes),
+        "/scan": max(scans.MOST_SCAN_BYTES, settings.max_body_bytes),
+    }
     app.add_middleware(BodyLimits, most_bytes=settings.max_body_bytes, longer=longer)
     app.add_middleware(
         Access, ring=ring, sessions=app.state.sessions, audit=service.audit, per_second=settings.requests_per_s

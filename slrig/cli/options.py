@@ -99,7 +99,7 @@ class MeshOptions:
     ] = None
     region: Annotated[
         Path | None,
-        typer.Option(help="TOML file of what is measured: box_mm, depth_mm, polygons_px, masks, least_contrast, …"),
+        typer.Option(help="TOML file of what is measured: box_mm, depth_mm and more. Default: all."),
     ] = None
 
     def asked(self) -> dict[str, Any]:

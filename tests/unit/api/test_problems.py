@@ -158,7 +158,7 @@ def test_refusals_of_http_itself_are_problems(
 
 def test_body_beyond_the_limit_is_refused_however_it_is_sent(client: TestClient) -> None:
     for content in (b" " * 5000, iter([b" " * 3000, b" " * 3000])):
-        response = client.post("/scan", content=content, headers={"Content-Type": "application/json"})
+        response = client.post("/schedule", content=content, headers={"Content-Type": "application/json"})
         assert (response.status_code, response.headers["content-type"]) == (413, "application/problem+json")
         assert response.json()["type"] == "/problems/content-too-large"
 

@@ -15,7 +15,7 @@ import numpy as np
 from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import NothingToReconstructError, ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
-from slrig.model import Calibration, Mesh, Shot
+from slrig.model import Calibration, Mesh, Region, Shot
 from slrig.model.header import CaptureHeader
 from slrig.scan.artefacts import MESH, encode_mesh_ply
 from slrig.scan.mesh_formats import encode_mesh_glb
@@ -37,7 +37,7 @@ TRIANGLE = Mesh(
 class LiveScan:
     """Counts the frames that come. The first pixel of a frame says what else to do: die (1), raise (2), hang (3)."""
 
-    def __init__(self, header: CaptureHeader, _calibration: Calibration) -> None:
+    def __init__(self, header: CaptureHeader, _calibration: Calibration, _region: Region | None) -> None:
         self.listed = len(header.frames)
         self.taken = 0
         self.ended = False

@@ -81,8 +81,8 @@ def scanned(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
     return Scanned(tmp_path_factory.mktemp("limited"))
 
 
-def same_points(part: Mesh, whole: Mesh, kept: NDArray[np.bool_]) -> None:
-    """The points of a region are those of the whole scan, as near as its own estimate of the noise makes them."""
+def same_points(part: Mesh, whole: Mesh, kept: Any) -> None:
+    """The points of a region are those that are `kept`, (V,) bool, of a whole scan, as near as noise estimates are."""
     from scipy.spatial import KDTree
 
     distance, _ = KDTree(whole.vertices_mm).query(part.vertices_mm)
