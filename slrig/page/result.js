@@ -95,11 +95,24 @@ function Figures({scan, report}) {
     <${Facts} of=${[
       ...figures(scan).map(([name, value, written]) => [name, value === undefined ? null : written(value)]),
       ["Patterns", summary.identity],
+      ["Limited to", limits(scan.plan.reconstruction?.region)],
       ["Calibration", calibration && (calibration.solved_at ? `${age === null ? "age not known" : `${Number(age.toPrecision(2))} days old`}` : calibration.absent)],
       ["Its expected error", calibration?.expected_error_mm && length(calibration.expected_error_mm)],
       ["Against the known truth, rms", summary.truth && length(summary.truth.rms_mm)],
     ]} />
     <p><a href=${scan.links.files["report.json"]}>The whole report</a></p>`;
+}
+
+/** What a scan was asked for, in words; null for everything. */
+function limits(region) {
+  if (!region) return null;
+  const {box_mm: box, depth_mm: depth, polygons_px: polygons, masks, least_contrast: contrast, most_sigma_mm: sigma} = region;
+  return [
+    box && `a box, ${["x", "y", "z"].map((axis, at) => `${axis} ${box[0][at]} to ${box[1][at]}`).join(", ")} mm`,
+    depth && `depths of ${depth[0]} to ${depth[1]} mm`,
+    ...Object.keys({...polygons, ...masks}).map((camera) => `a part of camera ${camera}'s image`),
+    contrast && `contrasts above ${percent(contrast)}`, sigma && `σ up to ${length(sigma)}`,
+  ].filter((each) => each).join("; ");
 }
 
 /** [name, value, how it is written] of the figures that two scans are compared by. */

@@ -1,6 +1,6 @@
 // The mesh in 3-D: a scene that draws only when something changed, the coarse mesh while a slow machine turns the full one.
 import {
-  Box3, BufferAttribute, BufferGeometry, Color, DoubleSide, Matrix4, Mesh, PerspectiveCamera, Points, Scene, ShaderMaterial, Vector2, Vector3, WebGLRenderer,
+  Box3, Box3Helper, BufferAttribute, BufferGeometry, Color, DoubleSide, Matrix4, Mesh, PerspectiveCamera, Points, Scene, ShaderMaterial, Vector2, Vector3, WebGLRenderer,
 } from "three";
 import {firstHit} from "./glb.js";
 import {OrbitControls} from "./vendor/OrbitControls.js";
@@ -14,6 +14,7 @@ const STILL_AFTER_MS = 250;
 const CLICK_PX = 5;
 /** So much of the canvas does the mesh fill at most. */
 const FILLED = 0.92;
+const LIMITS = "#0072b2";
 const NAMES = {POSITION: "position", NORMAL: "normal", COLOR_0: "albedo", _SIGMA: "sigma", _STRIPE: "stripe"};
 
 /**
@@ -120,6 +121,21 @@ export class View {
     if (first) this.front();
   }
 
+  /** Draw the box that a scan was limited to, its least and greatest corner in mm, as lines; null for none. */
+  limit(box_mm) {
+    if (this.limits) {
+      this.scene.remove(this.limits);
+      this.limits.dispose();
+    }
+    this.limits = null;
+    if (box_mm) {
+      const [[x, y, z], [right, down, away]] = box_mm;
+      this.limits = new Box3Helper(new Box3(new Vector3(x, -down, -away), new Vector3(right, -y, -z)), LIMITS);
+      this.scene.add(this.limits);
+    }
+    this.redraw();
+  }
+
   drop(slot, level, object) {
     this.scene.remove(object);
     object.geometry.dispose();
@@ -161,8 +177,10 @@ export class View {
     });
     const {center, radius} = this.box;
     const away = this.camera.position.distanceTo(center);
-    this.camera.near = Math.max(away - radius * 1.1, away / 1000, 1e-3);
-    this.camera.far = away + radius * 1.1;
+    const limits = this.limits?.box;
+    const reach = limits ? Math.max(radius, center.distanceTo(limits.getCenter(new Vector3())) + limits.min.distanceTo(limits.max) / 2) : radius;
+    this.camera.near = Math.max(away - reach * 1.1, away / 1000, 1e-3);
+    this.camera.far = away + reach * 1.1;
     this.camera.updateProjectionMatrix();
     const began = performance.now();
     this.renderer.render(this.scene, this.camera);

@@ -37,7 +37,9 @@ class AskedPixels:
         """
         asked = np.ones(code.refusal.shape, dtype=np.bool_) if self.pixels is None else self.pixels.copy()
         if self.least_contrast:
-            asked &= frames.contrast >= np.float32(self.least_contrast * frames.full_scale)
+            # What has no light at all is told as that.
+            strong = frames.contrast >= np.float32(self.least_contrast * frames.full_scale)
+            asked &= strong | (code.refusal == Refusal.NOT_LIT)
         if self.lowest_px is not None and self.highest_px is not None:
             half = np.float32(frames.gray.cell_px / 2)
             position = cell_position.astype(np.float32)

@@ -19,6 +19,7 @@ from tests.e2e.conftest import Start, write_rig
 from tests.e2e.page.conftest import PHONE, Visit, count, violations
 from tests.e2e.page.golden import looks_as_kept
 from tests.e2e.test_browser import scanned
+from tests.e2e.test_survival import ended
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -150,6 +151,21 @@ def test_a_result_is_looked_at_measured_compared_and_downloaded(start: Start, tm
     with service.client() as client:
         client.delete(scan)
     page.get_by_text("It was deleted, or the address is not right.").wait_for()
+
+
+def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Path, visit: Visit) -> None:
+    service = start(write_rig(tmp_path / "rig"))
+    region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "least_contrast": 0.02}
+    with service.client() as client:
+        scan = ended(client, client.start({"reconstruction": {"region": region}}))
+    assert scan["state"] == "succeeded", scan
+    page = visit(service, scan["links"]["self"][1:], size=(1280, 1100), ignored="404")
+    page.get_by_text("a box, x -20 to 20, y -25 to 15, z -40 to 40 mm; contrasts above 2 %").wait_for()
+    page.get_by_text("outside the region that the scan was asked for").wait_for()
+    page.get_by_role("button", name="Front").click()
+    shown = picture(page).astype(int)
+    # The lines are blue, and a grey plate is not.
+    assert ((shown[..., 0] - shown[..., 2]) > 100).sum() > 200
 
 
 def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Path, visit: Visit) -> None:
