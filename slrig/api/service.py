@@ -20,6 +20,7 @@ from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.feed import JobFeed
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
@@ -114,6 +115,7 @@ class Service:
         self.durations = Durations()
         self.traces = traces_by_environment()
         stores = (store, self.calibrations.register.jobs, self.verifications.jobs, self.acceptance.jobs)
+        self.feed = JobFeed(*stores)
         for jobs in stores:
             jobs.after_end = partial(self._ended, jobs)
         for desk in (self.verifications, self.calibrations, self.acceptance):
@@ -168,6 +170,7 @@ class Service:
         self.scheduler.close(timeout_s=_SCHEDULE_END_S)
         for desk in (self.verifications, self.calibrations, self.acceptance):
             desk.close()
+        self.feed.end()
 
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""
