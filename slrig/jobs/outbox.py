@@ -19,7 +19,7 @@ from slrig.jobs.records import Clock, JobRecord, JobState, reference, stamp, utc
 from slrig.jobs.tables import NoticeRow
 
 MOST_WAITING = 10_000
-LONGEST_WAIT = timedelta(hours=72)
+KEPT_FOR = timedelta(hours=72)
 
 _log = structlog.get_logger(__name__)
 
@@ -49,7 +49,7 @@ class Outbox:
         clock: Clock = utc_now,
         most: int = MOST_WAITING,
     ) -> None:
-        self._database = database
+        self.database = database
         self._rig = rig
         self._kinds = frozenset(kinds)
         self._clock = clock
@@ -85,26 +85,26 @@ class Outbox:
     def oldest(self) -> Notice | None:
         """The notice to send next. Drops those that have waited for too long."""
         while True:
-            with self._database.reading() as session:
+            with self.database.reading() as session:
                 row = session.scalar(select(NoticeRow).order_by(NoticeRow.number).limit(1))
             if row is None:
                 return None
-            limit = stamp(self._clock() - LONGEST_WAIT)
+            limit = stamp(self._clock() - KEPT_FOR)
             if row.at >= limit:
                 return Notice(row.number, row.id, row.body)
-            with self._database.changing() as session:
+            with self.database.changing() as session:
                 self._drop(
-                    session, NoticeRow.at < limit, f"they have waited for {LONGEST_WAIT // timedelta(hours=1)} hours"
+                    session, NoticeRow.at < limit, f"they have waited for {KEPT_FOR // timedelta(hours=1)} hours"
                 )
 
     def sent(self, notice: Notice) -> None:
         """Forget a notice that its receiver has."""
-        with self._database.changing() as session:
+        with self.database.changing() as session:
             session.execute(delete(NoticeRow).where(NoticeRow.number == notice.number))
 
     def waiting(self) -> tuple[int, float]:
         """How many wait, and for how many seconds the oldest does."""
-        with self._database.reading() as session:
+        with self.database.reading() as session:
             count, oldest = session.execute(select(func.count(), func.min(NoticeRow.at))).one()
         if count == 0:
             return 0, 0.0
