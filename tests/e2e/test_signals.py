@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -121,7 +123,7 @@ def test_receiver_that_hangs_holds_up_neither_a_job_nor_the_end(
 
 @pytest.mark.parametrize(("secret", "word"), [("whsec_c2hvcnQ=", "expected whsec_"), ("missing", "cannot be read")])
 def test_secret_that_is_none_ends_the_start(
-    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, secret: str, word: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, secret: str, word: str
 ) -> None:
     path = tmp_path / "secret"
     if secret != "missing":  # noqa: S105 - a case
@@ -129,11 +131,15 @@ def test_secret_that_is_none_ends_the_start(
         path.write_text(secret)
     monkeypatch.setenv("SLRIG_WEBHOOK_URL", "http://127.0.0.1:9/hook")
     monkeypatch.setenv("SLRIG_WEBHOOK_SECRET_FILE", str(path))
-    with pytest.raises(AssertionError) as error:
-        start(write_rig(tmp_path / "rig"))
-    assert f"webhook_secret_file: {path}" in str(error.value)
-    assert word in str(error.value)
-    assert "c2hvcnQ" not in str(error.value)
+    command = ["serve", str(write_rig(tmp_path / "rig")), "--port", "0", "--data", str(tmp_path / "data")]
+    refused = subprocess.run(  # noqa: S603 - our own command
+        [sys.executable, "-m", "slrig.cli", *command], capture_output=True, text=True, check=False, timeout=120
+    )
+    told = " ".join(refused.stderr.split())
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert f"webhook_secret_file: {path}" in told
+    assert word in told
+    assert "c2hvcnQ" not in told
 
 
 FINAL = {"succeeded", "failed", "cancelled", "interrupted"}
