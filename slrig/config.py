@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
 from slrig.bundle.description import CameraName
@@ -40,6 +40,9 @@ BracketSeconds = Annotated[
 LineSeconds = Annotated[float, Field(ge=0, le=0.1)]
 Gain = Annotated[float, Field(gt=0, le=1000)]
 DriverName = Annotated[str, Field(min_length=1)]
+NoticeKind = Literal[
+    "run.missed", "run.skipped", "run.failed", "run.interrupted", "health.changed", "job.ended"
+]  # fmt: skip
 
 
 class ScanDefaults(Strict):
@@ -251,16 +254,16 @@ class ServiceSettings(BaseSettings):
 
     `require_key` False opens the service to everyone who reaches it, so it is refused beyond this machine.
     `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
-    environment they are separated by commas. `webhook_url` is told when a scheduled run was missed or failed, and when
-    the rig's health changes; without it nothing is sent anywhere. Beyond the newest `keep_calibrations`, calibrations
-    are removed with their poses, but for the one in use and those that a scan or an acceptance test names. Scans are
-    kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes` sets a limit: beyond it the oldest are
-    removed, but for pinned ones and those whose files were asked for in the last quarter of an hour. `backlog_length`
-    is how many scans may be reconstructed, or wait for that, while the rig shoots the next one; what else computes
-    counts, too. `drain_s` is how long, after SIGTERM, the job that has the rig and those that compute may take to come
-    to their end before they are interrupted; what waits, and what has its frames, goes on at the next start. Nobody but
-    the service's own user may read the data, and the users of `data_group`, if it is set. `log_format` auto is text on
-    a terminal, and JSON lines elsewhere.
+    environment they are separated by commas. `webhook_url` is sent notices of `webhook_kinds`, all by default, signed
+    with `webhook_secret` or what `webhook_secret_file` holds; without an address nothing is sent anywhere. Beyond the
+    newest `keep_calibrations`, calibrations are removed with their poses, but for the one in use and those that a scan
+    or an acceptance test names. Scans are kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes`
+    sets a limit: beyond it the oldest are removed, but for pinned ones and those whose files were asked for in the last
+    quarter of an hour. `backlog_length` is how many scans may be reconstructed, or wait for that, while the rig shoots
+    the next one; what else computes counts, too. `drain_s` is how long, after SIGTERM, the job that has the rig and
+    those that compute may take to come to their end before they are interrupted; what waits, and what has its frames,
+    goes on at the next start. Nobody but the service's own user may read the data, and the users of `data_group`, if it
+    is set. `log_format` auto is text on a terminal, and JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -295,21 +298,32 @@ class ServiceSettings(BaseSettings):
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     log_format: Literal["auto", "text", "json"] = "auto"
     webhook_url: Annotated[str, Field(max_length=2000)] | None = None
+    webhook_secret: SecretStr | None = None
+    webhook_secret_file: Path | None = None
+    webhook_kinds: Annotated[tuple[NoticeKind, ...], NoDecode] = get_args(NoticeKind)
 
     @property
     def key_path(self) -> Path:
         """The file that holds the hashes of the service's keys."""
         return self.data_dir / "keys.json"
 
-    @field_validator("data_dir", "rig")
+    @field_validator("data_dir", "rig", "webhook_secret_file")
     @classmethod
     def _at_home(cls, path: Path | None) -> Path | None:
         return None if path is None else path.expanduser()
 
-    @field_validator("allowed_hosts", mode="before")
+    @field_validator("allowed_hosts", "webhook_kinds", mode="before")
     @classmethod
-    def _split(cls, hosts: object) -> object:
-        return tuple(host.strip() for host in hosts.split(",") if host.strip()) if isinstance(hosts, str) else hosts
+    def _split(cls, names: object) -> object:
+        return tuple(name.strip() for name in names.split(",") if name.strip()) if isinstance(names, str) else names
+
+    @field_validator("webhook_secret", mode="before")
+    @classmethod
+    def _a_text(cls, secret: object) -> object:
+        if not isinstance(secret, str | SecretStr | None):
+            message = "expected a text; put it in quotes"
+            raise ValueError(message)  # noqa: TRY004 - what pydantic collects
+        return secret or None
 
     @field_validator("webhook_url")
     @classmethod
@@ -345,7 +359,7 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
         The file is missing or not TOML, or a value is wrong; all faults in one message.
     """
     data: dict[str, Any] = {} if path is None else read_toml(path, MOST_CONFIG_BYTES)
-    for key in ("data_dir", "rig"):
+    for key in ("data_dir", "rig", "webhook_secret_file"):
         if path is not None and isinstance(data.get(key), str):
             data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
     source = "settings" if path is None else str(path)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Annotated, Any
 from uuid import UUID
 
-from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.exceptions import HTTPException
@@ -23,11 +23,18 @@ from slrig.calibrate.register import CalibrationRegister
 from slrig.config import ServiceSettings
 from slrig.errors import CalibrationNotFoundError, JobNotFoundError
 from slrig.failure import JobFailure
+from slrig.jobs.feed import JobFeed
 from slrig.jobs.records import JobEvent, JobState
-from slrig.jobs.store import JobStore
+from slrig.jobs.store import EVERY_JOB, JobStore
 
 _LAST_WORD_S = 2.0
 """How much longer than the work that it follows an event stream may live when the service ends."""
+
+_BATCH = 500
+"""How many events of all jobs are looked up at once."""
+
+_MOST_LOOKS = 16
+"""How many looks are kept for those who come to the same place after."""
 
 _SOLVES = {
     JobState.QUEUED: SessionState.OPEN,
@@ -38,9 +45,8 @@ _SOLVES = {
 }
 """What a calibration is while its newest solve is in a state."""
 
-LastEventId = Annotated[
-    int, Header(ge=0, le=2**53, description="number of the last event that was seen; those after it follow")
-]
+_SEEN = Header(ge=0, le=2**53, description="number of the last event that was seen; those after it follow")
+LastEventId = Annotated[int, _SEEN]
 
 router = APIRouter()
 
@@ -94,18 +100,19 @@ class Followed:
 
     look : the events after one, and whether no more will come, for now or because it was deleted; asked on another
     thread. watch : has a call made, from any thread, after each new event; returns the call that ends that. last :
-    number of the newest event.
+    number of the newest event. most : how many events a look finds at most; None: all that there are.
     """
 
     look: Callable[[int], tuple[Sequence[JobEvent], bool]]
     watch: Callable[[Callable[[], None]], Callable[[], None]]
     last: Callable[[], int]
+    most: int | None = None
 
 
-def _answers(events: str, nothing: str) -> dict[int | str, dict[str, Any]]:
+def _answers(events: str, nothing: str | None = None) -> dict[int | str, dict[str, Any]]:
     return {
         200: {"description": events, "content": {"text/event-stream": {"schema": {"type": "string"}}}},
-        204: {"description": nothing},
+        **({} if nothing is None else {204: {"description": nothing}}),
         **problems(429),
     }
 
@@ -118,6 +125,7 @@ class SharedLooks:
 
     def __init__(self, followed: Followed) -> None:
         self.last = followed.last
+        self.most = followed.most
         self._followed = followed
         self._followers: set[asyncio.Event] = set()
         self._looks: dict[int, asyncio.Future[tuple[Sequence[JobEvent], bool]]] = {}
@@ -157,11 +165,20 @@ class SharedLooks:
     async def look(self, after: int) -> tuple[Sequence[JobEvent], bool]:
         """See `Followed.look`."""
         if after not in self._looks:
+            if len(self._looks) >= _MOST_LOOKS:
+                # Of those who catch up, each at a place of its own.
+                self._looks.clear()
             self._looks[after] = asyncio.ensure_future(run_in_threadpool(self._followed.look, after))
         # One who goes away ends it for nobody else.
         return await asyncio.shield(self._looks[after])
 
 
+_EVERYTHING = _answers(
+    "the events of scans, verifications, poses, solves and positions, as the streams of their own have them, each with "
+    "`job`: its `id`, `kind` and `label`, the `series`, `calibration` or `acceptance` that it belongs to, and `links`. "
+    "Event numbers rise, with gaps. Without a number to begin after, the stream begins with what comes from now on, "
+    "and says first after which number that is. It ends with the service."
+)
 _JOB = _answers(
     "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
     "frames are brought to disk and computed with then; `file` events with the name of a file that can be fetched from "
@@ -208,10 +225,40 @@ async def follow_calibration(
     return await _stream(place, service.settings, calibration_id, followed, last_event_id)
 
 
+@router.get("/events", tags=["system"], response_class=Response, responses=_EVERYTHING)
+async def follow_everything(
+    place: StreamPlace,
+    service: Serving,
+    last_event_id: Annotated[int | None, _SEEN] = None,
+    after: Annotated[
+        int | None, Query(ge=0, le=2**53, description="as Last-Event-ID: 0 begins with the oldest on record")
+    ] = None,
+) -> Response:
+    """Follow all jobs, whatever their kind. `Last-Event-ID` comes before `after`."""
+    followed = followed_feed(service.feed, _BATCH)
+    seen = after if last_event_id is None else last_event_id
+    if seen is not None:
+        return _opened(place, service.settings, EVERY_JOB, followed, seen)
+    now = await run_in_threadpool(followed.last)
+    return _opened(place, service.settings, EVERY_JOB, followed, now, begins=now)
+
+
 async def _follow_job(place: Place, service: Serving, jobs: JobStore, job_id: UUID, after: int) -> Response:
     # One that is on no record is refused here; one that is deleted later only ends its stream.
     await run_in_threadpool(jobs.get, job_id)
     return await _stream(place, service.settings, job_id, followed_job(jobs, job_id), after)
+
+
+def followed_feed(feed: JobFeed, most: int) -> Followed:
+    """All jobs as they are followed until the service ends, in looks for so many events."""
+
+    def look(after: int) -> tuple[Sequence[JobEvent], bool]:
+        # In this order: what ends the service has its last event among those found.
+        ended = feed.ended
+        found = feed.events(after=after, limit=most)
+        return found, ended and len(found) < most
+
+    return Followed(look, feed.watch, feed.last, most)
 
 
 def followed_job(jobs: JobStore, job_id: UUID) -> Followed:
@@ -264,9 +311,16 @@ async def _stream(place: Place, settings: ServiceSettings, key: UUID, followed: 
     if over and not events:
         # An EventSource that reconnects after the last event is told by 204 to stop trying.
         return Response(status_code=204)
+    return _opened(place, settings, key, followed, after)
+
+
+def _opened(
+    place: Place, settings: ServiceSettings, key: UUID, followed: Followed, after: int, *, begins: int | None = None
+) -> Response:
+    """A stream of the events after one. See `told`. Raises HTTPException 429."""
     place.take()
     return EventSourceResponse(
-        told(place.streams, key, followed, after),
+        told(place.streams, key, followed, after, begins=begins),
         ping=settings.keepalive_s,
         sep="\n",
         # At the end of the service all work ends, and its stream by that; without this the stream would end first.
@@ -274,21 +328,28 @@ async def _stream(place: Place, settings: ServiceSettings, key: UUID, followed: 
     )
 
 
-async def told(streams: OpenStreams, key: UUID, followed: Followed, after: int) -> AsyncIterator[ServerSentEvent]:
-    """Each event after one, as it comes, until no more will. key : the same for all who follow the same."""
+async def told(
+    streams: OpenStreams, key: UUID, followed: Followed, after: int, *, begins: int | None = None
+) -> AsyncIterator[ServerSentEvent]:
+    """Each event after one, as it comes, until no more will. key : the same for all who follow the same.
+
+    begins : a number to say first, so that a client that lost the connection before the first event can go on.
+    """
     shared = streams.followed.setdefault(key, SharedLooks(followed))
     news = shared.join()
     try:
         # A client that names an event that has not come yet would never be told that it has.
         after = min(after, await run_in_threadpool(shared.last))
         over = False
+        if begins is not None:
+            yield ServerSentEvent(id=str(begins), sep="\n")
         while not over:
             news.clear()
             events, over = await shared.look(after)
             for event in events:
                 after = event.number
                 yield ServerSentEvent(json.dumps(_data(event)), event=event.kind, id=str(after), sep="\n")
-            if not over:
+            if not over and (shared.most is None or len(events) < shared.most):
                 await news.wait()
     finally:
         shared.leave(news)

@@ -29,6 +29,7 @@ from slrig.discovery import open_rig
 from slrig.errors import ConfigError, InvalidInputError, ServiceError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.outbox import Outbox
 from slrig.jobs.records import JobKind, utc_now
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import LOADING, READY, Worker, prepare_kernel_cache
@@ -65,7 +66,9 @@ def open_service(
     folder = DataFolder(settings.data_dir, group=settings.data_group)
     try:
         prepare_kernel_cache(folder.root / "cache")
-        store = JobStore(Database(folder.database), JobKind.SCAN)
+        database = Database(folder.database)
+        kinds = () if settings.webhook_url is None else settings.webhook_kinds
+        store = JobStore(database, JobKind.SCAN, outbox=Outbox(database, rig=rig.name, kinds=kinds))
         swept = sweep(store, folder)
     except BaseException:
         folder.release()

@@ -20,17 +20,19 @@ from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.config import ScanDefaults, ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.feed import JobFeed
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
-from slrig.schedule.notices import NoticedHealth, Notices
+from slrig.schedule.notices import NoticedHealth, tell_run
 from slrig.schedule.records import Run
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
+from slrig.schedule.webhook import Webhook, key_of_file, signing_key
 from slrig.verify.job import VerificationDesk
 from slrig.verify.verification import verification_tools
 
@@ -43,15 +45,17 @@ _SCHEDULE_END_S = 1.0
 class Service:
     """One service: its settings, its data, the one that scans, those that calibrate, verify and test, and the schedule.
 
-    Until `start` nothing works but what sends notices. worker : the runner's, which computes for all of them.
-    refuse_when_stale : whether the rig file has scans refused then. wanted_mm : what it wants of a point's error.
+    Until `start` nothing works. store : of scans; all jobs tell of their ends where those do. worker : the runner's,
+    which computes for all of them. refuse_when_stale : whether the rig file has scans refused then. wanted_mm : what it
+    wants of a point's error.
 
     Raises
     ------
     StorageError
         The disk refused. What was given is still the caller's to close.
     ConfigError
-        The environment asks for traces, and the library that sends them is not installed.
+        The environment asks for traces, and the library that sends them is not installed. Or the webhook's secret is
+        none.
     """
 
     def __init__(
@@ -75,25 +79,27 @@ class Service:
         self.runner = runner
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
-        database, spare_bytes = store.database, settings.min_free_bytes
+        database, outbox, spare_bytes = store.database, store.outbox, settings.min_free_bytes
+        self.webhook = None
+        if settings.webhook_url is not None:
+            self.webhook = Webhook(outbox, settings.webhook_url, _webhook_key(settings))
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
         self.audit = Audit(database)
         self.calibrations = Calibrations(
             folder,
             runner,
-            JobStore(database, JobKind.POSE, JobKind.SOLVE),
+            JobStore(database, JobKind.POSE, JobKind.SOLVE, outbox=outbox),
             rig_name=rig_name,
             tools=calibration_tools or usual_calibration_tools(worker),
             spare_bytes=spare_bytes,
             wanted_mm=wanted_mm,
         )
-        self.notices = Notices(settings.webhook_url, rig=rig_name)
         self.verifications = VerificationDesk(
             folder,
             runner.queue,
-            NoticedHealth(database, self.notices),
-            JobStore(database, JobKind.VERIFICATION),
+            NoticedHealth(database, outbox),
+            JobStore(database, JobKind.VERIFICATION, outbox=outbox),
             tools=verification_tools(worker),
             spare_bytes=spare_bytes,
         )
@@ -101,7 +107,7 @@ class Service:
         self.acceptance = AcceptanceDesk(
             folder,
             runner.queue,
-            JobStore(database, JobKind.POSITION),
+            JobStore(database, JobKind.POSITION, outbox=outbox),
             evaluate=worker.task("slrig.accept.running:evaluated", "evaluation of the position"),
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
             wanted_mm=wanted_mm,
@@ -109,6 +115,7 @@ class Service:
         self.durations = Durations()
         self.traces = traces_by_environment()
         stores = (store, self.calibrations.register.jobs, self.verifications.jobs, self.acceptance.jobs)
+        self.feed = JobFeed(*stores)
         for jobs in stores:
             jobs.after_end = partial(self._ended, jobs)
         for desk in (self.verifications, self.calibrations, self.acceptance):
@@ -121,10 +128,10 @@ class Service:
         )
         limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
         self.scan_retention = ScanRetention(store, folder, limits, runner.delete)
-        self.schedules = ScheduleStore(database)
+        self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
         self.tasks = Tasks(runner.queue, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
         # The folder's lock keeps every other process out.
-        self.scheduler = Scheduler(self.schedules, self.tasks, alone=True, notice=self.notices.run)
+        self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
 
     def _ended(self, jobs: JobStore, record: JobRecord) -> None:
         """Measure a job that is over, and make room after a scan."""
@@ -139,7 +146,9 @@ class Service:
             _log.exception("how long a job took could not be noted", job=str(record.id))
 
     def start(self) -> None:
-        """Open the rig, look at the clock, and remove what is old."""
+        """Open the rig, look at the clock, send what waits, and remove what is old."""
+        if self.webhook is not None:
+            self.webhook.start()
         self.runner.start()
         self.scheduler.start()
         # It reads the report of every scan, and nobody waits for it.
@@ -161,15 +170,23 @@ class Service:
         self.scheduler.close(timeout_s=_SCHEDULE_END_S)
         for desk in (self.verifications, self.calibrations, self.acceptance):
             desk.close()
+        self.feed.end()
 
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""
         self.end_work()
-        self.notices.close()
+        if self.webhook is not None:
+            self.webhook.close()
         if self.traces is not None:
             self.traces.close()
         self.store.database.close()
         self.folder.release()
+
+
+def _webhook_key(settings: ServiceSettings) -> bytes | None:
+    if settings.webhook_secret is not None:
+        return signing_key(settings.webhook_secret.get_secret_value(), "webhook_secret")
+    return None if settings.webhook_secret_file is None else key_of_file(settings.webhook_secret_file)
 
 
 async def _of_request(request: Request) -> Service:

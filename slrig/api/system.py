@@ -9,7 +9,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Response
 from prometheus_client import CollectorRegistry
-from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.registry import Collector
 from starlette.exceptions import HTTPException
@@ -64,6 +64,11 @@ class _Figures(Collector):
         yield GaugeMetricFamily("slrig_rig_waiting", "How many wait for the rig.", status.waiting)
         yield from self._calibration()
         yield from self._schedule()
+        outbox = self._service.store.outbox
+        waiting, oldest_s = outbox.waiting()
+        yield GaugeMetricFamily("slrig_notices_waiting", "Notices that the webhook has not taken yet.", waiting)
+        yield GaugeMetricFamily("slrig_notices_oldest_age_seconds", "How long the oldest of them has waited.", oldest_s)
+        yield CounterMetricFamily("slrig_notices_dropped", "Notices that were never sent.", outbox.dropped)
 
     def _calibration(self) -> Iterator[Metric]:
         health, latest, calibration = self._service.verifications.health()

@@ -111,6 +111,34 @@ class JobRecord:
     requested_by: str | None = None
 
 
+_PARENTS = {
+    JobKind.SCAN: ("series", "/scan/series"),
+    JobKind.POSE: ("calibration", "/calibration"),
+    JobKind.SOLVE: ("calibration", "/calibration"),
+    JobKind.POSITION: ("acceptance", "/acceptance"),
+}
+"""What the parent of a job of each kind is, and where the service has those."""
+
+
+def reference(job: JobRecord) -> dict[str, Any]:
+    """What names a job to those who follow jobs of all kinds: `id`, `kind`, `label`, the `series`, `calibration` or
+    `acceptance` that it belongs to, if it belongs to one, and `links`, by paths of the service.
+    """
+    named: dict[str, Any] = {"id": str(job.id), "kind": str(job.kind), "label": job.label}
+    links = {"self": f"/{'rig/verification' if job.kind is JobKind.VERIFICATION else job.kind}/{job.id}"}
+    links["events"] = f"{links['self']}/events"
+    if job.parent is not None:
+        name, room = _PARENTS[job.kind]
+        named[name], links[name] = str(job.parent), f"{room}/{job.parent}"
+        if job.kind is not JobKind.SCAN:
+            place = links[name]
+            links["self"] = f"{place}/pose/{job.plan['number']}" if job.kind is JobKind.POSE else place
+            links["events"] = f"{place}/events"
+    if job.kind is JobKind.POSITION:
+        del links["events"]
+    return {**named, "links": links}
+
+
 @dataclass(frozen=True, slots=True)
 class JobEvent:
     """One thing that happened to a job. `number` rises and never changes: it counts from 1 within the job, or, where

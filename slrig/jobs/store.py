@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from slrig.errors import JobNotFoundError
 from slrig.failure import JobFailure
 from slrig.jobs.database import Database
+from slrig.jobs.outbox import Outbox
 from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, actor, stamp, utc_now
 from slrig.jobs.tables import EventRow, JobRow, KeyRow
 
@@ -25,16 +26,25 @@ _LISTED = {
 
 _PROGRESS_PATIENCE_S = 0.2  # the work waits meanwhile
 
+EVERY_JOB = UUID(int=0)
+"""Stands for all jobs of a store where they are followed."""
+
 
 class JobStore:
-    """Jobs of one kind, or of a few that belong together. Any thread of the one process that owns it may call."""
+    """Jobs of one kind, or of a few that belong together. Any thread of the one process that owns it may call.
 
-    def __init__(self, database: Database, *kinds: JobKind, clock: Clock = utc_now) -> None:
+    outbox : where notices of their ends are put; without one nobody is told.
+    """
+
+    def __init__(
+        self, database: Database, *kinds: JobKind, clock: Clock = utc_now, outbox: Outbox | None = None
+    ) -> None:
         self.kinds = kinds
         self._clock = clock
         self._watching = threading.Lock()
         self._watchers: dict[UUID, list[Callable[[], None]]] = defaultdict(list)
         self.database = database
+        self.outbox = outbox or Outbox(database)
         self.after_end: Callable[[JobRecord], None] = lambda _: None
         """Told of each job of this store that comes to its end, once that is on record. It must not raise."""
 
@@ -77,9 +87,8 @@ class JobStore:
                 _append(session, row, "state", {"state": row.state, "time": row.created_at})
             if key is not None and (held := session.get(KeyRow, key)) is not None:
                 held.job_id = rows[0].id
-            made = [_record(row) for row in rows]
-        for parent in {record.parent for record in made if record.parent is not None}:
-            self._wake(parent)
+            made = [record_of(row) for row in rows]
+        self.wake(EVERY_JOB, *{record.parent for record in made})
         return made
 
     def restore(
@@ -109,7 +118,7 @@ class JobStore:
     def get(self, job_id: UUID) -> JobRecord:
         """Return a job. Raises JobNotFoundError."""
         with self.database.reading() as session:
-            return _record(self._find(session, job_id))
+            return record_of(self._find(session, job_id))
 
     def page(self, *, before: int | None, limit: int) -> Sequence[JobRecord]:
         """Return up to `limit` jobs, newest first, whose number is below `before`."""
@@ -117,21 +126,21 @@ class JobStore:
         if before is not None:
             query = query.where(JobRow.number < before)
         with self.database.reading() as session:
-            return [_record(row) for row in session.scalars(query)]
+            return [record_of(row) for row in session.scalars(query)]
 
     def unfinished(self) -> Sequence[JobRecord]:
         """Return the jobs that are in no final state, oldest first."""
         running = [state for state in JobState if not state.final]
         query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.state.in_(running)).order_by(JobRow.number)
         with self.database.reading() as session:
-            return [_record(row) for row in session.scalars(query)]
+            return [record_of(row) for row in session.scalars(query)]
 
     def finished(self) -> Sequence[JobRecord]:
         """Return the jobs that are in a final state, newest first."""
         running = [state for state in JobState if not state.final]
         query = select(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.state.not_in(running))
         with self.database.reading() as session:
-            return [_record(row) for row in session.scalars(query.order_by(JobRow.number.desc()))]
+            return [record_of(row) for row in session.scalars(query.order_by(JobRow.number.desc()))]
 
     def of(self, *parents: UUID) -> dict[UUID, list[JobRecord]]:
         """Return the jobs of each parent, oldest first; without a parent named, those of all that have one."""
@@ -141,7 +150,7 @@ class JobStore:
         found: dict[UUID, list[JobRecord]] = defaultdict(list)
         with self.database.reading() as session:
             for row in session.scalars(query):
-                found[UUID(row.parent)].append(_record(row))
+                found[UUID(row.parent)].append(record_of(row))
         return found
 
     def attempts(self, job_id: UUID) -> int:
@@ -154,7 +163,7 @@ class JobStore:
         with self.database.changing() as session:
             row = self._find(session, job_id)
             row.pinned = pinned
-            return _record(row)
+            return record_of(row)
 
     def states(self) -> dict[UUID, JobState]:
         """Return the state of every job on record."""
@@ -207,7 +216,8 @@ class JobStore:
             if JobState(row.state).final:
                 return False
             self._close_row(session, row, state, fault, summary)
-            ended = _record(row)
+            ended = record_of(row)
+            self.outbox.ended(session, ended)
         self._wake(job_id, row.parent)
         self.after_end(ended)
         return True
@@ -229,7 +239,7 @@ class JobStore:
         """Forget the jobs of a parent that is gone."""
         with self.database.changing() as session:
             session.execute(delete(JobRow).where(JobRow.kind.in_(self.kinds), JobRow.parent == str(parent)))
-        self._wake(parent)
+        self.wake(parent)
 
     def prune(self, keep: int) -> None:
         """Forget the oldest finished jobs, so that `keep` are left."""
@@ -271,8 +281,8 @@ class JobStore:
             return self._find(session, job_id).last_event
 
     def watch(self, job_id: UUID, wake: Callable[[], None]) -> Callable[[], None]:
-        """Have `wake` called, from any thread, after each new event of a job, or of any job of a parent, and after a
-        deletion. Returns the call that ends it.
+        """Have `wake` called, from any thread, after each new event of a job, of any job of a parent, or of all jobs,
+        and after a deletion. Returns the call that ends it.
         """
         with self._watching:
             self._watchers[job_id].append(wake)
@@ -313,12 +323,15 @@ class JobStore:
     def _now(self) -> str:
         return stamp(self._clock())
 
-    def _wake(self, job_id: UUID, parent: str | None = None) -> None:
-        woken = (job_id,) if parent is None else (job_id, UUID(parent))
+    def wake(self, *followed: UUID | None) -> None:
+        """Have those look again who `watch` one of these."""
         with self._watching:
-            watchers = [wake for each in woken for wake in self._watchers.get(each, ())]
+            watchers = [wake for each in followed if each is not None for wake in self._watchers.get(each, ())]
         for wake in watchers:
             wake()
+
+    def _wake(self, job_id: UUID, parent: str | None) -> None:
+        self.wake(EVERY_JOB, job_id, None if parent is None else UUID(parent))
 
 
 def _new_row(
@@ -344,7 +357,8 @@ def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> N
     session.add(EventRow(job_id=row.id, number=row.last_event, kind=kind, data=data))
 
 
-def _record(row: JobRow) -> JobRecord:
+def record_of(row: JobRow) -> JobRecord:
+    """A row as the record that it is."""
     return JobRecord(
         number=row.number,
         id=UUID(row.id),

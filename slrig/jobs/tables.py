@@ -96,6 +96,20 @@ class AuditRow(Base):
     __table_args__ = ({"sqlite_autoincrement": True},)
 
 
+class NoticeRow(Base):
+    """One notice that waits to be sent; `number` is their order, `id` what its receiver knows it by."""
+
+    __tablename__ = "notice"
+
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    id: Mapped[str] = mapped_column(String(36))
+    at: Mapped[str] = mapped_column(String(32))
+    kind: Mapped[str] = mapped_column(String(32))
+    body: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+    __table_args__ = ({"sqlite_autoincrement": True},)
+
+
 class ScheduleRow(Base):
     """One schedule."""
 

@@ -40,9 +40,6 @@ Raises RigBusyError where somebody holds the rig, before anything was done; Slri
 may pass, see `passes`, has the run try again within its grace.
 """
 
-Notice = Callable[[Schedule, Run], None]
-"""Told of every run that came to an end, or never began. Must not raise."""
-
 
 def passes(error: SlrigError) -> bool:
     """Whether a run that met this may go well a little later: the rig was held, a device failed, the worker was lost.
@@ -74,14 +71,12 @@ class Scheduler:
         clock: Clock = utc_now,
         alone: bool = True,
         execute: Callable[[Callable[[], None]], None] = in_a_thread,
-        notice: Notice = lambda _schedule, _run: None,
     ) -> None:
         self._store = store
         self._work = work
         self._clock = clock
         self._alone = alone
         self._execute = execute
-        self._notice = notice
         self._wanted = threading.Event()
         self._stop = threading.Event()
         self._idle = threading.Event()
@@ -90,7 +85,7 @@ class Scheduler:
 
     def start(self) -> None:
         """Record what a process before this one left behind, and look at the clock from now on."""
-        self._tell(self._store.interrupt_dead(self._clock(), alone=self._alone))
+        _log_runs(self._store.interrupt_dead(self._clock(), alone=self._alone))
         self._loop.start()
 
     def wake(self) -> None:
@@ -109,11 +104,11 @@ class Scheduler:
         """Look at the clock once. Returns when to look again."""
         now, store = self._clock(), self._store
         if self._idle.is_set():
-            self._tell(store.interrupt_own(now))
+            _log_runs(store.interrupt_own(now))
         store.beat(now)
-        self._tell(store.interrupt_dead(now))
-        self._tell(run for run in store.record_due(now) if run.state.final)
-        self._tell(store.expire(now))
+        _log_runs(store.interrupt_dead(now))
+        _log_runs(run for run in store.record_due(now) if run.state.final)
+        _log_runs(store.expire(now))
         for run in store.startable(now):
             if self._stop.is_set() or not self._idle.is_set():
                 break
@@ -162,14 +157,7 @@ class Scheduler:
         self._store.finish(run, state, self._clock(), reason=reason, result=result)
         # It may have been removed meanwhile.
         with suppress(ScheduleNotFoundError):
-            self._tell(each for each in self._store.runs(schedule.id) if each.number == run.number)
-
-    def _tell(self, runs: Iterable[Run]) -> None:
-        for run in runs:
-            schedule = self._store.get(run.schedule)
-            log = _log.info if run.state in {RunState.SUCCEEDED, RunState.COALESCED} else _log.warning
-            log("scheduled run", schedule=str(run.schedule), due=run.due.isoformat(), state=run.state, cause=run.reason)
-            self._notice(schedule, run)
+            _log_runs(each for each in self._store.runs(schedule.id) if each.number == run.number)
 
     def _look_again(self) -> None:
         while not self._stop.is_set():
@@ -182,3 +170,9 @@ class Scheduler:
                 wait_s = LOOK_S
             if not self._stop.is_set():
                 self._wanted.wait(min(max(wait_s, _LEAST_WAIT_S), LOOK_S))
+
+
+def _log_runs(runs: Iterable[Run]) -> None:
+    for run in runs:
+        log = _log.info if run.state in {RunState.SUCCEEDED, RunState.COALESCED} else _log.warning
+        log("scheduled run", schedule=str(run.schedule), due=run.due.isoformat(), state=run.state, cause=run.reason)

@@ -35,11 +35,16 @@ _AS_ORDERED = ("task", "options", "label", "grace_s", "retry_s", "catch_up", "en
 _run_adapter = TypeAdapter(Run)
 
 
+Notice = Callable[[Session, Schedule, Run], None]
+"""Told of every run that came to an end, or never began, in the transaction that records it."""
+
+
 class ScheduleStore:
     """Schedules and runs. Safe to call from any thread and from several processes. `now` is in UTC."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, *, notice: Notice = lambda *_: None) -> None:
         self.database = database
+        self._notice = notice
         self._owner = str(uuid4())
 
     def create(self, order: Order, now: datetime) -> Schedule:
@@ -185,6 +190,7 @@ class ScheduleStore:
             if row is not None and not RunState(row.state).final:
                 _close(row, state, now, reason)
                 row.result = None if result is None else dict(result)
+                self._tell(session, row)
 
     def beat(self, now: datetime) -> None:
         """Say that this process is alive, and with it the run that it has under way."""
@@ -230,7 +236,11 @@ class ScheduleStore:
             rows = list(session.scalars(query))
             for row in rows:
                 _close(row, state, now, reason(row))
+                self._tell(session, row)
             return [_run(row) for row in rows]
+
+    def _tell(self, session: Session, row: RunRow) -> None:
+        self._notice(session, _schedule(_found(session, UUID(row.schedule_id))), _run(row))
 
     def _recorded(self, session: Session, schedule: ScheduleRow, due: DueRun, now: datetime) -> list[RunRow]:
         if self._row(session, schedule.id, due.due) is not None:
@@ -252,6 +262,8 @@ class ScheduleStore:
         )
         session.add(row)
         session.flush()
+        if due.state.final:
+            self._tell(session, row)
         return [row]
 
     def _row(self, session: Session, schedule_id: str, due: datetime) -> RunRow | None:

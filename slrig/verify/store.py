@@ -9,6 +9,7 @@ from typing import Any
 from uuid import UUID, uuid4
 
 from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 from slrig.calibration.health.verdict import Health, HealthState, judged
 from slrig.calibration.health.verification import Verification, verification_from_document
@@ -55,6 +56,7 @@ class HealthStore:
     def add(self, found: Verification, *, calibration: str, at: datetime) -> VerificationRecord:
         """Judge a verification with those before it of its calibration, and put it on record. Raises StorageError."""
         with self.database.changing() as session:
+            newest = session.scalar(select(VerificationRow).order_by(VerificationRow.number.desc()).limit(1))
             query = select(VerificationRow).where(VerificationRow.calibration == calibration)
             # The first few too: a trend starts from them.
             first = list(session.scalars(query.order_by(VerificationRow.number).limit(3)))
@@ -69,7 +71,15 @@ class HealthStore:
             session.flush()
             for old in session.scalars(select(VerificationRow).where(VerificationRow.number <= row.number - _KEPT)):
                 session.delete(old)
-            return _record(row)
+            record = _record(row)
+            self.added(session, None if newest is None else _record(newest), record)
+            return record
+
+    def added(self, session: Session, before: VerificationRecord | None, now: VerificationRecord) -> None:
+        """Called in the transaction that puts a verification on record. before : the one before it, of any calibration.
+
+        For those who tell of it.
+        """
 
     def history(self, *, limit: int = 200, since: datetime | None = None) -> Sequence[VerificationRecord]:
         """Up to `limit` verifications, newest first, none older than `since`."""

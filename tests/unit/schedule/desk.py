@@ -27,14 +27,15 @@ class Desk:
         self.done: list[tuple[Schedule, Run]] = []
         self.told: list[tuple[datetime, RunState]] = []
         self.during: Callable[[], None] = lambda: None
-        self.store = ScheduleStore(Database(database))
+        self.store = ScheduleStore(
+            Database(database), notice=lambda _session, _schedule, run: self.told.append((run.due, run.state))
+        )
         self.scheduler = Scheduler(
             self.store,
             self._work,
             clock=lambda: self.now,
             alone=alone,
             execute=lambda call: call(),
-            notice=lambda _, run: self.told.append((run.due, run.state)),
         )
 
     def _work(self, schedule: Schedule, run: Run, cancelled: Callable[[], bool], /) -> Mapping[str, Any]:

@@ -1,84 +1,65 @@
-"""Notices: what is sent to the webhook, and what never stands in anybody's way."""
+"""Notices: what is put into the outbox of runs, of the rig's health and of jobs, with what it tells of."""
 
 from __future__ import annotations
 
-import json
-import queue
-import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
-from uuid import UUID
+from typing import Any, get_args
+from uuid import UUID, uuid4
 
 import pytest
-import structlog
+from sqlalchemy.orm import Session
 
-from slrig.config import ServiceSettings, read_settings
-from slrig.errors import ConfigError
+from slrig.config import NoticeKind
+from slrig.failure import JobFailure
 from slrig.jobs.database import Database
-from slrig.schedule.notices import TOLD, NoticedHealth, Notices
+from slrig.jobs.outbox import Outbox
+from slrig.jobs.records import JobKind, JobRecord, JobState, acting_as
+from slrig.jobs.store import JobStore
+from slrig.schedule.notices import TOLD, NoticedHealth, tell_run
 from slrig.schedule.records import Cron, Order, Run, RunState, Schedule, TaskKind
-from tests.unit.scan.fakes import WAIT_S
+from slrig.schedule.store import ScheduleStore
+from tests.unit.schedule.desk import Desk
 from tests.unit.verify.health_bench import a_verification, hours
 
 DUE = datetime(2026, 11, 23, 5, 30, tzinfo=UTC)
 SCHEDULE = Schedule(UUID(int=7), Order(Cron("30 6 * * *", "Europe/Berlin"), TaskKind.VERIFICATION), DUE, DUE)
 
 
-class Hook:
-    """A web server on this machine that keeps what is sent. While `gate` is clear it does not answer."""
-
-    def __init__(self) -> None:
-        self.status = 204
-        self.gate = threading.Event()
-        self.gate.set()
-        self.came: queue.Queue[dict[str, Any]] = queue.Queue()
-        hook = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self) -> None:
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                hook.came.put({"path": self.path, **json.loads(body)})
-                hook.gate.wait(WAIT_S)
-                self.send_response(hook.status)
-                self.end_headers()
-
-            def log_message(self, *_: object) -> None:
-                return
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/hook/secret"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
-
-    def close(self) -> None:
-        self.gate.set()
-        self.server.shutdown()
-        self.server.server_close()
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    made = Database(tmp_path / "slrig.sqlite")
+    yield made
+    made.close()
 
 
 @pytest.fixture
-def hook() -> Iterator[Hook]:
-    made = Hook()
-    yield made
-    made.close()
+def outbox(database: Database) -> Outbox:
+    return Outbox(database, rig="bench", kinds=get_args(NoticeKind), clock=lambda: DUE)
+
+
+def told(outbox: Outbox) -> list[dict[str, Any]]:
+    """All that waits, which then waits no longer."""
+    found = []
+    while (notice := outbox.oldest()) is not None:
+        found.append(dict(notice.body))
+        outbox.sent(notice)
+    return found
 
 
 def run(state: RunState, *, count: int = 1) -> Run:
     return Run(4, SCHEDULE.id, DUE, state, "rig busy: a scan", count, 1, DUE, None, None, None, None)
 
 
-def test_runs_that_a_person_has_to_know_of_are_sent_and_no_others(hook: Hook) -> None:
-    notices = Notices(hook.url, rig="bench", clock=lambda: DUE)
-    for state in RunState:
-        notices.run(SCHEDULE, run(state, count=3))
-    sent = [hook.came.get(timeout=WAIT_S) for _ in TOLD]
-    notices.close()
-    assert hook.came.empty()
+def test_runs_that_a_person_has_to_know_of_are_told_and_no_others(database: Database, outbox: Outbox) -> None:
+    with database.changing() as session:
+        for state in RunState:
+            tell_run(outbox, session, SCHEDULE, run(state, count=3))
+    sent = told(outbox)
+    assert len(sent) == len(TOLD)
     assert {each["kind"] for each in sent} == {"run.missed", "run.skipped", "run.failed", "run.interrupted"}
     skipped = next(each for each in sent if each["kind"] == "run.skipped")
-    assert skipped["path"] == "/hook/secret"
     assert skipped["words"] == (
         "rig 'bench': verification due 2026-11-23 06:30 +0100 was skipped, 3 times: rig busy: a scan"
     )
@@ -86,68 +67,123 @@ def test_runs_that_a_person_has_to_know_of_are_sent_and_no_others(hook: Hook) ->
         "number": 4, "due": DUE.isoformat(), "state": "skipped", "reason": "rig busy: a scan", "count": 3,
     }  # fmt: skip
     assert skipped["schedule"]["id"] == str(SCHEDULE.id)
-    assert skipped["at"] == DUE.isoformat()
+    assert (skipped["at"], skipped["rig"]) == ("2026-11-23T05:30:00.000+00:00", "bench")
+    assert len({each["id"] for each in sent}) == len(sent)
 
 
-def test_health_is_told_when_it_changes(hook: Hook, tmp_path: Path) -> None:
-    notices = Notices(hook.url, rig="bench")
-    health = NoticedHealth(Database(tmp_path / "slrig.sqlite"), notices)
+def test_run_that_fails_by_the_clock_is_told_with_its_row(tmp_path: Path) -> None:
+    desk = Desk(tmp_path / "slrig.sqlite")
+    outbox = Outbox(desk.store.database, rig="bench", kinds=get_args(NoticeKind), clock=lambda: desk.now)
+    desk.store = ScheduleStore(
+        desk.store.database, notice=lambda session, schedule, run: tell_run(outbox, session, schedule, run)
+    )
+    schedule = desk.store.create(Order(Cron("0 6 * * *", "UTC"), TaskKind.VERIFICATION, label="daily"), desk.now)
+    (due,) = desk.store.record_due(DUE.replace(hour=6, minute=0))
+    desk.store.finish(due, RunState.FAILED, desk.now, reason="no board")
+    desk.store.finish(due, RunState.FAILED, desk.now, reason="again")
+    (one,) = told(outbox)
+    assert (one["kind"], one["schedule"]["label"], one["run"]["reason"]) == ("run.failed", "daily", "no board")
+    assert one["schedule"]["id"] == str(schedule.id)
+    desk.store.database.close()
+
+
+def test_health_is_told_when_it_changes(database: Database, outbox: Outbox) -> None:
+    health = NoticedHealth(database, outbox)
     for hour, look in enumerate(
         [a_verification(), a_verification(), a_verification(6.0, evidence=400.0), a_verification(6.0, evidence=400.0)]
     ):
         health.add(look, calibration="one", at=hours(hour))
     health.add(a_verification(), calibration="two", at=hours(9))
-    first, second = (hook.came.get(timeout=WAIT_S) for _ in range(2))
-    notices.close()
-    health.database.close()
-    assert hook.came.empty()
+    first, second = told(outbox)
     assert (first["kind"], first["health"]["before"], first["health"]["state"]) == ("health.changed", "good", "stale")
     assert "turned by 0.050" in first["words"]
     assert (second["health"]["before"], second["health"]["state"]) == ("stale", "good")
 
 
-def test_hook_that_refuses_or_is_gone_is_in_the_log_and_in_nobodys_way(hook: Hook) -> None:
-    hook.status = 500
-    with structlog.testing.capture_logs() as log:
-        notices = Notices(hook.url, rig="bench")
-        notices.run(SCHEDULE, run(RunState.FAILED))
-        hook.came.get(timeout=WAIT_S)
-        notices.close()
-        hook.close()
-        notices = Notices(hook.url, rig="bench")
-        notices.run(SCHEDULE, run(RunState.FAILED))
-        notices.close()
-        notices.close()
-    assert [(each["event"], each["host"]) for each in log] == [
-        ("a notice was refused", "127.0.0.1"),
-        ("a notice was not delivered", "127.0.0.1"),
-    ]
-    assert "secret" not in str(log)
+def test_end_of_a_job_of_any_kind_is_told_once(database: Database, outbox: Outbox) -> None:
+    parent, at = uuid4(), JobState
+    fault = JobFailure("pose-refused", "no board is in view")
+    made: list[tuple[JobKind, dict[str, Any], UUID | None, JobState, dict[str, str]]] = [
+        (JobKind.SCAN, {}, None, at.SUCCEEDED, {"self": "/scan/{id}", "events": "/scan/{id}/events"}),
+        (JobKind.SCAN, {}, parent, at.CANCELLED, {
+            "self": "/scan/{id}", "events": "/scan/{id}/events", "series": "/scan/series/{parent}",
+        }),
+        (JobKind.POSE, {"number": 3}, parent, at.FAILED, {
+            "self": "/calibration/{parent}/pose/3", "events": "/calibration/{parent}/events",
+            "calibration": "/calibration/{parent}",
+        }),
+        (JobKind.SOLVE, {"number": 1}, parent, at.INTERRUPTED, {
+            "self": "/calibration/{parent}", "events": "/calibration/{parent}/events",
+            "calibration": "/calibration/{parent}",
+        }),
+        (JobKind.VERIFICATION, {}, None, at.SUCCEEDED, {
+            "self": "/rig/verification/{id}", "events": "/rig/verification/{id}/events",
+        }),
+        (JobKind.POSITION, {}, parent, at.SUCCEEDED, {
+            "self": "/acceptance/{parent}", "acceptance": "/acceptance/{parent}",
+        }),
+    ]  # fmt: skip
+    for kind, plan, of, state, links in made:
+        jobs = JobStore(database, kind, outbox=outbox, clock=lambda: DUE)
+        with acting_as("Ann"):
+            job = jobs.create(plan, rig="bench", label="by hand", parent=of)
+        jobs.advance(job.id, JobState.CAPTURING)
+        assert told(outbox) == [], "it has not ended"
+        jobs.finish(job.id, state, fault=fault if state is at.FAILED else None)
+        assert not jobs.finish(job.id, JobState.FAILED)
+        (one,) = told(outbox)
+        assert (one["kind"], one["job"]["kind"], one["job"]["state"]) == ("job.ended", kind, state)
+        assert (one["job"]["id"], one["job"]["label"], one["job"]["requested_by"]) == (str(job.id), "by hand", "Ann")
+        assert one["job"]["links"] == {
+            name: link.format(id=job.id, parent=parent) for name, link in links.items()
+        }, kind  # fmt: skip
+        assert one["job"]["finished_at"] == one["job"]["started_at"] == "2026-11-23T05:30:00.000+00:00"
+        assert one["job"]["error"] == (
+            {"code": "pose-refused", "message": "no board is in view"} if state is at.FAILED else None
+        )  # fmt: skip
+    assert one["words"] == f"rig 'bench': position {job.id} succeeded"
 
 
-def test_hook_that_does_not_answer_holds_nobody_up_and_fills_no_memory(hook: Hook) -> None:
-    hook.gate.clear()
-    with structlog.testing.capture_logs() as log:
-        notices = Notices(hook.url, rig="bench", most=2)
-        notices.run(SCHEDULE, run(RunState.FAILED))
-        hook.came.get(timeout=WAIT_S)
-        for _ in range(5):
-            notices.run(SCHEDULE, run(RunState.MISSED))
-        notices.close()
-    assert [each["event"] for each in log] == ["a notice was dropped: too many wait"] * 3
+def test_end_that_cannot_be_recorded_is_not_told_and_notice_that_cannot_be_written_holds_its_end(
+    database: Database, outbox: Outbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs = JobStore(database, JobKind.SCAN, outbox=outbox)
+    job = jobs.create({}, rig="bench", label=None)
+
+    class PowerCutError(Exception):
+        pass
+
+    def put(*_: object, **__: object) -> None:
+        raise PowerCutError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(outbox, "put", put)
+        with pytest.raises(PowerCutError):
+            jobs.finish(job.id, JobState.SUCCEEDED)
+    assert jobs.get(job.id).state is JobState.QUEUED
+    assert [event.kind for event in jobs.events(job.id, after=0)] == ["state"]
+
+    ended = outbox.ended
+
+    def cut_off(session: Session, job: JobRecord) -> None:
+        ended(session, job)
+        raise PowerCutError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(outbox, "ended", cut_off)
+        with pytest.raises(PowerCutError):
+            jobs.finish(job.id, JobState.SUCCEEDED)
+    assert (told(outbox), outbox.news.is_set()) == ([], False)
+    jobs.finish(job.id, JobState.SUCCEEDED)
+    assert outbox.news.is_set()
+    assert [each["job"]["state"] for each in told(outbox)] == ["succeeded"]
 
 
-def test_nothing_is_sent_by_default() -> None:
-    assert ServiceSettings().webhook_url is None
-    before = threading.active_count()
-    notices = Notices(None, rig="bench")
-    notices.run(SCHEDULE, run(RunState.FAILED))
-    notices.close()
-    assert threading.active_count() == before
-
-
-@pytest.mark.parametrize("url", ["ftp://host/hook", "host/hook", "http:///hook"])
-def test_address_that_is_none_is_refused_and_not_repeated(url: str) -> None:
-    with pytest.raises(ConfigError, match="webhook_url: expected an address that begins with http") as error:
-        read_settings(webhook_url=url)
-    assert url not in str(error.value)
+def test_kinds_that_are_not_wanted_are_not_kept(database: Database) -> None:
+    outbox = Outbox(database, rig="bench", kinds=["run.failed"])
+    jobs = JobStore(database, JobKind.SCAN, outbox=outbox)
+    jobs.finish(jobs.create({}, rig="bench", label=None).id, JobState.SUCCEEDED)
+    with database.changing() as session:
+        tell_run(outbox, session, SCHEDULE, run(RunState.MISSED))
+        tell_run(outbox, session, SCHEDULE, run(RunState.FAILED))
+    assert [each["kind"] for each in told(outbox)] == ["run.failed"]

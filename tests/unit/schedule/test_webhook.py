@@ -1,0 +1,372 @@
+"""The webhook: in order, signed, until taken; whatever its receiver does, it stands in nobody's way."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import structlog
+from pydantic import SecretStr
+
+from slrig.config import NoticeKind, ServiceSettings, read_settings
+from slrig.errors import ConfigError, StorageError
+from slrig.jobs.database import Database
+from slrig.jobs.outbox import Notice, Outbox
+from slrig.schedule.webhook import Webhook, key_of_file, signature, signing_key
+from tests.unit.scan.fakes import WAIT_S, SetClock
+from tests.unit.schedule.hook import PATH, SECRET, Hook, signed
+
+KEY = signing_key(SECRET, "here")
+BODY = b'{"test": 2432232314}'
+
+
+class Bench:
+    """An outbox on a clock that is set by hand, and a webhook that takes a step when a test says."""
+
+    def __init__(self, folder: Path, hook: Hook, *, most: int = 10_000) -> None:
+        self.clock = SetClock()
+        self.database = Database(folder / "slrig.sqlite")
+        self.outbox = Outbox(
+            self.database, rig="bench", kinds=get_args(NoticeKind), clock=self.clock, most=most
+        )  # fmt: skip
+        self.webhook = Webhook(self.outbox, hook.url, KEY, clock=self.clock, timeout_s=0.5)
+
+    def put(self, *names: str) -> None:
+        for name in names:
+            with self.database.changing() as session:
+                self.outbox.put(session, "run.failed", name)
+
+    def pass_time(self, until: timedelta) -> list[float]:
+        """Step as the clock says until it has moved on by so much. Returns how long it waited between steps."""
+        end, waits = self.clock.now + until, []
+        while self.clock.now < end:
+            wait_s = self.webhook.step()
+            assert wait_s is not None
+            waits.append(wait_s)
+            self.clock.move(seconds=wait_s)
+        return waits
+
+    def empty(self) -> None:
+        """Step until nothing waits; nothing may fail."""
+        while (wait_s := self.webhook.step()) is not None:
+            assert wait_s == 0
+
+
+@pytest.fixture
+def hook() -> Iterator[Hook]:
+    made = Hook()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path, hook: Hook) -> Iterator[Bench]:
+    made = Bench(tmp_path, hook)
+    yield made
+    made.webhook.close()
+    made.database.close()
+
+
+def came(hook: Hook) -> list[dict[str, Any]]:
+    return [hook.came.get() for _ in range(hook.came.qsize())]
+
+
+def names(hook: Hook) -> list[str]:
+    return [each["words"].removeprefix("rig 'bench': ") for each in came(hook)]
+
+
+def test_signature_is_that_of_the_published_vector() -> None:
+    made = signature(KEY, "msg_p5jXN8AQM9LWM0D4loKWxJek", 1614265330, BODY)
+    assert made == "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
+    headers = {
+        "webhook-id": "msg_p5jXN8AQM9LWM0D4loKWxJek", "webhook-timestamp": "1614265330", "webhook-signature": made,
+    }  # fmt: skip
+    assert signed({"headers": headers, "raw": BODY}), "the tests' own reading of the specification"
+    assert not signed({"headers": headers, "raw": BODY + b" "})
+    assert not signed({"headers": {**headers, "webhook-timestamp": "1614265331"}, "raw": BODY})
+
+
+def test_notice_is_signed_with_the_time_of_the_try_and_keeps_its_id(bench: Bench, hook: Hook) -> None:
+    bench.put("of a ß")
+    hook.status = 503
+    bench.webhook.step()
+    bench.clock.move(seconds=90)
+    hook.status = 200
+    bench.empty()
+    first, second = came(hook)
+    for one in (first, second):
+        assert signed(one)
+        assert not signed(one, "whsec_" + "A" * 32)
+        assert one["headers"]["webhook-id"] == one["id"]
+        assert one["headers"]["content-type"] == "application/json"
+        assert (one["path"], one["at"]) == (PATH, "2026-11-21T12:00:00.000+00:00")
+    assert first["raw"] == second["raw"]
+    tries = [datetime.fromtimestamp(int(each["headers"]["webhook-timestamp"]), UTC) for each in (first, second)]
+    assert tries == [bench.clock.now - timedelta(seconds=90), bench.clock.now]
+
+
+def test_without_a_secret_nothing_is_signed(bench: Bench, hook: Hook) -> None:
+    bench.put("one")
+    Webhook(bench.outbox, hook.url, None, clock=bench.clock).step()
+    (one,) = came(hook)
+    assert "webhook-signature" not in one["headers"]
+    assert one["headers"]["webhook-id"] == one["id"]
+
+
+def test_receiver_that_is_down_for_an_hour_is_told_all_once_and_in_order(bench: Bench, hook: Hook) -> None:
+    hook.status = 500
+    bench.put("1", "2")
+    waits = bench.pass_time(timedelta(hours=1))
+    assert waits[:10] == [1, 2, 4, 8, 16, 32, 64, 128, 256, 300]
+    assert set(waits[10:]) == {300}
+    # The first one is tried again and again, and none passes it.
+    assert set(names(hook)) == {"1"}
+    bench.put("3")
+    count, age_s = bench.outbox.waiting()
+    assert (count, age_s >= 3600) == (3, True)
+    hook.status = 204
+    bench.empty()
+    assert names(hook) == ["1", "2", "3"]
+    assert (bench.outbox.waiting(), bench.outbox.dropped) == ((0, 0.0), 0)
+    # What fails next begins with a short wait again.
+    hook.status = 500
+    bench.put("4")
+    assert bench.webhook.step() == 1
+
+
+def test_what_waits_outlives_the_process(tmp_path: Path, bench: Bench, hook: Hook) -> None:
+    hook.status = 500
+    bench.put("1", "2")
+    ids = [bench.outbox.oldest()]
+    bench.webhook.step()
+    came(hook)
+    again = Bench(tmp_path, hook)
+    hook.status = 200
+    again.empty()
+    told = came(hook)
+    assert [each["words"] for each in told] == ["rig 'bench': 1", "rig 'bench': 2"]
+    assert ids[0] is not None
+    assert told[0]["id"] == ids[0].id
+    again.database.close()
+
+
+def test_three_days_are_long_enough_and_the_log_says_what_went(bench: Bench, hook: Hook) -> None:
+    hook.status = 500
+    bench.put("old", "as old")
+    bench.clock.move(hours=71)
+    bench.put("young")
+    with structlog.testing.capture_logs() as log:
+        bench.pass_time(timedelta(hours=2))
+    (dropped,) = [each for each in log if each["event"] == "notices were dropped"]
+    assert (dropped["count"], dropped["cause"]) == (2, "they have waited for 72 hours")
+    assert bench.outbox.dropped == 2
+    came(hook)
+    hook.status = 200
+    bench.empty()
+    assert names(hook) == ["young"]
+
+
+def test_no_more_wait_than_may_and_the_oldest_go(tmp_path: Path, hook: Hook) -> None:
+    bench = Bench(tmp_path, hook, most=3)
+    bench.put("0")
+    bench.empty()
+    came(hook)
+    with structlog.testing.capture_logs() as log:
+        bench.put("1", "2", "3", "4", "5")
+    assert [each["cause"] for each in log] == 2 * ["more than 3 wait"]
+    assert (bench.outbox.waiting()[0], bench.outbox.dropped) == (3, 2)
+    bench.empty()
+    assert names(hook) == ["3", "4", "5"]
+    bench.database.close()
+
+
+def test_receiver_that_is_gone_is_told_nothing_more_by_this_process(tmp_path: Path, bench: Bench, hook: Hook) -> None:
+    hook.status = 410
+    bench.put("1")
+    with structlog.testing.capture_logs() as log:
+        assert bench.webhook.step() == 300
+    assert [each["event"] for each in log] == [
+        "the webhook is gone: nothing is sent before the next start of the service"
+    ]
+    hook.status = 200
+    bench.put("2")
+    assert bench.webhook.step() == 300
+    assert names(hook) == ["1"]
+    again = Bench(tmp_path, hook)
+    again.empty()
+    assert names(hook) == ["1", "2"]
+    again.database.close()
+
+
+def test_redirect_is_not_followed(bench: Bench, hook: Hook) -> None:
+    hook.status, hook.headers = 307, {"Location": hook.url}
+    bench.put("1")
+    with structlog.testing.capture_logs() as log:
+        assert bench.webhook.step() == 1
+    assert log[0]["cause"] == "status 307"
+    assert names(hook) == ["1"]
+    hook.status = 303
+    assert bench.webhook.step() == 2
+    assert names(hook) == ["1"]
+
+
+def _refuses(hook: Hook) -> None:
+    hook.close()
+
+
+def _hangs(hook: Hook) -> None:
+    hook.gate.clear()
+
+
+def _drips(hook: Hook) -> None:
+    hook.drips = True
+
+
+@pytest.mark.parametrize("how", [_refuses, _hangs, _drips])
+def test_receiver_that_gives_no_answer_costs_one_try(bench: Bench, hook: Hook, how: Callable[[Hook], None]) -> None:
+    how(hook)
+    bench.put("1")
+    began_s = time.monotonic()
+    with structlog.testing.capture_logs() as log:
+        assert bench.webhook.step() == 1
+    assert time.monotonic() - began_s < 10
+    (line,) = log
+    assert (line["event"], line["host"], line["tries"]) == ("a notice was not delivered", "127.0.0.1", 1)
+    assert "hidden-part" not in str(log)
+    assert bench.outbox.waiting()[0] == 1
+
+
+def test_certificate_that_nobody_vouches_for_is_refused(tmp_path: Path) -> None:
+    pem = tmp_path / "own.pem"
+    subprocess.run(  # noqa: S603 - our own command
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", pem, "-out", tmp_path / "crt",  # noqa: S607 - whichever there is
+         "-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    pem.write_text(pem.read_text() + (tmp_path / "crt").read_text())
+    hook = Hook(certificate=pem)
+    bench = Bench(tmp_path, hook)
+    bench.put("1")
+    with structlog.testing.capture_logs() as log:
+        assert bench.webhook.step() == 1
+    assert log[0]["cause"] == "ConnectError"
+    assert hook.came.empty()
+    hook.close()
+    bench.database.close()
+
+
+def test_notice_that_was_taken_is_not_sent_again_while_the_records_refuse(
+    bench: Bench, hook: Hook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: Notice) -> None:
+        message = "the disk is full"
+        raise StorageError(message)
+
+    bench.put("1", "2")
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.outbox, "sent", refuse)
+        for _ in range(3):
+            with pytest.raises(StorageError):
+                bench.webhook.step()
+    bench.empty()
+    assert names(hook) == ["1", "2"]
+
+
+def test_thread_sends_what_waits_and_what_comes_and_ends_at_once(bench: Bench, hook: Hook) -> None:
+    bench.put("1")
+    bench.webhook.start()
+    assert hook.next()["words"].endswith("1")
+    bench.put("2", "3")
+    assert [hook.next()["words"][-1] for _ in range(2)] == ["2", "3"]
+    bench.put("4")
+    began_s = time.monotonic()
+    bench.webhook.close()
+    bench.webhook.close()
+    assert time.monotonic() - began_s < 5
+    assert hook.next()["words"].endswith("4")
+    assert bench.outbox.waiting()[0] == 0
+
+
+@pytest.mark.parametrize("how", [_refuses, _hangs])
+def test_end_of_the_service_waits_a_second_at_most_for_a_receiver(
+    tmp_path: Path, hook: Hook, how: Callable[[Hook], None]
+) -> None:
+    how(hook)
+    bench = Bench(tmp_path, hook)
+    bench.webhook = Webhook(bench.outbox, hook.url, KEY, timeout_s=WAIT_S)
+    bench.webhook.start()
+    bench.put("1")
+    if how is _hangs:
+        hook.next()
+    began_s = time.monotonic()
+    bench.put("2")
+    assert time.monotonic() - began_s < 1, "whoever tells waits for nobody"
+    bench.webhook.close()
+    assert time.monotonic() - began_s < 4
+    assert bench.outbox.waiting()[0] == 2
+    hook.close()
+    for thread in threading.enumerate():
+        if thread.name == "slrig-notices":
+            thread.join(WAIT_S)
+            assert not thread.is_alive()
+    assert bench.outbox.waiting()[0] == 2, "what is answered later is for the next start"
+    bench.database.close()
+
+
+@pytest.mark.parametrize("secret", ["whsec_c2hvcnQ=", "whsec_" + "A" * 88, "no base64!", "whsec_", "ß"])
+def test_secret_that_is_none_is_refused_and_not_repeated(secret: str, tmp_path: Path) -> None:
+    path = tmp_path / "secret"
+    path.write_text(secret)
+    path.chmod(0o600)
+    with pytest.raises(ConfigError, match=r"^webhook_secret: expected whsec_") as of_text:
+        signing_key(secret, "webhook_secret")
+    with pytest.raises(ConfigError, match=r"^webhook_secret_file: ") as of_file:
+        key_of_file(path)
+    if hidden := secret.removeprefix("whsec_"):
+        assert hidden not in f"{of_text.value} {of_file.value}"
+
+
+def test_secret_may_lie_in_a_file_that_nobody_else_may_read(tmp_path: Path) -> None:
+    path = tmp_path / "secret"
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        key_of_file(path)
+    path.write_text(f"{SECRET}\n")
+    path.chmod(0o600)
+    assert key_of_file(path) == KEY == signing_key(SECRET.removeprefix("whsec_"), "here")
+    path.chmod(0o640)
+    with pytest.raises(ConfigError, match=r"others may read .*chmod 600"):
+        key_of_file(path)
+
+
+def test_settings_choose_kinds_and_hide_the_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ServiceSettings().webhook_kinds == get_args(NoticeKind)
+    assert ServiceSettings().webhook_url is None
+    monkeypatch.setenv("SLRIG_WEBHOOK_KINDS", "job.ended, run.failed")
+    monkeypatch.setenv("SLRIG_WEBHOOK_SECRET", SECRET)
+    settings = read_settings()
+    assert settings.webhook_kinds == ("job.ended", "run.failed")
+    assert settings.webhook_secret == SecretStr(SECRET)
+    assert SECRET not in repr(settings)
+    with pytest.raises(ConfigError, match="webhook_kinds"):
+        read_settings(webhook_kinds=("job.began",))
+    file = tmp_path / "settings.toml"
+    file.write_text('webhook_secret_file = "secret"\n')
+    assert read_settings(file).webhook_secret_file == tmp_path / "secret"
+    monkeypatch.delenv("SLRIG_WEBHOOK_SECRET")
+    file.write_text("webhook_secret = 123456789\n")
+    with pytest.raises(ConfigError, match="webhook_secret: expected a text") as error:
+        read_settings(file)
+    assert "123456789" not in str(error.value)
+
+
+@pytest.mark.parametrize("url", ["ftp://host/hook", "host/hook", "http:///hook"])
+def test_address_that_is_none_is_refused_and_not_repeated(url: str) -> None:
+    with pytest.raises(ConfigError, match="webhook_url: expected an address that begins with http") as error:
+        read_settings(webhook_url=url)
+    assert url not in str(error.value)
