@@ -126,6 +126,7 @@ def test_plan_is_request_over_rig_file_over_default(client: TestClient) -> None:
         "flip_rule": "delaunay",
         "smooth_boundary": True,
         "axis": None,
+        "region": None,
     }
     # The rig file's exposure belongs to its cameras, not to the plan.
     assert plan["exposure_s"] is None
