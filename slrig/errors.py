@@ -202,6 +202,12 @@ class WorkerLostError(SlrigError, code="worker-lost"):
     """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
 
 
+class WorkerBusyError(SlrigError, code="worker-busy"):
+    """The process that computes has other work, or is not ready yet, and somebody who waits for an answer would have
+    to wait too long. Asking again helps.
+    """
+
+
 class OutOfMemoryError(SlrigError, code="out-of-memory"):
     """A computation asked for more memory than the machine gives."""
 
