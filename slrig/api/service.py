@@ -73,6 +73,7 @@ class Service:
         self.folder = folder
         self.store = store
         self.runner = runner
+        self.worker = worker
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
         database, spare_bytes = store.database, settings.min_free_bytes

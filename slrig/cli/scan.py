@@ -15,7 +15,7 @@ from slrig.cli.client import ServiceClient
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
-from slrig.scan.offered import CAMERA_PICTURES, offered
+from slrig.scan.offered import PREFIXES, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -144,9 +144,8 @@ def _completed(
 def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
     unknown, cameras = [name for name in files if name not in offered(())], []
-    pictures = tuple(named("").partition(".")[0] for named in CAMERA_PICTURES)
-    if unknown and all(name.startswith(pictures) for name in unknown):
-        # A picture per camera: which there are is known once the rig is open.
+    if unknown and all(name.startswith(PREFIXES) for name in unknown):
+        # A file per camera: which there are is known once the rig is open.
         cameras = [each["name"] for each in client.get("/rig")["cameras"]]
         unknown = [name for name in unknown if cameras and name not in offered(cameras)]
     if unknown:

@@ -17,7 +17,12 @@ const PURPOSES = {
 };
 /** Made when they are asked for: to ask for their size would make them. */
 const MADE_LATER = ["mesh.stl", "mesh.obj", "view.glb", "coarse.glb", "bundle.zip"];
-const purpose = (name) => PURPOSES[name] ?? (name.startsWith("causes-") ? "causes as numbers, for programs" : "why pixels gave no point, as a picture");
+const OF_CAMERAS = [
+  [/^causes-/, "causes as numbers, for programs"], [/^rejected-/, "why pixels gave no point, as a picture"],
+  [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"],
+];
+const isMadeLater = (name) => MADE_LATER.includes(name) || /^(points|depth)-/.test(name);
+const purpose = (name) => PURPOSES[name] ?? OF_CAMERAS.find(([form]) => form.test(name))?.[1] ?? "";
 
 export function ResultScreen({id, may}) {
   const [scan, problem, again] = useValue(`/scan/${encodeURIComponent(id)}`, LOOK_AGAIN_S);
@@ -135,7 +140,7 @@ function Compare({scan, other, chosen}) {
 function Downloads({files}) {
   const [sizes, setSizes] = useState({});
   useEffect(() => {
-    for (const name of Object.keys(files).filter((each) => !MADE_LATER.includes(each)))
+    for (const name of Object.keys(files).filter((each) => !isMadeLater(each)))
       fetch(files[name], {method: "HEAD"}).then((answer) => {
         const bytes = Number(answer.headers.get("Content-Length"));
         if (answer.ok && bytes) setSizes((before) => ({...before, [name]: bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`}));
@@ -143,7 +148,7 @@ function Downloads({files}) {
   }, []);
   return html`<h3>Files</h3><div class="wide"><table><thead><tr><th>File</th><th>Size</th><th>For</th></tr></thead>
     <tbody>${Object.entries(files).map(([name, path]) => html`<tr><td><a href=${path} download=${name}>${name}</a></td>
-      <td>${sizes[name] ?? (MADE_LATER.includes(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
+      <td>${sizes[name] ?? (isMadeLater(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
 }
 
 function Keeping({scan, over, again, may}) {

@@ -42,13 +42,36 @@ def causes_picture(camera: str) -> str:
     return f"causes-{camera}.png"
 
 
-CAMERA_PICTURES = (rejected_picture, causes_picture)
+CLOUDS: Mapping[str, str] = {"points-{camera}.npz": "application/octet-stream"}
+"""The surface in the grid of a camera, made when asked for by `slrig.scan.cloud_files`: names and media types."""
+
+PREFIXES = ("rejected-", "causes-", *sorted({form.partition("{")[0] for form in CLOUDS}))
+"""With which the name of a camera's file begins."""
+
+
+def camera_files(camera: str) -> tuple[str, ...]:
+    """The names of a camera's files.
+
+    >>> camera_files("left")[:3]
+    ('rejected-left.png', 'causes-left.png', 'points-left.npz')
+    """
+    return rejected_picture(camera), causes_picture(camera), *(form.format(camera=camera) for form in CLOUDS)
+
+
+def cloud_named(name: str, cameras: Iterable[str]) -> tuple[str, str] | None:
+    """Which of `CLOUDS` a name means, and of which camera; None where it means none.
+
+    >>> cloud_named("points-left.npz", ["left", "right"])
+    ('points-{camera}.npz', 'left')
+    """
+    known = ((form, camera) for camera in cameras for form in CLOUDS)
+    return next((each for each in known if each[0].format(camera=each[1]) == name), None)
 
 
 def offered(cameras: Iterable[str]) -> tuple[str, ...]:
     """The names of a scan's files. cameras : of the rig.
 
-    >>> offered(["left"])[-3:]
-    ('rejected-left.png', 'causes-left.png', 'bundle.zip')
+    >>> offered(["left"])[-4:]
+    ('rejected-left.png', 'causes-left.png', 'points-left.npz', 'bundle.zip')
     """
-    return *MEDIA_TYPES, *(named(camera) for camera in cameras for named in CAMERA_PICTURES), BUNDLE_ZIP
+    return *MEDIA_TYPES, *(name for camera in cameras for name in camera_files(camera)), BUNDLE_ZIP
