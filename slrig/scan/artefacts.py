@@ -163,18 +163,22 @@ def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count:
     return [*_vertex_element(vertices, count=vertex_count), *faces]
 
 
-def encode_points_ply(curves: PointCurves, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
-    """Binary little-endian PLY in mm: position, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
+def encode_points_ply(
+    curves: PointCurves, normals: NDArray[np.float32], *, sigma_calibration_mm: FloatArray | None = None
+) -> bytes:
+    """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
     `bridge_after` per point.
 
-    `stripe` is the projector column rounded down, as in the mesh; `bridge_after` is 1 where the step to the next
-    point of its curve joins two stripes. sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
+    normals : (n, 3), unit, of the mesh; NaN for a point that is not in it. `stripe` is the projector column rounded
+    down, as in the mesh; `bridge_after` is 1 where the step to the next point of its curve joins two stripes.
+    sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
     """
     columns = np.floor(curves.column_px).astype(np.int32)
     points = _records(
         len(curves.points_mm),
         {
             **_columns(("x", "y", "z"), "f4", curves.points_mm),
+            **_columns(("nx", "ny", "nz"), "f4", normals),
             **_columns(("red", "green", "blue"), "u1", curves.colour),
             _MARK: ("u1", curves.mark),
             "sigma_mm": ("f4", curves.sigma_mm),

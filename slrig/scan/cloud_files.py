@@ -5,7 +5,6 @@ The service has them made by the worker: they take kernels, and libraries of oth
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from slrig.errors import InvalidInputError
 from slrig.jobs.data_folder import BUNDLE
 from slrig.model import Pinhole
 from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
+from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
 from slrig.scan.offered import causes_picture
 from slrig.scan.organised import OrganisedCloud, organised
 from slrig.scan.plan import Progress
@@ -28,29 +28,11 @@ from slrig.scan.plan import Progress
 STAGE = "organise points"
 
 
-def encode_npz(cloud: OrganisedCloud) -> bytes:
-    """The arrays of a cloud as numpy's own archive, not packed: `numpy.load` reads it, and needs no pickle.
-
-    Keys: points_mm, normals, sigma_mm, colour, mark, cause as in `OrganisedCloud`; causes (n,) str; camera and unit,
-    () str.
-    """
-    out = io.BytesIO()
-    np.savez(
-        out,
-        points_mm=cloud.points_mm,
-        normals=cloud.normals,
-        sigma_mm=cloud.sigma_mm,
-        colour=cloud.colour,
-        mark=cloud.mark,
-        cause=cloud.cause,
-        causes=np.array(cloud.causes),
-        camera=np.array(cloud.camera),
-        unit=np.array("mm"),
-    )
-    return out.getvalue()
-
-
-ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {"points-{camera}.npz": encode_npz}
+ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
+    "points-{camera}.npz": encode_npz,
+    "points-{camera}.pcd": encode_pcd,
+    "depth-{camera}.tiff": encode_depth_tiff,
+}
 
 
 def cloud_file(

@@ -42,7 +42,11 @@ def causes_picture(camera: str) -> str:
     return f"causes-{camera}.png"
 
 
-CLOUDS: Mapping[str, str] = {"points-{camera}.npz": "application/octet-stream"}
+CLOUDS: Mapping[str, str] = {
+    "points-{camera}.npz": "application/octet-stream",
+    "points-{camera}.pcd": "application/octet-stream",
+    "depth-{camera}.tiff": "image/tiff",
+}
 """The surface in the grid of a camera, made when asked for by `slrig.scan.cloud_files`: names and media types."""
 
 PREFIXES = ("rejected-", "causes-", *sorted({form.partition("{")[0] for form in CLOUDS}))
@@ -71,7 +75,7 @@ def cloud_named(name: str, cameras: Iterable[str]) -> tuple[str, str] | None:
 def offered(cameras: Iterable[str]) -> tuple[str, ...]:
     """The names of a scan's files. cameras : of the rig.
 
-    >>> offered(["left"])[-4:]
-    ('rejected-left.png', 'causes-left.png', 'points-left.npz', 'bundle.zip')
+    >>> offered(["left"])[-3:]
+    ('points-left.pcd', 'depth-left.tiff', 'bundle.zip')
     """
     return *MEDIA_TYPES, *(name for camera in cameras for name in camera_files(camera)), BUNDLE_ZIP
