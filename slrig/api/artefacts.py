@@ -197,7 +197,7 @@ for _form, _media_type in CLOUDS.items():
         _serve_cloud(_form),
         methods=["GET"],
         response_class=Response,
-        responses=_answers(_media_type, 503, 507),
+        responses=_answers(_media_type, 501, 503, 507),
         operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}",
         summary=f"Fetch {_form}",
     )

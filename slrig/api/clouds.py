@@ -16,7 +16,7 @@ from slrig.errors import InvalidInputError, JobNotFoundError, StorageError, Work
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.worker_process import Task
 from slrig.scan.artefacts import MESH, REPORT
-from slrig.scan.offered import CLOUDS, causes_picture
+from slrig.scan.offered import CLOUDS, causes_picture, extra_of
 
 MAKER = "slrig.scan.cloud_files:cloud_file"
 
@@ -32,11 +32,12 @@ _places = threading.BoundedSemaphore(MOST_WAITING)
 
 
 def clouds_of(folder: DataFolder, scan: Path, names: Iterable[str]) -> set[str]:
-    """The names of the clouds that can be made of a finished scan. names : of its files."""
+    """The names of the clouds that can be made of a finished scan, here. names : of its files."""
     given = set(names)
     prefix, suffix = causes_picture("/").split("/")
     cameras = [name.removeprefix(prefix).removesuffix(suffix) for name in given if name.startswith(prefix)]
-    return {form.format(camera=camera) for form in CLOUDS for camera in cameras if has_sources(folder, scan, camera)}
+    forms = [form for form in CLOUDS if extra_of(Path(form).suffix) is None]
+    return {form.format(camera=camera) for camera in cameras if has_sources(folder, scan, camera) for form in forms}
 
 
 def has_sources(folder: DataFolder, scan: Path, camera: str) -> bool:
@@ -52,8 +53,10 @@ def make_cloud(service: Service, scan_id: UUID, form: str, camera: str) -> None:
     ------
     WorkerBusyError
         It was not its turn for too long, or too many wait.
-    InvalidInputError
-        A file of the scan is not as slrig wrote it.
+    ExtraMissingError
+        The format takes a library that is not installed.
+    InvalidInputError, NothingToReconstructError
+        A file of the scan is not as slrig wrote it, or the camera sees nothing of the mesh.
     JobNotFoundError
         The scan was deleted meanwhile.
     StorageError

@@ -28,6 +28,7 @@ _CODES = {
     "unsupported-by-device wrong-system pose-refused solve-refused idempotency",
     429: "queue-full",
     500: "slrig device-state worker-lost out-of-memory",
+    501: "extra-missing",
     502: "scan-evidence device service",
     503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted data-folder-gone "
     "worker-busy",

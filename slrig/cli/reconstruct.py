@@ -18,12 +18,12 @@ from slrig.bundle.storage import write_file
 from slrig.cli.bundles import Row, named_bundles, work_through
 from slrig.cli.display import counted, progress_shown
 from slrig.cli.quality import quality_lines
-from slrig.errors import ConfigError
+from slrig.errors import ConfigError, ExtraMissingError
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
 from slrig.logs import set_up_logs_for_a_person
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, cloud_named, offered
+from slrig.scan.offered import BUNDLE_ZIP, cloud_named, extra_of, offered
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary
 
@@ -115,8 +115,8 @@ def reconstruct_and_tell(
 
 
 def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
-    """The cameras of a bundle. Raises ConfigError: its reconstruction has not one of the files; and as
-    `read_description`.
+    """The cameras of a bundle. Raises ConfigError: its reconstruction has not one of the files; ExtraMissingError: it takes a
+    library for one that is missing; and as `read_description`.
     """
     cameras = list(read_description(bundle).camera_formats())
     there_are = [name for name in offered(cameras) if name != BUNDLE_ZIP]
@@ -124,6 +124,11 @@ def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
     if unknown:
         message = f"{bundle}: it gives no {', '.join(unknown)}. There are: {', '.join(there_are)}."
         raise ConfigError(message)
+    for name in names:
+        lacking = extra_of(Path(name).suffix)
+        if lacking is not None:
+            message = f"{name} takes a library that is not installed: {lacking}"
+            raise ExtraMissingError(message)
     return cameras
 
 

@@ -131,6 +131,8 @@ def _completed(
     missing = [name for name in files if name not in offered]
     if missing:
         message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
+        if any(name.endswith(".e57") for name in missing):
+            message += " For E57, pip install 'slrig[e57]' where the service runs; the scan need not be repeated."
         raise ServiceError(message)
     with refusals_of(output):
         output.mkdir(parents=True, exist_ok=True)

@@ -11,15 +11,16 @@ const LOOK_AGAIN_S = 10;
 
 const PURPOSES = {
   "mesh.ply": "the mesh in mm, with σ for each vertex", "mesh.glb": "for viewers and web pages, in metres", "mesh.stl": "for CAD and printing, in mm",
-  "mesh.obj": "for modelling programs, in mm", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
+  "mesh.obj": "for modelling programs, in mm", "mesh.3mf": "for CAD and printing, in mm, with colours", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
   "preview.png": "a picture to send", "bundle.zip": "the frames and the calibration, to compute it all again", "view.glb": "what this page shows",
   "coarse.glb": "what this page shows first",
 };
 /** Made when they are asked for: to ask for their size would make them. */
-const MADE_LATER = ["mesh.stl", "mesh.obj", "view.glb", "coarse.glb", "bundle.zip"];
+const MADE_LATER = ["mesh.stl", "mesh.obj", "mesh.3mf", "view.glb", "coarse.glb", "bundle.zip"];
 const OF_CAMERAS = [
   [/^causes-/, "causes as numbers, for programs"], [/^rejected-/, "why pixels gave no point, as a picture"],
-  [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"],
+  [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"], [/^points-/, "the same for point-cloud programs"],
+  [/^depth-/, "depth at each pixel of the camera, as a picture of 16 bits"],
 ];
 const isMadeLater = (name) => MADE_LATER.includes(name) || /^(points|depth)-/.test(name);
 const purpose = (name) => PURPOSES[name] ?? OF_CAMERAS.find(([form]) => form.test(name))?.[1] ?? "";

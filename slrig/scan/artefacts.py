@@ -24,6 +24,7 @@ from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tr
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl
+from slrig.scan.threemf import encode_mesh_3mf
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 
 MESH = "mesh.ply"
@@ -32,6 +33,7 @@ REPORT_FORMAT = "slrig-report"
 ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {
     "mesh.stl": encode_mesh_stl,
     "mesh.obj": encode_mesh_obj,
+    "mesh.3mf": encode_mesh_3mf,
     "view.glb": encode_view_glb,
     "coarse.glb": encode_coarse_glb,
 }

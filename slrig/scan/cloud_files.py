@@ -21,6 +21,7 @@ from slrig.jobs.data_folder import BUNDLE
 from slrig.model import Pinhole
 from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
 from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
+from slrig.scan.e57_format import encode_e57
 from slrig.scan.offered import causes_picture
 from slrig.scan.organised import OrganisedCloud, organised
 from slrig.scan.plan import Progress
@@ -32,6 +33,7 @@ ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
     "points-{camera}.npz": encode_npz,
     "points-{camera}.pcd": encode_pcd,
     "depth-{camera}.tiff": encode_depth_tiff,
+    "points-{camera}.e57": encode_e57,
 }
 
 
@@ -50,6 +52,10 @@ def cloud_file(
     ------
     InvalidInputError, CalibrationError
         A file of the scan is not as slrig wrote it.
+    ExtraMissingError
+        The format takes a library that is not installed.
+    NothingToReconstructError
+        The camera sees nothing of the mesh, and the format has no form for that.
     StorageError
         A file of the scan cannot be read.
     """

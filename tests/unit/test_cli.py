@@ -486,6 +486,7 @@ def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path
         ("causes-left.png", ["left"], None),
         ("causes-top.png", ["left"], "no causes-top.png"),
         ("points-left.npz", ["left"], None),
+        ("points-left.e57", ["left"], None),
         ("points-top.npz", ["left"], "no points-top.npz"),
         ("bundle.zip", ["left"], None),
     ],
