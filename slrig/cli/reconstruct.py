@@ -115,8 +115,8 @@ def reconstruct_and_tell(
 
 
 def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
-    """The cameras of a bundle. Raises ConfigError: its reconstruction has not one of the files; ExtraMissingError: it takes a
-    library for one that is missing; and as `read_description`.
+    """The cameras of a bundle. Raises ConfigError: its reconstruction has not one of the files; ExtraMissingError: one
+    takes a library that is not installed; and as `read_description`.
     """
     cameras = list(read_description(bundle).camera_formats())
     there_are = [name for name in offered(cameras) if name != BUNDLE_ZIP]

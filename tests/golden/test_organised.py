@@ -141,7 +141,8 @@ def test_depth_is_read_in_mm_by_opencv_and_pillow(scan: Scan, camera: str) -> No
     with PIL.Image.open(path) as picture:
         np.testing.assert_array_equal(np.asarray(picture), values)
         told = json.loads(picture.tag_v2[270])  # type: ignore[attr-defined] # of TIFF pictures
-    assert (values.dtype, told["unit"], told["none"], told["camera"]) == (np.uint16, "mm", 0, camera)
+    assert values.dtype == np.uint16
+    assert (told["unit"], told["none"], told["camera"]) == ("mm", 0, camera)
     known = cloud["cause"] == 0
     np.testing.assert_array_equal(values != told["none"], known)
     depth_mm = told["offset"] + told["scale"] * values[known].astype(np.float64)

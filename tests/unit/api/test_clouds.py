@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
 import threading
@@ -140,6 +141,21 @@ def test_a_source_that_was_changed_is_told(
     assert refused.status_code == 422
     assert Path(name).name in refused.json()["detail"]
     assert not [each for each in place.iterdir() if NAME in each.name]
+
+
+def test_a_format_whose_library_is_missing_is_not_listed_and_says_what_to_install(
+    client: TestClient, scan: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clouds, "extra_of", lambda ending: "pip install" if ending == ".e57" else None)
+    files = client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert {"points-left.pcd", "depth-left.tiff", NAME} < set(files)
+    assert "points-left.e57" not in files
+    answer = client.get(f"/scan/{scan}/points-left.e57")
+    if importlib.util.find_spec("pye57") is None:
+        assert (answer.status_code, answer.json()["type"]) == (501, "/problems/extra-missing")
+        assert "pip install 'slrig[e57]'" in answer.json()["detail"]
+    else:
+        assert (answer.status_code, answer.headers["Content-Type"]) == (200, "model/e57")
 
 
 def test_a_request_waits_for_its_turn_and_not_for_ever(

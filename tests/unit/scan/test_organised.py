@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slrig.model import FloatArray, Mesh, Pinhole, Refusal, Size
 from slrig.scan import organised as module
+from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
 from slrig.scan.organised import NO_SURFACE, OrganisedCloud, organised
 
 SIZE = Size(48, 40)
@@ -174,3 +175,14 @@ def test_a_normal_that_is_not_known_stays_unknown() -> None:
     assert met.any()
     assert np.isfinite(cloud.points_mm[met]).all()
     assert np.isnan(cloud.normals).all()
+
+
+def test_a_cloud_without_points_has_its_files_all_the_same() -> None:
+    cloud = organised(mesh_of(np.zeros((0, 3, 3))), "left", camera(), np.zeros(SIZE.shape, dtype=np.uint8), CAUSES)
+    values = cv2.imdecode(np.frombuffer(encode_depth_tiff(cloud), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    assert values is not None
+    assert values.shape == SIZE.shape
+    assert not values.any()
+    table = np.frombuffer(encode_pcd(cloud).partition(b"DATA binary\n")[2], dtype="<f4").reshape(*SIZE.shape, 8)
+    assert np.isnan(table[..., [0, 1, 2, 3, 4, 5, 7]]).all()
+    assert encode_npz(cloud) == encode_npz(cloud)
