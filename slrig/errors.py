@@ -202,6 +202,16 @@ class WorkerLostError(SlrigError, code="worker-lost"):
     """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
 
 
+class ExtraMissingError(SlrigError, code="extra-missing"):
+    """What was asked for takes a library that is not installed where slrig runs. Name the command that installs it."""
+
+
+class WorkerBusyError(SlrigError, code="worker-busy"):
+    """The process that computes has other work, or is not ready yet, and somebody who waits for an answer would have
+    to wait too long. Asking again helps.
+    """
+
+
 class OutOfMemoryError(SlrigError, code="out-of-memory"):
     """A computation asked for more memory than the machine gives."""
 

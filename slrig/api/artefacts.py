@@ -15,14 +15,15 @@ from fastapi import APIRouter, Header, Response
 from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse, StreamingResponse
 
+from slrig.api.clouds import clouds_of, has_sources, make_cloud
 from slrig.api.openapi import BYTES, file_of
 from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
 from slrig.errors import ArtefactNotReadyError
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.records import JobRecord, JobState
 from slrig.scan.artefacts import MESH, ON_REQUEST, converted, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, MEDIA_TYPES, causes_picture, rejected_picture
+from slrig.scan.offered import BUNDLE_ZIP, CLOUDS, MEDIA_TYPES, causes_picture, rejected_picture
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
 _converting = threading.Lock()
@@ -32,6 +33,7 @@ _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 router = APIRouter(prefix="/scan/{scan_id}", tags=["files"])
 
+Camera = Annotated[str, PathParameter(pattern=CAMERA_NAME)]
 KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an ETag; 304 if it still holds")]
 
 
@@ -42,7 +44,8 @@ def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
         names = _known_files(folder.result(record.id))
     elif record.state.final and folder.owns(folder.scan(record.id)):
         names = _known_files(folder.scan(record.id))
-        if folder.owns(folder.scan(record.id) / "bundle"):
+        names |= clouds_of(folder, folder.scan(record.id), names)
+        if folder.owns(folder.scan(record.id) / BUNDLE):
             names.add(BUNDLE_ZIP)
     else:
         return {}
@@ -92,7 +95,31 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
     if made is not None:
         headers["Content-Disposition"] = f'inline; filename="{name}"'
         return Response(made, media_type=media_type, headers=headers)
-    return FileResponse(path, media_type=media_type, filename=name, content_disposition_type="inline", headers=headers)
+    return _kept(path, media_type, headers)
+
+
+def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
+    return FileResponse(
+        path, media_type=media_type, filename=path.name, content_disposition_type="inline", headers=headers
+    )
+
+
+def _cloud(service: Service, scan_id: UUID, form: str, camera: str, known: str | None) -> Response:
+    """One of `CLOUDS`. Made only when a scan is over: it takes all of its files."""
+    place = service.folder.scan(scan_id)
+    path = place / form.format(camera=camera)
+    record = service.store.get(scan_id)
+    service.scan_retention.reading(scan_id)
+    if not record.state.final or not has_sources(service.folder, place, camera):
+        _refuse_absent(record, path.name)
+    headers = _headers(scan_id, path.name)
+    if _still_known(known, headers["ETag"]):
+        return Response(status_code=304, headers=headers)
+    if not os.path.lexists(path):
+        make_cloud(service, scan_id, form, camera)
+    if not service.folder.owns(path):
+        _refuse_absent(record, path.name)
+    return _kept(path, CLOUDS[form], headers)
 
 
 def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | None:
@@ -134,10 +161,10 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
 _UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file is the one whose ETag was sent"}}
 
 
-def _answers(media_type: str) -> dict[int | str, dict[str, Any]]:
+def _answers(media_type: str, *further: int) -> dict[int | str, dict[str, Any]]:
     # A part of a JSON file is no JSON.
     part = {"description": "the range that was asked for", "content": {media_type: {"schema": BYTES}}}
-    return {**file_of(media_type, 409, 416), 206: part, **_UNCHANGED}
+    return {**file_of(media_type, 409, 416, *further), 206: part, **_UNCHANGED}
 
 
 for _name, _media_type in MEDIA_TYPES.items():
@@ -153,11 +180,34 @@ for _name, _media_type in MEDIA_TYPES.items():
     )
 
 
+def _serve_cloud(form: str) -> Callable[..., Response]:
+    def fetch(service: Serving, scan_id: UUID, camera: Camera, known: KnownTag = None) -> Response:
+        return _cloud(service, scan_id, form, camera, known)
+
+    fetch.__doc__ = (
+        f"Return {form.format(camera='CAMERA')}, the surface of a finished scan in the grid of a camera. It is made of "
+        "the scan's files when it is first asked for, and kept; 503 while others are computed for long."
+    )
+    return fetch
+
+
+for _form, _media_type in CLOUDS.items():
+    router.add_api_route(
+        f"/{_form}",
+        _serve_cloud(_form),
+        methods=["GET"],
+        response_class=Response,
+        responses=_answers(_media_type, 501, 503, 507),
+        operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}",
+        summary=f"Fetch {_form}",
+    )
+
+
 @router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
 def fetch_rejected(
     service: Serving,
     scan_id: UUID,
-    camera: Annotated[str, PathParameter(pattern=CAMERA_NAME)],
+    camera: Camera,
     known: KnownTag = None,
 ) -> Response:
     """Return the picture of a camera's refused pixels, one colour per cause."""
@@ -168,7 +218,7 @@ def fetch_rejected(
 def fetch_causes(
     service: Serving,
     scan_id: UUID,
-    camera: Annotated[str, PathParameter(pattern=CAMERA_NAME)],
+    camera: Camera,
     known: KnownTag = None,
 ) -> Response:
     """Return why each pixel of a camera gave no point: grey values are places in report.json's `causes`."""
@@ -183,7 +233,7 @@ def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Res
     """
     record = service.store.get(scan_id)
     service.scan_retention.reading(scan_id)
-    bundle = service.folder.scan(scan_id) / "bundle"
+    bundle = service.folder.scan(scan_id) / BUNDLE
     if not record.state.final or not service.folder.owns(bundle):
         _refuse_absent(record, BUNDLE_ZIP)
     headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}

@@ -28,8 +28,10 @@ _CODES = {
     "unsupported-by-device wrong-system pose-refused solve-refused idempotency",
     429: "queue-full",
     500: "slrig device-state worker-lost out-of-memory",
+    501: "extra-missing",
     502: "scan-evidence device service",
-    503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted data-folder-gone",
+    503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted data-folder-gone "
+    "worker-busy",
     504: "frame-timeout",
     507: "storage",
 }
@@ -37,7 +39,7 @@ _CODES = {
 STATUS = {code: status for status, codes in _CODES.items() for code in codes.split()}
 """Which status stands for which error, by its code. A test holds it against the whole error tree."""
 
-RETRY_AFTER_S = {"rig-busy": 5, "queue-full": 30, "key-in-flight": 1}
+RETRY_AFTER_S = {"rig-busy": 5, "queue-full": 30, "key-in-flight": 1, "worker-busy": 5}
 
 _NAMES = {413: "content-too-large", 416: "range-not-satisfiable", 422: "invalid-request"}
 # Python's own names for these differ from version to version.

@@ -77,6 +77,7 @@ class Service:
         self.folder = folder
         self.store = store
         self.runner = runner
+        self.worker = worker
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
         database, outbox, spare_bytes = store.database, store.outbox, settings.min_free_bytes

@@ -25,6 +25,7 @@ PATIENCE_S = 30.0
 """How long a connection that broke is tried again before the service counts as gone."""
 
 _RETRY_S = 0.5
+_BUSY_TRIES = 20  # of a file that the service has no time to make: half a minute each
 _LOCAL = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
@@ -160,16 +161,24 @@ class ServiceClient:
                 self._pause(_RETRY_S)
 
     def fetch(self, path: str, target: Path) -> None:
-        """Write an answer into a file, whole or not at all. Raises ServiceError, StorageError."""
+        """Write an answer into a file, whole or not at all. A service that says when to come again, because it has no
+        time to make the file now, is asked again for some minutes. Raises ServiceError, StorageError.
+        """
         partial = staging_name(target)
         try:
-            with self._reaching(), self._http.stream("GET", path) as response:
-                if response.status_code != 200:
-                    response.read()
-                    _refuse_problem(response)
-                with refusals_of(target), partial.open("xb") as file:
-                    for piece in response.iter_bytes(2**20):
-                        file.write(piece)
+            for left in reversed(range(_BUSY_TRIES)):
+                with self._reaching(), self._http.stream("GET", path) as response:
+                    later_s = response.headers.get("Retry-After", "") if response.status_code == 503 else ""
+                    if later_s.isdecimal() and left:
+                        self._pause(float(later_s))
+                        continue
+                    if response.status_code != 200:
+                        response.read()
+                        _refuse_problem(response)
+                    with refusals_of(target), partial.open("xb") as file:
+                        for piece in response.iter_bytes(2**20):
+                            file.write(piece)
+                    break
             with refusals_of(target):
                 partial.replace(target)
         finally:

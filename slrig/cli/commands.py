@@ -130,7 +130,7 @@ def scan(
     file: Annotated[
         list[str] | None,
         typer.Option(
-            help="File to fetch, mesh.obj and mesh.stl among them; may be repeated. "
+            help="File to fetch, as mesh.obj or points-CAMERA.npz; may be repeated. "
             "Default: mesh.ply, preview.png, report.json."
         ),
     ] = None,
@@ -196,6 +196,10 @@ def reconstruct(
         list[FurtherFormat] | None,
         typer.Option("--format", help="Write the mesh in this format as well as PLY and GLB; may be repeated."),
     ] = None,
+    file: Annotated[
+        list[str] | None,
+        typer.Option(help="Write this file, too, as points-CAMERA.npz; may be repeated. slrig scan has the same."),
+    ] = None,
     mesh: MeshOptions,
     decode_only: Annotated[
         bool,
@@ -208,7 +212,8 @@ def reconstruct(
     if decode_only:
         decode_and_tell(bundles, output)
         return
-    reconstruct_and_tell(bundles, output, calibration=calibration, formats=mesh_format or (), options=mesh.chosen())
+    further = [*(f"mesh.{each}" for each in mesh_format or ()), *(file or ())]
+    reconstruct_and_tell(bundles, output, calibration=calibration, further=further, options=mesh.chosen())
 
 
 @app.command()

@@ -13,13 +13,17 @@ from rich.table import Column
 
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.description import read_description
+from slrig.bundle.reading import CALIBRATION
+from slrig.bundle.storage import write_file
 from slrig.cli.bundles import Row, named_bundles, work_through
 from slrig.cli.display import counted, progress_shown
 from slrig.cli.quality import quality_lines
+from slrig.errors import ConfigError, ExtraMissingError
 from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
 from slrig.logs import set_up_logs_for_a_person
-from slrig.scan.artefacts import MESH, write_converted
+from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
+from slrig.scan.offered import BUNDLE_ZIP, cloud_named, extra_of, offered
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary
 
@@ -62,35 +66,37 @@ def decode_and_tell(asked: Sequence[Path], output: Path) -> None:
 
 
 def reconstruct_and_tell(
-    asked: Sequence[Path], output: Path, *, calibration: Path | None, formats: Sequence[str], options: Mapping[str, Any]
+    asked: Sequence[Path], output: Path, *, calibration: Path | None, further: Sequence[str], options: Mapping[str, Any]
 ) -> None:
     """Reconstruct, show the progress, and print where the results lie. Raises what the pipeline raises, and of several
     bundles what `work_through` does.
 
-    formats : further formats of the mesh, "stl" or "obj"; options : fields of `ReconstructionPlan` that were given.
+    further : names of files that are written as well; options : fields of `ReconstructionPlan` that were given.
     """
     set_up_logs_for_a_person()
     plan = ReconstructionPlan(**options)
     bundles, several = named_bundles(asked)
     # What is wrong with the files is said at once, not after a minute in which kernels are compiled.
+    further = tuple(dict.fromkeys(further))
     if not several:
-        read_description(bundles[0])
+        _require_offered(further, bundles[0])
     if calibration is not None:
         read_calibration(calibration)
-    further = [f"mesh.{name}" for name in dict.fromkeys(formats)]
 
     def reconstructed(bundle: Path, folder: Path, progress: Progress) -> dict[str, Any]:
         from slrig.scan.reconstruct import reconstruct_bundle
 
+        cameras = _require_offered(further, bundle)
         report = reconstruct_bundle(
             bundle, folder, plan=plan, calibration=calibration, progress=progress, cancelled=lambda: False
         )
         for name in further:
             progress(f"writing {name}", 1.0, "")
-            write_converted(folder, name)
+            _write_further(folder, name, cameras, calibration or bundle / CALIBRATION)
         return report_summary(report)
 
-    told = [(Path(name).suffix[1:], name) for name in further]
+    always = (MESH, "preview.png", REPORT)
+    told = [(Path(name).suffix[1:], name) for name in further if name not in always]
     files = (("mesh", MESH), *told, ("preview", "preview.png"), ("report", "report.json"))
     if several:
         work_through(
@@ -106,6 +112,35 @@ def reconstruct_and_tell(
         typer.echo(f"{what:<10}{output / name}")
     for line in quality_lines(summary):
         typer.echo(line)
+
+
+def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
+    """The cameras of a bundle. Raises ConfigError: its reconstruction has not one of the files; ExtraMissingError: one
+    takes a library that is not installed; and as `read_description`.
+    """
+    cameras = list(read_description(bundle).camera_formats())
+    there_are = [name for name in offered(cameras) if name != BUNDLE_ZIP]
+    unknown = [name for name in names if name not in there_are]
+    if unknown:
+        message = f"{bundle}: it gives no {', '.join(unknown)}. There are: {', '.join(there_are)}."
+        raise ConfigError(message)
+    for name in names:
+        lacking = extra_of(Path(name).suffix)
+        if lacking is not None:
+            message = f"{name} takes a library that is not installed: {lacking}"
+            raise ExtraMissingError(message)
+    return cameras
+
+
+def _write_further(folder: Path, name: str, cameras: Sequence[str], calibration: Path) -> None:
+    """Write a file of a reconstruction that is made only when it is asked for. Raises as its maker does."""
+    cloud = cloud_named(name, cameras)
+    if cloud is not None:
+        from slrig.scan.cloud_files import cloud_file
+
+        write_file(folder / name, cloud_file(folder, *cloud, calibration=calibration))
+    elif name in ON_REQUEST:
+        write_converted(folder, name)
 
 
 def _figures(name: str) -> Column:

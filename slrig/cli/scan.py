@@ -15,7 +15,7 @@ from slrig.cli.client import ServiceClient
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
-from slrig.scan.offered import CAMERA_PICTURES, offered
+from slrig.scan.offered import PREFIXES, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -131,6 +131,8 @@ def _completed(
     missing = [name for name in files if name not in offered]
     if missing:
         message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
+        if any(name.endswith(".e57") for name in missing):
+            message += " For E57, pip install 'slrig[e57]' where the service runs; the scan need not be repeated."
         raise ServiceError(message)
     with refusals_of(output):
         output.mkdir(parents=True, exist_ok=True)
@@ -144,9 +146,8 @@ def _completed(
 def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
     unknown, cameras = [name for name in files if name not in offered(())], []
-    pictures = tuple(named("").partition(".")[0] for named in CAMERA_PICTURES)
-    if unknown and all(name.startswith(pictures) for name in unknown):
-        # A picture per camera: which there are is known once the rig is open.
+    if unknown and all(name.startswith(PREFIXES) for name in unknown):
+        # A file per camera: which there are is known once the rig is open.
         cameras = [each["name"] for each in client.get("/rig")["cameras"]]
         unknown = [name for name in unknown if cameras and name not in offered(cameras)]
     if unknown:

@@ -24,7 +24,7 @@ from typing import Any
 import structlog
 
 from slrig import logs
-from slrig.errors import ScanCancelledError, WorkerLostError
+from slrig.errors import ScanCancelledError, WorkerBusyError, WorkerLostError
 from slrig.failure import errors_by_code, interruption
 from slrig.jobs.frame_feed import FrameFeed
 from slrig.jobs.worker_process import Failed, Fed, Preparing, Ready, Run, Task, Unloadable, received, sent, serve
@@ -185,9 +185,11 @@ class Worker:
         cancelled: Callable[[], bool] = _never,
         made: Made = _unheard,
         feed: FrameFeed | None = None,
+        within_s: float | None = None,
     ) -> Any:
         """Do a task when it is its turn, and return its result. Frames that `feed` has sent, all of them, are used.
-        made : is told the name of each file of the result that is there before the task is over.
+        made : is told the name of each file of the result that is there before the task is over. within_s : the longest
+        wait for its beginning, None for any.
 
         Whatever but an answer ends the wait, the process is replaced: what it still computes belongs to nobody.
 
@@ -199,13 +201,18 @@ class Worker:
             `cancelled` turned true.
         ScanInterruptedError
             The worker was closed.
+        WorkerBusyError
+            It did not begin within `within_s`: others were before it, or the process was not ready.
         WorkerLostError
             The process ended, showed no sign of life, or told no progress for too long.
         UnexpectedWorkerError
             The task has a defect.
         """
-        with self._its_turn(task, progress, cancelled):
+        until_s = None if within_s is None else time.monotonic() + within_s
+        with self._its_turn(task, progress, cancelled, until_s):
             self.start()
+            if until_s is not None:
+                self._wait_until_ready(task, until_s)
             with self._guard:
                 process, pipe, stops = self._process, self._pipe, self._stops
                 self._running = True
@@ -256,7 +263,9 @@ class Worker:
         return call
 
     @contextmanager
-    def _its_turn(self, task: Task, progress: Told, cancelled: Callable[[], bool]) -> Iterator[None]:
+    def _its_turn(
+        self, task: Task, progress: Told, cancelled: Callable[[], bool], until_s: float | None
+    ) -> Iterator[None]:
         """Wait until the jobs that came before are over."""
         turn, told = next(self._numbers), False
         with self._turn:
@@ -272,11 +281,22 @@ class Worker:
                 if cancelled():
                     message = f"The {task.what} was cancelled."
                     raise ScanCancelledError(message)
+                if until_s is not None and time.monotonic() > until_s:
+                    message = f"Another job is computed, and the {task.what} has to wait for it. Ask again."
+                    raise WorkerBusyError(message)
             yield
         finally:
             with self._turn:
                 self._turns.remove(turn)
                 self._turn.notify_all()
+
+    def _wait_until_ready(self, task: Task, until_s: float) -> None:
+        """Wait, in its turn, until the process has loaded its kernels, or cannot."""
+        while self.condition != READY and self._loading:
+            if time.monotonic() > until_s:
+                message = f"The worker is not ready yet for the {task.what} ({self._condition}). Ask again."
+                raise WorkerBusyError(message)
+            time.sleep(POLL_S)
 
     def close(self) -> None:
         """End the process, whatever it does. Idempotent."""

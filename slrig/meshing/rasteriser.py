@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from slrig.model import IntArray, Size
 
 _MOST_BANDS = 4  # each has a picture of its own, which is 8 bytes a pixel
 _FACES_AT_LEAST = 50_000  # in a band: a millisecond of work, as much as it takes to bring two pictures together
+
+
+Nearness = TypeVar("Nearness", NDArray[np.float32], NDArray[np.float64])
 
 
 class View(NamedTuple):
@@ -33,17 +36,25 @@ def rasterised(placed: NDArray[np.float32], faces: IntArray, size: Size) -> View
     """
     at_least = max(_FACES_AT_LEAST, -(-len(faces) // _MOST_BANDS))
     given = np.ascontiguousarray(placed), np.ascontiguousarray(faces), size.height_px, size.width_px
-    (inverse, face), *others = in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least)
-    while others:
-        next_inverse, next_face = others.pop(0)
-        # Only what is nearer: of equally near triangles the first stays, as inside a band.
-        nearer = next_inverse > inverse
-        np.copyto(inverse, next_inverse, where=nearer)
-        np.copyto(face, next_face, where=nearer)
+    inverse, face = brought_together(in_bands(_z_buffer, len(faces), *given, rows_at_least=at_least))
     unseen = inverse == 0
     inverse[unseen] = np.nan
     face[unseen] = -1
     return View(np.reciprocal(inverse, out=inverse), face)
+
+
+def brought_together(pictures: list[tuple[Nearness, IntArray]]) -> tuple[Nearness, IntArray]:
+    """The first of some pictures of inverse depth and triangle, (H, W) each, with what is nearer in the others, which
+    the list loses.
+    """
+    inverse, face = pictures.pop(0)
+    while pictures:
+        next_inverse, next_face = pictures.pop(0)
+        # Only what is nearer: of equally near triangles the first stays, as inside a band.
+        nearer = next_inverse > inverse
+        np.copyto(inverse, next_inverse, where=nearer)
+        np.copyto(face, next_face, where=nearer)
+    return inverse, face
 
 
 def normals_seen(

@@ -11,13 +11,19 @@ const LOOK_AGAIN_S = 10;
 
 const PURPOSES = {
   "mesh.ply": "the mesh in mm, with σ for each vertex", "mesh.glb": "for viewers and web pages, in metres", "mesh.stl": "for CAD and printing, in mm",
-  "mesh.obj": "for modelling programs, in mm", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
+  "mesh.obj": "for modelling programs, in mm", "mesh.3mf": "for CAD and printing, in mm, with colours", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
   "preview.png": "a picture to send", "bundle.zip": "the frames and the calibration, to compute it all again", "view.glb": "what this page shows",
   "coarse.glb": "what this page shows first",
 };
 /** Made when they are asked for: to ask for their size would make them. */
-const MADE_LATER = ["mesh.stl", "mesh.obj", "view.glb", "coarse.glb", "bundle.zip"];
-const purpose = (name) => PURPOSES[name] ?? (name.startsWith("causes-") ? "causes as numbers, for programs" : "why pixels gave no point, as a picture");
+const MADE_LATER = ["mesh.stl", "mesh.obj", "mesh.3mf", "view.glb", "coarse.glb", "bundle.zip"];
+const OF_CAMERAS = [
+  [/^causes-/, "causes as numbers, for programs"], [/^rejected-/, "why pixels gave no point, as a picture"],
+  [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"], [/^points-/, "the same for point-cloud programs"],
+  [/^depth-/, "depth at each pixel of the camera, as a picture of 16 bits"],
+];
+const isMadeLater = (name) => MADE_LATER.includes(name) || /^(points|depth)-/.test(name);
+const purpose = (name) => PURPOSES[name] ?? OF_CAMERAS.find(([form]) => form.test(name))?.[1] ?? "";
 
 export function ResultScreen({id, may}) {
   const [scan, problem, again] = useValue(`/scan/${encodeURIComponent(id)}`, LOOK_AGAIN_S);
@@ -148,7 +154,7 @@ function Compare({scan, other, chosen}) {
 function Downloads({files}) {
   const [sizes, setSizes] = useState({});
   useEffect(() => {
-    for (const name of Object.keys(files).filter((each) => !MADE_LATER.includes(each)))
+    for (const name of Object.keys(files).filter((each) => !isMadeLater(each)))
       fetch(files[name], {method: "HEAD"}).then((answer) => {
         const bytes = Number(answer.headers.get("Content-Length"));
         if (answer.ok && bytes) setSizes((before) => ({...before, [name]: bytes < 1e6 ? `${Math.ceil(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`}));
@@ -156,7 +162,7 @@ function Downloads({files}) {
   }, []);
   return html`<h3>Files</h3><div class="wide"><table><thead><tr><th>File</th><th>Size</th><th>For</th></tr></thead>
     <tbody>${Object.entries(files).map(([name, path]) => html`<tr><td><a href=${path} download=${name}>${name}</a></td>
-      <td>${sizes[name] ?? (MADE_LATER.includes(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
+      <td>${sizes[name] ?? (isMadeLater(name) ? "made when asked for" : "–")}</td><td>${purpose(name)}</td></tr>`)}</tbody></table></div>`;
 }
 
 function Keeping({scan, over, again, may}) {

@@ -24,6 +24,7 @@ from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tr
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl
+from slrig.scan.threemf import encode_mesh_3mf
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 
 MESH = "mesh.ply"
@@ -32,6 +33,7 @@ REPORT_FORMAT = "slrig-report"
 ON_REQUEST: Mapping[str, Callable[[Mesh], bytes]] = {
     "mesh.stl": encode_mesh_stl,
     "mesh.obj": encode_mesh_obj,
+    "mesh.3mf": encode_mesh_3mf,
     "view.glb": encode_view_glb,
     "coarse.glb": encode_coarse_glb,
 }
@@ -163,18 +165,22 @@ def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count:
     return [*_vertex_element(vertices, count=vertex_count), *faces]
 
 
-def encode_points_ply(curves: PointCurves, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
-    """Binary little-endian PLY in mm: position, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
+def encode_points_ply(
+    curves: PointCurves, normals: NDArray[np.float32], *, sigma_calibration_mm: FloatArray | None = None
+) -> bytes:
+    """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe`, `source`,
     `bridge_after` per point.
 
-    `stripe` is the projector column rounded down, as in the mesh; `bridge_after` is 1 where the step to the next
-    point of its curve joins two stripes. sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
+    normals : (n, 3), unit, of the mesh; NaN for a point that is not in it. `stripe` is the projector column rounded
+    down, as in the mesh; `bridge_after` is 1 where the step to the next point of its curve joins two stripes.
+    sigma_calibration_mm : (n,), as for `encode_mesh_ply`.
     """
     columns = np.floor(curves.column_px).astype(np.int32)
     points = _records(
         len(curves.points_mm),
         {
             **_columns(("x", "y", "z"), "f4", curves.points_mm),
+            **_columns(("nx", "ny", "nz"), "f4", normals),
             **_columns(("red", "green", "blue"), "u1", curves.colour),
             _MARK: ("u1", curves.mark),
             "sigma_mm": ("f4", curves.sigma_mm),

@@ -77,26 +77,26 @@ def encode_mesh_obj(mesh: Mesh) -> bytes:
     Positions have five decimals (10 nm), normals and colours four. Normals are left out if one is not known.
     """
     known = bool(np.isfinite(mesh.normals).all())
-    positions = _rounded(mesh.vertices_mm, _OBJ_POSITION_DECIMALS)
+    positions = rounded(mesh.vertices_mm, _OBJ_POSITION_DECIMALS)
     vertices = np.column_stack([positions, mesh.colour / 255])
     number = f"%.{_OBJ_POSITION_DECIMALS}f"
     unit = f"%.{_OBJ_UNIT_DECIMALS}f"
     pieces = ["# slrig mesh, millimetres; v x y z red green blue\no scan\n"]
-    pieces += _lines(" ".join(["v", *[number] * 3, *[unit] * 3]), vertices)
+    pieces += table_lines(" ".join(["v", *[number] * 3, *[unit] * 3]), vertices)
     if known:
-        pieces += _lines(" ".join(["vn", *[unit] * 3]), _rounded(mesh.normals, _OBJ_UNIT_DECIMALS))
-        pieces += _lines("f %d//%d %d//%d %d//%d", np.repeat(mesh.faces + 1, 2, axis=1))
+        pieces += table_lines(" ".join(["vn", *[unit] * 3]), rounded(mesh.normals, _OBJ_UNIT_DECIMALS))
+        pieces += table_lines("f %d//%d %d//%d %d//%d", np.repeat(mesh.faces + 1, 2, axis=1))
     else:
-        pieces += _lines("f %d %d %d", mesh.faces + 1)
+        pieces += table_lines("f %d %d %d", mesh.faces + 1)
     return "".join(pieces).encode("ascii")
 
 
-def _rounded(values: NDArray[np.float32], decimals: int) -> FloatArray:
+def rounded(values: NDArray[np.float32], decimals: int) -> FloatArray:
     """The values as they are written: a zero has no sign."""
     return np.asarray(np.rint(values.astype(np.float64) * 10**decimals) / 10**decimals + 0.0)
 
 
-def _lines(form: str, table: NDArray[Any]) -> Iterator[str]:
+def table_lines(form: str, table: NDArray[Any]) -> Iterator[str]:
     """The rows of a table, a line each, many together: one step of Python for each would take ten times as long."""
     for rows in _slices(len(table)):
         part = table[rows]

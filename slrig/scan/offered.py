@@ -5,6 +5,7 @@ Loads nothing: a command asks it before anything is shot.
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterable, Mapping
 
 MEDIA_TYPES: Mapping[str, str] = {
@@ -12,6 +13,7 @@ MEDIA_TYPES: Mapping[str, str] = {
     "mesh.glb": "model/gltf-binary",
     "mesh.stl": "model/stl",
     "mesh.obj": "model/obj",
+    "mesh.3mf": "model/3mf",
     "view.glb": "model/gltf-binary",
     "coarse.glb": "model/gltf-binary",
     "points.ply": "application/octet-stream",
@@ -42,13 +44,53 @@ def causes_picture(camera: str) -> str:
     return f"causes-{camera}.png"
 
 
-CAMERA_PICTURES = (rejected_picture, causes_picture)
+CLOUDS: Mapping[str, str] = {
+    "points-{camera}.npz": "application/octet-stream",
+    "points-{camera}.pcd": "application/octet-stream",
+    "depth-{camera}.tiff": "image/tiff",
+    "points-{camera}.e57": "model/e57",
+}
+"""The surface in the grid of a camera, made when asked for by `slrig.scan.cloud_files`: names and media types."""
+
+PREFIXES = ("rejected-", "causes-", *sorted({form.partition("{")[0] for form in CLOUDS}))
+"""With which the name of a camera's file begins."""
+
+
+def camera_files(camera: str) -> tuple[str, ...]:
+    """The names of a camera's files.
+
+    >>> camera_files("left")[:3]
+    ('rejected-left.png', 'causes-left.png', 'points-left.npz')
+    """
+    return rejected_picture(camera), causes_picture(camera), *(form.format(camera=camera) for form in CLOUDS)
+
+
+_EXTRAS = {".e57": ("pye57", "e57")}
+"""Endings of files that take a library that slrig does not bring, and the extra that does."""
+
+
+def extra_of(ending: str) -> str | None:
+    """What to install before files of this ending can be made; None where nothing is missing, or needed."""
+    library, extra = _EXTRAS.get(ending, (None, ""))
+    if library is None or importlib.util.find_spec(library) is not None:
+        return None
+    return f"pip install 'slrig[{extra}]'"
+
+
+def cloud_named(name: str, cameras: Iterable[str]) -> tuple[str, str] | None:
+    """Which of `CLOUDS` a name means, and of which camera; None where it means none.
+
+    >>> cloud_named("points-left.npz", ["left", "right"])
+    ('points-{camera}.npz', 'left')
+    """
+    known = ((form, camera) for camera in cameras for form in CLOUDS)
+    return next((each for each in known if each[0].format(camera=each[1]) == name), None)
 
 
 def offered(cameras: Iterable[str]) -> tuple[str, ...]:
     """The names of a scan's files. cameras : of the rig.
 
     >>> offered(["left"])[-3:]
-    ('rejected-left.png', 'causes-left.png', 'bundle.zip')
+    ('depth-left.tiff', 'points-left.e57', 'bundle.zip')
     """
-    return *MEDIA_TYPES, *(named(camera) for camera in cameras for named in CAMERA_PICTURES), BUNDLE_ZIP
+    return *MEDIA_TYPES, *(name for camera in cameras for name in camera_files(camera)), BUNDLE_ZIP

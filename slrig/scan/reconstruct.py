@@ -58,11 +58,13 @@ class _Meshed:
     """The mesh and its points, the cameras with all their refusals, and what the report says.
 
     share_mm : (n,) float64, the calibration's part of each point's standard deviation, and mesh_share_mm : (V,) of each
-    vertex's; None where the calibration does not state its error. notes : for the report.
+    vertex's; None where the calibration does not state its error. normals : (n, 3) float32 of the points, NaN beside
+    the mesh. notes : for the report.
     """
 
     mesh: Mesh
     curves: PointCurves
+    normals: NDArray[np.float32]
     share_mm: FloatArray | None
     mesh_share_mm: FloatArray | None
     cameras: list[CameraResult]
@@ -161,7 +163,7 @@ def reconstruct_into(
         # The mesh is what somebody waits for; what is left is shared by two threads.
         pictures = beside.submit(_encoded_pictures, mesh, cameras)
         place("mesh.glb", encode_mesh_glb(mesh))
-        place("points.ply", encode_points_ply(meshed.curves, sigma_calibration_mm=meshed.share_mm))
+        place("points.ply", encode_points_ply(meshed.curves, meshed.normals, sigma_calibration_mm=meshed.share_mm))
         covered = covered_share(mesh, cameras[0])
         figures = {**meshed.figures, "figures": mesh_figures(mesh.vertices_mm, mesh.faces)}
         entered("pictures", 0.85, "")
@@ -270,6 +272,7 @@ def _meshed(
     return _Meshed(
         mesh=mesh,
         curves=curves,
+        normals=surface.normals,
         share_mm=share,
         mesh_share_mm=None if share is None else share[_used(surface.faces, len(share))],
         cameras=cameras,

@@ -38,8 +38,11 @@ def recorded(folder: Path) -> Path:
 
 def worked(service: ServiceProcess) -> None:
     """All kinds of work, each to its end."""
-    assert scanned(service)["state"] == "succeeded"
+    scan = scanned(service)
+    assert scan["state"] == "succeeded"
     with Caller(service) as caller:
+        for name in (each for each in scan["links"]["files"] if each.startswith(("points-", "depth-", "mesh."))):
+            assert caller.http.get(scan["links"]["files"][name]).status_code == 200, name
         assert caller.http.get("/calibration/board.pdf").content[:4] == b"%PDF"
         made = caller.post("/calibration", 201, board=BOARD)
         caller.post(made["links"]["pose"], 202)

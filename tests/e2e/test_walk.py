@@ -30,6 +30,7 @@ def test_scan_of_the_rendered_rig_gives_a_mesh_whose_bundle_gives_it_again(
         "report.json",
         "rejected-left.png",
         "causes-left.png",
+        "points-left.npz",
         "bundle.zip",
     )
     chosen = [argument for name in files for argument in ("--file", name)]
@@ -50,11 +51,11 @@ def test_scan_of_the_rendered_rig_gives_a_mesh_whose_bundle_gives_it_again(
     with zipfile.ZipFile(output / "bundle.zip") as archive:
         archive.extractall(tmp_path / "bundle")
     again = tmp_path / "again"
-    formats = ["--format", "obj", "--format", "stl"]
+    formats = ["--format", "obj", "--format", "stl", "--file", "points-left.npz"]
     result = CliRunner().invoke(app, ["reconstruct", str(tmp_path / "bundle"), "--output", str(again), *formats])
     assert result.exit_code == 0, result.output
     assert f"obj       {again / 'mesh.obj'}" in result.stdout
-    for name in ("mesh.ply", "mesh.glb", "mesh.obj"):
+    for name in ("mesh.ply", "mesh.glb", "mesh.obj", "points-left.npz"):
         assert (again / name).read_bytes() == (output / name).read_bytes()
     stl, ply = (trimesh.load(again / name, process=False) for name in ("mesh.stl", "mesh.ply"))
     np.testing.assert_array_equal(stl.triangles, ply.triangles)

@@ -479,12 +479,15 @@ def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path
         (
             "rejected-top.png",
             ["left"],
-            "There are: .*, rejected-left.png, causes-left.png, bundle.zip",
+            "There are: .*, rejected-left.png, causes-left.png, points-left.npz, .*bundle.zip",
         ),
         ("rejected-top.png", [], None),
         ("rejected-left.png", ["left"], None),
         ("causes-left.png", ["left"], None),
         ("causes-top.png", ["left"], "no causes-top.png"),
+        ("points-left.npz", ["left"], None),
+        ("points-left.e57", ["left"], None),
+        ("points-top.npz", ["left"], "no points-top.npz"),
         ("bundle.zip", ["left"], None),
     ],
 )
@@ -509,6 +512,28 @@ def test_name_that_no_scan_has_is_exit_code_2_without_a_service(tmp_path: Path) 
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert all(f" {name}," in result.stderr for name in MEDIA_TYPES)
+
+
+@pytest.mark.parametrize(("busy", "fetched"), [(2, True), (1000, False)])
+def test_a_file_that_has_to_wait_is_asked_for_again(tmp_path: Path, busy: int, fetched: bool) -> None:
+    asked, pauses = [], list[float]()
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        asked.append(request.url.path)
+        if len(asked) <= busy:
+            return httpx2.Response(503, headers={"Retry-After": "5"}, json={"detail": "Another job is computed."})
+        return httpx2.Response(200, content=b"npz")
+
+    target = tmp_path / "points-left.npz"
+    with client_of(handler, pauses) as client:
+        if fetched:
+            client.fetch("/scan/1/points-left.npz", target)
+        else:
+            with pytest.raises(ServiceError, match="Another job is computed"):
+                client.fetch("/scan/1/points-left.npz", target)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"npz"] * fetched
+    assert pauses == [5.0] * (len(asked) - 1)
+    assert 2 < len(asked) < 50
 
 
 def test_ctrl_c_cancels_the_scan_on_the_service(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -109,6 +110,35 @@ def test_several_bundles_are_reconstructed_as_each_alone(
         assert (out / name / "mesh.ply").read_bytes() == (alone / "mesh.ply").read_bytes()
         assert within(out / name) == sorted([*within(alone), "mesh.stl"])
     assert [row[:2] for row in rows(result)] == [["scan-1", f"{triangles:,}"], ["scan-2", f"{triangles:,}"]]
+
+
+def test_files_of_a_camera_are_written_by_name_and_with_the_calibration_that_was_given(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("slrig.cli.reconstruct.prepare_kernels", lambda _: 0)
+    bundle, out = tmp_path / "bundle", tmp_path / "out"
+    shutil.copytree(recorded, bundle)
+    calibration = (bundle / "calibration.json").rename(tmp_path / "elsewhere.json")
+    names = ["points-sample.npz", "mesh.stl", "mesh.ply"]
+    chosen = [word for name in names for word in ("--file", name)]
+    result = run(bundle, "--output", out, "--calibration", calibration, *chosen)
+    assert result.exit_code == 0, result.output
+    assert f"npz       {out / 'points-sample.npz'}" in result.stdout
+    assert result.stdout.count("mesh.ply") == 1
+    with np.load(out / "points-sample.npz") as cloud:
+        assert np.isfinite(cloud["points_mm"]).all(axis=2).mean() > 0.5
+    assert (out / "mesh.stl").is_file()
+
+
+@pytest.mark.parametrize("name", ["points-left.npz", "bundle.zip", "../mesh.stl"])
+def test_a_file_that_no_reconstruction_gives_is_refused_at_once(
+    recorded: Path, tmp_path: Path, work: Reconstruction, name: str
+) -> None:
+    result = run(recorded, "--output", tmp_path / "out", "--file", name)
+    assert result.exit_code == 2
+    assert f"it gives no {name}. There are: mesh.ply, " in result.stderr
+    assert "points-sample.npz" in result.stderr
+    assert (work.seen, work.prepared) == ([], 0)
 
 
 def test_a_folder_of_bundles_is_worked_through_in_natural_order(

@@ -58,6 +58,7 @@ def test_scan_is_accepted_followed_and_fetched(client: TestClient) -> None:
     assert set(files) == {
         "bundle.zip",
         "coarse.glb",
+        "mesh.3mf",
         "mesh.glb",
         "mesh.obj",
         "mesh.ply",
@@ -296,7 +297,7 @@ def test_mesh_can_be_fetched_while_pictures_and_figures_are_made(client: TestCli
     scan = client.get(f"/scan/{scan_id}").json()
     assert (scan["state"], list(scan["links"]["files"])) == (
         "computing",
-        ["coarse.glb", "mesh.obj", "mesh.ply", "mesh.stl", "view.glb"],
+        ["coarse.glb", "mesh.3mf", "mesh.obj", "mesh.ply", "mesh.stl", "view.glb"],
     )
     early = client.get(scan["links"]["files"]["mesh.ply"])
     assert (early.status_code, early.headers["ETag"]) == (200, f'"{scan_id}/mesh.ply"')

@@ -20,6 +20,7 @@ from slrig.errors import (
     ScanCancelledError,
     ScanInterruptedError,
     StorageError,
+    WorkerBusyError,
     WorkerLostError,
 )
 from slrig.failure import failure_of, interruption
@@ -326,3 +327,37 @@ def test_kernel_cache_moves_only_when_the_package_cannot_be_written(
     prepare_kernel_cache(tmp_path / "cache")
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "cache")
     assert (tmp_path / "cache").is_dir()
+
+
+def test_a_task_that_cannot_begin_in_time_is_refused_and_the_worker_goes_on(worker: Worker, tmp_path: Path) -> None:
+    gate, began = tmp_path / "gate", threading.Event()
+    before = worker.process_id
+
+    def began_and_goes_on() -> bool:
+        began.set()
+        return False
+
+    waiting = threading.Thread(
+        target=worker.run, args=(task("wait_for", gate),), kwargs={"cancelled": began_and_goes_on}
+    )
+    waiting.start()
+    assert began.wait(WAIT_S)
+    with pytest.raises(WorkerBusyError, match=r"Another job is computed, and the examination has to wait.*Ask again"):
+        worker.run(task("process_id"), within_s=0.0)
+    gate.touch()
+    waiting.join(WAIT_S)
+    assert worker.run(task("process_id"), within_s=WAIT_S) == worker.process_id == before
+    assert worker.jobs == 0
+
+
+def test_a_process_that_is_not_ready_in_time_goes_on_with_its_kernels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fresh, gate = Worker("tests.unit.jobs.preparing_pipeline"), tmp_path / "go"
+    monkeypatch.setenv("PREPARING_GATE", str(gate))
+    with pytest.raises(WorkerBusyError, match="not ready yet for the report"):
+        fresh.run(Task(f"{PIPELINE}:process_id", what="report"), within_s=0.0)
+    before = fresh.process_id
+    gate.touch()
+    assert fresh.run(Task(f"{PIPELINE}:process_id", what="report"), within_s=WAIT_S) == before
+    fresh.close()

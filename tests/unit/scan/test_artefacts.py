@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from slrig.errors import InvalidInputError, StorageError
 from slrig.model import Mesh, PointCurves, Refusal, Size
@@ -152,12 +153,20 @@ def test_formats_that_are_made_on_request_are_offered() -> None:
     assert set(ON_REQUEST) < set(MEDIA_TYPES)
 
 
+def example_normals() -> NDArray[np.float32]:
+    """Of the points of `example_curves`: one is not known."""
+    return np.array([[0, 0, -1], [0.6, 0, -0.8], [np.nan] * 3, [0, 1, 0], [0, 0, -1]], dtype=np.float32)
+
+
 def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:
     curves = example_curves()
-    (tmp_path / "points.ply").write_bytes(encode_points_ply(curves))
+    normals = example_normals()
+    (tmp_path / "points.ply").write_bytes(encode_points_ply(curves, normals))
     found = load(tmp_path / "points.ply")
     data = found.metadata["_ply_raw"]["vertex"]["data"]
     assert found.vertices == pytest.approx(curves.points_mm, rel=1e-6)
+    for axis, name in enumerate(("nx", "ny", "nz")):
+        np.testing.assert_array_equal(data[name].ravel(), normals[:, axis])
     assert data["stripe"].ravel().tolist() == [4, 4, 4, 7, 7]
     assert data["source"].ravel().tolist() == curves.source.tolist()
     assert data["bridge_after"].ravel().tolist() == [1, 0, 0, 0, 1]
@@ -170,7 +179,7 @@ def test_points_hold_their_column_source_and_bridges(tmp_path: Path) -> None:
 def digest() -> str:
     """Of every file that these values give."""
     mesh, curves = example_mesh(), example_curves()
-    data = b"".join(encode(mesh) for encode in ENCODERS) + encode_points_ply(curves)
+    data = b"".join(encode(mesh) for encode in ENCODERS) + encode_points_ply(curves, example_normals())
     return hashlib.sha256(data).hexdigest()
 
 

@@ -1,0 +1,99 @@
+"""The files that are made of a finished scan by mathematics, on request: its surface in the grid of one camera.
+
+The service has them made by the worker: they take kernels, and libraries of other people.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.bundle.calibration_file import read_calibration
+from slrig.bundle.reading import CALIBRATION
+from slrig.bundle.storage import refusals_of
+from slrig.errors import InvalidInputError
+from slrig.jobs.data_folder import BUNDLE
+from slrig.model import Pinhole
+from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
+from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
+from slrig.scan.e57_format import encode_e57
+from slrig.scan.offered import causes_picture
+from slrig.scan.organised import OrganisedCloud, organised
+from slrig.scan.plan import Progress
+
+STAGE = "organise points"
+
+
+ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
+    "points-{camera}.npz": encode_npz,
+    "points-{camera}.pcd": encode_pcd,
+    "depth-{camera}.tiff": encode_depth_tiff,
+    "points-{camera}.e57": encode_e57,
+}
+
+
+def cloud_file(
+    folder: Path,
+    form: str,
+    camera: str,
+    *,
+    calibration: Path | None = None,
+    progress: Progress = lambda *_: None,
+) -> bytes:
+    """One of `ENCODERS`, for a camera, made of the files of a finished scan. calibration : the one that the mesh was
+    made with, None for that in the scan's bundle.
+
+    Raises
+    ------
+    InvalidInputError, CalibrationError
+        A file of the scan is not as slrig wrote it.
+    ExtraMissingError
+        The format takes a library that is not installed.
+    NothingToReconstructError
+        The camera sees nothing of the mesh, and the format has no form for that.
+    StorageError
+        A file of the scan cannot be read.
+    """
+    progress(STAGE, 0.0, "")
+    return ENCODERS[form](organised_scan(folder, camera, calibration=calibration or folder / BUNDLE / CALIBRATION))
+
+
+def organised_scan(folder: Path, camera: str, *, calibration: Path) -> OrganisedCloud:
+    """The cloud of a camera, of the files of a finished scan. Raises as `cloud_file`."""
+    mesh = decode_mesh_ply(_read(folder / MESH))
+    devices = read_calibration(calibration).cameras
+    if camera not in devices:
+        message = f"{calibration}: it knows cameras {sorted(devices)}, and not '{camera}'"
+        raise InvalidInputError(message)
+    device = devices[camera]
+    return organised(mesh, camera, device, _refused(folder / causes_picture(camera), device), _causes(folder / REPORT))
+
+
+def _read(path: Path) -> bytes:
+    with refusals_of(path):
+        return path.read_bytes()
+
+
+def _refused(path: Path, device: Pinhole) -> NDArray[np.uint8]:
+    found = cv2.imdecode(np.frombuffer(_read(path), dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.shape != device.size.shape or found.dtype != np.uint8:
+        what = "none that can be read" if found is None else f"{found.shape} {found.dtype}"
+        message = (
+            f"{path.name}: expected a grey picture of {device.size} as the calibration's camera has, found {what}; "
+            "reconstruct the bundle again"
+        )
+        raise InvalidInputError(message)
+    return np.asarray(found, dtype=np.uint8)
+
+
+def _causes(path: Path) -> list[str]:
+    try:
+        return [str(cause["name"]) for cause in json.loads(_read(path))["causes"]]
+    except (ValueError, KeyError, TypeError) as cause:
+        message = f"{path.name}: it does not name the causes of refused pixels; reconstruct the bundle again"
+        raise InvalidInputError(message) from cause

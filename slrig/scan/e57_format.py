@@ -1,0 +1,56 @@
+"""A cloud in a camera's grid as E57 (ASTM E2807), the format of scanners and surveyors, by pye57."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from slrig.bundle.storage import refusals_of
+from slrig.errors import ExtraMissingError, NothingToReconstructError, StorageError
+from slrig.scan.offered import extra_of
+from slrig.scan.organised import OrganisedCloud
+
+_METRES_PER_MM = 0.001
+
+
+def encode_e57(cloud: OrganisedCloud) -> bytes:
+    """One scan of the points that are there, in metres, as the standard has it, in the world's axes, with sRGB colours
+    and the row and column of each. The format has no normals of its own. Two files of one cloud differ in their GUIDs.
+
+    Raises
+    ------
+    ExtraMissingError
+        pye57 is not installed.
+    NothingToReconstructError
+        There is no point.
+    StorageError
+        The folder for temporary files refused: the library writes files only.
+    """
+    try:
+        from pye57 import E57
+        from pye57.libe57 import E57Exception
+    except ImportError as cause:
+        message = f"points-{cloud.camera}.e57 is written by pye57, which is missing: {extra_of('.e57')}"
+        raise ExtraMissingError(message) from cause
+    rows, columns = np.nonzero(cloud.cause == 0)
+    if not len(rows):
+        message = f"camera '{cloud.camera}' sees nothing of the mesh, and E57 has no form for a scan without points"
+        raise NothingToReconstructError(message)
+    points = cloud.points_mm[rows, columns] * np.float32(_METRES_PER_MM)
+    colours = cloud.colour[rows, columns]
+    table = {f"cartesian{axis}": np.ascontiguousarray(points[:, place]) for place, axis in enumerate("XYZ")}
+    table |= {f"color{name}": colours[:, place] for place, name in enumerate(("Red", "Green", "Blue"))}
+    table |= {"rowIndex": rows.astype(np.uint16), "columnIndex": columns.astype(np.uint16)}
+    with TemporaryDirectory(prefix="slrig-") as folder:
+        path = Path(folder, f"{cloud.camera}.e57")
+        try:
+            file = E57(str(path), mode="w")
+            file.write_scan_raw(table, name=cloud.camera)
+            file.close()
+        except E57Exception as cause:
+            message = f"{path}: the disk refused: {cause}; free some space there"
+            raise StorageError(message) from cause
+        with refusals_of(path):
+            return path.read_bytes()
