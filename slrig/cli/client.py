@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 import httpx2
 
 from slrig import KEY_VARIABLE
-from slrig.bundle.storage import refusals_of, staging_name
+from slrig.disk import refusals_of, staging_name
 from slrig.errors import ConfigError, ServiceError
 from slrig.printable import printable
 

@@ -18,10 +18,10 @@ import typer
 
 import slrig
 from slrig import KEY_VARIABLE
-from slrig.bundle.storage import refusals_of
 from slrig.cli.client import ServiceClient
 from slrig.cli.display import counted, progress_shown
 from slrig.cli.scan import scan_with, tell_result
+from slrig.disk import refusals_of
 from slrig.errors import ConfigError, ServiceError
 from slrig.scan.plan import Progress
 

@@ -10,10 +10,10 @@ from typing import Any
 import typer
 from rich.table import Column
 
-from slrig.bundle.storage import refusals_of
 from slrig.cli.client import ServiceClient
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
+from slrig.disk import refusals_of
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import CAMERA_PICTURES, offered
 
