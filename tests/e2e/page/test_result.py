@@ -171,7 +171,7 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Pa
 def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Path, visit: Visit) -> None:
     service = start(write_rig(tmp_path / "rig", head="realtime = true"))
     with service.client() as client:
-        scan: str = client.start({"label": "a wrong one"})["links"]["self"]
+        scan: str = client.scans.start(label="a wrong one")["links"]["self"]
     page = visit(service, scan[1:], size=PHONE, dark=True)
     page.get_by_role("button", name="Stop it").click()
     page.get_by_text("The scan was stopped").wait_for()
