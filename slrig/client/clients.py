@@ -39,8 +39,8 @@ H = TypeVar("H", httpx2.Client, httpx2.AsyncClient)
 class _Service(Remote[W]):
     """What both clients offer: scans as objects; the service's interface in namespaces; what links of answers name."""
 
-    def __init__(self, wire: W, url: str) -> None:
-        super().__init__(Core(wire, url))
+    def __init__(self, wire: W) -> None:
+        super().__init__(Core(wire))
         self.scans = Scans(self.core)
         self.rig = RigState(self.core)
         self.calibration = Calibrations(self.core)
@@ -112,8 +112,8 @@ class _Service(Remote[W]):
 class Client(_Service[Blocking]):
     """A service, called and waited for. A context manager.
 
-    key : the API key; None: as SLRIG_API_KEY says. pause : what waits between two tries. transport : httpx2's, in place
-    of the network.
+    url, key : None: as SLRIG_URL and SLRIG_API_KEY say; without the first, the service of this machine. pause : what
+    waits between two tries. transport : httpx2's, in place of the network.
 
     Raises
     ------
@@ -123,13 +123,13 @@ class Client(_Service[Blocking]):
 
     def __init__(
         self,
-        url: str = URL,
+        url: str | None = None,
         key: str | None = None,
         *,
         pause: Callable[[float], None] = time.sleep,
         transport: httpx2.BaseTransport | None = None,
     ) -> None:
-        super().__init__(Blocking(_http(httpx2.Client, url, key, transport=transport), pause), url)
+        super().__init__(Blocking(_http(httpx2.Client, url, key, transport=transport), pause))
 
     def __enter__(self) -> Self:
         return self
@@ -146,9 +146,9 @@ class AsyncClient(_Service[Awaited]):
     """The same, awaited, on asyncio's event loop. See `Client`."""
 
     def __init__(
-        self, url: str = URL, key: str | None = None, *, transport: httpx2.AsyncBaseTransport | None = None
+        self, url: str | None = None, key: str | None = None, *, transport: httpx2.AsyncBaseTransport | None = None
     ) -> None:
-        super().__init__(Awaited(_http(httpx2.AsyncClient, url, key, transport=transport)), url)
+        super().__init__(Awaited(_http(httpx2.AsyncClient, url, key, transport=transport)))
 
     async def __aenter__(self) -> Self:
         return self
@@ -161,7 +161,8 @@ class AsyncClient(_Service[Awaited]):
         await self.core.wire.http.aclose()
 
 
-def _http(kind: type[H], url: str, key: str | None, **options: Any) -> H:
+def _http(kind: type[H], url: str | None, key: str | None, **options: Any) -> H:
+    url = url or os.environ.get("SLRIG_URL") or URL
     key = key if key is not None else os.environ.get(KEY_VARIABLE) or None
     if key is not None and not (key.isascii() and key.isprintable()):
         message = (

@@ -29,6 +29,7 @@ PATIENCE_S = 30.0
 """How long a connection that broke is tried again before the service counts as gone."""
 
 _RETRY_S = 0.5
+_BUSY_TRIES = 20  # of a file that the service has no time to make: half a minute each
 _HEAD_END = b"\r\n\r\n"
 _LENGTH = b"content-length:"
 
@@ -38,10 +39,9 @@ W = TypeVar("W", bound="Blocking | Awaited")
 
 @dataclass(frozen=True, slots=True)
 class Core(Generic[W]):
-    """One service, over a wire. url : where it is."""
+    """One service, over a wire."""
 
     wire: W
-    url: str
 
     async def send(
         self,
@@ -65,11 +65,11 @@ class Core(Generic[W]):
         request = self.wire.http.build_request(method, path, params=params, headers=headers, **body)
         try:
             try:
-                response = await self.wire.send(request)
+                response = await self._sent(request)
             except (httpx2.ReadError, httpx2.RemoteProtocolError):
                 if not once:
                     raise
-                response = await self.wire.send(request)
+                response = await self._sent(request)
         except httpx2.TransportError as error:
             raise self._unreached(error) from error
         if response.status_code >= 400:
@@ -149,7 +149,7 @@ class Core(Generic[W]):
     @asynccontextmanager
     async def _opened(self, path: str, **request: Any) -> AsyncIterator[httpx2.Response]:
         """A streamed answer; closed at the end. Raises ServiceError where it is a refusal."""
-        response = await self.wire.send(self.wire.http.build_request("GET", path, **request), stream=True)
+        response = await self._sent(self.wire.http.build_request("GET", path, **request), stream=True)
         try:
             if response.status_code >= 400:
                 await self.wire.read(response)
@@ -158,10 +158,25 @@ class Core(Generic[W]):
         finally:
             await self.wire.shut(response)
 
+    async def _sent(self, request: httpx2.Request, *, stream: bool = False) -> httpx2.Response:
+        """The answer to a request. A service that says when to ask again, because it has no time to make a file now, is
+        asked again for some minutes.
+        """
+        tries = _BUSY_TRIES if request.method == "GET" else 1
+        while True:
+            tries -= 1
+            response = await self.wire.send(request, stream=stream)
+            later_s = response.headers.get("Retry-After", "") if response.status_code == 503 else ""
+            if not (later_s.isdecimal() and tries):
+                return response
+            await self.wire.shut(response)
+            await self.wire.pause(float(later_s))
+
     def _unreached(self, error: Exception) -> UnreachableError:
+        url = str(self.wire.http.base_url).rstrip("/")
         return UnreachableError(
-            f"The service at {self.url} cannot be reached ({error}). Start it with `slrig serve RIG`, or name another "
-            "with --url."
+            f"The service at {url} cannot be reached ({error}). Start it with `slrig serve RIG`, or name another with "
+            "--url."
         )
 
 

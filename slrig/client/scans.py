@@ -31,7 +31,7 @@ _COARSE = "coarse.glb"
 
 def _of_cloud(name: str, doc: str) -> Fetched[Any]:
     async def fetched(result: ScanResult[W]) -> Any:
-        return getattr(await result.of_camera(None), name)
+        return getattr(await result.of_camera(), name)
 
     return Fetched(fetched, f"{doc} Of the first camera; see `Cloud`.")
 
@@ -60,9 +60,9 @@ class ScanResult(Remote[W]):
     cause: Fetched[Bytes] = _of_cloud("cause", "(H, W) uint8.")
     causes: Fetched[tuple[str, ...]] = _of_cloud("causes", "Names of `cause`.")
 
-    async def of_camera(self, camera: str | None) -> Cloud:
-        """See `cloud`, which drives it."""
-        found = [name for name in self.files if name.startswith("points-")]
+    async def of_camera(self, camera: str | None = None) -> Cloud:
+        """The points of a camera; of the first one of the rig where none is named."""
+        found = [name for name in self.files if name.startswith("points-") and name.endswith(".npz")]
         if camera is None and len(found) > 1:
             # In the order of the rig.
             cameras = (await self._report())["cameras"]

@@ -157,7 +157,7 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Pa
     service = start(write_rig(tmp_path / "rig"))
     region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "least_contrast": 0.02}
     with service.client() as client:
-        scan = ended(client, client.start({"reconstruction": {"region": region}}))
+        scan = ended(client, client.scans.start(reconstruction={"region": region}))
     assert scan["state"] == "succeeded", scan
     page = visit(service, scan["links"]["self"][1:], size=(1280, 1100), ignored="404")
     page.get_by_text("a box, x -20 to 20, y -25 to 15, z -40 to 40 mm; contrasts above 2 %").wait_for()

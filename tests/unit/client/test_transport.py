@@ -208,6 +208,32 @@ def test_a_file_is_fetched_whole_or_not_at_all(kind: Kind, tmp_path: Path) -> No
 
 
 @both
+@pytest.mark.parametrize(("busy", "fetched"), [(2, True), (1000, False)])
+def test_a_file_that_has_to_wait_is_asked_for_again(
+    kind: Kind, tmp_path: Path, pauses: list[float], busy: int, fetched: bool
+) -> None:
+    asked: list[str] = []
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        asked.append(request.url.path)
+        if len(asked) <= busy:
+            return httpx2.Response(503, headers={"Retry-After": "5"}, json={"detail": "Another job is computed."})
+        return httpx2.Response(200, content=b"npz")
+
+    async def case() -> None:
+        await settled(client_of(kind, handler).fetch("/scan/1/points-left.npz", tmp_path / "points-left.npz"))
+
+    if fetched:
+        run(case())
+    else:
+        with pytest.raises(RefusedError, match="Another job is computed"):
+            run(case())
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"npz"] * fetched
+    assert pauses == [5.0] * (len(asked) - 1)
+    assert 2 < len(asked) < 50
+
+
+@both
 def test_pictures_come_as_arrays_however_the_stream_is_cut(kind: Kind) -> None:
     import io
 
