@@ -88,25 +88,35 @@ class Core(Generic[W]):
             return await self.wire.apart(lambda: decoded(response.content))
         return {"str": response.text, "bytes": response.content}.get(kind)
 
-    async def follow(self, path: str) -> AsyncGenerator[Event]:
+    def follow_all(self, path: str, **request: Any) -> AsyncGenerator[Event]:
+        """Yield what happens to all jobs, from now on or as the request says. See `follow`."""
+        return self.follow(path, seen=None, **request)
+
+    async def follow(self, path: str, *, seen: int | None = 0, **request: Any) -> AsyncGenerator[Event]:
         """Yield what happens to a job, from its first event to its last, whatever happens to the connection.
+
+        seen : number of the event to begin after; None: as the request says.
 
         Raises
         ------
         ServiceError
             The service is gone for longer than `PATIENCE_S`, or refuses.
         """
-        seen, waited_s = 0, 0.0
+        waited_s = 0.0
         while True:
-            headers = {"Last-Event-ID": str(seen), "Accept": "text/event-stream", "Cache-Control": "no-store"}
+            headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
+            if seen is not None:
+                headers["Last-Event-ID"] = str(seen)
             try:
-                async with self._opened(path, headers=headers) as response:
+                async with self._opened(path, headers=headers, **request) as response:
                     if response.status_code == 204:
                         return
                     async with aclosing(self.wire.events(response)) as events:
                         async for event in events:
                             waited_s, seen = 0.0, int(event.id)
-                            yield event_of(seen, event.event, json.loads(event.data))
+                            # One without data only says where the stream begins.
+                            if event.data:
+                                yield event_of(seen, event.event, json.loads(event.data))
             except (httpx2.SSEError, ValueError) as error:
                 raise foreign(response) from error
             except httpx2.TransportError as error:

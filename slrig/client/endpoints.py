@@ -318,6 +318,10 @@ class System(Remote[W]):
     open_session = entry("POST /session", _told, "Log in by a cookie, as a browser does.")
     close_session = entry("DELETE /session", _done, "Log out.")
 
+    @stream("GET /events", Core.follow_all)
+    def follow(self, *, after: int | None = None) -> Event:
+        """What happens to all jobs from now on; after=0 begins with the oldest event on record."""
+
     @endpoint("GET /session/link")
     def follow_link(self, token: str) -> None:
         """Log in by the link that `slrig serve` printed."""

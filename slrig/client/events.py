@@ -9,11 +9,12 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Event:
-    """Something that happened. number : rises from event to event. Of a kind that this client does not know, no more is
-    told.
+    """Something that happened. number : rises from event to event. job : whose it is, where all jobs are followed. Of a
+    kind that this client does not know, no more is told.
     """
 
     number: int
+    job: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +71,7 @@ def event_of(number: int, kind: str, data: Mapping[str, Any]) -> Event:
     """An event as it was sent.
 
     >>> event_of(3, "file", {"name": "mesh.ply"})
-    FileReady(number=3, name='mesh.ply')
+    FileReady(number=3, job=None, name='mesh.ply')
     """
     found = _KINDS.get(kind, Event)
     known = {field.name for field in fields(found)} - {"number"}

@@ -21,7 +21,7 @@ from slrig.client.errors import (
     UnauthorizedError,
     UnreachableError,
 )
-from slrig.client.events import Progress, StateChange
+from slrig.client.events import Captured, Progress, StateChange
 from slrig.errors import ConfigError, ServiceError, StorageError
 from tests.unit.client.service import URL, Broken, client_of, each, event_answer, run, settled, stream
 
@@ -97,6 +97,31 @@ def test_a_broken_stream_goes_on_after_the_last_event_seen(kind: Kind, pauses: l
         StateChange(number=3, state="succeeded"),
     ]
     assert asked == ["0", "2", "3"]
+    assert len(pauses) == 1
+
+
+@both
+def test_all_jobs_are_followed_from_where_the_stream_began(kind: Kind, pauses: list[float]) -> None:
+    asked: list[tuple[str, str | None]] = []
+
+    def handler(request: httpx2.Request) -> httpx2.Response:
+        asked.append((request.url.query.decode(), request.headers.get("Last-Event-ID")))
+        if len(asked) == 1:
+            # Where it begins, and nothing else before the connection breaks.
+            return event_answer(Broken(b"id: 41\n\n" + stream({"id": 42, "kind": "captured", "job": {"id": "5f"}})))
+        return event_answer(stream({"id": 50, "kind": "state", "state": "succeeded", "job": {"id": "5f"}}))
+
+    async def case() -> list[Any]:
+        found = []
+        async for event in each(client_of(kind, handler).system.follow(after=7)):
+            found.append(event)
+            if len(found) == 2:
+                break
+        return found
+
+    job = {"id": "5f"}
+    assert run(case()) == [Captured(number=42, job=job), StateChange(number=50, state="succeeded", job=job)]
+    assert asked == [("after=7", None), ("after=7", "42")]
     assert len(pauses) == 1
 
 
