@@ -14,8 +14,8 @@ from slrig.accept.evaluation import Reading, reading
 from slrig.accept.plan import AcceptancePlan, Step
 from slrig.accept.store import keep_points
 from slrig.accept.verdicts import AcceptanceResult, verdicts
-from slrig.bundle.storage import refusals_of
 from slrig.devices import Rig
+from slrig.disk import refusals_of
 from slrig.errors import (
     CalibrationError,
     InvalidInputError,

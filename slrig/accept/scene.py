@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from slrig.accept.plan import AcceptancePlan, Artefact, Step
-from slrig.bundle.storage import refusals_of, write_file
+from slrig.bundle.storage import write_file
 from slrig.config import HeadTable, RigConfig
+from slrig.disk import refusals_of
 from slrig.errors import UnsupportedByDeviceError, setting
 from slrig.model import FloatArray
 

@@ -21,8 +21,9 @@ import structlog
 
 from slrig.accept.evaluation import Evidence
 from slrig.accept.records import AcceptanceRecord, AcceptanceState, record_from_json, record_json
-from slrig.bundle.storage import refusals_of, write_file
+from slrig.bundle.storage import write_file
 from slrig.calibration.artefacts import Decision
+from slrig.disk import refusals_of
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder, remove

@@ -19,7 +19,8 @@ from slrig.bundle.description import CAMERA_NAME, DESCRIPTION
 from slrig.bundle.png import encode_frame
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.refused import FOLDER, LIST, Refused, RefusedEntry, RefusedList
-from slrig.bundle.storage import json_bytes, refusals_of, staging_name, sync_folder, write_durably
+from slrig.bundle.storage import json_bytes, sync_folder, write_durably
+from slrig.disk import refusals_of, staging_name
 from slrig.errors import BundleError, CalibrationError, StorageError
 from slrig.model import Calibration, CameraFormat, Capture, Pattern, Shot, Size
 

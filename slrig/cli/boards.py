@@ -8,9 +8,10 @@ from pathlib import Path
 
 import typer
 
-from slrig.bundle.storage import refusals_of, write_file
+from slrig.bundle.storage import write_file
 from slrig.calibration.board import USUAL_BOARD, Board, BoardKind
 from slrig.cli.options import BoardOptions
+from slrig.disk import refusals_of
 from slrig.errors import CalibrationError
 
 

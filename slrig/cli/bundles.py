@@ -17,8 +17,8 @@ import typer
 from rich.table import Column
 
 from slrig.bundle.description import DESCRIPTION, read_description
-from slrig.bundle.storage import refusals_of
 from slrig.cli.display import ProgressDisplay, print_table, progress_shown
+from slrig.disk import refusals_of
 from slrig.errors import ConfigError
 from slrig.failure import UNEXPECTED, failure_of
 from slrig.scan.artefacts import REPORT

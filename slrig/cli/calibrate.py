@@ -15,7 +15,7 @@ from slrig.cli.options import AsJson, BoardOptions, Service, by_beginning, group
 from slrig.errors import CalibrationNotFoundError, ConfigError, ServiceError
 
 if TYPE_CHECKING:
-    from slrig.cli.client import ServiceClient
+    from slrig.client import Client
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -347,11 +347,11 @@ def _unsolved(session: Mapping[str, Any]) -> str:
     return "imported, without its poses" if session["imported"] else f"{session['state']}; solve it first"
 
 
-def _path(client: ServiceClient, beginning: str) -> str:
+def _path(client: Client, beginning: str) -> str:
     return f"/calibration/{_whole_id(client, beginning)}"
 
 
-def _whole_id(client: ServiceClient, beginning: str) -> str:
+def _whole_id(client: Client, beginning: str) -> str:
     """The id of the one calibration whose id begins so. Raises CalibrationNotFoundError."""
     known = client.get("/calibration?limit=200")["calibrations"]
     none = "none; open one with: slrig calibrate run"

@@ -16,9 +16,9 @@ from rich.text import Text
 
 from slrig.calibration.board import Board
 from slrig.cli.calibration_screen import coverage_picture, outcome, refused, tell_next, tell_result
-from slrig.cli.client import ServiceClient
 from slrig.cli.demo import still_missing
 from slrig.cli.display import answered, progress_shown
+from slrig.client import Client
 from slrig.errors import CalibrationStateError, PoseRefusedError, ServiceError, SolveRefusedError
 
 FINAL = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
@@ -27,7 +27,7 @@ _STATES = {"queued": "waiting for the rig", "capturing": "shooting", "computing"
 _KEYS = "[bold]Enter[/bold] shoot   [bold]s[/bold] solve   [bold]d[/bold] drop the last   [bold]q[/bold] leave"
 
 
-def opened(client: ServiceClient, board: Board, *, label: str | None, projector: bool = True) -> dict[str, Any]:
+def opened(client: Client, board: Board, *, label: str | None, projector: bool = True) -> dict[str, Any]:
     """A new session for a board; without the projector, of the cameras alone. Raises ServiceError."""
     asked: dict[str, Any] = {
         "kind": str(board.kind),
@@ -42,7 +42,7 @@ def opened(client: ServiceClient, board: Board, *, label: str | None, projector:
 
 
 def walk(
-    client: ServiceClient,
+    client: Client,
     session: Mapping[str, Any],
     *,
     scripted: bool,
@@ -82,7 +82,7 @@ class Walk:
 
     def __init__(
         self,
-        client: ServiceClient,
+        client: Client,
         session: Mapping[str, Any],
         console: Console,
         *,

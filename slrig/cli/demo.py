@@ -18,10 +18,10 @@ import typer
 
 import slrig
 from slrig import KEY_VARIABLE
-from slrig.bundle.storage import refusals_of
-from slrig.cli.client import ServiceClient
 from slrig.cli.display import counted, progress_shown
 from slrig.cli.scan import scan_with, tell_result
+from slrig.client import Client
+from slrig.disk import refusals_of
 from slrig.errors import ConfigError, ServiceError
 from slrig.scan.plan import Progress
 
@@ -44,7 +44,7 @@ def run_demo(rig: Path | None, output: Path) -> None:
     key = secrets.token_urlsafe(32)
     with progress_shown() as display:
         display("starting the service", 0.0, str(rig))
-        with _service(rig, data, key) as process, ServiceClient(_url(process, data), key) as client:
+        with _service(rig, data, key) as process, Client(_url(process, data), key) as client:
             _await_ready(process, client, data, display)
 
             def shown(stage: str, fraction: float, detail: str) -> None:
@@ -107,7 +107,7 @@ def _url(process: subprocess.Popen[bytes], data: Path) -> str:
     return url
 
 
-def _await_ready(process: subprocess.Popen[bytes], client: ServiceClient, data: Path, display: Progress) -> None:
+def _await_ready(process: subprocess.Popen[bytes], client: Client, data: Path, display: Progress) -> None:
     deadline = time.monotonic() + START_LIMIT_S
     told = ""
     while (missing := still_missing(client)) is not None:
@@ -119,24 +119,25 @@ def _await_ready(process: subprocess.Popen[bytes], client: ServiceClient, data: 
         time.sleep(_POLL_S)
 
 
-def still_missing(client: ServiceClient) -> str | None:
+def still_missing(client: Client) -> str | None:
     """What the service's rig waits for, None once it is open. Raises ServiceError with what is wrong.
 
     The reconstruction is not waited for: its kernels are prepared while the frames are taken. How far they are is told.
     """
-    now = client.readiness()
-    if now is None:
+    try:
+        now = client.system.readiness()
+    except ServiceError:
         return "the service is starting"
-    found = now.checks.get("rig", "")
+    found: str = now["checks"].get("rig", "")
     if found == "ok":
         return None
-    if "rig" not in now.pending:
+    if "rig" not in now["pending"]:
         message = f"The rig cannot be opened: {found}"
         raise ServiceError(message)
-    return f"{found}; {now.checks.get('reconstruction', '')}" if "reconstruction" in now.pending else found
+    return f"{found}; {now['checks'].get('reconstruction', '')}" if "reconstruction" in now["pending"] else found
 
 
-def remove_earlier(client: ServiceClient, scan: Mapping[str, Any]) -> int:
+def remove_earlier(client: Client, scan: Mapping[str, Any]) -> int:
     """Delete the scans that earlier demos made with the same rig, and no others; return how many."""
     page: dict[str, Any] = {"next": "/scan?limit=200"}
     scans: list[dict[str, Any]] = []

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import typer
 
-from slrig.errors import SlrigError
+from slrig import KEY_VARIABLE
+from slrig.errors import ConfigError, SlrigError
 
 if TYPE_CHECKING:
-    from slrig.cli.client import ServiceClient
+    from slrig.client import Client
 
 RigFile = Annotated[Path, typer.Argument(metavar="RIG", help="Rig file; examples are in config/rigs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -29,11 +30,22 @@ class Service:
         Path | None, typer.Option(help="File that holds the service's API key. Default: the variable SLRIG_API_KEY.")
     ] = None
 
-    def client(self) -> ServiceClient:
+    def client(self) -> Client:
         """A client of it. Raises ConfigError."""
-        from slrig.cli.client import ServiceClient, read_key
+        from slrig.client import Client
 
-        return ServiceClient(self.url, read_key(self.key_file))
+        return Client(self.url, None if self.key_file is None else _read_key(self.key_file))
+
+
+def _read_key(file: Path) -> str:
+    """The API key that a file holds. Raises ConfigError."""
+    try:
+        return file.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        message = (
+            f"The API key cannot be read from {file}: {error}. Name the file that holds it, or set {KEY_VARIABLE}."
+        )
+        raise ConfigError(message) from error
 
 
 @dataclass(frozen=True, slots=True)

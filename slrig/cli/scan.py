@@ -10,23 +10,23 @@ from typing import Any
 import typer
 from rich.table import Column
 
-from slrig.bundle.storage import refusals_of
-from slrig.cli.client import ServiceClient
 from slrig.cli.display import print_table, progress_shown
 from slrig.cli.quality import quality_lines
+from slrig.client import Client, ScanJob
+from slrig.client.wire import Blocking
+from slrig.disk import refusals_of
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
 from slrig.scan.offered import PREFIXES, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
 """Of a scan's number in its series, which has at most 500."""
-_STATES = {"queued": "waiting for the rig", "capturing": "preparing the rig", "computing": "reconstructing"}
 
 FILES = ("mesh.ply", "preview.png", "report.json")
 
 
 def scan_with(
-    client: ServiceClient,
+    client: Client,
     request: Mapping[str, Any],
     output: Path,
     *,
@@ -46,12 +46,12 @@ def scan_with(
     """
     _require_offered(client, files)
     with progress_shown() if display is None else nullcontext(display) as told:
-        started = client.start(request)
-        return _completed(client, started, started["links"]["cancel"], output, files, told)
+        job = _started(client, request)
+        return _completed(client, job, job.scan["links"]["cancel"], output, files, told)
 
 
 def series_with(
-    client: ServiceClient,
+    client: Client,
     request: Mapping[str, Any],
     output: Path,
     *,
@@ -74,16 +74,16 @@ def series_with(
     failures: list[str] = []
     try:
         with progress_shown() if display is None else nullcontext(display) as told:
-            series = client.start(request)["links"]["series"]
-            scans = client.get(series)["scans"]
-            for number, started in enumerate(scans, 1):
+            job = _started(client, request)
+            series, scans = job.scan["links"]["series"], job.series()
+            for number, job in enumerate(scans, 1):
                 name = f"{number:0{_DIGITS}}"
 
                 def of_all(stage: str, fraction: float, detail: str, name: str = name) -> None:
                     told(f"{name} of {len(scans)}: {stage}", fraction, detail)
 
                 try:
-                    scan = _completed(client, started, f"{series}/cancel", output / name, files, of_all)
+                    scan = _completed(client, job, f"{series}/cancel", output / name, files, of_all)
                 except (ServiceError, ScanCancelledError) as error:
                     rows.append((name, "", "", str(error)))
                     failures.append(name)
@@ -99,38 +99,29 @@ def series_with(
         raise ServiceError(message)
 
 
+def _started(client: Client, request: Mapping[str, Any]) -> ScanJob[Blocking]:
+    # Whether it waits for the rig is as the request says, or the service.
+    return client.start_scan(**{"if_busy": None, **request})
+
+
 def _completed(
-    client: ServiceClient,
-    started: Mapping[str, Any],
+    client: Client,
+    job: ScanJob[Blocking],
     cancel: str,
     output: Path,
     files: Sequence[str],
     told: Callable[[str, float, str], None],
 ) -> dict[str, Any]:
     """Follow a scan to its end, fetch its files, and return it. cancel : what Ctrl-C asks for."""
-    fraction = 0.0
     try:
-        for event in client.follow(started):
-            if event["kind"] == "progress":
-                fraction = event["fraction"]
-                told(event["stage"], fraction, event["detail"])
-            elif event["kind"] == "state" and event["state"] in _STATES:
-                told(_STATES[event["state"]], fraction, "")
+        result = job.result(told)
     except KeyboardInterrupt:
         with suppress(ServiceError):
-            client.post(cancel, None)
+            client.post(cancel)
         raise
-    scan = client.get(started["links"]["self"])
-    if scan["state"] == "cancelled":
-        message = f"Scan {scan['id']} was cancelled by another client."
-        raise ScanCancelledError(message)
-    if scan["state"] != "succeeded":
-        message = f"Scan {scan['id']} {scan['state']}: {scan['error']['detail']}"
-        raise ServiceError(message)
-    offered = scan["links"]["files"]
-    missing = [name for name in files if name not in offered]
+    missing = [name for name in files if name not in result.files]
     if missing:
-        message = f"The scan has no {', '.join(missing)}. It has: {', '.join(offered)}."
+        message = f"The scan has no {', '.join(missing)}. It has: {', '.join(result.files)}."
         if any(name.endswith(".e57") for name in missing):
             message += " For E57, pip install 'slrig[e57]' where the service runs; the scan need not be repeated."
         raise ServiceError(message)
@@ -138,12 +129,12 @@ def _completed(
         output.mkdir(parents=True, exist_ok=True)
     for name in files:
         told(f"fetching {name}", 1.0, "")
-        client.fetch(offered[name], output / name)
+        result.save(name, output)
     told("done", 1.0, "")
-    return scan
+    return result.scan
 
 
-def _require_offered(client: ServiceClient, files: Sequence[str]) -> None:
+def _require_offered(client: Client, files: Sequence[str]) -> None:
     """Refuse names that no scan has before minutes are spent on one."""
     unknown, cameras = [name for name in files if name not in offered(())], []
     if unknown and all(name.startswith(PREFIXES) for name in unknown):

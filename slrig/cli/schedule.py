@@ -13,7 +13,7 @@ from slrig.cli.options import AsJson, Service, by_beginning, given, grouped
 from slrig.errors import ScheduleError, ScheduleNotFoundError
 
 if TYPE_CHECKING:
-    from slrig.cli.client import ServiceClient
+    from slrig.client import Client
 
 app = typer.Typer(no_args_is_help=True, help="Work for the rig at set times.")
 
@@ -171,11 +171,11 @@ def _options(told: list[str]) -> dict[str, Any]:
     return options
 
 
-def _path(client: ServiceClient, beginning: str) -> str:
+def _path(client: Client, beginning: str) -> str:
     return str(_chosen(client, beginning)["links"]["self"])
 
 
-def _chosen(client: ServiceClient, beginning: str) -> Mapping[str, Any]:
+def _chosen(client: Client, beginning: str) -> Mapping[str, Any]:
     """The schedule whose id begins so."""
     return by_beginning(client.get("/schedule")["schedules"], beginning, "schedule", ScheduleNotFoundError)
 

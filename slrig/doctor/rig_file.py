@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from slrig.bundle.faults import read_text
-from slrig.bundle.storage import refusals_of, staging_name, write_durably
+from slrig.bundle.storage import write_durably
 from slrig.config import MOST_CONFIG_BYTES, read_rig
+from slrig.disk import refusals_of, staging_name
 from slrig.doctor.advice import ExposureAdvice
 from slrig.doctor.doctor import Diagnosis
 from slrig.doctor.findings import Severity, ms

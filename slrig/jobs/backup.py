@@ -22,7 +22,8 @@ from typing import BinaryIO, Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tree
+from slrig.bundle.storage import sync_folder, sync_tree
+from slrig.disk import refusals_of, staging_name
 from slrig.errors import StorageError
 from slrig.jobs.data_folder import DATABASE, ORPHANS, SCANS
 from slrig.jobs.database import PATIENCE_S

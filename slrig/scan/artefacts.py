@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.bundle.storage import refusals_of, staging_name, sync_folder, sync_tree, write_file
+from slrig.bundle.storage import sync_folder, sync_tree, write_file
+from slrig.disk import refusals_of, staging_name
 from slrig.errors import InvalidInputError
 from slrig.model import FloatArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl

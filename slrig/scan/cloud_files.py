@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.reading import CALIBRATION
-from slrig.bundle.storage import refusals_of
+from slrig.disk import refusals_of
 from slrig.errors import InvalidInputError
 from slrig.jobs.data_folder import BUNDLE
 from slrig.model import Pinhole

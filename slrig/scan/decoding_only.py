@@ -16,7 +16,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from slrig.bundle.reading import read_capture
-from slrig.bundle.storage import refusals_of, write_file
+from slrig.bundle.storage import write_file
+from slrig.disk import refusals_of
 from slrig.errors import PatternError, setting
 from slrig.model import Axis, Capture, Gray, Refusal, without_missing_bits
 from slrig.patterns.positions import cell_positions, index_of_word

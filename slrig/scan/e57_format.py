@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from slrig.bundle.storage import refusals_of
+from slrig.disk import refusals_of
 from slrig.errors import ExtraMissingError, NothingToReconstructError, StorageError
 from slrig.scan.offered import extra_of
 from slrig.scan.organised import OrganisedCloud

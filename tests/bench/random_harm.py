@@ -108,10 +108,10 @@ def whole(service: ServiceProcess) -> list[str]:
     return faults
 
 
-def scanned(service: ServiceProcess, **asked: object) -> dict[str, Any]:
+def scanned(service: ServiceProcess, **asked: Any) -> dict[str, Any]:
     """A scan from its start to its end."""
     with service.client() as client:
-        scan = client.start({"if_busy": "queue", **asked})
-        for _ in client.follow(scan):
+        scan = client.scans.start(if_busy="queue", **asked)
+        for _ in client.follow(scan["links"]["events"]):
             pass
         return client.get(scan["links"]["self"])

@@ -59,11 +59,11 @@ def test_hundreds_of_scans_leave_nothing_behind(start: Start, tmp_path: Path, mo
     service = start(write_rig(tmp_path / "rig"), fresh=True)
     figures: list[Held] = []
     with service.client() as client:
-        pinned = ended(client, client.start({"label": "pinned"}))["links"]["self"]
-        client._http.put(f"{pinned}/pin").raise_for_status()
-        read = ended(client, client.start({"label": "being read"}))["links"]["self"]
+        pinned = ended(client, client.scans.start(label="pinned"))
+        client.scans.pin(pinned["id"])
+        read = ended(client, client.scans.start(label="being read"))["links"]["self"]
         for number in range(SCANS):
-            scan = ended(client, client.start({}))
+            scan = ended(client, client.scans.start())
             assert scan["state"] == "succeeded", scan
             # Somebody goes on reading this one.
             client.fetch(f"{read}/report.json", tmp_path / "report.json")
@@ -71,7 +71,7 @@ def test_hundreds_of_scans_leave_nothing_behind(start: Start, tmp_path: Path, mo
                 figures.append(Held.of(service))
                 print(number, figures[-1])  # noqa: T201 - figures of the bench
         kept = {each["links"]["self"] for each in client.get("/scan?limit=200")["scans"]}
-        for path in (pinned, read):
+        for path in (pinned["links"]["self"], read):
             assert path in kept
             client.fetch(f"{path}/mesh.ply", tmp_path / "mesh.ply")
     assert KEPT <= len(kept) <= KEPT + 2

@@ -88,11 +88,11 @@ def test_refused_records_poison_no_later_scan(start: Start, tmp_path: Path) -> N
         way, lasts_s = WAYS[number % len(WAYS)]
         plan = asked()
         with service.client() as client:
-            scan = client.start({"if_busy": "queue", **plan})
+            scan = client.scans.start(if_busy="queue", **plan)
             pause.wait(chance.uniform(0, 4.0))
             with way(service):
                 pause.wait(lasts_s or chance.uniform(0.2, 5.0))
-            for _ in client.follow(scan):
+            for _ in client.follow(scan["links"]["events"]):
                 pass
             scan = client.get(scan["links"]["self"])
         cause = "" if scan["error"] is None else scan["error"]["type"]

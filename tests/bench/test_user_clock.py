@@ -24,7 +24,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
+from slrig.client.events import Captured, FileReady, Progress, StateChange
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.scan.acquisition import capture_frames
@@ -79,22 +80,22 @@ class Clock:
 class Watched:
     """A scan that is followed; `until` goes on to the next event of a kind."""
 
-    def __init__(self, client: ServiceClient) -> None:
+    def __init__(self, client: Client) -> None:
         self.posted_s = time.perf_counter()
-        self.scan = client.start({})
-        self._events = client.follow(self.scan)
+        self.scan = client.scans.start()
+        self._events = client.follow(self.scan["links"]["events"])
         self._times: dict[str, float] = {}
         self._files: dict[str, float] = {}
 
     def until(self, state: str) -> None:
         for event in self._events:
             now = time.perf_counter()
-            if event["kind"] == "file":
-                self._files[event["name"]] = now
-            elif event["kind"] == "progress" and event["stage"] == "capture":
+            if isinstance(event, FileReady):
+                self._files[event.name] = now
+            elif isinstance(event, Progress) and event.stage == "capture":
                 self._times["captured"] = now
-            elif event["kind"] in {"state", "captured"}:
-                reached = event["state"] if event["kind"] == "state" else "free"
+            elif isinstance(event, StateChange | Captured):
+                reached = event.state if isinstance(event, StateChange) else "free"
                 self._times[reached] = now
                 if reached == state:
                     return
@@ -117,7 +118,7 @@ def processor_s(service: ServiceProcess) -> float:
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def warmed(client: ServiceClient) -> None:
+def warmed(client: Client) -> None:
     for _ in range(2):
         Watched(client).clock()
 
@@ -187,7 +188,7 @@ def test_viewers_do_not_slow_a_capture(start: Start, replayed: Path) -> None:
                     client.get("/rig")
                     over.wait(1.0)
                 else:
-                    for _ in client.follow(scan):
+                    for _ in client.follow(scan["links"]["events"]):
                         pass
                     return
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
 from tests.e2e.forking import ForkedCommand, worker_of
 from tests.npm import lacking
 
@@ -104,8 +104,8 @@ class ServiceProcess:
         assert " at http://" in greeting, self.log.read_text()
         self.url = greeting.split(" at ")[1].split(",")[0]
 
-    def client(self, key: str | None = KEY) -> ServiceClient:
-        return ServiceClient(self.url, key)
+    def client(self, key: str | None = KEY) -> Client:
+        return Client(self.url, key)
 
     def worker_id(self) -> int:
         """The process id of the reconstruction process."""

@@ -31,9 +31,9 @@ def test_backup_while_scans_run_restores_every_finished_scan(start: Start, tmp_p
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
     with first.client() as client:
-        scans = [client.start({"label": "first"}), *(client.start({"if_busy": "queue"}) for _ in range(3))]
+        scans = [client.scans.start(label="first"), *(client.scans.start(if_busy="queue") for _ in range(3))]
         # A third of a minute each however fast the machine is, so that no backup finds the last one ended.
-        scans += [client.start({"if_busy": "queue", "exposures_s": BRACKET, "patterns": BOTH}) for _ in range(4)]
+        scans += [client.scans.start(if_busy="queue", exposures_s=BRACKET, patterns=BOTH) for _ in range(4)]
         done = ended(client, scans[0])
         assert done["state"] == "succeeded"
         made = slrig("backup", tmp_path / "earlier", "--data", first.data, "--json")
@@ -67,7 +67,7 @@ def test_backup_while_scans_run_restores_every_finished_scan(start: Start, tmp_p
             assert files == contents(first.data / "scans" / scan)
         client.fetch(done["links"]["files"]["mesh.ply"], tmp_path / "mesh.ply")
         assert (tmp_path / "mesh.ply").read_bytes() == (first.data / "scans" / done["id"] / "mesh.ply").read_bytes()
-        assert ended(client, client.start({}))["state"] == "succeeded"
+        assert ended(client, client.scans.start())["state"] == "succeeded"
     assert second.stop() == 0
 
     mesh = tmp_path / "backup" / "data" / "scans" / done["id"] / "mesh.ply"

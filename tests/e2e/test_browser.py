@@ -138,7 +138,7 @@ def log_in(page: Page, service: ServiceProcess) -> None:
 def scanned(service: ServiceProcess) -> str:
     """The path of a scan that succeeded."""
     with service.client() as client:
-        scan = ended(client, client.start({}))
+        scan = ended(client, client.scans.start())
     assert scan["state"] == "succeeded"
     path: str = scan["links"]["self"]
     return path

@@ -10,7 +10,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
 from tests.e2e.conftest import KEY, ServiceProcess, Start
 
 SCENE = """
@@ -142,7 +142,7 @@ def write_rig(folder: Path, *, head: str = "", carries: str = "false") -> Path:
 def scanned(service: ServiceProcess) -> dict[str, Any]:
     """A scan once it is over."""
     with service.client() as client:
-        scan = client.start({})
+        scan = client.scans.start()
         following(client, scan)
         return client.get(scan["links"]["self"])
 
@@ -216,7 +216,7 @@ def test_pose_that_is_killed_is_swept_and_one_under_way_keeps_scans_out(start: S
         assert "Start it again" in found["error"]["detail"]
         caller.ready()
         with service.client() as client:
-            scan = client.start({})
+            scan = client.scans.start()
             refused = caller.post(made["links"]["pose"], 409, position=1)
             assert refused["holder"] == scan["id"]
             client.post(scan["links"]["cancel"], None)
@@ -247,7 +247,7 @@ def test_disk_that_is_full_during_a_pose_fails_it_and_no_other(start: Start, tmp
     assert service.stop() == 0
 
 
-def following(client: ServiceClient, scan: dict[str, Any]) -> None:
+def following(client: Client, scan: dict[str, Any]) -> None:
     """Wait until a scan is over."""
-    for _ in client.follow(scan):
+    for _ in client.follow(scan["links"]["events"]):
         pass

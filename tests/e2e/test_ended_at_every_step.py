@@ -93,7 +93,7 @@ def at(
         with running.client() as client:
             if step.name == "open":
                 hold.until_reached()
-            scan = client.start({}) if waiting is None else waiting
+            scan = client.scans.start() if waiting is None else waiting
         hold.until_reached()
         assert desk.was_lit() or step.name in DARK_STEPS
         yield running, scan

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
 from tests.e2e.conftest import ServiceProcess
 from tests.e2e.faulty_rig.desk import WAIT_S, Desk, Step
 from tests.e2e.faulty_rig.driver import PLAYER
@@ -98,7 +98,7 @@ class Stand:
 
     desk: Desk
     service: ServiceProcess
-    client: ServiceClient
+    client: Client
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_fault_ends_the_scan_and_nothing_else(stand: Stand, case: Case) -> None:
     desk.forget()
     for step, what in filter(None, (case.first, (case.step, case.what))):
         desk.fault(step, what)
-    record = ended(client, client.start({}))
+    record = ended(client, client.scans.start())
     answers = _is_dark(desk, case), _rig_tells(client, case)
     if case.step.name == "open":
         _check_unopened(scanned(client), case)
@@ -189,7 +189,7 @@ def _is_dark(desk: Desk, case: Case) -> str:
     return "dark"
 
 
-def _rig_tells(client: ServiceClient, case: Case) -> str:
+def _rig_tells(client: Client, case: Case) -> str:
     """What GET /rig says while the fault stays. A rig that opens again looks well: nobody can know better."""
     if case.what != UNPLUG and case.step.name != "open":
         return "/rig: opens again"

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from slrig.client.events import StateChange
 from tests.e2e.conftest import STOP_LIMIT_S, ServiceProcess
 from tests.e2e.faulty_rig.desk import Desk, Step
 from tests.e2e.faulty_rig.scenery import CAMERA_NAME
@@ -80,7 +81,7 @@ def test_disk_that_is_full_for_everything_is_on_record_once_it_is_not(service: S
     with service.client() as client:
         desk.forget()
         with desk.held(READ) as hold:
-            scan = client.start({})
+            scan = client.scans.start()
             hold.until_reached()
             limit = no_file_longer(service.process.pid, 0)
             limit.__enter__()
@@ -113,9 +114,9 @@ def test_ended_in_the_middle_of_the_reconstruction(service: ServiceProcess, desk
         alive = os.pidfd_open(worker)
         os.kill(worker, signal.SIGSTOP)
         with service.client() as client:
-            scan = client.start({})
-            for event in client.follow(scan):
-                if event.get("state") == "computing":
+            scan = client.scans.start()
+            for event in client.follow(scan["links"]["events"]):
+                if isinstance(event, StateChange) and event.state == "computing":
                     break
             assert not desk.lit
         service.process.send_signal(how)
@@ -129,7 +130,7 @@ def test_ended_in_the_middle_of_the_reconstruction(service: ServiceProcess, desk
         try:
             with service.client() as client:
                 # Nobody was told that it ended: it goes on.
-                for _ in client.follow(scan):
+                for _ in client.follow(scan["links"]["events"]):
                     pass
                 assert client.get(scan["links"]["self"])["state"] == "succeeded"
                 assert half_written(data) == []

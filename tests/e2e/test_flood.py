@@ -67,7 +67,7 @@ def test_a_scan_succeeds_beside_a_flood_of_connections(start: Start, tmp_path: P
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         address = (urlsplit(service.url).hostname, urlsplit(service.url).port)
         with service.client() as client:
-            scan = client.start({})
+            scan = client.scans.start()
             followed_to(client, scan, "capture")
             waits_s = []
             head = f"POST /scan HTTP/1.1\r\nHost: {address[0]}\r\nAuthorization: Bearer {KEY}\r\n"

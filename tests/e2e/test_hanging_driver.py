@@ -39,7 +39,7 @@ def service(tmp_path: Path, desk: Desk) -> Iterator[ServiceProcess]:
 
 def test_read_that_does_not_return_ends_the_scan(service: ServiceProcess, desk: Desk) -> None:
     with service.client() as client, desk.held(READ) as hold:
-        scan = client.start({})
+        scan = client.scans.start()
         hold.until_reached()
         assert desk.lit
         # A frame has 2 s; what takes more than twice that, and 5 s, does not keep its time-out.
@@ -50,9 +50,9 @@ def test_read_that_does_not_return_ends_the_scan(service: ServiceProcess, desk: 
             assert words in record["error"]["detail"]
         assert desk.light[-1] == ("blank", False)
         assert client.get("/rig")["error"] == record["error"]["detail"]
-        assert client.readiness() is not None
+        assert client.system.readiness() is not None
         with pytest.raises(ServiceError, match="has not come back from read"):
-            client.start({"if_busy": "queue"})
+            client.scans.start(if_busy="queue")
         hold.go.set()
         # Now that it has returned, the rig is opened afresh by itself.
         assert desk.came(PLAYER, "open")
@@ -68,7 +68,7 @@ def test_driver_that_does_not_return_cannot_hold_back_the_end(service: ServicePr
         with service.client() as client:
             if step.name == "open":
                 hold.until_reached()
-            scan = client.start({})
+            scan = client.scans.start()
         hold.until_reached()
         follower = Follower(service, scan)
         began_s = time.monotonic()

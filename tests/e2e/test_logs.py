@@ -12,7 +12,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from slrig import KEY_VARIABLE
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
+from slrig.client.events import StateChange
 from tests.e2e import talkative_service
 from tests.e2e.conftest import STOP_LIMIT_S
 
@@ -34,9 +35,11 @@ def test_all_lines_have_one_form(tmp_path: Path) -> None:
         with socket.create_connection((address.hostname, address.port), timeout=10) as malformed:
             malformed.sendall(f"GET\r\nAuthorization Bearer {KEY}\r\n\r\n".encode())
             assert malformed.recv(100).startswith(b"HTTP/1.1 400")
-        with ServiceClient(url, KEY) as client:
-            scan = client.start({"label": "one"})
-            assert [event["state"] for event in client.follow(scan)][-1] == "succeeded"
+        with Client(url, KEY) as client:
+            scan = client.scans.start(label="one")
+            *_, last = client.follow(scan["links"]["events"])
+            assert isinstance(last, StateChange)
+            assert last.state == "succeeded"
         process.send_signal(signal.SIGTERM)
         assert process.wait(STOP_LIMIT_S) == 1
     finally:

@@ -91,8 +91,8 @@ def test_service_holds_its_rig_and_ends_in_good_order(start: Start, tmp_path: Pa
     service = start(write_rig(tmp_path / "rig"), fresh=True)
     with service.client() as client:
         assert client.get("/livez")["checks"]
-        scan = client.start({})
-        states = [event.get("state") for event in client.follow(scan)]
+        scan = client.scans.start()
+        states = [getattr(event, "state", None) for event in client.follow(scan["links"]["events"])]
         assert states[-1] == "succeeded", service.log.read_text()
         assert [each["driver"] for each in client.get("/device")["elsewhere"]] == ["dlpc350", "dlpc900", "v4l2"]
     assert service.stop() == 0

@@ -17,7 +17,8 @@ import httpx2
 import pytest
 
 from slrig.api.calibration import MOST_IMPORT_BYTES
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
+from slrig.client.events import Progress
 from tests.e2e.conftest import KEY, ServiceProcess, write_rig
 from tests.e2e.test_survival import SLOW, ended
 from tests.npm import lacking
@@ -58,8 +59,8 @@ class Proxied:
     def http(self) -> httpx2.Client:
         return httpx2.Client(base_url=self.url, transport=self.transport(), timeout=30)
 
-    def client(self) -> ServiceClient:
-        return ServiceClient(self.url, KEY, transport=self.transport())
+    def client(self) -> Client:
+        return Client(self.url, KEY, transport=self.transport())
 
 
 @pytest.fixture(scope="module")
@@ -162,9 +163,9 @@ def proxied(
 
 def test_scan_is_followed_as_it_happens_and_its_files_come_whole(proxied: Proxied, tmp_path: Path) -> None:
     with proxied.client() as client, proxied.service.client() as direct:
-        scan = client.start({})
-        for event in client.follow(scan):
-            if event.get("stage") == "capture":
+        scan = client.scans.start()
+        for event in client.follow(scan["links"]["events"]):
+            if isinstance(event, Progress) and event.stage == "capture":
                 # A proxy that holds events back would give this one when the scan is over.
                 assert direct.get(scan["links"]["self"])["state"] == "capturing"
                 break

@@ -36,8 +36,8 @@ def scanned(start: Start, rig: Path, data: Path) -> Path:
     """Serve a rig, POST one scan; the folder of its files."""
     service = start(rig, data)
     with service.client() as client:
-        scan = client.start({})
-        for _ in client.follow(scan):
+        scan = client.scans.start()
+        for _ in client.follow(scan["links"]["events"]):
             pass
         record = client.get(scan["links"]["self"])
     assert record["state"] == "succeeded", record

@@ -34,7 +34,7 @@ def scanned(start: Start, folder: Path, projector: str) -> dict[str, dict[str, A
     reports: dict[str, dict[str, Any]] = {}
     with service.client() as client:
         for name, plan in PLANS.items():
-            record = ended(client, client.start(plan))
+            record = ended(client, client.scans.start(**plan))
             assert record["state"] == "succeeded", record["error"]
             reports[name] = json.loads((folder / "data" / "scans" / record["id"] / "report.json").read_text())
     assert service.stop() == 0

@@ -98,7 +98,7 @@ def test_schedule_finds_a_scan_at_the_rig_and_tries_again_within_its_grace(start
         made = caller.post(
             "/schedule", 201, cron="* * * * *", task="verification", enabled=False, options=options, retry_s=1
         )
-        scan = client.start({})
+        scan = client.scans.start()
         at_once(caller, service, made)
         waiting = awaited(lambda: newest(caller, made, "waiting"), "a run that waits")
         assert waiting["attempts"] >= 1

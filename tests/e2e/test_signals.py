@@ -58,13 +58,13 @@ def test_every_end_is_told_once_in_order_and_signed_through_a_kill(
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
     with first.client() as client, Caller(first) as caller:
-        done = ended(client, client.start({"label": "done"}))
+        done = ended(client, client.scans.start(label="done"))
         assert done["state"] == "succeeded"
-        cancelled = client.start({"label": "cancelled"})
+        cancelled = client.scans.start(label="cancelled")
         followed_to(client, cancelled, "capture")
         caller.post(cancelled["links"]["cancel"], 202)
         assert ended(client, cancelled)["state"] == "cancelled"
-        cut_off = client.start({"label": "cut off"})
+        cut_off = client.scans.start(label="cut off")
         followed_to(client, cut_off, "capture")
         # Nobody listened so far, and nothing was held up by that.
         assert waiting(caller) == 2
@@ -72,7 +72,7 @@ def test_every_end_is_told_once_in_order_and_signed_through_a_kill(
         first.kill()
     second = start(rig)
     with second.client() as client, Caller(second) as caller:
-        assert ended(client, client.start({"label": "later"}))["state"] == "succeeded"
+        assert ended(client, client.scans.start(label="later"))["state"] == "succeeded"
         assert waiting(caller) == 4
         receiver = hook()
         came = [receiver.next() for _ in range(4)]
@@ -80,7 +80,7 @@ def test_every_end_is_told_once_in_order_and_signed_through_a_kill(
         second.kill()
     third = start(rig)
     with third.client() as client, Caller(third) as caller:
-        assert ended(client, client.start({"label": "last"}))["state"] == "succeeded"
+        assert ended(client, client.scans.start(label="last"))["state"] == "succeeded"
         came.append(receiver.next())
         awaited(lambda: waiting(caller) == 0, "the end of the outbox")
         assert third.stop() == 0
@@ -112,7 +112,7 @@ def test_receiver_that_hangs_holds_up_neither_a_job_nor_the_end(
     receiver.gate.clear()
     with service.client() as client:
         for _ in range(2):
-            assert ended(client, client.start({}))["state"] == "succeeded"
+            assert ended(client, client.scans.start())["state"] == "succeeded"
         receiver.next()
         began_s = time.monotonic()
         assert service.stop() == 0
@@ -189,9 +189,9 @@ def test_all_jobs_are_followed_by_two_one_of_whom_comes_back(start: Start, tmp_p
     service = start(calibrated_rig(tmp_path / "rig"))
     with Caller(service) as caller, service.client() as client:
         caller.ready()
-        before = ended(client, client.start({"label": "before"}))
+        before = ended(client, client.scans.start(label="before"))
         oldest, newest = Follower(service, "/events?after=0"), Follower(service, "/events", leaves=True)
-        scan = client.start({"label": "cancelled"})
+        scan = client.scans.start(label="cancelled")
         followed_to(client, scan, "capture")
         caller.post(scan["links"]["cancel"], 202)
         assert newest.ended() is None
@@ -200,7 +200,7 @@ def test_all_jobs_are_followed_by_two_one_of_whom_comes_back(start: Start, tmp_p
         # The number in the header is the one that counts.
         back = Follower(service, "/events?after=0", newest.seen[-1][0])
         awaited(lambda: back.ends_of(verification["id"]), "the verification, later")
-        waiting_scan = client.start({"label": "cut off"})
+        waiting_scan = client.scans.start(label="cut off")
         followed_to(client, waiting_scan, "capture")
         own = caller.http.get(f"{before['links']['events']}", headers={"Last-Event-ID": "0"}).text
         began_s = time.monotonic()

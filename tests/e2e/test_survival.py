@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
+from slrig.client.events import Progress
 from slrig.errors import ServiceError
 from tests.e2e.conftest import STOP_LIMIT_S, Start, write_rig
 from tests.e2e.forking import ForkedCommand
@@ -24,18 +25,18 @@ pytestmark = pytest.mark.slow
 SLOW = "realtime = true"
 
 
-def followed_to(client: ServiceClient, scan: dict[str, Any], stage: str) -> None:
+def followed_to(client: Client, scan: dict[str, Any], stage: str) -> None:
     """Return once the scan has told of this stage or state."""
-    for event in client.follow(scan):
-        if stage in {event.get("stage"), event.get("state")}:
+    for event in client.follow(scan["links"]["events"]):
+        if stage in {getattr(event, "stage", None), getattr(event, "state", None)}:
             return
     message = f"the scan ended without {stage}"
     raise AssertionError(message)
 
 
-def ended(client: ServiceClient, scan: dict[str, Any]) -> dict[str, Any]:
+def ended(client: Client, scan: dict[str, Any]) -> dict[str, Any]:
     """The scan once it is over."""
-    for _ in client.follow(scan):
+    for _ in client.follow(scan["links"]["events"]):
         pass
     return client.get(scan["links"]["self"])
 
@@ -44,14 +45,14 @@ def test_a_terminal_that_is_closed_ends_it_in_good_order(start: Start, tmp_path:
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
     with first.client() as client:
-        scan = client.start({})
+        scan = client.scans.start()
         begun = threading.Event()
 
         def follow() -> None:
             try:
                 with first.client() as follower:
-                    for event in follower.follow(scan):
-                        if event.get("stage") == "capture":
+                    for event in follower.follow(scan["links"]["events"]):
+                        if isinstance(event, Progress) and event.stage == "capture":
                             begun.set()
             except ServiceError:
                 return
@@ -71,36 +72,36 @@ def test_a_terminal_that_is_closed_ends_it_in_good_order(start: Start, tmp_path:
 def test_killed_reconstruction_fails_its_scan_and_the_next_one_succeeds(start: Start, tmp_path: Path) -> None:
     service = start(write_rig(tmp_path / "rig"))
     with service.client() as client:
-        assert ended(client, client.start({}))["state"] == "succeeded"
+        assert ended(client, client.scans.start())["state"] == "succeeded"
         worker = service.worker_id()
         os.kill(worker, signal.SIGSTOP)
-        scan = client.start({})
+        scan = client.scans.start()
         followed_to(client, scan, "computing")
         os.kill(worker, signal.SIGKILL)
         record = ended(client, scan)
         assert record["state"] == "failed"
         assert record["error"]["type"] == "/problems/worker-lost"
         assert list(record["links"]["files"]) == ["bundle.zip"]
-        assert ended(client, client.start({}))["state"] == "succeeded"
+        assert ended(client, client.scans.start())["state"] == "succeeded"
 
 
 def test_a_kill_costs_the_scan_that_is_shot_and_none_that_is_reconstructed(start: Start, tmp_path: Path) -> None:
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
     with first.client() as client:
-        assert ended(client, client.start({}))["state"] == "succeeded"
+        assert ended(client, client.scans.start())["state"] == "succeeded"
         worker = first.worker_id()
         os.kill(worker, signal.SIGSTOP)
-        computed = [client.start({"label": "first"})]
+        computed = [client.scans.start(label="first")]
         followed_to(client, computed[0], "computing")
         # Not in line: the rig is free.
-        computed.append(client.start({"label": "second"}))
+        computed.append(client.scans.start(label="second"))
         followed_to(client, computed[1], "computing")
         assert client.get("/rig")["computing"] == [each["id"] for each in computed]
-        shot = client.start({"label": "third"})
-        for event in client.follow(shot):
+        shot = client.scans.start(label="third")
+        for event in client.follow(shot["links"]["events"]):
             # Long enough for the frames of the second to be a bundle.
-            if event["kind"] == "progress" and event["fraction"] > 0.25:
+            if isinstance(event, Progress) and event.fraction > 0.25:
                 break
         first.kill()
         os.kill(worker, signal.SIGKILL)
@@ -113,18 +114,18 @@ def test_a_kill_costs_the_scan_that_is_shot_and_none_that_is_reconstructed(start
             assert record["state"] == "succeeded", record
             assert (second.data / "scans" / scan["id"] / "mesh.ply").stat().st_size > 1000
         assert list((second.data / ".incoming").iterdir()) == []
-        assert ended(client, client.start({}))["state"] == "succeeded"
+        assert ended(client, client.scans.start())["state"] == "succeeded"
     assert second.stop() == 0
 
 
 def test_cancelled_scan_leaves_the_rig_ready(start: Start, tmp_path: Path) -> None:
     service = start(write_rig(tmp_path / "rig", head=SLOW))
     with service.client() as client:
-        scan = client.start({})
+        scan = client.scans.start()
         followed_to(client, scan, "capture")
         client.post(scan["links"]["cancel"], None)
         assert ended(client, scan)["state"] == "cancelled"
-        assert ended(client, client.start({}))["state"] == "succeeded"
+        assert ended(client, client.scans.start())["state"] == "succeeded"
 
 
 def test_rig_that_cannot_be_opened_as_its_file_is_ends_the_service_with_the_reason(tmp_path: Path) -> None:
@@ -168,8 +169,8 @@ def test_told_to_end_it_lets_the_scan_come_to_its_end_and_keeps_the_queue(
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
     with first.client() as client:
-        under_way = client.start({})
-        waiting = client.start({"if_busy": "queue"})
+        under_way = client.scans.start()
+        waiting = client.scans.start(if_busy="queue")
         followed_to(client, under_way, "capture")
         first.process.send_signal(signal.SIGTERM)
         # It is told to everybody while it comes to its end; right after that nobody answers any more.
@@ -179,7 +180,7 @@ def test_told_to_end_it_lets_the_scan_come_to_its_end_and_keeps_the_queue(
     with second.client() as client:
         assert client.get(under_way["links"]["self"])["state"] == "succeeded"
         assert ended(client, waiting)["state"] == "succeeded"
-        followed_to(client, client.start({}), "capture")
+        followed_to(client, client.scans.start(), "capture")
     # Told twice, it waits no longer.
     second.process.send_signal(signal.SIGTERM)
     second.process.send_signal(signal.SIGTERM)

@@ -9,7 +9,7 @@ import httpx2
 
 from slrig.api.calibration_schemas import CalibrationBody, CalibrationList, PoseBody
 from slrig.calibrate.pose_judging import summary
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
 from tests.unit.calibrate.solved import BOARD, solved_result
 
 ID = "3f6c1f6e-9f0e-4c57-8a39-5f8a4f0c2b11"
@@ -200,5 +200,5 @@ class Desk:
         return json.loads(json.dumps(session))  # type: ignore[no-any-return]
 
 
-def client_of(desk: Desk) -> ServiceClient:
-    return ServiceClient("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(desk))
+def client_of(desk: Desk) -> Client:
+    return Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(desk))

@@ -17,14 +17,14 @@ import pytest
 from typer.testing import CliRunner
 
 from slrig.api.schemas import ScanRequest
-from slrig.cli import client as client_module
-from slrig.cli.client import ServiceClient, read_key
 from slrig.cli.commands import INTERRUPTED, app
 from slrig.cli.demo import remove_earlier, still_missing
 from slrig.cli.display import ProgressDisplay, print_json, print_table
+from slrig.cli.options import Service
 from slrig.cli.quality import quality_lines
 from slrig.cli.scan import scan_with, series_with, tell_result
-from slrig.errors import ConfigError, ScanCancelledError, ServiceError, SlrigError
+from slrig.client import Client, ScanJob
+from slrig.errors import ScanCancelledError, ServiceError, SlrigError
 from slrig.scan.offered import MEDIA_TYPES
 
 SCAN = {
@@ -45,9 +45,9 @@ SCAN = {
 Handler = Callable[[httpx2.Request], httpx2.Response]
 
 
-def client_of(handler: Handler, pauses: list[float] | None = None) -> ServiceClient:
+def client_of(handler: Handler, pauses: list[float] | None = None) -> Client:
     pause = (lambda _s: None) if pauses is None else pauses.append
-    return ServiceClient("http://127.0.0.1:1", "key", pause=pause, transport=httpx2.MockTransport(handler))
+    return Client("http://127.0.0.1:1", "key", pause=pause, transport=httpx2.MockTransport(handler))
 
 
 def stream(*events: dict[str, Any]) -> bytes:
@@ -119,119 +119,21 @@ def test_devices_lists_the_rendered_rig_for_people_and_programs() -> None:
 
 
 def test_key_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def sent(key_file: Path | None) -> str | None:
+        with Service(key_file=key_file).client() as client:
+            return client.core.wire.http.headers.get("Authorization")
+
     monkeypatch.setenv("SLRIG_API_KEY", "from the environment")
-    assert read_key(None) == "from the environment"
+    assert sent(None) == "Bearer from the environment"
     (tmp_path / "key").write_text("from a file\n")
-    assert read_key(tmp_path / "key") == "from a file"
+    assert sent(tmp_path / "key") == "Bearer from a file"
     monkeypatch.delenv("SLRIG_API_KEY")
-    assert read_key(None) is None
-
-
-def test_request_carries_the_key_and_an_idempotency_key() -> None:
-    seen: list[httpx2.Request] = []
-
-    def handler(request: httpx2.Request) -> httpx2.Response:
-        seen.append(request)
-        if len(seen) == 1:
-            message = "the connection broke"
-            raise httpx2.ReadError(message)
-        return httpx2.Response(202, json=SCAN)
-
-    with client_of(handler) as client:
-        assert client.start({"label": "cup"})["id"] == "5f"
-    assert [request.headers["Authorization"] for request in seen] == ["Bearer key"] * 2
-    first, second = (request.headers["Idempotency-Key"] for request in seen)
-    assert first == second
-    assert json.loads(seen[1].content) == {"label": "cup"}
-
-
-def test_broken_stream_goes_on_after_the_last_event_seen() -> None:
-    asked: list[str] = []
-    pauses: list[float] = []
-
-    def cut() -> Iterator[bytes]:
-        yield stream({"id": 1, "kind": "state", "state": "queued"}, {"id": 2, "kind": "progress", "fraction": 0.5})
-        message = "the connection broke"
-        raise httpx2.ReadError(message)
-
-    def handler(request: httpx2.Request) -> httpx2.Response:
-        asked.append(request.headers["Last-Event-ID"])
-        if len(asked) == 1:
-            return event_answer(cut())
-        if len(asked) == 2:
-            return event_answer(stream({"id": 3, "kind": "state", "state": "succeeded"}))
-        return httpx2.Response(204)
-
-    with client_of(handler, pauses) as client:
-        events = list(client.follow(SCAN))
-    assert [event.get("state") for event in events] == ["queued", None, "succeeded"]
-    assert asked == ["0", "2", "3"]
-    assert len(pauses) == 1
-
-
-def test_service_that_stays_away_is_given_up() -> None:
-    pauses: list[float] = []
-
-    def handler(_request: httpx2.Request) -> httpx2.Response:
-        message = "refused"
-        raise httpx2.ConnectError(message)
-
-    with client_of(handler, pauses) as client, pytest.raises(ServiceError, match="slrig serve RIG"):
-        list(client.follow(SCAN))
-    assert sum(pauses) == pytest.approx(client_module.PATIENCE_S)
-
-
-def test_problem_is_told_with_every_fault() -> None:
-    problem = {
-        "status": 422,
-        "detail": "The request has 2 faults.",
-        "errors": [{"field": "exposure_s", "message": "too long"}, {"field": "if_busy", "message": "unknown"}],
-    }
-
-    def handler(_request: httpx2.Request) -> httpx2.Response:
-        return httpx2.Response(422, json=problem)
-
-    with client_of(handler) as client, pytest.raises(ServiceError) as refused:
-        client.start({})
-    assert str(refused.value).splitlines() == [
-        "The request has 2 faults.",
-        "  exposure_s: too long",
-        "  if_busy: unknown",
-    ]
-
-
-def test_another_program_on_the_port_is_recognised() -> None:
-    with (
-        client_of(lambda _request: httpx2.Response(404, text="<html>nginx</html>")) as client,
-        pytest.raises(ServiceError, match="Is another program listening there"),
-    ):
-        client.get("/scan")
-
-
-@pytest.mark.parametrize("url", ["http://[", "foo", "127.0.0.1:8731", "ftp://127.0.0.1", "http://"])
-def test_address_that_is_no_url_is_refused(url: str) -> None:
-    with pytest.raises(ConfigError, match=r"is no URL of a service: .*http://127\.0\.0\.1:8731"):
-        ServiceClient(url, None)
-
-
-@pytest.mark.parametrize("key", ["schlüssel", "two\nlines"])
-def test_key_that_cannot_be_sent_is_refused_by_its_name(key: str) -> None:
-    with pytest.raises(ConfigError, match="The API key holds a character that no key has") as refused:
-        ServiceClient("http://127.0.0.1:1", key)
-    assert "URL" not in str(refused.value)
-
-
-def test_refused_key_is_told_with_where_to_put_it() -> None:
-    with (
-        client_of(lambda _request: httpx2.Response(401, json={"detail": "another key"})) as client,
-        pytest.raises(ServiceError, match="another key\nSet SLRIG_API_KEY, or name its file with --key-file"),
-    ):
-        client.get("/scan")
+    assert sent(None) is None
 
 
 def ready_answer(status: int, rig: str, *pending: str) -> httpx2.Response:
     checks = {"rig": rig, "reconstruction": "preparing kernels, first time only: 3 of 56"}
-    return httpx2.Response(status, json={"checks": checks, "pending": [*pending, "reconstruction"]})
+    return httpx2.Response(status, json={"detail": "", "checks": checks, "pending": [*pending, "reconstruction"]})
 
 
 def test_demo_waits_for_the_rig_and_for_nothing_else() -> None:
@@ -309,7 +211,7 @@ def test_a_scan_asks_the_service_for_the_options_that_were_given(
 ) -> None:
     asked: list[dict[str, Any]] = []
 
-    def scanned(_client: ServiceClient, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
+    def scanned(_client: Client, request: dict[str, Any], _output: Path, **_: object) -> dict[str, Any]:
         asked.append(request)
         return SCAN
 
@@ -319,20 +221,6 @@ def test_a_scan_asks_the_service_for_the_options_that_were_given(
     assert asked[0]["reconstruction"] == wanted
     # The service understands what it is asked.
     assert ScanRequest.model_validate_json(json.dumps(asked[0])).reconstruction.model_dump(exclude_none=True) == wanted
-
-
-def test_file_is_fetched_whole_or_not_at_all(tmp_path: Path) -> None:
-    def cut() -> Iterator[bytes]:
-        yield b"half"
-        message = "the connection broke"
-        raise httpx2.ReadError(message)
-
-    with client_of(lambda _request: httpx2.Response(200, content=cut())) as client, pytest.raises(ServiceError):
-        client.fetch("/scan/5f/mesh.ply", tmp_path / "mesh.ply")
-    assert list(tmp_path.iterdir()) == []
-    with client_of(lambda _request: httpx2.Response(200, content=b"whole")) as client:
-        client.fetch("/scan/5f/mesh.ply", tmp_path / "mesh.ply")
-    assert [path.name for path in tmp_path.iterdir()] == ["mesh.ply"]
 
 
 class Walk:
@@ -457,10 +345,10 @@ def test_a_series_that_is_broken_off_is_cancelled_as_a_whole(tmp_path: Path, mon
         posted.extend([request.url.path] if request.method == "POST" else [])
         return httpx2.Response(202, json={**started, "scans": [started, started]})
 
-    def interrupted(_client: ServiceClient, _scan: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    def interrupted(_job: object, _told: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ServiceClient, "follow", interrupted)
+    monkeypatch.setattr(ScanJob, "result", interrupted)
     with client_of(answer) as client, pytest.raises(KeyboardInterrupt):
         series_with(client, {"repeat": 2}, tmp_path, display=ignore)
     assert posted == ["/scan", "/scan/series/9/cancel"]

@@ -12,8 +12,8 @@ import pytest
 
 from slrig.api.calibration_schemas import ComparisonBody
 from slrig.bundle import write_calibration, write_opencv_calibration
-from slrig.cli.client import ServiceClient
 from slrig.cli.options import Service
+from slrig.client import Client
 from tests.unit.calibrate.solved import solved_result
 from tests.unit.calibrate_command import refused, run
 from tests.unit.calibration_desk import ID, Desk
@@ -74,7 +74,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> list[httpx2.Request]:
     monkeypatch.setattr(
         Service,
         "client",
-        lambda _self: ServiceClient("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
+        lambda _self: Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
     )
     return asked
 
@@ -110,14 +110,14 @@ def test_check_tells_what_the_solve_kept_of_its_halves(kept: list[httpx2.Request
 
 
 def test_check_says_why_there_is_none(kept: list[httpx2.Request], monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = ServiceClient.get
+    whole = Client.get
     lacking: dict[str, Any] = {"result": None}
 
-    def get(client: ServiceClient, path: str) -> Any:
-        found = whole(client, path)
+    def get(client: Client, path: str) -> Any:
+        found = whole.__get__(client, Client)(path)
         return {**found, **lacking} if path.endswith(ID) else found
 
-    monkeypatch.setattr(ServiceClient, "get", get)
+    monkeypatch.setattr(Client, "get", get)
     assert "has no solve to check: it is solved" in run("check", ID).stderr
     lacking |= {"state": "solved", "imported": True}
     assert "it is imported, without its poses" in run("check", ID).stderr

@@ -16,9 +16,9 @@ from fastapi import FastAPI
 from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from slrig.cli.client import ServiceClient
 from slrig.cli.commands import app
 from slrig.cli.options import Service
+from slrig.client import Client
 from tests.unit.api.conftest import KEY, ServedBench
 from tests.unit.calibrate_command import refused
 
@@ -43,8 +43,8 @@ def reached(service: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
         kept = {"content-type": told.headers.get("content-type", "")}
         return httpx2.Response(told.status_code, content=told.content, headers=kept)
 
-    def client(_service: Service) -> ServiceClient:
-        return ServiceClient("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
+    def client(_service: Service) -> Client:
+        return Client("http://127.0.0.1:1", KEY, transport=httpx2.MockTransport(forward))
 
     monkeypatch.setattr(Service, "client", client)
     yield

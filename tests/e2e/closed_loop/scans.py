@@ -81,8 +81,8 @@ def served(start: Start, rig: Path, data: Path) -> Scanned:
     """Serve a rig, POST one scan, and wait for its end."""
     service = start(rig, data)
     with service.client() as client:
-        scan = client.start({})
-        for _ in client.follow(scan):
+        scan = client.scans.start()
+        for _ in client.follow(scan["links"]["events"]):
             pass
         record = client.get(scan["links"]["self"])
     assert record["state"] == "succeeded", f"{record}\n{service.log.read_text()[-3000:]}"

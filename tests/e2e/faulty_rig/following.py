@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
+from slrig.client.events import StateChange
 from slrig.errors import ServiceError
 from tests.e2e.conftest import KEY, ServiceProcess
 from tests.e2e.faulty_rig.desk import WAIT_S
@@ -30,11 +31,11 @@ class Follower:
         return self.states[-1]
 
     def _follow(self) -> None:
-        with ServiceClient(self._url, KEY, pause=_give_up) as client:
+        with Client(self._url, KEY, pause=_give_up) as client:
             try:
-                for event in client.follow(self._scan):
-                    if event["kind"] == "state":
-                        self.states.append(event["state"])
+                for event in client.follow(self._scan["links"]["events"]):
+                    if isinstance(event, StateChange):
+                        self.states.append(event.state)
                     self._began.set()
             except ServiceError:
                 # The stream broke off, or there is nothing more to connect to.

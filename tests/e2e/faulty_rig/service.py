@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from slrig.bundle import write_calibration
-from slrig.cli.client import ServiceClient
+from slrig.client import Client
 from tests.e2e.conftest import ServiceProcess
 from tests.e2e.faulty_rig import scenery
 from tests.e2e.faulty_rig.desk import Desk
@@ -73,16 +73,16 @@ def write_rig(folder: Path, desk: Desk, trigger: str) -> Path:
     return rig
 
 
-def ended(client: ServiceClient, scan: dict[str, Any]) -> dict[str, Any]:
+def ended(client: Client, scan: dict[str, Any]) -> dict[str, Any]:
     """The scan once it is over."""
-    for _ in client.follow(scan):
+    for _ in client.follow(scan["links"]["events"]):
         pass
     return client.get(scan["links"]["self"])
 
 
-def scanned(client: ServiceClient) -> dict[str, Any]:
+def scanned(client: Client) -> dict[str, Any]:
     """A scan from its start to its end."""
-    return ended(client, client.start({"if_busy": "queue"}))
+    return ended(client, client.scans.start(if_busy="queue"))
 
 
 def half_written(data: Path) -> list[str]:

@@ -59,7 +59,7 @@ def test_devices_are_shown_as_set_and_as_examined(start: Start, tmp_path: Path, 
     page.get_by_role("region", name="Plugged in").get_by_text("Installed drivers").wait_for()
     assert violations(page) == []
     with service.client() as client:
-        client.start({"exposure_s": 0.012})
+        client.scans.start(exposure_s=0.012)
     camera.get_by_text("12 ms", exact=True).wait_for()
     page.get_by_role("row").filter(has_text="POST /scan").get_by_text("202").wait_for()
     page.get_by_text("Logged in as environment").wait_for()

@@ -157,7 +157,7 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Pa
     service = start(write_rig(tmp_path / "rig"))
     region = {"box_mm": [[-20, -25, -40], [20, 15, 40]], "least_contrast": 0.02}
     with service.client() as client:
-        scan = ended(client, client.start({"reconstruction": {"region": region}}))
+        scan = ended(client, client.scans.start(reconstruction={"region": region}))
     assert scan["state"] == "succeeded", scan
     page = visit(service, scan["links"]["self"][1:], size=(1280, 1100), ignored="404")
     page.get_by_text("a box, x -20 to 20, y -25 to 15, z -40 to 40 mm; contrasts above 2 %").wait_for()
@@ -171,7 +171,7 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Pa
 def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Path, visit: Visit) -> None:
     service = start(write_rig(tmp_path / "rig", head="realtime = true"))
     with service.client() as client:
-        scan: str = client.start({"label": "a wrong one"})["links"]["self"]
+        scan: str = client.scans.start(label="a wrong one")["links"]["self"]
     page = visit(service, scan[1:], size=PHONE, dark=True)
     page.get_by_role("button", name="Stop it").click()
     page.get_by_text("The scan was stopped").wait_for()

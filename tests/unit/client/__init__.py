@@ -1,0 +1,1 @@
+"""The client, before a service that answers from a table."""
