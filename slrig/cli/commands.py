@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import sys
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,13 +22,6 @@ from slrig.cli.scan_options import ColourOptions
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
-
-
-class FurtherFormat(StrEnum):
-    """Formats of the mesh that are written only when they are asked for."""
-
-    STL = "stl"
-    OBJ = "obj"
 
 
 class _Commands(typer.core.TyperGroup):
@@ -192,13 +184,11 @@ def reconstruct(
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration to use in place of the bundle's calibration.json.")
     ] = None,
-    mesh_format: Annotated[
-        list[FurtherFormat] | None,
-        typer.Option("--format", help="Write the mesh in this format as well as PLY and GLB; may be repeated."),
-    ] = None,
     file: Annotated[
         list[str] | None,
-        typer.Option(help="Write this file, too, as points-CAMERA.npz; may be repeated. slrig scan has the same."),
+        typer.Option(
+            help="Write this, too, as mesh.stl or points-CAMERA.npz; may be repeated. slrig scan has the same."
+        ),
     ] = None,
     mesh: MeshOptions,
     decode_only: Annotated[
@@ -212,8 +202,7 @@ def reconstruct(
     if decode_only:
         decode_and_tell(bundles, output)
         return
-    further = [*(f"mesh.{each}" for each in mesh_format or ()), *(file or ())]
-    reconstruct_and_tell(bundles, output, calibration=calibration, further=further, options=mesh.chosen())
+    reconstruct_and_tell(bundles, output, calibration=calibration, further=file or (), options=mesh.chosen())
 
 
 @app.command()
