@@ -196,10 +196,7 @@ def reconstruct(
         list[FurtherFormat] | None,
         typer.Option("--format", help="Write the mesh in this format as well as PLY and GLB; may be repeated."),
     ] = None,
-    file: Annotated[
-        list[str] | None,
-        typer.Option(help="Write this file, too, as points-CAMERA.npz; may be repeated. slrig scan has the same."),
-    ] = None,
+    file: Annotated[list[str] | None, typer.Option(help="Write this, too, as points-CAMERA.npz; repeatable.")] = None,
     mesh: MeshOptions,
     decode_only: Annotated[
         bool,
