@@ -186,9 +186,7 @@ def reconstruct(
     ] = None,
     file: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Write this, too, as mesh.stl or points-CAMERA.npz; may be repeated. slrig scan has the same."
-        ),
+        typer.Option(help="Write this, too, as mesh.stl or points-CAMERA.npz; repeatable. slrig scan has the same."),
     ] = None,
     mesh: MeshOptions,
     decode_only: Annotated[

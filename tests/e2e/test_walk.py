@@ -51,7 +51,7 @@ def test_scan_of_the_rendered_rig_gives_a_mesh_whose_bundle_gives_it_again(
     with zipfile.ZipFile(output / "bundle.zip") as archive:
         archive.extractall(tmp_path / "bundle")
     again = tmp_path / "again"
-    formats = ["--format", "obj", "--format", "stl", "--file", "points-left.npz"]
+    formats = ["--file", "mesh.obj", "--file", "mesh.stl", "--file", "points-left.npz"]
     result = CliRunner().invoke(app, ["reconstruct", str(tmp_path / "bundle"), "--output", str(again), *formats])
     assert result.exit_code == 0, result.output
     assert f"obj       {again / 'mesh.obj'}" in result.stdout

@@ -103,7 +103,7 @@ def test_several_bundles_are_reconstructed_as_each_alone(
     monkeypatch.setattr("slrig.cli.reconstruct.prepare_kernels", lambda _: 0)
     alone, out = tmp_path / "alone", tmp_path / "out"
     assert run(scans / "scan-1", "--output", alone).exit_code == 0
-    result = run(scans / "scan-1", scans / "scan-2", "--output", out, "--format", "stl")
+    result = run(scans / "scan-1", scans / "scan-2", "--output", out, "--file", "mesh.stl")
     assert result.exit_code == 0, result.output
     triangles = json.loads((alone / "report.json").read_text())["mesh"]["figures"]["triangles"]
     for name in ("scan-1", "scan-2"):
