@@ -75,7 +75,7 @@ def serves(spec: Spec, described: Described) -> bool:
         return True
     folder, is_any, _ = spec.line.partition("{name}")
     here = f"{described.method} {described.path}"
-    return bool(is_any) and here.startswith(folder) and bool(re.fullmatch(r"[a-z{}-]+\.[a-z]+", here[len(folder) :]))
+    return bool(is_any) and here.startswith(folder) and bool(re.fullmatch(r"[a-z{}-]+\.[a-z0-9]+", here[len(folder) :]))
 
 
 def of(described: Described) -> str:
