@@ -22,7 +22,7 @@ import tifffile
 from slrig.bundle.frame_headers import BMP_SIGNATURE, JPEG_SIGNATURE, TIFF_SIGNATURES, Bitmap, Jpeg, tiff_page_count
 from slrig.bundle.png import COLOUR, FILTERS, GREY, HEADER, SIGNATURE, png_file, rows_above_added
 from slrig.errors import BundleError
-from slrig.model import CameraFormat, Pixels
+from slrig.model import CameraFormat, Pixels, Size
 
 TIFF_ZLIB = (8, 32946)  # compression: Adobe's deflate and the older one
 TIFF_COMPRESSIONS = (1, 5, *TIFF_ZLIB)  # none, LZW
@@ -84,6 +84,35 @@ def read_with_colour(
     grey = {page: _grey(path, page, image, camera) for page, image in images.items()}
     kept = {page: image for page, image in images.items() if page in coloured and image is not None and image.ndim == 3}
     return grey, {page: image for page, image in kept.items() if int(image.max()) <= camera.full_scale}
+
+
+def frame_format(path: Path) -> CameraFormat:
+    """Extent and bits of the samples, 8 or 16, of the first page of a frame file, by its header alone.
+    Raises BundleError: the file is missing or cut, or is none that `read_pages` reads.
+    """
+    data = _read_bytes(path)
+    try:
+        if data.startswith(SIGNATURE) and data[12:16] == b"IHDR" and len(data) >= 33:
+            width, height, bits = HEADER.unpack(data[16:29])[:3]
+        elif data.startswith(BMP_SIGNATURE):
+            bitmap = Bitmap.of(data)
+            width, height, bits = bitmap.width, bitmap.height, 8
+        elif data.startswith(JPEG_SIGNATURE):
+            jpeg = Jpeg.of(data)
+            width, height, bits = jpeg.width, jpeg.height, 8
+        elif data.startswith(TIFF_SIGNATURES):
+            tiff_page_count(data)
+            with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+                page = tiff.pages[0]
+                width, height, bits = page.imagewidth, page.imagelength, page.bitspersample
+        else:
+            raise ValueError(f"a file that begins with {data[:8]!r}")
+        if bits not in (8, 16):
+            raise ValueError(f"samples of {bits} bits")
+        return CameraFormat(Size(width, height), bits)
+    except TIFF_FAULTS as cause:
+        expected = "a whole PNG, TIFF, BMP or JPEG file of 8 or 16 bits"
+        raise BundleError(f"{path}: expected {expected}, found {cause}; save the frame as PNG") from cause
 
 
 def _refuse(path: Path, expected: str, found: str, remedy: str) -> NoReturn:

@@ -125,16 +125,7 @@ def _read_device(found: Value, path: Path, name: str) -> Pinhole:
     if not _is_side(width_px) or not _is_side(height_px):
         _refuse(path, f"whole numbers as extent of '{name}', from 1 to {MOST_SIDE_PX}", "something else",
                 "correct image_width and image_height")  # fmt: skip
-    distortion = _matrix(entries, "distortion_coefficients", path, name).ravel()
-    if distortion.size < 4 or distortion[5:].any():
-        _refuse(
-            path,
-            f"k1, k2, p1, p2 and at most k3 as distortion of '{name}'",
-            shorten(distortion[:14].tolist()),
-            "calibrate without the rational, thin prism and tilt models",
-        )
-    five = np.zeros(5)
-    five[: min(distortion.size, 5)] = distortion[:5]
+    five = five_terms(_matrix(entries, "distortion_coefficients", path, name), path, name)
     try:
         return Pinhole(
             Size(width_px, height_px),
@@ -145,6 +136,23 @@ def _read_device(found: Value, path: Path, name: str) -> Pinhole:
         )
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {name}.{cause}") from cause
+
+
+def five_terms(distortion: FloatArray, path: Path, name: str) -> FloatArray:
+    """(5,) float64: k1, k2, p1, p2 and k3 of OpenCV's coefficients, 4 or more.
+    Raises CalibrationError: there are fewer, or one beyond k3 is not 0.
+    """
+    found = distortion.ravel()
+    if found.size < 4 or found[5:].any():
+        _refuse(
+            path,
+            f"k1, k2, p1, p2 and at most k3 as distortion of '{name}'",
+            shorten(found[:14].tolist()),
+            "calibrate without the rational, thin prism and tilt models",
+        )
+    five = np.zeros(5)
+    five[: min(found.size, 5)] = found[:5]
+    return five
 
 
 def _is_side(value: Value) -> TypeGuard[int]:

@@ -291,14 +291,38 @@ def deactivate(calibration: CalibrationId, service: Service) -> None:
 @app.command()
 @grouped
 def export(
-    calibration: CalibrationId,
+    calibration: Annotated[
+        str, typer.Argument(metavar="ID_OR_FILE", help=f"{_ID_HELP} Or a file, or a folder as ROS has it.")
+    ],
     file: Annotated[
         Path,
         typer.Argument(metavar="FILE", help="File to write: .json, OpenCV's .yml or .xml, or the report as .html."),
     ],
+    to: Annotated[
+        Literal["slrig", "opencv", "ros", "kalibr"] | None,
+        typer.Option(help="Whose form. ros: a new folder of camera_info and transforms. Default: by the ending."),
+    ] = None,
+    *,
     service: Service,
 ) -> None:
-    """Write a calibration that a service keeps into a file."""
+    """Write a calibration of a service, or a file, into a file.
+
+    Reads and writes the forms of slrig, OpenCV, ROS and Kalibr.
+    """
+    if Path(calibration).exists() or to is not None:
+        import tempfile
+
+        from slrig.cli.foreign import write_form
+        from slrig.foreign.calibrations import read_any_calibration
+
+        with tempfile.TemporaryDirectory() as folder:
+            source = Path(calibration)
+            if not source.exists():
+                source = Path(folder) / "calibration.json"
+                with service.client() as client:
+                    _fetch(client, calibration, source.name, source)
+            write_form(read_any_calibration(source), file, to)
+        return
     name = FILES.get(file.suffix.lower())
     if name is None:
         message = (
@@ -307,32 +331,43 @@ def export(
         )
         raise ConfigError(message)
     with service.client() as client:
-        session = client.get(_path(client, calibration))
-        offered = session["links"]["files"]
-        if name not in offered:
-            has = f"It has: {', '.join(offered)}." if offered else f"It is {session['state']}; solve it first."
-            message = f"Calibration {session['id'][:8]} has no {name}. {has}"
-            raise ServiceError(message)
-        client.fetch(offered[name], file)
+        _fetch(client, calibration, name, file)
     typer.echo(f"{'written':<10}{file}")
+
+
+def _fetch(client: Client, calibration: str, name: str, file: Path) -> None:
+    """Write a file of a calibration that a service keeps. Raises CalibrationNotFoundError, ServiceError."""
+    session = client.get(_path(client, calibration))
+    offered = session["links"]["files"]
+    if name not in offered:
+        has = f"It has: {', '.join(offered)}." if offered else f"It is {session['state']}; solve it first."
+        message = f"Calibration {session['id'][:8]} has no {name}. {has}"
+        raise ServiceError(message)
+    client.fetch(offered[name], file)
 
 
 @app.command(name="import")
 @grouped
 def submit(
     *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Calibration: slrig's .json, or OpenCV's .yml or .xml.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="Calibration: slrig's .json, OpenCV's .yml or .xml, Kalibr's .yaml, a folder of ROS's."
+        ),
+    ],
     label: Annotated[str | None, typer.Option(help="Free text, to find the calibration again.")] = None,
     service: Service,
 ) -> None:
     """Give a service a calibration that was found elsewhere."""
     import tempfile
 
-    from slrig.bundle import read_calibration, write_calibration
+    from slrig.bundle import write_calibration
+    from slrig.foreign.calibrations import read_any_calibration
 
     with service.client() as client:
         # Looked at here first, so that faults are told by the file's name; one form travels, whichever the file has.
-        calibration = read_calibration(file)
+        calibration = read_any_calibration(file)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "calibration.json"
             write_calibration(path, calibration)

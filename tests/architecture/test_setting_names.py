@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 # What only a terminal shows: commands by hand, words to whoever starts the service, and what is printed on a board.
 OF_THE_COMMAND_LINE = (
     "slrig/cli", "slrig/api", "slrig/doctor", "slrig/jobs/data_folder.py", "slrig/jobs/database.py",
-    "slrig/calibration/boards/printing.py",
+    "slrig/calibration/boards/printing.py", "slrig/foreign",
     "drivers/screen/refusals.py",  # options of xrandr
 )  # fmt: skip
 # Programs that are not ours.

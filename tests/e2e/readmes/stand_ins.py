@@ -136,6 +136,14 @@ STAND_INS = (
         "cp -r board/service/scans/*/bundle board/bundle",
         "the demonstration keeps its bundle as a folder",
     ),
+    StandIn(
+        "slrig import teapot --projector 1024x768 --output teapot-bundle",
+        "mkdir teapot && cp scans/demo/service/scans/*/bundle/frames/left/00?.png "
+        "scans/demo/service/scans/*/bundle/frames/left/01[0-3].png scans/demo/service/scans/*/bundle/calibration.json "
+        "teapot && slrig import teapot --projector 256x192 --pattern 'white black columns' --cell-px 4 --camera left "
+        "--output teapot-bundle",
+        "the Gray code of the demonstration, in smaller pictures, takes the place of another program's images",
+    ),
     StandIn("pip install -e '.[test,bench]'", None, "would change the environment of the tests"),
     StandIn("pytest tests/bench/test_pipeline_speed.py -s", None, "measures speed: nothing else may run beside it"),
     StandIn("pytest tests/bench -s", None, "takes an hour, on a machine that does nothing else"),

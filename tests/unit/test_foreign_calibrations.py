@@ -1,0 +1,281 @@
+"""Calibrations of ROS, Kalibr and OpenCV's samples: what they say in metres and quaternions, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import httpx2
+import numpy as np
+import pytest
+import yaml
+
+from slrig.bundle import read_calibration, write_calibration
+from slrig.cli.options import Service
+from slrig.client import Client
+from slrig.errors import CalibrationError
+from slrig.foreign.calibrations import read_any_calibration, write_any_calibration
+from slrig.foreign.yaml_text import MOST_BYTES, read_yaml
+from slrig.model import Calibration, Pinhole, Size
+from tests.samples import sample_calibration
+from tests.strangers import harmed
+from tests.unit.calibrate_command import refused, run
+from tests.unit.calibration_desk import ID, Desk
+
+CAMCHAIN = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.2, 1e-05, 0.0, 2.5e-4]
+  distortion_model: radtan
+  intrinsics: [458.6, 457.2, 367.2, 248.3]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.0, -1.0, 0.0, -0.11]
+  - [1.0, 0.0, 0.0, 0.02]
+  - [0.0, 0.0, 1.0, 0.003]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0, 0, 0, 0]
+  distortion_model: radtan
+  intrinsics: [400, 400, 512, 384]
+  resolution: [1024, 768]
+  rostopic: /projector/image_raw
+"""
+INFO = """image_width: 640
+image_height: 480
+camera_name: head_camera
+camera_matrix: {rows: 3, cols: 3, data: [600.0, 0, 320.0, 0, 601.0, 240.0, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.1, -0.2, 0.001, 0.002, 0.03]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+projection_matrix: {rows: 3, cols: 4, data: [600.0, 0, 320.0, 0, 0, 601.0, 240.0, 0, 0, 0, 1, 0]}
+"""
+# The bar stands 1 m before the table and is turned by a quarter about z; the camera is 0.2 m along the bar's x.
+TRANSFORMS = """transforms:
+- header: {frame_id: table}
+  child_frame_id: bar
+  transform:
+    translation: {x: 0, y: 0, z: -1.0}
+    rotation: {x: 0, y: 0, z: 0.7071067811865476, w: 0.7071067811865476}
+- header: {frame_id: bar}
+  child_frame_id: left_optical_frame
+  transform:
+    translation: {x: 0.2, y: 0, z: 0}
+    rotation: {x: 0, y: 0, z: 0, w: 1}
+"""
+
+
+def written(path: Path, text: str) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def ros(folder: Path, **changed: str) -> Path:
+    for name, text in {"left": INFO, "transforms": TRANSFORMS, **changed}.items():
+        written(folder / f"{name}.yaml", text)
+    return folder
+
+
+def devices(calibration: Calibration) -> dict[str, Pinhole]:
+    assert calibration.projector is not None
+    return {**calibration.cameras, "projector": calibration.projector}
+
+
+def test_a_camchain_is_read_as_kalibr_means_it(tmp_path: Path) -> None:
+    found = read_any_calibration(written(tmp_path / "camchain.yaml", CAMCHAIN))
+    assert list(found.cameras) == ["cam0"]
+    assert found.projector is not None
+    assert found.cameras["cam0"].size == Size(752, 480)
+    assert found.cameras["cam0"].distortion.tolist() == [-0.2, 1e-05, 0.0, 2.5e-4, 0.0]
+    assert found.cameras["cam0"].matrix.tolist() == [[458.6, 0, 367.2], [0, 457.2, 248.3], [0, 0, 1]]
+    # A point 1 m before cam0, 100 mm to its right.
+    seen = found.projector.rotation @ [100.0, 0.0, 1000.0] + found.projector.translation_mm
+    assert np.allclose(seen, [-110.0, 120.0, 1003.0])
+
+
+def test_camera_infos_are_read_with_their_transforms(tmp_path: Path) -> None:
+    left = read_any_calibration(ros(tmp_path / "ros")).cameras["left"]
+    assert left.size == Size(640, 480)
+    assert left.distortion.tolist() == [0.1, -0.2, 0.001, 0.002, 0.03]
+    # The bar's x is the table's y: the camera is at (0, 0.2, -1) m, and what is at (0, 0.2, 0) is 1 m before it.
+    assert np.allclose(left.centre_mm, [0, 200, -1000])
+    assert np.allclose(left.rotation @ [0, 200, 0] + left.translation_mm, [0, 0, 1000], atol=1e-9)
+    assert np.allclose(left.rotation @ [0, 210, 0] + left.translation_mm, [10, 0, 1000], atol=1e-9)
+
+
+@pytest.mark.parametrize("form", ["opencv", "ros", "kalibr"])
+def test_what_is_written_reads_back(tmp_path: Path, form: Any) -> None:
+    calibration = sample_calibration()
+    if form == "kalibr":
+        without_k3 = {name: replace(each, distortion=each.distortion * [1, 1, 1, 1, 0])
+                      for name, each in devices(calibration).items()}  # fmt: skip
+        calibration = Calibration(without_k3, without_k3.pop("projector"))
+    path = tmp_path / {"opencv": "rig.yml", "ros": "rig", "kalibr": "rig.yaml"}[form]
+    write_any_calibration(path, calibration, form)
+    found, wanted = devices(read_any_calibration(path)), devices(calibration)
+    assert list(found) == list(wanted)
+    first = next(iter(wanted.values()))
+    for name, device in found.items():
+        assert device.size == wanted[name].size
+        assert np.array_equal(device.matrix, wanted[name].matrix)
+        assert np.array_equal(device.distortion, wanted[name].distortion)
+        for point in np.eye(3) * 300.0:
+            # Kalibr's world is the frame of its first camera.
+            there = first.rotation @ point + first.translation_mm if form == "kalibr" else point
+            assert np.allclose(
+                device.rotation @ there + device.translation_mm,
+                wanted[name].rotation @ point + wanted[name].translation_mm,
+                atol=1e-9,
+            )  # fmt: skip
+
+
+def test_opencvs_stereo_sample_is_of_two_cameras_or_of_a_camera_and_the_projector(tmp_path: Path) -> None:
+    path = tmp_path / "stereo.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    turn = cv2.Rodrigues(np.array([0.0, 0.1, 0.0]))[0]
+    values = (np.diag([50.0, 51, 1]), np.zeros((1, 5)), np.diag([60.0, 61, 1]), np.zeros((1, 8)), turn, np.ones((3, 1)))
+    for name, value in zip(("M1", "D1", "M2", "D2", "R", "T"), values, strict=True):
+        storage.write(name, value)
+    storage.release()
+    sizes = {"left": Size(40, 30), "right": Size(44, 33)}
+    both = read_any_calibration(path, cameras=sizes, projector=Size(32, 24))
+    assert {name: each.size for name, each in both.cameras.items()} == sizes
+    assert both.projector is None
+    one = read_any_calibration(path, cameras={"left": Size(40, 30)}, projector=Size(32, 24))
+    assert one.projector is not None
+    assert one.projector.matrix[0, 0] == 60
+    assert np.allclose(one.projector.rotation, turn)
+    with pytest.raises(CalibrationError, match="extents of its images, found one of OpenCV's sample"):
+        read_any_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("model: radtan", "model: equidistant", "found pinhole-equidistant"),
+        ("camera_model: pinhole", "camera_model: omni", "expected pinhole-radtan"),
+        ("[458.6, 457.2, 367.2, 248.3]", "[458.6, 457.2, 367.2]", "with 3 and 4"),
+        ("cam1:", "cam2:", "expected Kalibr's cam0, cam1"),
+        ("  rostopic: /cam0/image_raw\n", "  shutter: rolling\n", "cam0 is wrong:\n  shutter: unknown key"),
+        ("[0.0, -1.0, 0.0, -0.11]", "[0.0, -2.0, 0.0, -0.11]", "cam1.rotation"),
+        ("cam1:\n  T_cn_cnm1:", "cam1:\n  T_cam_imu:", "expected one for each but cam0"),
+        ("rostopic: /cam0/image_raw", "camera_model: pinhole", "expected each key once"),
+        ("intrinsics: [458.6, 457.2", "intrinsics: [.nan, 457.2", "finite number"),
+    ],
+)
+def test_a_camchain_that_is_wrong_is_refused(tmp_path: Path, before: str, after: str, words: str) -> None:
+    assert before in CAMCHAIN
+    path = written(tmp_path / "chain.yaml", CAMCHAIN.replace(before, after, 1))
+    with pytest.raises(CalibrationError) as caught:
+        read_any_calibration(path)
+    assert words in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"left": INFO.replace("plumb_bob", "equidistant")}, "expected the distortion plumb_bob"),
+        ({"left": INFO.replace("rows: 3, cols: 3, data: [600.0, 0,", "rows: 3, cols: 3, data: [0,")}, "expected 9"),
+        ({"left": INFO.replace("image_width: 640", "image_width: 640.5")}, "image_width"),
+        ({"right": INFO}, "expected a transform to the frame right or right_optical_frame"),
+        ({"transforms": TRANSFORMS.replace("table", "left_optical_frame")}, "found a circle"),
+        ({"transforms": TRANSFORMS.replace("{frame_id: bar}", "{frame_id: wall}")}, "table, wall"),
+        ({"transforms": TRANSFORMS.replace("w: 1}", "w: 2}")}, "quaternion of length 1"),
+        ({"transforms": TRANSFORMS.replace("child_frame_id: bar", "child_frame_id: left_optical_frame")}, "found two"),
+    ],
+)
+def test_a_folder_of_ros_that_is_wrong_is_refused(tmp_path: Path, changed: dict[str, str], words: str) -> None:
+    with pytest.raises(CalibrationError) as caught:
+        read_any_calibration(ros(tmp_path / "ros", **changed))
+    assert words in str(caught.value)
+
+
+def test_yaml_that_would_grow_is_refused_before_it_is_built(tmp_path: Path) -> None:
+    bomb = "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
+    for text, words in (
+        (bomb, "without anchors"),
+        ("[" * 10_000, "not deep in each other"),
+        ("a: !!python/object/apply:os.getcwd []", "python/object"),
+        ("a: [1", "at line 1"),
+        ("a: '" + "x" * MOST_BYTES + "'", f"at most {MOST_BYTES} bytes"),
+    ):
+        with pytest.raises(CalibrationError, match=words):
+            read_yaml(written(tmp_path / "rig.yaml", text))
+
+
+def test_a_harmed_file_is_read_or_refused(tmp_path: Path) -> None:
+    chance = random.Random(3)
+    good = [each.encode() for each in (CAMCHAIN, INFO, TRANSFORMS)]
+    outcomes = {"read": 0, "refused": 0}
+    for _ in range(300):
+        folder = ros(tmp_path / "ros")
+        number = chance.randrange(3)
+        data = harmed(good[number], good, chance)
+        path = tmp_path / "chain.yaml" if number == 0 else folder / ("left.yaml", "transforms.yaml")[number - 1]
+        path.write_bytes(data)
+        try:
+            read_any_calibration(path if number == 0 else folder)
+            outcomes["read"] += 1
+        except CalibrationError:
+            outcomes["refused"] += 1
+    assert min(outcomes.values()) > 8
+
+
+def test_a_lens_that_kalibr_lacks_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"without k3 and skew.* left, right, projector"):
+        write_any_calibration(tmp_path / "chain.yaml", sample_calibration(), "kalibr")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_converts_files(tmp_path: Path) -> None:
+    write_calibration(tmp_path / "rig.json", sample_calibration())
+    assert run("export", tmp_path / "rig.json", tmp_path / "rig", "--to", "ros").exit_code == 0
+    assert yaml.safe_load((tmp_path / "rig" / "left.yaml").read_text())["distortion_model"] == "plumb_bob"
+    assert run("export", tmp_path / "rig", tmp_path / "back.json").exit_code == 0
+    assert np.allclose(
+        read_calibration(tmp_path / "back.json").cameras["right"].rotation,
+        sample_calibration().cameras["right"].rotation,
+    )
+    assert "--to; found '.yaml'" in refused(run("export", tmp_path / "rig", tmp_path / "chain.yaml"))
+    assert "expected a new folder" in refused(run("export", tmp_path / "rig.json", tmp_path / "rig", "--to", "ros"))
+
+
+def test_the_command_converts_what_a_service_keeps_and_gives_it_what_it_reads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_calibration(tmp_path / "kept.json", sample_calibration())
+    desk = Desk()
+    desk.state = "solved"
+    session: Mapping[str, Any] = desk.session()
+    given: list[Any] = []
+
+    def answer(request: httpx2.Request) -> httpx2.Response:
+        path = request.url.path
+        if path == "/calibration":
+            return httpx2.Response(200, json={"calibrations": [session], "active": None})
+        if path == "/calibration/import":
+            given.append(json.loads(request.content))
+        if path.endswith("/calibration.json"):
+            return httpx2.Response(200, content=(tmp_path / "kept.json").read_bytes())
+        return httpx2.Response(200, json=session)
+
+    monkeypatch.setattr(
+        Service,
+        "client",
+        lambda _self: Client("http://127.0.0.1:1", "key", transport=httpx2.MockTransport(answer)),
+    )
+    assert run("export", ID[:8], tmp_path / "rig", "--to", "ros").exit_code == 0
+    assert set(devices(read_any_calibration(tmp_path / "rig"))) == {"left", "right", "projector"}
+    chain = written(tmp_path / "chain.yaml", CAMCHAIN)
+    assert run("import", chain).exit_code == 0
+    assert given[0]["projector"]["size_px"] == [1024, 768]
