@@ -79,6 +79,11 @@ def import_images(
     if len(asked) > 1 or ((white or black) and names is None):
         message = f"expected one of {', '.join(ways)}, and --white and --black with --names, found {', '.join(asked)}"
         raise ConfigError(message)
+    if program in ("scan3d", "slstudio") and (cell_px, offset_px) != (1, 0):
+        message = (
+            f"--format {program}: expected no --cell-px and --offset-px, which its order says itself; say --pattern"
+        )
+        raise ConfigError(message)
     naming = Naming(program or (None if asked else "opencv"), pattern, names, white, black, listed)
     code = Code(parse_size(projector), cell_px=cell_px, offset_px=offset_px)
     found, used = import_capture(

@@ -15,6 +15,7 @@ from slrig.bundle.description import MOST_CAMERA_PX
 from slrig.bundle.faults import read_text
 from slrig.bundle.images import frame_format, read_with_colour
 from slrig.bundle.writing import BundleWriter
+from slrig.disk import refusals_of
 from slrig.errors import BundleError
 from slrig.foreign.calibrations import read_any_calibration
 from slrig.foreign.layouts import (
@@ -72,7 +73,8 @@ def import_capture(
     names : of the cameras, in the natural order of what they are called in the folder. bit_depth : of samples in files
     of 16 bits. Raises BundleError, PatternError, CalibrationError: what was expected and found; StorageError.
     """
-    found = _found(folder, code, naming)
+    with refusals_of(folder):
+        found = _found(folder, code, naming)
     if names:
         if len(names) != len(found.cameras):
             have = ", ".join(found.cameras)

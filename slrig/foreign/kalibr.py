@@ -48,7 +48,9 @@ def read_kalibr(path: Path) -> Calibration:
     data = read_yaml(path)
     if not isinstance(data, dict) or not data or list(data) != [f"cam{number}" for number in range(len(data))]:
         found = ", ".join(map(str, list(data)[:5])) if isinstance(data, dict) and data else "no map"
-        raise CalibrationError(f"{path}: expected Kalibr's cam0, cam1 … in this order, found {found}; export it again")
+        raise CalibrationError(
+            f"{path}: expected Kalibr's cam0, cam1 … in this order, found {found}; of ROS name the folder"
+        )
     chain = [_entry(path, key, entry) for key, entry in data.items()]
     rotation, translation_mm = np.eye(3), np.zeros(3)
     devices = {}

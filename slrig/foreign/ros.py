@@ -8,6 +8,7 @@ whose transforms have one root are in one world, that of the root.
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from slrig.bundle.description import MOST_SIDE_PX
 from slrig.bundle.faults import Strict, explain, keys_of
-from slrig.bundle.storage import write_file
+from slrig.bundle.storage import sync_folder, write_durably
+from slrig.disk import refusals_of, staging_name
 from slrig.errors import CalibrationError
 from slrig.foreign.yaml_text import read_yaml, yaml_bytes
 from slrig.model import Calibration, FloatArray, Pinhole, Size
@@ -179,25 +181,36 @@ def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
 
 
 def write_ros(folder: Path, calibration: Calibration) -> None:
-    """Write a calibration as camera_info of each device and their transforms.
+    """Write a calibration as camera_info of each device and their transforms, the whole folder or nothing.
     Raises CalibrationError: a camera is called projector or transforms, or the folder is there already; StorageError.
     """
     if folder.exists() or {PROJECTOR, "transforms"} & set(calibration.cameras):
         raise CalibrationError(f"{folder}: expected a new folder, and no camera of the name {PROJECTOR} or transforms")
-    folder.mkdir(parents=True)
     devices = dict(calibration.cameras)
     if calibration.projector is not None:
         devices[PROJECTOR] = calibration.projector
     transforms: list[dict[str, Any]] = []
+    texts: dict[str, bytes] = {}
     for name, device in devices.items():
-        write_file(folder / f"{name}.yaml", yaml_bytes(_info(name, device)))
+        texts[f"{name}.yaml"] = yaml_bytes(_info(name, device))
         turn = Rotation.from_matrix(device.rotation.T).as_quat().tolist()
         pose = {
             "translation": dict(zip("xyz", (device.centre_mm / _MM_PER_M).tolist(), strict=True)),
             "rotation": dict(zip("xyzw", turn, strict=True)),
         }
         transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": pose})
-    write_file(folder / TRANSFORMS, yaml_bytes({"transforms": transforms}))
+    texts[TRANSFORMS] = yaml_bytes({"transforms": transforms})
+    staging = staging_name(folder)
+    with refusals_of(folder):
+        try:
+            staging.mkdir()
+            for file, text in texts.items():
+                write_durably(staging / file, text)
+            sync_folder(staging)
+            staging.rename(folder)
+            sync_folder(folder.parent)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
 
 def _info(name: str, device: Pinhole) -> dict[str, Any]:

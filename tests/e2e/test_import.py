@@ -310,6 +310,7 @@ def test_what_does_not_fit_is_refused_in_words(recorded: Callable[[str], Recorde
     refused(imported(whole, out, "--format", "slstudio"), "expected 10, 8, 16 images", "phase shifts are not read")
     refused(imported(whole, out, "--format", "scan3d", "--names", "{bit}.png"), "expected one of --format")
     refused(imported(whole, out, "--camera", "a", "--camera", "b"), "expected 1 names of cameras (cam0), found 2")
+    refused(imported(whole, out, "--format", "scan3d", "--cell-px", 2), "expected no --cell-px and --offset-px")
     refused(imported(tmp_path / "none", out), "expected a folder of images")
     (whole / "07.png").unlink()
     refused(imported(whole, out), "found 33 images")

@@ -247,6 +247,8 @@ def test_the_command_converts_files(tmp_path: Path) -> None:
         sample_calibration().cameras["right"].rotation,
     )
     assert "--to; found '.yaml'" in refused(run("export", tmp_path / "rig", tmp_path / "chain.yaml"))
+    assert "create the folder first" in refused(run("export", tmp_path / "rig", tmp_path / "no" / "x", "--to", "ros"))
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["back.json", "rig", "rig.json"]
     assert "expected a new folder" in refused(run("export", tmp_path / "rig.json", tmp_path / "rig", "--to", "ros"))
 
 
