@@ -38,6 +38,8 @@ _JSON_TYPES = frozenset({"application/json", "application/problem+json"})
 _BURST_S = 4.0
 """How many seconds' worth of requests may come at once: a page with its pictures."""
 _MOST_COUNTED = 1024
+_LOOK_AGAIN_S = 10.0
+"""How long a stream may go on that was begun with a key that has been revoked, or has expired, since then."""
 
 _log = structlog.get_logger(__name__)
 
@@ -93,17 +95,31 @@ class Access:
             await self._refuse(refusal, address, caller, method, path, scope, receive, send)
             return
         scope.setdefault("state", {})["caller"] = caller
-        status, made = 0, ""
+        status, made, is_stream, looked_s, is_over = 0, "", False, time.monotonic(), False
 
         async def noted(message: Message) -> None:
-            nonlocal status, made
+            nonlocal status, made, is_stream, looked_s, is_over
             if message["type"] == "http.response.start":
-                status, made = message["status"], Headers(raw=message.get("headers", [])).get("location", "")
+                kept = Headers(raw=message.get("headers", []))
+                status, made, is_stream = message["status"], kept.get("location", ""), "content-length" not in kept
+            elif is_stream and message.get("more_body") and time.monotonic() >= looked_s + _LOOK_AGAIN_S:
+                looked_s = time.monotonic()
+                try:
+                    self._caller(headers, path)
+                except Refused as refusal:
+                    is_over = True
+                    # To whoever makes the stream it is as if the client had gone.
+                    raise ConnectionAbortedError(str(refusal)) from refusal
             await send(message)
 
         name = ANYONE if caller is None else caller.name
-        with acting_as(name):
-            await self._app(scope, receive, noted)
+        try:
+            with acting_as(name):
+                await self._app(scope, receive, noted)
+        except Exception:
+            if not is_over:
+                raise
+            await send({"type": "http.response.body", "body": b"", "more_body": False})
         if method not in READING or path == LINK_PATH:
             await self._note(name, address, method, path, status, made)
 

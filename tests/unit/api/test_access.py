@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import asyncio
+from collections.abc import AsyncIterator, Iterator
 from datetime import timedelta
 from typing import Any
 
 import pytest
+from fastapi.responses import StreamingResponse
 from fastapi.testclient import TestClient
+from sse_starlette import EventSourceResponse
+from starlette.types import Receive, Send
+from starlette.types import Scope as ASGIScope
 
 from slrig.api import access
-from slrig.api.access import Rates, Refused
+from slrig.api.access import Access, Rates, Refused
 from slrig.api.app import bare_app, create_app
 from slrig.api.keys import KeyRing
 from slrig.api.scopes import READING, Scope, needed_scope
@@ -90,6 +95,44 @@ def test_a_key_that_is_over_opens_nothing(served: ServedBench, ring: KeyRing) ->
     assert mine.get("/scan").status_code == 200
     ring.revoke("Bob")
     assert mine.get("/scan").status_code == 401
+
+
+@pytest.mark.usefixtures("client")
+@pytest.mark.parametrize("answer", [EventSourceResponse, StreamingResponse])
+def test_a_stream_ends_with_the_key_that_began_it(
+    served: ServedBench, ring: KeyRing, monkeypatch: pytest.MonkeyPatch, answer: type[StreamingResponse]
+) -> None:
+    monkeypatch.setattr(access, "_LOOK_AGAIN_S", 0.0)
+    mine = ring.add("Ann", [])
+    made = []
+
+    async def endless() -> AsyncIterator[str]:
+        for number in range(1000):
+            if number == 3:
+                ring.revoke("Ann")
+            made.append(number)
+            yield f"part {number}"
+            await asyncio.sleep(0)
+
+    async def app(scope: ASGIScope, receive: Receive, send: Send) -> None:
+        await answer(endless())(scope, receive, send)
+
+    guarded = Access(app, ring=ring, sessions=sessions(served), audit=served.service.audit, per_second=1e6)
+    body = TestClient(guarded, base_url=HERE).get("/events", headers={"Authorization": f"Bearer {mine}"}).text
+    assert "part 2" in body
+    assert "part 3" not in body
+    assert len(made) < 10
+    # A defect of what makes the stream is none of the key's.
+    defective = Access(broken, ring=ring, sessions=sessions(served), audit=served.service.audit, per_second=1e6)
+    with pytest.raises(ZeroDivisionError):
+        TestClient(defective, base_url=HERE, headers={"X-API-Key": ring.add("Bob", [])}).get("/events")
+
+
+async def broken(_scope: ASGIScope, _receive: Receive, send: Send) -> None:
+    """An application that fails in the middle of a stream."""
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body", "body": b"part 0", "more_body": True})
+    raise ZeroDivisionError
 
 
 @pytest.mark.usefixtures("client")
