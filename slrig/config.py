@@ -16,7 +16,7 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, Setting
 
 from slrig.bundle.description import CameraName
 from slrig.bundle.faults import Strict, checked, explain, read_toml
-from slrig.bundle.region_file import RegionTable
+from slrig.bundle.region_file import RegionTable, with_masks
 from slrig.errors import ConfigError
 from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, bracket_fault
 
@@ -216,7 +216,11 @@ def read_rig(path: Path) -> RigConfig:
     ConfigError
         The file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one message.
     """
-    return rig_of(read_toml(path, MOST_CONFIG_BYTES), path)
+    data = read_toml(path, MOST_CONFIG_BYTES)
+    scan = data.get("scan")
+    if isinstance(scan, Mapping) and isinstance(scan.get("region"), Mapping):
+        data["scan"] = {**scan, "region": with_masks(scan["region"], path.parent)}
+    return rig_of(data, path)
 
 
 def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:

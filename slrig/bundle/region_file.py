@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
@@ -68,13 +69,23 @@ def read_region(path: Path) -> RegionTable:
     ConfigError
         The file cannot be read, or is no region, with every fault in one message.
     """
-    table = read_toml(path, MOST_REGION_BYTES)
+    return checked(RegionTable, with_masks(read_toml(path, MOST_REGION_BYTES), path.parent), str(path))
+
+
+def with_masks(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """What a file says of a region, with the masks that it names by their paths, from its own folder on, in it.
+    Raises ConfigError: one of them cannot be read.
+    """
     masks = table.get("masks")
-    if isinstance(masks, dict):
-        for camera, named in masks.items():
-            if isinstance(named, str) and named.lower().endswith(".png"):
-                masks[camera] = base64.b64encode(_bytes_of(path.parent / named)).decode()
-    return checked(RegionTable, table, str(path))
+    if not isinstance(masks, Mapping):
+        return dict(table)
+    read = {
+        camera: base64.b64encode(_bytes_of(folder / named)).decode()
+        if isinstance(named, str) and named.lower().endswith(".png")
+        else named
+        for camera, named in masks.items()
+    }
+    return {**table, "masks": read}
 
 
 def _bytes_of(path: Path) -> bytes:

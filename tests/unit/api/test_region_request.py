@@ -82,6 +82,11 @@ def test_a_request_comes_before_the_rig_file(client: TestClient, tmp_path: Path)
     request = ScanRequest.model_validate({"reconstruction": {"region": {"least_contrast": 0.1}}})
     assert scan_plan(request, usual).reconstruction.region == Region(least_contrast=0.1)
     assert scan_plan(ScanRequest(), ScanDefaults()).reconstruction.region is None
+    (tmp_path / "left.png").write_bytes(base64.b64decode(mask_of(20, 10)))
+    path.write_text(RIG + '[scan.region.masks]\nleft = "left.png"\n')
+    assert scan_plan(ScanRequest(), read_rig(path).scan).reconstruction.region == Region(
+        masks={"left": mask_of(20, 10)}
+    )
     path.write_text(RIG + "[scan.region]\ndepth_mm = [200, 100]\n")
     with pytest.raises(ConfigError, match=r"depth_mm: expected two rising numbers, found 200 and 100"):
         read_rig(path)
