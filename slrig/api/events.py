@@ -324,7 +324,7 @@ def _opened(
         ping=settings.keepalive_s,
         sep="\n",
         # At the end of the service all work ends, and its stream by that; without this the stream would end first.
-        shutdown_grace_period=settings.shutdown_s + _LAST_WORD_S,
+        shutdown_grace_period=settings.drain_s + settings.shutdown_s + _LAST_WORD_S,
     )
 
 

@@ -11,12 +11,13 @@ import threading
 from pathlib import Path
 from typing import Any
 
+import httpx2
 import pytest
 
 from slrig.client import Client
 from slrig.client.events import Progress
 from slrig.errors import ServiceError
-from tests.e2e.conftest import STOP_LIMIT_S, Start, write_rig
+from tests.e2e.conftest import KEY, STOP_LIMIT_S, Start, write_rig
 from tests.e2e.forking import ForkedCommand
 
 pytestmark = pytest.mark.slow
@@ -167,14 +168,19 @@ def test_told_to_end_it_lets_the_scan_come_to_its_end_and_keeps_the_queue(
 ) -> None:
     monkeypatch.setenv("SLRIG_DRAIN_S", "60")
     rig = write_rig(tmp_path / "rig", head=SLOW)
+    # A stream lives as long as the work that it follows, however little a stop may take besides.
+    monkeypatch.setenv("SLRIG_SHUTDOWN_S", "0.1")
     first = start(rig)
+    monkeypatch.delenv("SLRIG_SHUTDOWN_S")
     with first.client() as client:
-        under_way = client.scans.start()
+        under_way = client.scans.start(patterns={"line_shift_period_px": 32}, exposures_s=[0.004, 0.008, 0.016])
         waiting = client.scans.start(if_busy="queue")
         followed_to(client, under_way, "capture")
-        first.process.send_signal(signal.SIGTERM)
-        # It is told to everybody while it comes to its end; right after that nobody answers any more.
-        followed_to(client, under_way, "succeeded")
+        key = {"Authorization": f"Bearer {KEY}"}
+        with httpx2.stream("GET", f"{first.url}{under_way['links']['events']}", headers=key, timeout=60) as events:
+            first.process.send_signal(signal.SIGTERM)
+            # It is told to everybody while it comes to its end; right after that nobody answers any more.
+            assert '"succeeded"' in events.read().decode()
     assert first._gone(STOP_LIMIT_S) == 0
     second = start(rig)
     with second.client() as client:
