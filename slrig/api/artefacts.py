@@ -40,8 +40,7 @@ KnownTag = Annotated[str | None, Header(alias="If-None-Match", description="an E
 def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
     """Name to URL path of each file of a scan that can be fetched now."""
     if record.state is JobState.COMPUTING:
-        # One that is put in its place meanwhile has its files there: whoever asks once more is told of all.
-        names = _known_files(folder.result(record.id))
+        names = set().union(*map(_known_files, folder.places(record.id)))
     elif record.state.final and folder.owns(folder.scan(record.id)):
         names = _known_files(folder.scan(record.id))
         names |= clouds_of(folder, folder.scan(record.id), names)
@@ -128,7 +127,7 @@ def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | No
     """
     if record.state is not JobState.COMPUTING:
         return None
-    for place in (folder.result(record.id), folder.scan(record.id)):
+    for place in folder.places(record.id):
         with suppress(FileNotFoundError):
             return converted(folder.read(place / MESH), name) if name in ON_REQUEST else folder.read(place / name)
     return None

@@ -196,6 +196,12 @@ class DataFolder:
         """Where the files of a scan that is being reconstructed lie, once each is there."""
         return self.staging(scan_id) / _RESULT
 
+    def places(self, scan_id: UUID) -> tuple[Path, Path, Path]:
+        """Where a file of a scan that is being reconstructed may lie. `commit` moves it from one to the next: whoever
+        looks in this order finds it.
+        """
+        return self.result(scan_id), self.staging(scan_id), self.scan(scan_id)
+
     def hidden(self, scan_id: UUID) -> str:
         """What is left out of words that outlast the staging folder: where that lies."""
         return f"{self.staging(scan_id)}/"

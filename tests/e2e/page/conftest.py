@@ -11,7 +11,7 @@ from tests.e2e.conftest import KEY, ServiceProcess
 from tests.npm import npm_package
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page
+    from playwright.sync_api import Browser, ConsoleMessage, Locator, Page
 
 LIMIT_MS = 60_000
 DESK, PHONE = (1280, 800), (390, 844)
@@ -46,7 +46,11 @@ def visit(browser: Browser) -> Iterator[Visit]:
             if ignored is None or ignored not in what:
                 complaints.append(what)
 
-        page.on("console", lambda message: note(message.text) if message.type in {"error", "warning"} else None)
+        def heard(message: ConsoleMessage) -> None:
+            if message.type in {"error", "warning"}:
+                note(f"{message.text} ({message.location['url']})")
+
+        page.on("console", heard)
         page.on("pageerror", lambda error: note(str(error)))
         page.on("request", lambda request: note(request.url) if foreign(request.url, service.url) else None)
         if key is not None:
