@@ -33,6 +33,10 @@ camera about 10."""
 DESCRIPTORS_PER_CONNECTION = 2
 """Its socket, and a file that is sent through it."""
 
+NEWCOMERS = 32
+"""Connections beyond the most that wait for their request to be read while all others are being answered: a probe that
+comes just then is no stranger. They are taken from the kept descriptors."""
+
 WANTED_DESCRIPTORS = 4096
 """The soft limit that the service asks for; systems give 1024 unless asked. Enough for the most connections that the
 settings allow."""
@@ -74,12 +78,14 @@ class Room:
         return self._open.total()
 
     def enter(self, newcomer: Connection) -> None:
-        """Let a connection in, and have one make room for it where there is none: perhaps itself."""
+        """Let a connection in, and have one make room for it where there is none: itself if nobody else owes anything,
+        and `NEWCOMERS` wait already.
+        """
         self._open[newcomer.address] += 1
         self._owing[newcomer] = None
         if not is_loopback(newcomer.address) and self._open[newcomer.address] > self.most_per_address:
             self._make_room(each for each in self._owing if each.address == newcomer.address)
-        elif self.open > self.most:
+        elif self.open > self.most + NEWCOMERS or (self.open > self.most and next(iter(self._owing)) is not newcomer):
             self._make_room(iter(self._owing))
 
     def _make_room(self, candidates: Iterator[Connection]) -> None:

@@ -177,8 +177,12 @@ def test_a_request_under_way_never_makes_room() -> None:
     async def test() -> None:
         async with serving(LONG, most=4) as served:
             served.server.config.loaded_app = slow
+            # A probe that comes while all others are being answered is heard; more than a few are not.
             working = [await served.connect(GET) for _ in range(4)]
             await until(lambda: len(served.server.server_state.tasks) == 4)
+            for count in range(5, 5 + connections.NEWCOMERS):
+                working.append(await served.connect(GET))
+                await until(lambda count=count: len(served.server.server_state.tasks) == count)  # type: ignore[misc]
             refused, _ = await served.connect()
             assert b" 503 " in await refused.readline()
             release.set()
