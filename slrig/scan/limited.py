@@ -151,7 +151,6 @@ def _drawn(region: Region, name: str, size: Size) -> NDArray[np.bool_] | None:
     """(H, W) bool: where polygon and mask let a camera look; None where there are none."""
     drawn = np.full(size.shape, 255, dtype=np.uint8)
     if name in region.masks:
-        region.require_fits(dict.fromkeys(region.cameras, size))
         mask = cv2.imdecode(np.frombuffer(region.mask_png(name), dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
         if mask is None or mask.shape != size.shape:
             message = f"region.masks.{name}: the PNG cannot be read; save it again"

@@ -96,7 +96,7 @@ class ScanStream:
     PatternError
         The frames announced cannot be decoded, or tell no depth.
     ConfigError
-        Nothing of the region is in a camera's image.
+        The region names a camera that is not there, a mask of another extent, or nothing in a camera's image.
     """
 
     def __init__(
@@ -114,6 +114,8 @@ class ScanStream:
         devices = [calibration.cameras[name] for name in header.cameras]
         self.axis = axis or chosen_axis(header.axes, devices, calibration.projector)
         self.calibration = calibration
+        if region is not None:
+            region.require_fits({name: form.size for name, form in header.cameras.items()})
         self._cameras = {}
         for name, form in header.cameras.items():
             part = None

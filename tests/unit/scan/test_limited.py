@@ -205,6 +205,11 @@ def test_frames_that_came_live_give_the_same_bytes(scanned: Scanned) -> None:
     assert (again / "mesh.ply").read_bytes() == (recorded / "mesh.ply").read_bytes()
 
 
+def test_a_camera_that_is_not_there_is_no_region(scanned: Scanned) -> None:
+    with pytest.raises(ConfigError, match=r"names camera 'middle'; there are \['left'\]"):
+        scanned(Region(polygons_px={"middle": ((0.0, 0.0), (9.0, 0.0), (9.0, 9.0))}))
+
+
 def test_a_region_without_a_surface_and_one_out_of_sight_are_told_apart(scanned: Scanned) -> None:
     with pytest.raises(ConfigError, match="nothing of it is in the image of camera"):
         scanned(Region(box_mm=((5000.0, 0.0, 0.0), (5001.0, 1.0, 1.0))))
