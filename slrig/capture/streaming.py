@@ -67,7 +67,7 @@ class _Eye:
     """What is known of one camera. waiting : frames whose pattern is still shown, and what each says against itself."""
 
     skew_ns: int
-    cadence: Cadence = field(default_factory=Cadence)
+    cadence: Cadence
     last: Frame | None = None
     waiting: list[tuple[Frame, str | None]] = field(default_factory=list)
 
@@ -101,7 +101,10 @@ class _Stream:
         self._reader = reader
         self._clock = session.rig.clock
         self._eyes = {
-            name: _Eye(round(shutter_skew_s(camera, name, session.rig.synchronisation) * 1e9))
+            name: _Eye(
+                round(shutter_skew_s(camera, name, session.rig.synchronisation) * 1e9),
+                Cadence(applied.least_period_s if (applied := session.applied.get(name)) else None),
+            )
             for name, camera in session.rig.cameras.items()
         }
         self._showings: deque[_Showing] = deque()

@@ -61,3 +61,23 @@ def test_a_camera_that_counts_anew_is_learnt_anew() -> None:
         cadence.note(frame(number, number * PERIOD_NS))
     cadence.note(frame(0, 10**12))
     assert cadence.start_after(0) is None
+
+
+def test_one_frame_is_enough_where_a_camera_states_its_period() -> None:
+    cadence = Cadence(PERIOD_NS / 1e9)
+    assert cadence.start_after(0) is None
+    cadence.note(frame(0, 10**12))
+    foretold = cadence.start_after(10**12 + 2 * PERIOD_NS)
+    assert foretold is not None
+    start_ns, spare_ns = foretold
+    assert abs(start_ns - (10**12 + 3 * PERIOD_NS)) < 100  # the second may begin too early
+    assert abs(spare_ns - PERIOD_NS / 10) < 100
+
+
+def test_a_period_that_is_stated_wrongly_is_corrected_by_the_frames() -> None:
+    cadence = Cadence(PERIOD_NS / 2e9)
+    for number in range(3):
+        cadence.note(frame(number, 10**12 + number * PERIOD_NS))
+    foretold = cadence.start_after(10**12 + 20 * PERIOD_NS - 1_000)
+    assert foretold is not None
+    assert abs(foretold[0] - (10**12 + 20 * PERIOD_NS)) < 100
