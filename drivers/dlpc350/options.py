@@ -6,10 +6,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from drivers.pattern_engine.options import LightOptions
+from drivers.pattern_engine.options import UsbLightOptions
 
 
-class EngineOptions(LightOptions, use_attribute_docstrings=True):
+class EngineOptions(UsbLightOptions, use_attribute_docstrings=True):
     """The keys of a `[projector]` table with `driver = "dlpc350"`."""
 
     patterns: Annotated[str, Field(min_length=1)]

@@ -7,10 +7,10 @@ from typing import Annotated
 from pydantic import Field
 
 from drivers.dlpc900.timing import EDGES_US
-from drivers.pattern_engine.options import LightOptions
+from drivers.pattern_engine.options import UsbLightOptions
 
 
-class EngineOptions(LightOptions, use_attribute_docstrings=True):
+class EngineOptions(UsbLightOptions, use_attribute_docstrings=True):
     """The keys of a `[projector]` table with `driver = "dlpc900"`."""
 
     start_s: Annotated[float, Field(ge=0, le=1)] = 0.05

@@ -35,15 +35,10 @@ class LightOptions(Strict, use_attribute_docstrings=True):
     """The LEDs that patterns are lit with."""
 
     led_current: Share = 0.3
-    """Current of these LEDs, as a share of the board's most; used once led_current_inverted is known."""
+    """Current of these LEDs, as a share of the board's most."""
 
     led_current_limit: Share = 0.5
     """No more current than this, whatever led_current says."""
-
-    led_current_inverted: bool | None = None
-    """True where 255 switches an LED off and 0 gives it the most current, with the polarity register at "normal"; false
-    on boards that are built as TI's guides say. `slrig doctor` finds it out. Until it is written here, light is 5 % of
-    the board's most at the most, on average and whichever it is, and sequences are not played."""
 
     duty_limit: Share = 1.0
     """Light is on for no more than this share of the time while a sequence is played."""
@@ -55,7 +50,7 @@ class LightOptions(Strict, use_attribute_docstrings=True):
     """In a played sequence, light lasts this much longer than the exposure."""
 
     trigger_polarity: Literal["high", "low"] = "high"
-    """Which way TRIG_OUT_1 goes as the pattern's light begins: high, it rises; low, it falls."""
+    """Which way the trigger output goes as the pattern's light begins: high, it rises; low, it falls."""
 
     @model_validator(mode="after")
     def _within_limits(self) -> Self:
@@ -75,6 +70,15 @@ class LightOptions(Strict, use_attribute_docstrings=True):
     def colour_of(self, pattern: Pattern) -> Colour:
         """The LEDs that a pattern is lit with."""
         return Colour[pattern.colour.upper()] if isinstance(pattern, Primary) else self.colour
+
+
+class UsbLightOptions(LightOptions, use_attribute_docstrings=True):
+    """The same, of engines with a USB port."""
+
+    led_current_inverted: bool | None = None
+    """True where 255 switches an LED off and 0 gives it the most current, with the polarity register at "normal"; false
+    on boards that are built as TI's guides say. `slrig doctor` finds it out. Until it is written here, led_current is
+    not used: light is 5 % of the board's most at the most, on average and whichever it is, and nothing is played."""
 
     @property
     def current_byte(self) -> int:
