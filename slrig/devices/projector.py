@@ -92,14 +92,14 @@ class Projector(Protocol):
 
 @runtime_checkable
 class FlashedProjector(Projector, Protocol):
-    """A projector that shows only the patterns that a person put into its memory."""
+    """A projector that shows only the patterns that were put into its memory when a person asked for it."""
 
     def write_patterns(self, sequence: PatternSequence) -> str:
-        """Write files from which its memory is filled with these patterns, and return where they are and what to do.
+        """Fill its memory with these patterns, or write files for that, and return what was done and what is to do.
 
         `load` never writes them: what is tried only to see whether the projector takes it must not replace them.
         Raises UnsupportedByDeviceError: the patterns are for another size, or too many; DeviceError or StorageError:
-        the files cannot be written.
+        memory or files cannot be written.
         """
         ...
 

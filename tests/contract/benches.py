@@ -14,6 +14,7 @@ from slrig.model import Capture, PatternSequence, Size
 from slrig.patterns.sequence import encode, scan_patterns
 from tests.contract import (
     depthai_bench,
+    dlpc347x_bench,
     dlpc350_bench,
     dlpc900_bench,
     genicam_bench,
@@ -115,6 +116,7 @@ BENCHES: dict[str, Callable[[Path], Bench]] = {
     "gentl (a producer of our own)": gentl_bench.bench,
     "depthai (host-only)": depthai_bench.bench,
     "picamera2 (a stand-in for the library)": picamera2_bench.bench,
+    "dlpc347x": dlpc347x_bench.bench,
     "dlpc350": dlpc350_bench.bench,
     "dlpc900": dlpc900_bench.bench,
     "serial projector": serial_bench.bench,

@@ -30,6 +30,7 @@ CLASSES = {
     "depthai": {"usb_device"},
     "genicam": {"usb_device"},
     "gentl": {"usb_device"},
+    "dlpc347x": {"i2c"},
     "dlpc350": {"hidraw"},
     "dlpc900": {"hidraw"},
     "serial_projector": {"ttyACM", "ttyUSB", "ttyS", "ttyAMA"},
@@ -64,7 +65,8 @@ def test_every_driver_has_its_devices_in_the_unit_or_a_reason() -> None:
 
 def test_classes_are_there_before_their_first_device() -> None:
     modules = (DEPLOY / "slrig.modules").read_text(encoding="utf-8").splitlines()
-    by_module = {"video4linux": "videodev", "hidraw": "hid", "ttyACM": "cdc_acm", "ttyUSB": "usbserial"}
+    by_module = {"video4linux": "videodev", "hidraw": "hid", "i2c": "i2c-dev"}
+    by_module |= {"ttyACM": "cdc_acm", "ttyUSB": "usbserial"}
     built_in = {"usb_device", "ttyS", "ttyAMA"}
     assert set().union(*CLASSES.values()) == by_module.keys() | built_in
     assert {line for line in modules if line and not line.startswith("#")} == set(by_module.values())

@@ -13,7 +13,7 @@ from slrig.option_models import described_drivers, kinds_of, option_model
 
 SHIPPED = {
     *("depthai", "genicam", "gentl", "opencv", "picamera2", "v4l2"),
-    *("dlpc350", "dlpc900", "kms", "screen", "serial_projector"),
+    *("dlpc347x", "dlpc350", "dlpc900", "kms", "screen", "serial_projector"),
     *("replay", "simulated"),
 }
 

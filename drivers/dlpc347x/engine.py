@@ -1,0 +1,304 @@
+"""What the DLPC347x understands, in words: each method is one of its commands, with what it answers.
+
+Numbers, lengths and bits: the programmer's guides (DLPC3479: DLPU081B; DLPC3470 and DLPC3478: DLPU075B), and TI's own
+sources of 2019 (dlpc347x.c, in github.com/isabella232/LightField under dlp-4710/dlpc347x). Where both are known and
+contradict each other, the guide is followed, for it is later: an entry of the order has 25 bytes there and 24 in TI's
+source (the number of the first pattern was added), and the kind of flash data has 4 bytes and not 1.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from enum import IntEnum
+
+from drivers.dlpc347x.bus import Bus
+from drivers.dlpc347x.flash import HEAD, Place, size_of
+from drivers.pattern_engine.options import Colour
+from slrig.errors import DeviceError, UnsupportedByDeviceError
+
+
+class Command(IntEnum):
+    """Writes. That with the next number reads what was set."""
+
+    MODE = 0x05  # 4: patterns from flash
+    LED_CONTROL = 0x50  # 0: by the currents that are set
+    LED_ENABLE = 0x52  # bits 0-2 red, green, blue
+    LED_CURRENT = 0x54  # red, green, blue: 2 bytes each; more is more current ("directly controls the LED current")
+    TRIGGER_IN = 0x90  # bit 0: patterns wait for it
+    TRIGGER_OUT = 0x92  # bit 0: 2, not 1; bit 1 on; bit 2 inverted; delay (4, µs)
+    ORDER = 0x98
+    CONTROL = 0x9E  # 0 start, 1 stop; how often it is repeated
+    FLASH_KIND = 0xDE
+    FLASH_LENGTH = 0xDF
+    FLASH_ERASE = 0xE0
+    FLASH_WRITE = 0xE1  # and E2h for what follows
+
+
+class Read(IntEnum):
+    """Reads of what is not set."""
+
+    LED_MOST = 0x5D
+    LIGHT = 0x9D  # mode, depth, light (4, µs): bit 0 supported; least light, dark before, dark after (4 each, µs)
+    STATE = 0x9F  # ready, entries of the order, and five more
+    SHORT = 0xD0
+    SYSTEM = 0xD1
+    VERSION = 0xD2  # patch (2), minor, major
+    COMMUNICATION = 0xD3  # 2: of this bus
+    CONTROLLER = 0xD4
+    FLASH_CHECK = 0xDD  # bytes (4): 0 is well
+    FLASH = 0xE3  # and E4h for what follows
+
+
+INITIALISED, COMMUNICATION, SYSTEM, ERASING, FLASH, SEQUENCE, MAIN = (1 << bit for bit in (0, 1, 3, 4, 5, 6, 7))
+"""Bits of the short status."""
+REFUSALS = (
+    "it does not know the command",
+    "a parameter is not one that it has",
+    "it failed while it worked on it",
+    "a batch file failed",
+    "it could not answer",
+    "the command has more or fewer parameters in its firmware: update it to TI's latest",
+    "its bus timed out",
+)
+"""By bit of the communication status."""
+FAULTS = {
+    0: "its mirrors failed",
+    1: "the interface of its mirrors failed",
+    2: "the training of its mirrors failed",
+    11: "the red LED failed",
+    12: "the green LED failed",
+    13: "the blue LED failed",
+    16: "the sequence was aborted",
+    17: "the sequence failed",
+    18: "its supply is low",
+    29: "its watchdog ran out",
+}
+"""By bit of the system status' four bytes."""
+SEQUENCES = {
+    1: "it has no such light",
+    2: "the dark before the light is too short or too long",
+    3: "the dark after the light is too short or too long",
+    4: "it has no such delay of TRIG_OUT_1",
+    5: "it has no such delay of TRIG_OUT_2",
+    6: "its order has fewer entries",
+}
+"""By number in bits 19 to 23 of the system status."""
+READY_S, ERASED_S = 1.0, 20.0
+MOST_READ, MOST_WRITTEN = 256, 256
+"""Bytes of flash at once: 256 are read at the most, 1024 written; adapters on USB take fewer."""
+PATTERNS = bytes([0xD0, 0, 0, 0])
+"""The kind of flash data ("entire sensing pattern data", dlpc347x.h)."""
+_ENTRY = struct.Struct("<BBBQIIIB")
+_INTERNAL_MODE, _INTERNAL = 4, 1
+_ASK_AGAIN_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What the engine says of a light, µs."""
+
+    supported: bool
+    least_us: int
+    before_us: int
+    after_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """An entry of the order: patterns of a set from one on, lit alike, none of them inverted. Times in µs."""
+
+    place: Place
+    count: int
+    leds: int
+    light_us: int
+    before_us: int
+    after_us: int
+
+    @property
+    def packed(self) -> bytes:
+        """As it is read back; it is sent with one byte before it."""
+        return _ENTRY.pack(self.place.set, self.count, self.leds, 0, *astuple(self)[3:], self.place.index)
+
+    @property
+    def lasts_us(self) -> int:
+        """All its patterns together."""
+        return self.count * (self.before_us + self.light_us + self.after_us)
+
+
+class Engine:
+    """The controller behind a bus. Every method raises DeviceError and DeviceGoneError as the bus does."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._never = threading.Event()
+        self._repeats = 0
+
+    @property
+    def name(self) -> str:
+        """Words for it, for messages."""
+        return self._bus.name
+
+    def close(self) -> None:
+        """Let the bus go. Idempotent."""
+        self._bus.close()
+
+    def tell(self, command: int, data: bytes = b"") -> None:
+        """Send a command, and ask whether it was taken.
+        Raises UnsupportedByDeviceError, with what the engine says, if it was not; DeviceError if the engine failed.
+        """
+        self._bus.write(command, data)
+        short = self._short()
+        if short & COMMUNICATION:
+            told = self._bus.read(Read.COMMUNICATION, 2, b"\2")[0]
+            causes = "; ".join(words for bit, words in enumerate(REFUSALS) if told >> bit & 1) or f"{told:#04x}"
+            message = f"{self.name} does not take the command {command:02x}h {data.hex(' ')}: {causes}"
+            raise UnsupportedByDeviceError(message)
+        if short & (SYSTEM | SEQUENCE | FLASH):
+            raise self._fault(short)
+
+    def settle(self, command: Command, data: bytes, asked: bytes = b"", *, read: bytes | None = None) -> None:
+        """Set something, and compare what is read back. asked : what the read is sent; read : what it should give.
+        Raises UnsupportedByDeviceError if that is something else.
+        """
+        wanted = data if read is None else read
+        self.tell(command, data)
+        got = self._bus.read(command + 1, len(wanted), asked)
+        if got != wanted:
+            name = command.name.lower().replace("_", " ")
+            message = f"{self.name}: asked for {name} {wanted.hex(' ')}, the engine gives {got.hex(' ')}; "
+            raise UnsupportedByDeviceError(message + "switch it off and on, and update its firmware to TI's latest")
+
+    def wait_until_initialised(self, timeout_s: float) -> None:
+        """Return when the main program takes commands. What was wrong before is forgotten."""
+        self._wait(INITIALISED | MAIN, INITIALISED | MAIN, timeout_s, "finish its initialisation")
+        # Errors are told once, by whoever reads them (DLPU075B, "Read System Status").
+        self._bus.read(Read.COMMUNICATION, 2, b"\2")
+        self._bus.read(Read.SYSTEM, 4)
+
+    def controller(self) -> int:
+        """The number of its kind."""
+        return self._bus.read(Read.CONTROLLER, 1)[0]
+
+    def version(self) -> str:
+        """Of its firmware."""
+        patch, minor, major = struct.unpack("<HBB", self._bus.read(Read.VERSION, 4))
+        return f"{major}.{minor}.{patch}"
+
+    def take_patterns_from_flash(self) -> None:
+        """Choose the mode. Patterns wait for nobody."""
+        self.settle(Command.MODE, bytes([_INTERNAL_MODE]))
+        self.settle(Command.TRIGGER_IN, b"\0")
+
+    def set_current(self, share: float) -> None:
+        """Set the current of every LED, as a share of its most, which stands in the engine's flash."""
+        most = struct.unpack("<3H", self._bus.read(Read.LED_MOST, 6))
+        self.settle(Command.LED_CONTROL, b"\0")
+        self.settle(Command.LED_CURRENT, struct.pack("<3H", *(round(share * each) for each in most)))
+
+    def set_trigger_out(self, *, active_low: bool, delay_us: int) -> None:
+        """Set TRIG_OUT_2, which is on while a pattern is lit; TRIG_OUT_1, of whole sets, is off."""
+        for number, on, late in ((0, False, 0), (1, True, delay_us)):
+            inverted = on and active_low
+            sent, got = (
+                struct.pack("<Bi", flags, late) for flags in (number | on << 1 | inverted << 2, on | inverted << 1)
+            )
+            self.settle(Command.TRIGGER_OUT, sent, bytes([number]), read=got)
+
+    def light(self, leds: Colour, light_us: int) -> Light:
+        """Ask whether a pattern of 1 bit can be lit for so long, and what dark that takes."""
+        depth = int(leds is Colour.WHITE)
+        told = self._bus.read(Read.LIGHT, 13, struct.pack("<BBI", _INTERNAL, depth, light_us))
+        return Light(bool(told[0] & 1), *struct.unpack_from("<3I", told, 1))
+
+    def order(self, entries: Sequence[Entry], repeats: int) -> None:
+        """Set what `start` shows: these, and so many times again. Whether "again" counts the first, nobody says."""
+        for number, entry in enumerate(entries):
+            self.tell(Command.ORDER, bytes([number == 0]) + entry.packed)
+        for number, entry in enumerate(entries):
+            got = self._bus.read(Command.ORDER + 1, _ENTRY.size, bytes([number]))
+            if got != entry.packed:
+                message = f"{self.name}: entry {number} was {entry.packed.hex(' ')}, the engine gives {got.hex(' ')}"
+                raise UnsupportedByDeviceError(message + "; update its firmware to TI's latest")
+        self._repeats = repeats
+        until = time.monotonic() + READY_S
+        while (told := self._bus.read(Read.STATE, 7))[0] != 1 or told[1] != len(entries):
+            if time.monotonic() > until:
+                message = f"{self.name} is not ready for {len(entries)} entries, and says {told.hex(' ')}"
+                raise DeviceError(message + "; switch it off and on, and write its flash: slrig patterns RIG")
+            self._never.wait(_ASK_AGAIN_S)
+
+    def leds(self, *, by_sequence: bool) -> None:
+        """Let the sequence switch the LEDs, or switch them all off; compare what is read back."""
+        self.settle(Command.LED_ENABLE, bytes([7 if by_sequence else 0]))
+
+    def start(self) -> None:
+        """Start what was ordered."""
+        self.tell(Command.CONTROL, bytes([0, self._repeats]))
+
+    def stop(self) -> None:
+        """Stop it."""
+        self.tell(Command.CONTROL, b"\1\0")
+
+    def flash(self) -> bytes:
+        """Return the block of patterns in its flash; empty where there is none."""
+        self.tell(Command.FLASH_KIND, PATTERNS)
+        size = size_of(head) if len(head := self._read_flash(HEAD)) == HEAD else 0
+        if not HEAD < size < 1 << 20:
+            return b""
+        self.tell(Command.FLASH_KIND, PATTERNS)
+        return self._read_flash(size)
+
+    def write_flash(self, block: bytes) -> None:
+        """Erase the patterns in its flash, write others, and compare what is read back (DLPU075B §3, "update internal
+        pattern data": kind, check, erase, length, start, continue).
+        """
+        self.tell(Command.FLASH_KIND, PATTERNS)
+        if told := self._bus.read(Read.FLASH_CHECK, 1, struct.pack("<I", len(block)))[0]:
+            message = f"{self.name}: asked for {len(block)} bytes of patterns, its flash has no room ({told:#04x}); "
+            raise UnsupportedByDeviceError(message + "scan one axis only, or with a shorter line_shift_period_px")
+        self.tell(Command.FLASH_ERASE, bytes.fromhex("AABBCCDD"))
+        self._wait(ERASING, 0, ERASED_S, "erase its flash")
+        length = 0
+        for start in range(0, len(block), MOST_WRITTEN):
+            part = block[start : start + MOST_WRITTEN]
+            length = self._set_length(len(part), length)
+            self.tell(Command.FLASH_WRITE + (start > 0), part)
+        if self.flash() != block:
+            message = f"{self.name}: its flash does not give back what was written; write it again: slrig patterns RIG"
+            raise DeviceError(message)
+
+    def _read_flash(self, size: int) -> bytes:
+        data, length = b"", 0
+        while len(data) < size:
+            length = self._set_length(min(size - len(data), MOST_READ), length)
+            data += self._bus.read(Read.FLASH + (len(data) > 0), length)
+        return data
+
+    def _set_length(self, length: int, before: int) -> int:
+        if length != before:
+            self.tell(Command.FLASH_LENGTH, struct.pack("<H", length))
+        return length
+
+    def _short(self) -> int:
+        return self._bus.read(Read.SHORT, 1)[0]
+
+    def _wait(self, mask: int, wanted: int, timeout_s: float, what: str) -> None:
+        until = time.monotonic() + timeout_s
+        while (short := self._short()) & mask != wanted:
+            if time.monotonic() > until:
+                message = f"{self.name} did not {what} in {timeout_s:g} s (status {short:#04x}); switch it off and on"
+                raise DeviceError(message)
+            self._never.wait(_ASK_AGAIN_S)
+
+    def _fault(self, short: int) -> DeviceError:
+        system = int.from_bytes(self._bus.read(Read.SYSTEM, 4), "little")
+        if sequence := system >> 19 & 0x1F:
+            told = SEQUENCES.get(sequence, f"sequence error {sequence}")
+            return UnsupportedByDeviceError(f"{self.name} does not take the sequence: {told}")
+        told = "; ".join(words for bit, words in FAULTS.items() if system >> bit & 1)
+        told = told or ("its flash failed" if short & FLASH else f"status {short:#04x}, {system:#010x}")
+        return DeviceError(f"{self.name} says: {told}; switch it off and on")

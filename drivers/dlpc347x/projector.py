@@ -1,0 +1,210 @@
+"""The light engine as a projector: an order of patterns in its flash is shown."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import pairwise
+
+from drivers.dlpc347x.bus import Bus
+from drivers.dlpc347x.engine import Engine, Entry, Light
+from drivers.dlpc347x.flash import Line, Lines, Mirrors, Place, block_of, places_in, places_of
+from drivers.dlpc347x.options import EngineOptions
+from drivers.pattern_engine.light import HeldLight
+from drivers.pattern_engine.options import Colour
+from drivers.pattern_engine.timing import LEFT_ALONE_S, Timing, check_duty, light_us
+from slrig.devices import ProjectorInfo, Shown
+from slrig.errors import DeviceGoneError, UnsupportedByDeviceError
+from slrig.model import PatternSequence, Size
+
+MIRRORS = {
+    0x0F: ("DLPC3470", Mirrors("DLP2010", Size(854, 480), before=(32, 0), after=(0, 10))),
+    0x0B: ("DLPC3478", Mirrors("DLP3010", Size(1280, 720), before=(48, 0), after=(0, 0))),
+}
+"""By the number of the controller (dlpc347x.h, `ControllerDeviceId_e`): its name, and its mirrors (its data sheet,
+features). Mirrors beyond the picture: dlpc347x_internal_patterns.c, `SetDMDInfo`."""
+AWAKE_S = 10.0
+COMMANDS_S = 0.06
+"""What the commands of one `show` take, typically: 100 bits per ms, and some 600 bytes."""
+HELD_US = 7_600
+"""The longest light of a pattern of 1 bit (release notes of DLPC3478 8.0.1, timings of internal patterns)."""
+END_US = 1_000_000
+"""Dark at the end of a played sequence, in which this program stops the engine."""
+MOST_REPEATS = 254
+"""255 is for ever, as TI's programs use it."""
+
+
+class LightEngine(HeldLight[Engine]):
+    """Implements `slrig.devices.FlashedProjector` on a DLPC3470 or DLPC3478.
+
+    Parameters
+    ----------
+    bus
+        An open engine, whatever state it is in; it is dark and ready afterwards, or closed if that failed.
+    options
+        What the rig file says.
+
+    Raises
+    ------
+    UnsupportedByDeviceError
+        It is another controller, or does not take a setting.
+    DeviceError, DeviceGoneError
+        The engine failed.
+    """
+
+    def __init__(self, bus: Bus, options: EngineOptions) -> None:
+        super().__init__(Engine(bus), options)
+        self._options = options
+        self._lines: Lines
+        self._held: Mapping[Line, tuple[Place, ...]] = {}
+        self._places: tuple[Place, ...] = ()
+        self._colours: tuple[Colour, ...] = ()
+        self._lights: dict[tuple[Colour, int], Light] = {}
+        self._take_over()
+
+    def write_patterns(self, sequence: PatternSequence) -> str:
+        """See `FlashedProjector`. Into the engine itself, if it lacks any; what its flash had before is gone then."""
+        self._state.require_size(sequence, self._lines.mirrors.size)
+        block = block_of(sequence, self._lines)
+        with self._lock:
+            self._state.require_open()
+            self._state.loaded = None
+            self.blank()
+            if self._engine.flash() == block:
+                return f"the flash of {self._engine.name} holds these {len(sequence)} patterns already"
+            self._engine.write_flash(block)
+            self._held = places_in(block)
+            self._engine.take_patterns_from_flash()
+            self.blank()
+        return (
+            f"{len(sequence)} patterns were written into the flash of {self._engine.name}, and read back: it is ready"
+        )
+
+    def load(self, sequence: PatternSequence) -> None:
+        """See `Projector`. Refuses patterns that the flash lacks."""
+        self._state.require_open()
+        self._state.loaded = None
+        self.blank()
+        self._state.require_size(sequence, self._lines.mirrors.size)
+        self._places = places_of(sequence, self._lines, self._held)
+        self._colours = tuple(map(self._options.colour_of, sequence.patterns))
+        self._state.loaded = sequence
+
+    def show(self, index: int) -> Shown:
+        """See `Projector`. Light that pulses, 97 % of the time; dark again after `hold_s`, and `LEFT_ALONE_S` after the
+        end of this program.
+        """
+        self._state.require_pattern(index)
+        entry = self._entry(self._places[index], 1, self._colours[index], HELD_US)
+        # A repeat more or less than counted is within what it is left alone for.
+        repeats = min(round(LEFT_ALONE_S * 1e6) // entry.lasts_us - 1, MOST_REPEATS)
+        started_ns = self._run((entry,), repeats)
+        self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=LEFT_ALONE_S / 2)
+        return self._shown(index, started_ns, time.monotonic_ns() + round(self._options.start_s * 1e9))
+
+    def play(self, exposure_s: float, period_s: float) -> None:
+        """See `Projector`. Refuses, before the engine does, a timing that it does not have, and says which rule."""
+        sequence = self._state.require_loaded("play")
+        if len({place.set for place in self._places}) > 1:
+            message = (
+                f"asked to play {len(sequence)} patterns of both axes, or more than a set of the flash holds: how long "
+                "the engine takes from one set to the next is not known; scan one axis only, or without the wire"
+            )
+            raise UnsupportedByDeviceError(message)
+        options = self._options
+        least = self._light_of(options.colour, HELD_US)
+        wanted_us = light_us(
+            exposure_s,
+            period_s,
+            margin_s=options.light_margin_s,
+            least_us=least.least_us,
+            dark_us=least.before_us + least.after_us,
+        )
+        check_duty(Timing(wanted_us, round(period_s * 1e6)), options.duty_limit)
+        entries: list[Entry] = []
+        # The last pattern has an entry of its own, and stays dark after it until this program stops the engine: it is
+        # not documented whether a repeat of 0 is once or for ever, and 1 is once or twice.
+        begins = [at for at in range(len(sequence)) if at in (0, len(sequence) - 1) or self._breaks(at)]
+        for begin, end in pairwise([*begins, len(sequence)]):
+            lit = self._entry(self._places[begin], end - begin, self._colours[begin], wanted_us)
+            dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_US if end == len(sequence) else 0)
+            entries.append(replace(lit, after_us=dark_us))
+        self._run(tuple(entries), 1)
+        lasts_us = sum(entry.lasts_us for entry in entries)
+        self._dark_at_s = time.monotonic() + options.start_s + (lasts_us - END_US / 2) / 1e6
+
+    def _breaks(self, at: int) -> bool:
+        """Whether pattern `at` needs an entry of its own: it is not the next one in the flash, or lit otherwise."""
+        return self._places[at].index != self._places[at - 1].index + 1 or self._colours[at] != self._colours[at - 1]
+
+    def _entry(self, place: Place, count: int, colour: Colour, wanted_us: int) -> Entry:
+        light = self._light_of(colour, wanted_us)
+        return Entry(place, count, colour, wanted_us, light.before_us, light.after_us)
+
+    def _light_of(self, colour: Colour, wanted_us: int) -> Light:
+        """What the engine says of a light; it is asked once. Raises UnsupportedByDeviceError: it has none such."""
+        light = self._lights.get((colour, wanted_us)) or self._engine.light(colour, wanted_us)
+        if not light.supported:
+            message = (
+                f"asked for {wanted_us} µs of {colour.name.lower()} light, the engine has none; its shortest is "
+                f"{light.least_us} µs, the longest that TI states {HELD_US} µs; shorten exposure_s, or trigger the "
+                "cameras by software, where exposures may be longer"
+            )
+            raise UnsupportedByDeviceError(message)
+        self._lights[colour, wanted_us] = light
+        return light
+
+    def _run(self, entries: tuple[Entry, ...], repeats: int) -> int:
+        """Stop, set, start. Return when the command to start was sent."""
+        with self._lock:
+            self._state.require_open()
+            try:
+                self.blank()
+                self._engine.order(entries, repeats)
+                started_ns = time.monotonic_ns()
+                self._engine.leds(by_sequence=True)
+                self._engine.start()
+            except BaseException:
+                self._darken()
+                raise
+        return started_ns
+
+    def _wake(self) -> None:
+        for fault in self._darken():
+            if isinstance(fault, DeviceGoneError):
+                raise fault
+        self._engine.wait_until_initialised(AWAKE_S)
+
+    def _prepare(self) -> ProjectorInfo:
+        engine, options = self._engine, self._options
+        engine.leds(by_sequence=False)
+        number = engine.controller()
+        if number not in MIRRORS:
+            message = f"{engine.name} is controller {number:#04x}, this driver knows the DLPC3470 and the DLPC3478"
+            two = "; how the flash of a DLPC3479 is filled, TI's sources tell in two ways: it is not served"
+            raise UnsupportedByDeviceError(message + (two if number == 0x0C else ""))
+        name, mirrors = MIRRORS[number]
+        self._lines = Lines(mirrors, (options.mirror_rows, options.mirror_columns))
+        engine.take_patterns_from_flash()
+        # Another mode may start what the engine shows by itself.
+        self.blank()
+        try:
+            self._held = places_in(block) if (block := engine.flash()) else {}
+        except struct.error:
+            self._held = {}
+        engine.set_current(options.led_current)
+        engine.set_trigger_out(active_low=options.trigger_polarity == "low", delay_us=options.trigger_delay_us)
+        light = self._light_of(options.colour, HELD_US)
+        return ProjectorInfo(
+            name="projector",
+            model=f"{name} light engine, {mirrors.name}, firmware {engine.version()}",
+            serial="",
+            size=mirrors.size,
+            plays=True,
+            latency_s=options.start_s + COMMANDS_S,
+            gap_s=options.light_margin_s + (light.before_us + light.after_us) / 1e6,
+            duty=options.duty_limit,
+            lights=options.colour is Colour.WHITE,
+        )
