@@ -18,9 +18,10 @@ from slrig.bundle.description import CAMERA_NAME
 from slrig.bundle.faults import Strict, explain, keys_of
 from slrig.bundle.storage import write_file
 from slrig.errors import CalibrationError
-from slrig.foreign.ros import PROJECTOR, Side
+from slrig.foreign.ros import Side
 from slrig.foreign.yaml_text import read_yaml, yaml_bytes
 from slrig.model import Calibration, Pinhole, Size
+from slrig.ros_messages import PROJECTOR
 
 _MM_PER_M = 1000.0
 Four = Annotated[list[float], Field(min_length=4, max_length=4)]

@@ -23,12 +23,9 @@ from slrig.disk import refusals_of, staging_name
 from slrig.errors import CalibrationError
 from slrig.foreign.yaml_text import read_yaml, yaml_bytes
 from slrig.model import Calibration, FloatArray, Pinhole, Size
+from slrig.ros_messages import FRAME, MM_PER_M, PROJECTOR, WORLD, lens, pose
 
 TRANSFORMS = "transforms.yaml"
-PROJECTOR = "projector"
-FRAME = "_optical_frame"
-WORLD = "world"
-_MM_PER_M = 1000.0
 
 Side = Annotated[int, Field(ge=1, le=MOST_SIDE_PX)]
 
@@ -125,11 +122,11 @@ def read_ros(folder: Path) -> Calibration:
 
 def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
     info = _checked(path, CameraInfo)
-    lens = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
-    if info.distortion_model not in ("plumb_bob", "rational_polynomial") or lens[5:].any() or len(lens) < 4:
+    terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
+    if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
         raise CalibrationError(
             f"{path}: expected the distortion plumb_bob (k1, k2, p1, p2, k3), found {info.distortion_model} with "
-            f"{len(lens)} numbers; slrig has no other lens: calibrate with plumb_bob"
+            f"{len(terms)} numbers; slrig has no other lens: calibrate with plumb_bob"
         )
     frame = next((each for each in (name, name + FRAME) if each in poses), None)
     if frame is None:
@@ -139,7 +136,7 @@ def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: s
         )
     rotation, translation_mm = poses[frame]
     five = np.zeros(5)
-    five[: min(len(lens), 5)] = lens[:5]
+    five[: min(len(terms), 5)] = terms[:5]
     matrix = info.camera_matrix.array(f"{path}: camera_matrix")
     try:
         return Pinhole(Size(info.image_width, info.image_height), matrix, five, rotation, translation_mm)
@@ -176,7 +173,7 @@ def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
             rotation, at = rotation @ back, parents[at].header.frame_id
         if at != root:
             raise CalibrationError(f"{path}: expected a way from {frame} to {root}, found a circle; join them")
-        poses[frame] = (rotation, translation * _MM_PER_M)
+        poses[frame] = (rotation, translation * MM_PER_M)
     return poses
 
 
@@ -193,12 +190,12 @@ def write_ros(folder: Path, calibration: Calibration) -> None:
     texts: dict[str, bytes] = {}
     for name, device in devices.items():
         texts[f"{name}.yaml"] = yaml_bytes(_info(name, device))
-        turn = Rotation.from_matrix(device.rotation.T).as_quat().tolist()
-        pose = {
-            "translation": dict(zip("xyz", (device.centre_mm / _MM_PER_M).tolist(), strict=True)),
+        place, turn = pose(device.rotation, device.translation_mm)
+        stands = {
+            "translation": dict(zip("xyz", place, strict=True)),
             "rotation": dict(zip("xyzw", turn, strict=True)),
         }
-        transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": pose})
+        transforms.append({"header": {"frame_id": WORLD}, "child_frame_id": name + FRAME, "transform": stands})
     texts[TRANSFORMS] = yaml_bytes({"transforms": transforms})
     staging = staging_name(folder)
     with refusals_of(folder):
@@ -217,15 +214,16 @@ def _info(name: str, device: Pinhole) -> dict[str, Any]:
     def matrix(array: FloatArray) -> dict[str, Any]:
         return {"rows": array.shape[0], "cols": array.shape[1], "data": array.ravel().tolist()}
 
+    sees = lens(device.matrix, device.distortion)
     return {
         "image_width": device.size.width_px,
         "image_height": device.size.height_px,
         "camera_name": name,
-        "camera_matrix": matrix(device.matrix),
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": matrix(device.distortion[None]),
-        "rectification_matrix": matrix(np.eye(3)),
-        "projection_matrix": matrix(np.hstack([device.matrix, np.zeros((3, 1))])),
+        "camera_matrix": matrix(sees["k"]),
+        "distortion_model": sees["distortion_model"],
+        "distortion_coefficients": matrix(sees["d"][None]),
+        "rectification_matrix": matrix(sees["r"]),
+        "projection_matrix": matrix(sees["p"]),
     }
 
 

@@ -7,15 +7,14 @@ import json
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from slrig.model import FloatArray
 from slrig.reconstruction.optics import to_depths
+from slrig.ros_messages import POINT_FIELDS, point_table
 from slrig.scan.organised import OrganisedCloud
 
 _MOST = 65535
-_PCD_FIELDS = ("x", "y", "z", "normal_x", "normal_y", "normal_z", "rgb", "sigma")
 
 
 def encode_npz(cloud: OrganisedCloud) -> bytes:
@@ -84,16 +83,12 @@ def encode_pcd(cloud: OrganisedCloud) -> bytes:
     world's as a quaternion, w x y z.
     """
     high, wide = cloud.cause.shape
-    table: NDArray[np.float32] = np.zeros((high, wide, len(_PCD_FIELDS)), dtype="<f4")
-    table[..., :3], table[..., 3:6], table[..., 7] = cloud.points_mm, cloud.normals, cloud.sigma_mm
-    red, green, blue = np.moveaxis(cloud.colour.astype("<u4"), 2, 0)
-    table[..., 6] = (red << 16 | green << 8 | blue).view("<f4")
     x, y, z, w = Rotation.from_matrix(cloud.device.rotation.T).as_quat(canonical=True)
-    count = len(_PCD_FIELDS)
+    count = len(POINT_FIELDS)
     header = [
         "# .PCD v0.7 - slrig, millimetres",
         "VERSION 0.7",
-        f"FIELDS {' '.join(_PCD_FIELDS)}",
+        f"FIELDS {' '.join(POINT_FIELDS)}",
         f"SIZE {' '.join(['4'] * count)}",
         f"TYPE {' '.join(['F'] * count)}",
         f"COUNT {' '.join(['1'] * count)}",
@@ -103,4 +98,4 @@ def encode_pcd(cloud: OrganisedCloud) -> bytes:
         f"POINTS {high * wide}",
         "DATA binary",
     ]
-    return "\n".join(header).encode("ascii") + b"\n" + table.tobytes()
+    return "\n".join(header).encode("ascii") + b"\n" + point_table(cloud).tobytes()
