@@ -13,7 +13,6 @@ from rich.table import Column
 
 from slrig.bundle.calibration_file import read_calibration
 from slrig.bundle.description import read_description
-from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.storage import write_file
 from slrig.cli.bundles import Row, named_bundles, work_through
 from slrig.cli.display import counted, progress_shown
@@ -23,7 +22,7 @@ from slrig.jobs.worker import prepare_kernel_cache
 from slrig.jobs.worker_wait import PREPARING
 from slrig.logs import set_up_logs_for_a_person
 from slrig.scan.artefacts import MESH, ON_REQUEST, REPORT, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, cloud_named, extra_of, offered
+from slrig.scan.offered import BUNDLE_ZIP, CALIBRATION_USED, extra_of, offered, on_demand
 from slrig.scan.plan import Progress, ReconstructionPlan
 from slrig.scan.records import report_summary
 
@@ -92,7 +91,7 @@ def reconstruct_and_tell(
         )
         for name in further:
             progress(f"writing {name}", 1.0, "")
-            _write_further(folder, name, cameras, calibration or bundle / CALIBRATION)
+            _write_further(folder, name, cameras, bundle, calibration)
         return report_summary(report)
 
     always = (MESH, "preview.png", REPORT)
@@ -119,7 +118,7 @@ def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
     takes a library that is not installed; and as `read_description`.
     """
     cameras = list(read_description(bundle).camera_formats())
-    there_are = [name for name in offered(cameras) if name != BUNDLE_ZIP]
+    there_are = [name for name in offered(cameras) if name not in (CALIBRATION_USED, BUNDLE_ZIP)]
     unknown = [name for name in names if name not in there_are]
     if unknown:
         message = f"{bundle}: it gives no {', '.join(unknown)}. There are: {', '.join(there_are)}."
@@ -132,13 +131,13 @@ def _require_offered(names: Sequence[str], bundle: Path) -> list[str]:
     return cameras
 
 
-def _write_further(folder: Path, name: str, cameras: Sequence[str], calibration: Path) -> None:
+def _write_further(folder: Path, name: str, cameras: Sequence[str], bundle: Path, calibration: Path | None) -> None:
     """Write a file of a reconstruction that is made only when it is asked for. Raises as its maker does."""
-    cloud = cloud_named(name, cameras)
-    if cloud is not None:
+    found = on_demand(name, cameras)
+    if found is not None:
         from slrig.scan.cloud_files import cloud_file
 
-        write_file(folder / name, cloud_file(folder, *cloud, calibration=calibration))
+        write_file(folder / name, cloud_file(folder, *found, bundle=bundle, calibration=calibration))
     elif name in ON_REQUEST:
         write_converted(folder, name)
 

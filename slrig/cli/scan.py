@@ -16,7 +16,7 @@ from slrig.client import Client, ScanJob
 from slrig.client.wire import Blocking
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, ScanCancelledError, ServiceError
-from slrig.scan.offered import PREFIXES, offered
+from slrig.scan.offered import PREFIXES, installed_by, offered
 
 _HEADS = ("scan", Column("triangles", justify="right"), Column("σ mm", justify="right"), "")
 _DIGITS = 3
@@ -122,8 +122,9 @@ def _completed(
     missing = [name for name in files if name not in result.files]
     if missing:
         message = f"The scan has no {', '.join(missing)}. It has: {', '.join(result.files)}."
-        if any(name.endswith(".e57") for name in missing):
-            message += " For E57, pip install 'slrig[e57]' where the service runs; the scan need not be repeated."
+        for name in missing:
+            if (command := installed_by(Path(name).suffix)) is not None:
+                message += f" For {name}, {command} where the service runs; the scan need not be repeated."
         raise ServiceError(message)
     with refusals_of(output):
         output.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The files that are made of a finished scan by mathematics, on request: its surface in the grid of one camera.
+"""The files that are made of a finished scan by mathematics, on request: its surface in the grid of its cameras.
 
 The service has them made by the worker: they take kernels, and libraries of other people.
 """
@@ -14,15 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.bundle.calibration_file import read_calibration
-from slrig.bundle.reading import CALIBRATION
+from slrig.bundle.description import read_description
+from slrig.bundle.reading import CALIBRATION, open_bundle
 from slrig.disk import refusals_of
-from slrig.errors import InvalidInputError
+from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.jobs.data_folder import BUNDLE
-from slrig.model import Pinhole
+from slrig.model import Mesh, Pinhole
 from slrig.scan.artefacts import MESH, REPORT, decode_mesh_ply
+from slrig.scan.bag_format import encode_bag, white_images
 from slrig.scan.cloud_formats import encode_depth_tiff, encode_npz, encode_pcd
 from slrig.scan.e57_format import encode_e57
-from slrig.scan.offered import causes_picture
+from slrig.scan.offered import BAG, causes_picture
 from slrig.scan.organised import OrganisedCloud, organised
 from slrig.scan.plan import Progress
 
@@ -40,27 +42,47 @@ ENCODERS: Mapping[str, Callable[[OrganisedCloud], bytes]] = {
 def cloud_file(
     folder: Path,
     form: str,
-    camera: str,
+    camera: str | None,
     *,
+    bundle: Path | None = None,
     calibration: Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> bytes:
-    """One of `ENCODERS`, for a camera, made of the files of a finished scan. calibration : the one that the mesh was
-    made with, None for that in the scan's bundle.
+    """One of `ENCODERS`, for a camera, or the bag of all, made of the files of a finished scan. bundle : None for that
+    of the scan. calibration : the one that the mesh was made with, None for that in the bundle.
 
     Raises
     ------
-    InvalidInputError, CalibrationError
+    InvalidInputError, CalibrationError, BundleError
         A file of the scan is not as slrig wrote it.
     ExtraMissingError
         The format takes a library that is not installed.
     NothingToReconstructError
-        The camera sees nothing of the mesh, and the format has no form for that.
+        The camera sees nothing of the mesh, and the format has no form for that; or no camera has a map of causes.
     StorageError
         A file of the scan cannot be read.
     """
     progress(STAGE, 0.0, "")
-    return ENCODERS[form](organised_scan(folder, camera, calibration=calibration or folder / BUNDLE / CALIBRATION))
+    bundle = bundle or folder / BUNDLE
+    calibration = calibration or bundle / CALIBRATION
+    if form == BAG:
+        return _bag(folder, bundle, calibration)
+    if camera is None:
+        message = f"{form}: expected the name of a camera, found none"
+        raise InvalidInputError(message)
+    return ENCODERS[form](organised_scan(folder, camera, calibration=calibration))
+
+
+def _bag(folder: Path, bundle: Path, calibration: Path) -> bytes:
+    known = read_calibration(calibration)
+    cameras = {each: device for each, device in known.cameras.items() if (folder / causes_picture(each)).exists()}
+    if not cameras:
+        message = f"{folder}: no camera has a map of causes; reconstruct the bundle again"
+        raise NothingToReconstructError(message)
+    mesh = decode_mesh_ply(_read(folder / MESH))
+    # One at a time: each takes some hundred megabytes.
+    clouds = (_organised(folder, mesh, camera, device) for camera, device in cameras.items())
+    return encode_bag(known, clouds, white_images(open_bundle(bundle)), read_description(bundle).captured_at)
 
 
 def organised_scan(folder: Path, camera: str, *, calibration: Path) -> OrganisedCloud:
@@ -70,7 +92,10 @@ def organised_scan(folder: Path, camera: str, *, calibration: Path) -> Organised
     if camera not in devices:
         message = f"{calibration}: it knows cameras {sorted(devices)}, and not '{camera}'"
         raise InvalidInputError(message)
-    device = devices[camera]
+    return _organised(folder, mesh, camera, devices[camera])
+
+
+def _organised(folder: Path, mesh: Mesh, camera: str, device: Pinhole) -> OrganisedCloud:
     return organised(mesh, camera, device, _refused(folder / causes_picture(camera), device), _causes(folder / REPORT))
 
 

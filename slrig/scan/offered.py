@@ -25,6 +25,9 @@ MEDIA_TYPES: Mapping[str, str] = {
 BUNDLE_ZIP = "bundle.zip"
 """The recorded frames, of a scan that failed, too."""
 
+CALIBRATION_USED = "calibration.json"
+"""The calibration that the mesh was made with: that in the bundle."""
+
 
 def rejected_picture(camera: str) -> str:
     """The picture of a camera's refused pixels, for people.
@@ -52,6 +55,12 @@ CLOUDS: Mapping[str, str] = {
 }
 """The surface in the grid of a camera, made when asked for by `slrig.scan.cloud_files`: names and media types."""
 
+BAG = "scan.mcap"
+"""The scan as a ROS 2 bag, made when asked for by `slrig.scan.cloud_files`, too: all cameras in one."""
+
+ON_DEMAND: Mapping[str, str] = {**CLOUDS, BAG: "application/octet-stream"}
+"""What the worker makes: names and media types."""
+
 PREFIXES = ("rejected-", "causes-", *sorted({form.partition("{")[0] for form in CLOUDS}))
 """With which the name of a camera's file begins."""
 
@@ -65,24 +74,33 @@ def camera_files(camera: str) -> tuple[str, ...]:
     return rejected_picture(camera), causes_picture(camera), *(form.format(camera=camera) for form in CLOUDS)
 
 
-_EXTRAS = {".e57": ("pye57", "e57")}
+_EXTRAS = {".e57": ("pye57", "e57"), ".mcap": ("rosbags", "ros")}
 """Endings of files that take a library that slrig does not bring, and the extra that does."""
 
 
 def extra_of(ending: str) -> str | None:
     """What to install before files of this ending can be made; None where nothing is missing, or needed."""
-    library, extra = _EXTRAS.get(ending, (None, ""))
-    if library is None or importlib.util.find_spec(library) is not None:
-        return None
-    return f"pip install 'slrig[{extra}]'"
+    library, _ = _EXTRAS.get(ending, (None, ""))
+    return None if library is None or importlib.util.find_spec(library) is not None else installed_by(ending)
 
 
-def cloud_named(name: str, cameras: Iterable[str]) -> tuple[str, str] | None:
-    """Which of `CLOUDS` a name means, and of which camera; None where it means none.
+def installed_by(ending: str) -> str | None:
+    """What to install where files of this ending are made; None where nothing is needed.
 
-    >>> cloud_named("points-left.npz", ["left", "right"])
-    ('points-{camera}.npz', 'left')
+    >>> installed_by(".e57"), installed_by(".npz")
+    ("pip install 'slrig[e57]'", None)
     """
+    return f"pip install 'slrig[{_EXTRAS[ending][1]}]'" if ending in _EXTRAS else None
+
+
+def on_demand(name: str, cameras: Iterable[str]) -> tuple[str, str | None] | None:
+    """Which of `ON_DEMAND` a name means, and of which camera; None where it means none.
+
+    >>> on_demand("points-left.npz", ["left", "right"]), on_demand("scan.mcap", ["left"])
+    (('points-{camera}.npz', 'left'), ('scan.mcap', None))
+    """
+    if name == BAG:
+        return BAG, None
     known = ((form, camera) for camera in cameras for form in CLOUDS)
     return next((each for each in known if each[0].format(camera=each[1]) == name), None)
 
@@ -90,7 +108,8 @@ def cloud_named(name: str, cameras: Iterable[str]) -> tuple[str, str] | None:
 def offered(cameras: Iterable[str]) -> tuple[str, ...]:
     """The names of a scan's files. cameras : of the rig.
 
-    >>> offered(["left"])[-3:]
-    ('depth-left.tiff', 'points-left.e57', 'bundle.zip')
+    >>> offered(["left"])[-4:]
+    ('points-left.e57', 'scan.mcap', 'calibration.json', 'bundle.zip')
     """
-    return *MEDIA_TYPES, *(name for camera in cameras for name in camera_files(camera)), BUNDLE_ZIP
+    of_cameras = (name for camera in cameras for name in camera_files(camera))
+    return *MEDIA_TYPES, *of_cameras, BAG, CALIBRATION_USED, BUNDLE_ZIP

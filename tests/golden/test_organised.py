@@ -1,12 +1,12 @@
 """The surface of a rendered scan in the grids of its cameras, against mesh and truth, and read by other programs.
 
 What reads the files here is not what wrote them: OpenCV and Pillow the depth, pypcd4 the PCD, the crate e57 (by its
-Python package) the E57, lib3mf the 3MF.
+Python package) the E57, lib3mf the 3MF, mcap and rosbags' reader the bag.
 """
 
 from __future__ import annotations
 
-import importlib
+import io
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,30 +19,25 @@ import trimesh
 
 from slrig.bundle import read_truth
 from slrig.bundle.calibration_file import read_calibration
+from slrig.bundle.description import read_description
+from slrig.bundle.reading import read_bundle
 from slrig.config import read_rig
 from slrig.discovery import open_rig
 from slrig.meshing.search_tree import SearchTree
-from slrig.model import FloatArray, Pinhole
+from slrig.model import FloatArray, Pinhole, White
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import decode_mesh_ply, write_converted
 from slrig.scan.cloud_files import ENCODERS, cloud_file
+from slrig.scan.offered import BAG
 from slrig.scan.plan import ScanPlan
 from tests.golden.test_bundles import reconstructed
-from tests.npm import lacking
+from tests.ros_readers import colours, library, point_columns, seen_at
 
 pytestmark = pytest.mark.slow
 
 RIG = Path(__file__).parents[2] / "config" / "rigs" / "two_cameras.toml"
 CAMERAS = ("left", "right")
 SAMPLES = 20_000
-
-
-def library(name: str) -> Any:
-    """A reader that is not ours."""
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        lacking(f"needs {name}: pip install 'slrig[e57,readers]'")
 
 
 class Scan(NamedTuple):
@@ -69,6 +64,8 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
         for form in ENCODERS:
             data = cloud_file(folder / "scan", form, camera, calibration=calibration)
             (folder / "scan" / form.format(camera=camera)).write_bytes(data)
+    library("rosbags.rosbag2")
+    (folder / "scan" / BAG).write_bytes(cloud_file(folder / "scan", BAG, None, bundle=folder / "bundle"))
     return Scan(folder / "scan", report, dict(read_calibration(calibration).cameras))
 
 
@@ -189,6 +186,61 @@ def test_an_e57_is_read_in_metres_with_colours(scan: Scan, camera: str) -> None:
     text = reader.raw_xml(path)
     assert "<rowIndex" in text
     assert "<columnIndex" in text
+
+
+def test_a_bag_is_read_in_metres_with_devices_and_white_images(scan: Scan) -> None:
+    told: dict[str, Any] = {}
+    stamps: set[int] = set()
+    with library("rosbags.highlevel").AnyReader([scan.folder / BAG]) as reader:
+        for connection, stamp_ns, data in reader.messages():
+            message = told[connection.topic] = reader.deserialize(data, connection.msgtype)
+            header = message.transforms[0].header if connection.topic == "/tf_static" else message.header
+            stamps |= {stamp_ns, header.stamp.sec * 10**9 + header.stamp.nanosec}
+            (offered,) = connection.ext.offered_qos_profiles
+            assert (offered.durability.name, offered.reliability.name) == ("TRANSIENT_LOCAL", "RELIABLE")
+    # Another reader finds the same bytes, by the format's own index, and what rosbag2 looks for.
+    mcap = library("mcap.reader").make_reader(io.BytesIO((scan.folder / BAG).read_bytes()), validate_crcs=True)
+    assert (mcap.get_header().profile, [each.name for each in mcap.iter_metadata()]) == ("ros2", ["rosbag2"])
+    read = {channel.topic: (schema, channel, message) for schema, channel, message in mcap.iter_messages()}
+    assert set(read) == set(told)
+    assert {(schema.encoding, channel.message_encoding) for schema, channel, _ in read.values()} == {("ros2msg", "cdr")}
+
+    captured_at = read_description(scan.folder.parent / "bundle").captured_at
+    assert captured_at is not None
+    stamps |= {message.log_time for _, _, message in read.values()}
+    assert stamps == {int(captured_at.timestamp()) * 10**9}
+
+    transforms = told.pop("/tf_static")
+    assert {(each.header.frame_id, each.child_frame_id) for each in transforms.transforms} == {
+        ("world", f"{name}_optical_frame") for name in (*CAMERAS, "projector")
+    }
+    assert set(told) == {"/slrig/projector/camera_info"} | {
+        f"/slrig/{name}/{what}" for name in CAMERAS for what in ("points", "camera_info", "image_raw")
+    }
+    capture = read_bundle(scan.folder.parent / "bundle").capture
+    # White is shown more than once.
+    white = {shot.camera: shot for shot in reversed(capture.shots) if capture.patterns[shot.pattern] == White()}
+    for camera in CAMERAS:
+        cloud, message = scan.cloud(camera), told[f"/slrig/{camera}/points"]
+        columns, known = point_columns(message), cloud["cause"] == 0
+        for part, names, scale in (
+            ("points_mm", ("x", "y", "z"), 1000),
+            ("normals", ("normal_x", "normal_y", "normal_z"), 1),
+            ("sigma_mm", ("sigma",), 1000),
+        ):
+            found = np.stack([columns[name] for name in names], axis=2).reshape(cloud[part].shape)
+            np.testing.assert_allclose(found, cloud[part] / np.float32(scale), rtol=2e-7, atol=0)
+        for name in set(columns) - {"rgb"}:
+            np.testing.assert_array_equal(np.isfinite(columns[name]), known)
+        np.testing.assert_array_equal(colours(columns), cloud["colour"])
+        # A point in metres is seen at its pixel, by transform and camera info alone.
+        points_m = np.stack([columns[axis] for axis in "xyz"], axis=2)[known].astype(np.float64)
+        rows, places = np.nonzero(known)
+        seen = seen_at(transforms, told[f"/slrig/{camera}/camera_info"], points_m)
+        assert np.abs(seen - np.stack((places, rows), axis=1)).max() < 1e-3
+        image = told[f"/slrig/{camera}/image_raw"]
+        assert image.header.frame_id == f"{camera}_optical_frame"
+        np.testing.assert_array_equal(image.data.reshape(image.height, image.width, -1)[..., 0], white[camera].image)
 
 
 def test_a_3mf_is_read_in_mm_with_colours(scan: Scan) -> None:

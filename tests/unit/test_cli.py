@@ -375,6 +375,7 @@ def test_file_that_this_scan_has_not_is_told_before_anything_is_fetched(tmp_path
         ("causes-top.png", ["left"], "no causes-top.png"),
         ("points-left.npz", ["left"], None),
         ("points-left.e57", ["left"], None),
+        ("scan.mcap", ["left"], None),
         ("points-top.npz", ["left"], "no points-top.npz"),
         ("bundle.zip", ["left"], None),
     ],
