@@ -19,11 +19,21 @@ from slrig.api.clouds import clouds_of, has_sources, make_cloud
 from slrig.api.openapi import BYTES, file_of
 from slrig.api.service import Service, Serving
 from slrig.bundle.description import CAMERA_NAME
+from slrig.bundle.reading import CALIBRATION
 from slrig.errors import ArtefactNotReadyError
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.records import JobRecord, JobState
 from slrig.scan.artefacts import MESH, ON_REQUEST, converted, write_converted
-from slrig.scan.offered import BUNDLE_ZIP, CLOUDS, MEDIA_TYPES, causes_picture, rejected_picture
+from slrig.scan.offered import (
+    BAG,
+    BUNDLE_ZIP,
+    CALIBRATION_USED,
+    CLOUDS,
+    MEDIA_TYPES,
+    ON_DEMAND,
+    causes_picture,
+    rejected_picture,
+)
 
 # A conversion takes a second and some hundred megabytes: one at a time, whoever asks.
 _converting = threading.Lock()
@@ -50,6 +60,8 @@ def ready_files(folder: DataFolder, record: JobRecord) -> dict[str, str]:
         return {}
     if MESH in names:
         names |= set(ON_REQUEST)
+        if record.state.final and folder.owns(folder.scan(record.id) / BUNDLE / CALIBRATION):
+            names.add(CALIBRATION_USED)
     return {name: f"/scan/{record.id}/{name}" for name in sorted(names)}
 
 
@@ -87,12 +99,12 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
             write_converted(place, name)
         made = _made_so_far(service.folder, record, name)
     if made is None and not (record.state.final and service.folder.owns(path)):
-        _refuse_absent(record, name)
+        _refuse_absent(record, path.name)
     headers = _headers(scan_id, name)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if made is not None:
-        headers["Content-Disposition"] = f'inline; filename="{name}"'
+        headers["Content-Disposition"] = f'inline; filename="{path.name}"'
         return Response(made, media_type=media_type, headers=headers)
     return _kept(path, media_type, headers)
 
@@ -103,8 +115,8 @@ def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
     )
 
 
-def _cloud(service: Service, scan_id: UUID, form: str, camera: str, known: str | None) -> Response:
-    """One of `CLOUDS`. Made only when a scan is over: it takes all of its files."""
+def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known: str | None) -> Response:
+    """One of `ON_DEMAND`. Made only when a scan is over: it takes all of its files."""
     place = service.folder.scan(scan_id)
     path = place / form.format(camera=camera)
     record = service.store.get(scan_id)
@@ -118,7 +130,7 @@ def _cloud(service: Service, scan_id: UUID, form: str, camera: str, known: str |
         make_cloud(service, scan_id, form, camera)
     if not service.folder.owns(path):
         _refuse_absent(record, path.name)
-    return _kept(path, CLOUDS[form], headers)
+    return _kept(path, ON_DEMAND[form], headers)
 
 
 def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | None:
@@ -200,6 +212,21 @@ for _form, _media_type in CLOUDS.items():
         operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}",
         summary=f"Fetch {_form}",
     )
+
+
+@router.get(f"/{BAG}", response_class=Response, responses=_answers(ON_DEMAND[BAG], 501, 503, 507))
+def fetch_bag(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+    """Return a finished scan as a ROS 2 bag: points of each camera, white images, and where the devices stand.
+
+    It is made when it is first asked for, and kept; 503 while others are computed for long.
+    """
+    return _cloud(service, scan_id, BAG, None, known)
+
+
+@router.get(f"/{CALIBRATION_USED}", response_class=Response, responses=_answers("application/json"))
+def fetch_calibration_used(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
+    """Return the calibration that a finished scan was made with: lenses and poses of its devices."""
+    return _file(service, scan_id, f"{BUNDLE}/{CALIBRATION}", "application/json", known)
 
 
 @router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))

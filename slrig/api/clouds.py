@@ -1,4 +1,4 @@
-"""The files of a finished scan that the worker makes when they are first asked for: its surface in a camera's grid."""
+"""The files of a finished scan that the worker makes when they are first asked for: its surface in cameras' grids."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from pathlib import Path
 from uuid import UUID
 
 from slrig.api.service import Service
+from slrig.bundle.description import DESCRIPTION
 from slrig.bundle.reading import CALIBRATION
 from slrig.bundle.storage import write_file
 from slrig.errors import InvalidInputError, JobNotFoundError, StorageError, WorkerBusyError
 from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.worker_process import Task
 from slrig.scan.artefacts import MESH, REPORT
-from slrig.scan.offered import CLOUDS, causes_picture, extra_of
+from slrig.scan.offered import BAG, CLOUDS, causes_picture, extra_of
 
 MAKER = "slrig.scan.cloud_files:cloud_file"
 
@@ -32,22 +33,26 @@ _places = threading.BoundedSemaphore(MOST_WAITING)
 
 
 def clouds_of(folder: DataFolder, scan: Path, names: Iterable[str]) -> set[str]:
-    """The names of the clouds that can be made of a finished scan, here. names : of its files."""
+    """The names of the clouds, and of the bag, that can be made of a finished scan, here. names : of its files."""
     given = set(names)
     prefix, suffix = causes_picture("/").split("/")
     cameras = [name.removeprefix(prefix).removesuffix(suffix) for name in given if name.startswith(prefix)]
     forms = [form for form in CLOUDS if extra_of(Path(form).suffix) is None]
-    return {form.format(camera=camera) for camera in cameras if has_sources(folder, scan, camera) for form in forms}
+    found = {form.format(camera=camera) for camera in cameras if has_sources(folder, scan, camera) for form in forms}
+    if cameras and extra_of(Path(BAG).suffix) is None and has_sources(folder, scan, None):
+        found.add(BAG)
+    return found
 
 
-def has_sources(folder: DataFolder, scan: Path, camera: str) -> bool:
-    """Whether the files are there that a camera's cloud is made of."""
-    sources = MESH, REPORT, causes_picture(camera), f"{BUNDLE}/{CALIBRATION}"
+def has_sources(folder: DataFolder, scan: Path, camera: str | None) -> bool:
+    """Whether the files are there that a camera's cloud is made of; None: the bag, but for maps of causes."""
+    further = f"{BUNDLE}/{DESCRIPTION}" if camera is None else causes_picture(camera)
+    sources = MESH, REPORT, further, f"{BUNDLE}/{CALIBRATION}"
     return all(folder.owns(scan / source) for source in sources)
 
 
-def make_cloud(service: Service, scan_id: UUID, form: str, camera: str) -> None:
-    """Have the worker make one of `CLOUDS` of a finished scan, and keep it, unless it is there.
+def make_cloud(service: Service, scan_id: UUID, form: str, camera: str | None) -> None:
+    """Have the worker make one of `ON_DEMAND` of a finished scan, and keep it, unless it is there.
 
     Raises
     ------

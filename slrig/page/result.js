@@ -13,10 +13,10 @@ const PURPOSES = {
   "mesh.ply": "the mesh in mm, with σ for each vertex", "mesh.glb": "for viewers and web pages, in metres", "mesh.stl": "for CAD and printing, in mm",
   "mesh.obj": "for modelling programs, in mm", "mesh.3mf": "for CAD and printing, in mm, with colours", "points.ply": "the points before meshing", "report.json": "all figures of this scan",
   "preview.png": "a picture to send", "bundle.zip": "the frames and the calibration, to compute it all again", "view.glb": "what this page shows",
-  "coarse.glb": "what this page shows first",
+  "coarse.glb": "what this page shows first", "scan.mcap": "a bag for ROS 2 and Foxglove, in metres", "calibration.json": "lenses and poses of this scan's devices",
 };
 /** Made when they are asked for: to ask for their size would make them. */
-const MADE_LATER = ["mesh.stl", "mesh.obj", "mesh.3mf", "view.glb", "coarse.glb", "bundle.zip"];
+const MADE_LATER = ["mesh.stl", "mesh.obj", "mesh.3mf", "view.glb", "coarse.glb", "scan.mcap", "bundle.zip"];
 const OF_CAMERAS = [
   [/^causes-/, "causes as numbers, for programs"], [/^rejected-/, "why pixels gave no point, as a picture"],
   [/^points-.*npz$/, "a point for each pixel of the camera, for numpy"], [/^points-/, "the same for point-cloud programs"],

@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib.util
 import io
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from pathlib import Path
 from uuid import UUID
 
@@ -18,8 +20,11 @@ from fastapi.testclient import TestClient
 
 from slrig.api import clouds
 from slrig.bundle.calibration_file import write_calibration
+from slrig.bundle.writing import BundleWriter
 from slrig.jobs.worker_process import Task
-from slrig.model import Calibration, Pinhole, Size
+from slrig.model import Calibration, CameraFormat, Pinhole, Shot, Size, White
+from slrig.scan.offered import BAG
+from tests.ros_readers import library, point_columns
 from tests.unit.api.conftest import ServedBench, ended
 from tests.unit.scan import fake_pipeline
 from tests.unit.scan.fakes import WAIT_S
@@ -156,6 +161,35 @@ def test_a_format_whose_library_is_missing_is_not_listed_and_says_what_to_instal
         assert "pip install 'slrig[e57]'" in answer.json()["detail"]
     else:
         assert (answer.status_code, answer.headers["Content-Type"]) == (200, "model/e57")
+
+
+def test_a_scan_is_one_bag_of_all_its_cameras(
+    client: TestClient, served: ServedBench, scan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    library("rosbags.rosbag2")
+    place = served.service.folder.scan(UUID(scan))
+    (place / "bundle" / "bundle.json").unlink()
+    assert BAG not in client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert client.get(f"/scan/{scan}/{BAG}").status_code == 409
+    white = np.arange(SIZE.width_px * SIZE.height_px, dtype=np.uint16).reshape(SIZE.shape).astype(np.uint8)
+    moment = datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC)
+    forms = {"left": CameraFormat(SIZE, 8)}
+    with BundleWriter(tmp_path / "bundle", SIZE, [White()], forms, captured_at=moment) as bundle:
+        bundle.add(Shot(0, "left", white))
+    shutil.copytree(tmp_path / "bundle", place / "bundle", dirs_exist_ok=True)
+    files = client.get(f"/scan/{scan}").json()["links"]["files"]
+    assert client.get(files["calibration.json"]).json()["cameras"]["left"]["size_px"] == [40, 30]
+    fetched = client.get(files[BAG])
+    assert fetched.status_code == 200, fetched.text
+    assert fetched.content == (place / BAG).read_bytes()
+    with library("rosbags.highlevel").AnyReader([place / BAG]) as reader:
+        said = {each.topic: (at, reader.deserialize(data, each.msgtype)) for each, at, data in reader.messages()}
+    assert {at for at, _ in said.values()} == {int(moment.timestamp()) * 10**9}
+    columns = point_columns(said["/slrig/left/points"][1])
+    np.testing.assert_allclose([columns[axis][13, 15] for axis in "xyz"], (0.003, 0.003, 0), atol=1e-9)
+    np.testing.assert_array_equal(said["/slrig/left/image_raw"][1].data.reshape(SIZE.shape), white)
+    monkeypatch.setattr(clouds, "extra_of", lambda ending: "pip install" if ending == ".mcap" else None)
+    assert BAG not in client.get(f"/scan/{scan}").json()["links"]["files"]
 
 
 def test_a_request_waits_for_its_turn_and_not_for_ever(
