@@ -162,6 +162,12 @@ class SolveRefusedError(SlrigError, code="solve-refused"):
     """
 
 
+class RegistrationRefusedError(SlrigError, code="registration-refused"):
+    """Views are sound one by one, and cannot be put into one frame: too little overlap, or surfaces that do not agree.
+    Name the views, and what to scan or to tell instead.
+    """
+
+
 class CalibrationNotFoundError(SlrigError, code="calibration-not-found"):
     """No calibration, or no pose of one, of this id is on record here."""
 

@@ -43,7 +43,7 @@ def named_bundles(asked: Sequence[Path]) -> tuple[list[Path], bool]:
     several = False
     for one in asked:
         with refusals_of(one):
-            for path in _matching(one):
+            for path in matching(one):
                 inside = _bundles_inside(path)
                 several |= bool(inside)
                 found |= {bundle.absolute(): bundle for bundle in inside or [path]}
@@ -100,10 +100,10 @@ def work_through(
         raise typer.Exit(1 if UNEXPECTED in failed.values() else 2)
 
 
-def _matching(asked: Path) -> list[Path]:
+def matching(asked: Path) -> list[Path]:
     """What a pattern names, in natural order. A path stands for itself, and so does what matches nothing."""
     matching = [] if asked.exists() else glob(str(asked))  # noqa: PTH207 - Path.glob takes no absolute pattern
-    return sorted(map(Path, matching), key=_natural) or [asked]
+    return sorted(map(Path, matching), key=natural) or [asked]
 
 
 def _bundles_inside(folder: Path) -> list[Path]:
@@ -112,7 +112,7 @@ def _bundles_inside(folder: Path) -> list[Path]:
     """
     if not folder.is_dir() or (folder / DESCRIPTION).is_file():
         return []
-    inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=_natural)
+    inside = sorted((each for each in folder.iterdir() if each.is_dir() and each.name[0] != "."), key=natural)
     # A scan of the service has its bundle beside its results.
     held = {each: [place for place in (each, each / BUNDLE) if (place / DESCRIPTION).is_file()][:1] for each in inside}
     found = [place for places in held.values() for place in places]
@@ -122,7 +122,7 @@ def _bundles_inside(folder: Path) -> list[Path]:
     return found
 
 
-def _natural(path: Path) -> list[str | int]:
+def natural(path: Path) -> list[str | int]:
     """A key that sorts scan-2 before scan-10."""
     parts = re.split(r"([0-9]+)", str(path))
     return [int(part) if place % 2 else part.casefold() for place, part in enumerate(parts)]

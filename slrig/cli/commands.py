@@ -17,6 +17,7 @@ import typer.core
 from slrig.cli import calibrate, key, schedule
 from slrig.cli.backup import backup, restore
 from slrig.cli.foreign import import_images
+from slrig.cli.model import model
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
 from slrig.cli.scan_options import ColourOptions
@@ -372,6 +373,7 @@ def accept(
         raise typer.Exit(1)
 
 
+app.command()(model)
 app.command()(patterns)
 app.command(name="import")(import_images)
 app.command()(backup)

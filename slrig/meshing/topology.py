@@ -92,6 +92,15 @@ def topology_counts(faces: IntArray) -> TopologyCounts:
     )
 
 
+def boundary_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
+    """(vertex_count,) bool: the ends of edges that one triangle alone uses."""
+    faces = np.ascontiguousarray(faces)
+    border = np.zeros(vertex_count, dtype=np.bool_)
+    half_edges = in_groups(np.minimum(faces, faces[:, [1, 2, 0]]).ravel(), vertex_count)
+    in_bands(_edge_counts, vertex_count, faces, *half_edges, border)
+    return border
+
+
 def used_vertices(faces: IntArray, vertex_count: int) -> NDArray[np.bool_]:
     """(vertex_count,) bool: the vertices that a face uses."""
     used = np.zeros(vertex_count, dtype=np.bool_)

@@ -1,0 +1,98 @@
+"""Poses of an object that a stage turns about one axis, and that axis from poses that were found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from slrig.model import FloatArray
+from slrig.views.registration import Registration
+
+_EXACT_MM = 1e-3
+"""Deviation that poses are given in any case, so that a motion that was held, and has none, does not outweigh all."""
+_LEAST_TURN_RAD = np.deg2rad(1.0)
+
+
+def turntable(axis_point_mm: FloatArray, axis_direction: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """(N, 4, 4): the poses of views of an object that a stage turned, as the cameras that stand still see it.
+
+    axis_point_mm, axis_direction : (3,), in the frame of the views. angles_rad : (N,), how far the stage stood turned
+    about that direction, right-handed. A pose takes a view back to the first one's angle.
+    """
+    direction = np.asarray(axis_direction, dtype=np.float64) / np.linalg.norm(axis_direction)
+    back = angles_rad[0] - np.asarray(angles_rad, dtype=np.float64)
+    turns = Rotation.from_rotvec(back[:, None] * direction).as_matrix()
+    poses = np.tile(np.eye(4), (len(turns), 1, 1))
+    poses[:, :3, :3] = turns
+    poses[:, :3, 3] = axis_point_mm - turns @ axis_point_mm
+    return poses
+
+
+@dataclass(frozen=True, slots=True)
+class FoundAxis:
+    """The axis that poses turn about, and how well it is known.
+
+    point_mm : (3,), the point of it nearest to the object's middle; direction : (3,), unit; angles_rad : (N,), of the
+    stage, as the poses have them, within half a turn of 0. point_sigma_mm, direction_sigma_rad : standard deviations
+    across the axis, rms of both directions. rms_mm : how far from a pure turn the poses are, at the object's radius.
+    """
+
+    point_mm: FloatArray
+    direction: FloatArray
+    angles_rad: FloatArray
+    point_sigma_mm: float
+    direction_sigma_rad: float
+    rms_mm: float
+
+
+def found_axis(registration: Registration, towards: FloatArray) -> FoundAxis | None:
+    """The axis and angles of a turntable that fit poses best, by their covariance; None where nothing was turned.
+
+    towards : (3,), a direction that the axis is to have an acute angle with, as that of the start.
+    """
+    poses, middle, radius = registration.poses, registration.middle_mm, registration.radius_mm
+    vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
+    if np.linalg.norm(vectors, axis=1).max() < _LEAST_TURN_RAD:
+        return None
+    direction = np.linalg.svd(vectors)[2][0]
+    direction *= 1.0 if direction @ towards > 0 else -1.0
+    # Points of the axis stay where they are: T x = x.
+    still = (np.eye(3) - poses[:, :3, :3]).reshape(-1, 3)
+    point = middle + np.linalg.lstsq(still, poses[:, :3, 3].ravel() - still @ middle, rcond=1e-6)[0]
+    across = np.linalg.svd(direction[None])[2][1:]
+    scale = np.tile(np.repeat([radius, 1.0], 3), len(poses) - 1)
+    covariance = registration.covariance * scale[:, None] * scale
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance + _EXACT_MM**2 * np.eye(len(scale))))
+
+    def axis(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        tilted = direction + parameters[2:4] @ across / radius
+        return point + parameters[:2] @ across, tilted / np.linalg.norm(tilted)
+
+    def apart(parameters: FloatArray) -> FloatArray:
+        change = poses @ np.linalg.inv(turntable(*axis(parameters), np.append(0.0, parameters[4:])))
+        turns = radius * Rotation.from_matrix(change[:, :3, :3]).as_rotvec()
+        return np.hstack([turns, change[:, :3, :3] @ middle + change[:, :3, 3] - middle])[1:].ravel()
+
+    def whitened(parameters: FloatArray) -> FloatArray:
+        return np.asarray(whiten @ apart(parameters))
+
+    begin = np.concatenate([np.zeros(4), -(vectors @ direction)[1:]])
+    fit = least_squares(whitened, begin)
+    # Where poses are no pure turns within their deviations, the axis is known the less.
+    beyond = max(1.0, np.sqrt(2 * fit.cost / (len(fit.fun) - len(fit.x))))
+    slopes = np.asarray(fit.jac)
+    sigma = beyond * np.sqrt(np.diag(np.linalg.pinv(slopes.T @ slopes)))
+    left = np.square(apart(fit.x)).reshape(-1, 6).sum(axis=1)
+    place, way = axis(fit.x)
+    turned = np.append(0.0, fit.x[4:])
+    return FoundAxis(
+        point_mm=place + way * (way @ (middle - place)),
+        direction=way,
+        angles_rad=(turned + np.pi) % (2 * np.pi) - np.pi,
+        point_sigma_mm=float(np.sqrt(np.mean(sigma[:2] ** 2))),
+        direction_sigma_rad=float(np.sqrt(np.mean(sigma[2:4] ** 2)) / radius),
+        rms_mm=float(np.sqrt(left.mean())),
+    )

@@ -1,0 +1,109 @@
+"""Registration of views whose true poses are known; small ones here, eight at a time in tests/golden/test_views.py."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slrig.errors import RegistrationRefusedError
+from slrig.model import AlbedoMark, FloatArray
+from slrig.views.freedom import Motion
+from slrig.views.matching import side_of
+from slrig.views.registration import registered
+from slrig.views.turntable import found_axis, turntable
+from tests.turned_views import AXIS, AXIS_POINT_MM, Turned, bumpy, displacement_mm, plane, seen, vase, wrong_axis
+
+ANGLES = [0.0, 40.0, 80.0]
+
+
+@pytest.fixture(scope="module")
+def three() -> Turned:
+    """Three views of an object that no motion maps on itself."""
+    return seen(bumpy, ANGLES, pitch_mm=1.0)
+
+
+def test_three_views_come_to_where_they_belong_from_a_wrong_axis(three: Turned) -> None:
+    views, starts = three.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
+    found = registered(views, starts)
+    wrong = [displacement_mm(*each) for each in zip(views, found.poses, three.poses, strict=True)]
+    assert displacement_mm(views[2], starts[2], three.poses[2]) > 1.0
+    assert wrong[0] == 0.0
+    assert max(wrong) < 0.012
+    # What is stated is what is there, and each pair is told with figures of its own.
+    assert max(wrong) < 3 * found.sigma_mm.max()
+    assert found.free == ()
+    by_pair = {(each.first, each.second): each for each in found.pairs}
+    assert set(by_pair) == {(0, 1), (0, 2), (1, 2)}
+    assert by_pair[0, 1].overlap > by_pair[0, 2].overlap > 0.2
+    assert all(0.9 < each.rms_over_sigma < 1.2 and each.closure_mm < 0.02 for each in found.pairs)
+    # The stage's axis is found from the object itself.
+    axis = found_axis(found, AXIS)
+    assert axis is not None
+    aside = np.cross(axis.point_mm - AXIS_POINT_MM, AXIS)
+    assert np.linalg.norm(aside) < 0.01
+    assert np.linalg.norm(np.cross(axis.direction, AXIS)) < np.deg2rad(0.02)
+    assert np.rad2deg(axis.angles_rad) == pytest.approx(ANGLES, abs=0.02)
+
+
+def test_a_vase_may_turn_about_its_axis_and_is_held_at_the_angle_told() -> None:
+    turned = seen(vase, ANGLES, pitch_mm=1.0)
+    views, starts = turned.noisy(1, length_mm=2.0), wrong_axis(ANGLES)
+    found = registered(views, starts)
+    assert [(each.view, each.motion) for each in found.free] == [(1, Motion.TURN), (2, Motion.TURN)]
+    for each in found.free:
+        assert np.linalg.norm(np.cross(each.direction, AXIS)) < 0.01
+        assert each.free_mm > 1.0
+    # The turn is the start's, to the second order of the axis's error, and all else is found.
+    for pose, start, true in zip(found.poses[1:], starts[1:], turned.poses[1:], strict=True):
+        change, left = pose[:3, :3] @ start[:3, :3].T, pose[:3, :3] @ true[:3, :3].T
+        assert abs(_turn_about(AXIS, change)) < np.deg2rad(0.005)
+        across = np.linalg.norm(np.cross(AXIS, left @ AXIS))
+        assert across < np.deg2rad(0.02)
+
+
+def test_two_planes_have_three_free_motions() -> None:
+    turned = plane([0.0, 3.0])
+    found = registered(turned.noisy(0, length_mm=2.0), turned.poses)
+    assert sorted(each.motion for each in found.free) == [Motion.SHIFT, Motion.SHIFT, Motion.TURN]
+    assert displacement_mm(turned.exact[1], found.poses[1], turned.poses[1]) < 0.01
+
+
+def test_a_view_that_overlaps_no_other_is_named() -> None:
+    turned = seen(bumpy, [0.0, 40.0, 180.0], pitch_mm=2.0)
+    with pytest.raises(RegistrationRefusedError, match=r"^back: .* share more than 2% of the surface"):
+        registered(turned.exact, turned.poses, names=["front", "side", "back"])
+    with pytest.raises(RegistrationRefusedError, match="two views or more"):
+        registered(turned.exact[:1], turned.poses[:1])
+
+
+def test_a_view_of_another_shape_is_named(three: Turned) -> None:
+    stretched = replace(three.exact[1], vertices_mm=three.exact[1].vertices_mm * np.float32(1.03))
+    views = [three.exact[0], stretched, three.exact[2]]
+    with pytest.raises(RegistrationRefusedError, match=r"^side: expected a surface that agrees"):
+        registered(views, three.poses, names=["front", "side", "other side"])
+
+
+def test_what_is_marked_or_lies_at_the_boundary_is_no_source(three: Turned) -> None:
+    mesh = three.exact[0]
+    usable = side_of(mesh).usable
+    assert 0 < (~usable).sum() < len(usable) / 2
+    mark = np.where(usable, AlbedoMark.SATURATED, AlbedoMark.NONE).astype(np.uint8)
+    with pytest.raises(RegistrationRefusedError, match="none of its"):
+        registered([replace(mesh, mark=mark), mesh], [np.eye(4), np.eye(4)])
+
+
+def _turn_about(axis: FloatArray, turn: FloatArray) -> float:
+    """Angle about an axis of a small turn, rad."""
+    skew = (turn - turn.T) / 2
+    return float(axis @ np.array([skew[2, 1], skew[0, 2], skew[1, 0]]))
+
+
+def test_a_turntable_takes_views_back_to_the_first() -> None:
+    point = np.array([1.0, 2.0, 3.0])
+    first, second = turntable(point, np.array([0.0, 0.0, 2.0]), np.deg2rad([10.0, 100.0]))
+    assert first == pytest.approx(np.eye(4))
+    # What the stage turned from x to y comes back to x; the axis stays.
+    assert second @ np.array([1.0, 3.0, 3.0, 1.0]) == pytest.approx([2.0, 2.0, 3.0, 1.0])
+    assert second[:3, :3] @ point + second[:3, 3] == pytest.approx(point)
