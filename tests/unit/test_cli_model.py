@@ -1,0 +1,117 @@
+"""`slrig model`: which scans are meant, where they start from, and what is written and told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from slrig.bundle.poses_file import Poses, encode_poses, read_poses
+from slrig.cli.commands import app
+from slrig.errors import ConfigError
+from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
+from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
+
+ANGLE = 40.0
+STAGE = [
+    "--angle", str(ANGLE), "--axis-point", *map(str, np.add(AXIS_POINT_MM, [0.3, 0.0, -0.2])),
+    "--axis-direction", *map(str, AXIS),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with scans 9, 10 and 11 of an object on a stage, and one scan's mesh of a vase beside it."""
+    folder = tmp_path_factory.mktemp("scans")
+    turned = seen(bumpy, [0.0, ANGLE, 2 * ANGLE], pitch_mm=1.5)
+    for number, view in zip((9, 10, 11), turned.noisy(0, length_mm=2.0), strict=True):
+        (folder / "all" / f"scan-{number}").mkdir(parents=True)
+        (folder / "all" / f"scan-{number}" / "mesh.ply").write_bytes(encode_mesh_ply(view))
+    for number, view in enumerate(seen(vase, [0.0, ANGLE], pitch_mm=1.5).noisy(0, length_mm=2.0)):
+        (folder / f"vase-{number}.ply").write_bytes(encode_mesh_ply(view))
+    return folder
+
+
+def model(*words: object) -> Result:
+    return CliRunner().invoke(app, ["model", *map(str, words)], env={"COLUMNS": "120"})
+
+
+def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Path, tmp_path: Path) -> None:
+    done = model(scans / "all", "--output", tmp_path / "model", *STAGE)
+    assert done.exit_code == 0, done.output
+    table = done.stdout.splitlines()
+    assert [line.split()[0] for line in table[:4]] == ["view", "scan-9", "scan-10", "scan-11"]
+    assert any(line.startswith("axis ") and "±" in line for line in table)
+    report = json.loads((tmp_path / "model" / "report.json").read_text())
+    assert len(report["pairs"]) == 3
+    assert np.shape(report["registration"]["covariance"]) == (12, 12)
+    assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
+    known = read_poses(tmp_path / "model" / "poses.json")
+    assert list(known.poses) == ["scan-9", "scan-10", "scan-11"]
+    assert known.axis is not None
+    assert np.linalg.norm(np.cross(known.axis[0] - AXIS_POINT_MM, AXIS)) < 0.03
+    # One mesh in the frame of the first scan: the second one's vertices follow its own.
+    placed = decode_mesh_ply((tmp_path / "model" / "placed.ply").read_bytes())
+    views = [decode_mesh_ply((scans / "all" / name / "mesh.ply").read_bytes()) for name in known.poses]
+    first, second = len(views[0].vertices_mm), len(views[1].vertices_mm)
+    assert len(placed.faces) == sum(len(view.faces) for view in views)
+    pose = known.poses["scan-10"]
+    wanted = views[1].vertices_mm @ pose[:3, :3].T + pose[:3, 3]
+    assert placed.vertices_mm[first : first + second] == pytest.approx(wanted, abs=1e-4)
+    # Two of them, the other way round, from the poses that were written.
+    names = ["scan-11", "scan-10"]
+    again = model(
+        *(scans / "all" / name for name in names), "--output", tmp_path / "two", "--poses",
+        tmp_path / "model" / "poses.json",
+    )  # fmt: skip
+    assert again.exit_code == 0, again.output
+    two = read_poses(tmp_path / "two" / "poses.json").poses
+    back = np.linalg.inv(known.poses["scan-11"]) @ known.poses["scan-10"]
+    assert displacement_mm(views[1], two["scan-10"], back) < 0.02
+
+
+def test_a_vase_is_told_to_be_free(scans: Path, tmp_path: Path) -> None:
+    done = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "model", *STAGE)
+    assert done.exit_code == 0, done.output
+    assert "free      1 view may turn about an axis along (-0.0" in done.stdout
+    assert "held as the start has it" in done.stdout
+    (free,) = json.loads((tmp_path / "model" / "report.json").read_text())["free"]
+    assert (free["view"], free["motion"]) == ("vase-1", "turn")
+
+
+def test_what_is_missing_is_said(scans: Path, tmp_path: Path) -> None:
+    poses = tmp_path / "some.json"
+    poses.write_bytes(encode_poses(Poses({"scan-9": np.eye(4)})))
+    folder, to = scans / "all", ("--output", tmp_path / "none")
+    for words, expected in (
+        ([folder, *to], "found none of them"),
+        ([folder, *to, "--angle", 40], "found --angle"),
+        ([folder, *to, "--angle", 40, "--axis", poses], "expected the key axis"),
+        ([folder, *to, "--poses", poses], "found none of scan-10, scan-11"),
+        ([folder / "scan-9", *to, *STAGE], "expected two scans or more"),
+        ([folder / "scan-9", folder / "scan-9", *to, *STAGE], "two called scan-9"),
+        ([tmp_path, *to, *STAGE], "expected a scan's folder with mesh.ply"),
+        ([folder, *to, *STAGE[:2], *STAGE[6:]], "together"),
+    ):
+        refused = model(*words)
+        assert (refused.exit_code, expected in refused.stderr) == (2, True), (words, refused.output)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_file_of_poses_says_what_is_wrong_with_it(tmp_path: Path) -> None:
+    file = tmp_path / "poses.json"
+    for pose, expected in (
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "expected a rotation"),
+        (np.diag([1.01, 1.0, 1.0, 1.0]), "expected a rotation"),
+    ):
+        file.write_bytes(encode_poses(Poses({"front": pose})))
+        with pytest.raises(ConfigError, match=expected):
+            read_poses(file)
+    file.write_bytes(encode_poses(Poses({}, (np.zeros(3), np.zeros(3)))))
+    with pytest.raises(ConfigError, match="vector with a length"):
+        read_poses(file)
+    file.write_bytes(encode_poses(Poses({"front": np.eye(4)}, (np.ones(3), np.array([0.0, 0.0, 1.0])))))
+    assert read_poses(file).poses["front"] == pytest.approx(np.eye(4))
