@@ -35,7 +35,7 @@ _MEDIAN = 0.6745
 """Median of absolute values over the standard deviation, of a normal distribution."""
 _MOST_STEPS = 60
 _LEAST_STEP = 0.1
-"""Squared, in deviations of a parameter if all matches were independent, which are some five times too small."""
+"""Squared, in deviations of a parameter if all matches were independent, which are three to six times too small."""
 _MOST_MISFIT = 4.0
 """Residuals over their deviations, by the median, beyond which a view's surface is not that of the others: rendered
 scans of calibrated rigs have 1 to 2."""

@@ -11,6 +11,7 @@ import pytest
 from slrig.meshing.adjacency import neighbours
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.topology import (
+    boundary_vertices,
     component_sizes,
     degenerate_faces,
     duplicate_face_count,
@@ -47,6 +48,10 @@ def test_a_grid_has_the_border_of_a_rectangle() -> None:
     faces = grid(5, 7)
     counts = topology_counts(faces)
     assert counts.boundary_vertices == counts.boundary_edges == 2 * (4 + 6)
+    border = boundary_vertices(faces, 36)  # one more than there are: unused
+    assert not border[35]
+    assert border[:35].reshape(5, 7)[1:-1, 1:-1].sum() == 0
+    assert border.sum() == 2 * (4 + 6)
     assert counts.euler_characteristic == 1
     assert counts.misoriented_edges == counts.nonmanifold_edges == 0
 
