@@ -259,7 +259,8 @@ class ServiceSettings(BaseSettings):
     `require_key` False opens the service to everyone who reaches it, so it is refused beyond this machine.
     `allowed_hosts` are names, beside `host` and those of this machine, that a request may carry as its Host; in the
     environment they are separated by commas. `webhook_url` is sent notices of `webhook_kinds`, all by default, signed
-    with `webhook_secret` or what `webhook_secret_file` holds; without an address nothing is sent anywhere. Beyond the
+    with `webhook_secret` or what `webhook_secret_file` holds. `mqtt_url` is a broker that all notices are published at,
+    with the user and password of `mqtt_login` or `mqtt_login_file`. Without an address nothing is sent. Beyond the
     newest `keep_calibrations`, calibrations are removed with their poses, but for the one in use and those that a scan
     or an acceptance test names. Scans are kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes`
     sets a limit: beyond it the oldest are removed, but for pinned ones and those whose files were asked for in the last
@@ -305,13 +306,16 @@ class ServiceSettings(BaseSettings):
     webhook_secret: SecretStr | None = None
     webhook_secret_file: Path | None = None
     webhook_kinds: Annotated[tuple[NoticeKind, ...], NoDecode] = get_args(NoticeKind)
+    mqtt_url: Annotated[str, Field(max_length=2000)] | None = None
+    mqtt_login: SecretStr | None = None
+    mqtt_login_file: Path | None = None
 
     @property
     def key_path(self) -> Path:
         """The file that holds the hashes of the service's keys."""
         return self.data_dir / "keys.json"
 
-    @field_validator("data_dir", "rig", "webhook_secret_file")
+    @field_validator("data_dir", "rig", "webhook_secret_file", "mqtt_login_file")
     @classmethod
     def _at_home(cls, path: Path | None) -> Path | None:
         return None if path is None else path.expanduser()
@@ -321,7 +325,7 @@ class ServiceSettings(BaseSettings):
     def _split(cls, names: object) -> object:
         return tuple(name.strip() for name in names.split(",") if name.strip()) if isinstance(names, str) else names
 
-    @field_validator("webhook_secret", mode="before")
+    @field_validator("webhook_secret", "mqtt_login", mode="before")
     @classmethod
     def _a_text(cls, secret: object) -> object:
         if not isinstance(secret, str | SecretStr | None):
@@ -363,7 +367,7 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
         The file is missing or not TOML, or a value is wrong; all faults in one message.
     """
     data: dict[str, Any] = {} if path is None else read_toml(path, MOST_CONFIG_BYTES)
-    for key in ("data_dir", "rig", "webhook_secret_file"):
+    for key in ("data_dir", "rig", "webhook_secret_file", "mqtt_login_file"):
         if path is not None and isinstance(data.get(key), str):
             data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
     source = "settings" if path is None else str(path)

@@ -39,6 +39,7 @@ from slrig.scan.acquisition import capture_frames
 from slrig.scan.job import PIPELINE
 from slrig.scan.runner import Runner
 from slrig.scan.sweep import sweep
+from slrig.schedule.receivers import wanted_kinds
 
 ADDRESS_FILE = "service.json"
 """Where in the data folder a running service tells its URL and process id."""
@@ -67,8 +68,8 @@ def open_service(
     try:
         prepare_kernel_cache(folder.root / "cache")
         database = Database(folder.database)
-        kinds = () if settings.webhook_url is None else settings.webhook_kinds
-        store = JobStore(database, JobKind.SCAN, outbox=Outbox(database, rig=rig.name, kinds=kinds))
+        outbox = Outbox(database, rig=rig.name, wanted=wanted_kinds(settings))
+        store = JobStore(database, JobKind.SCAN, outbox=outbox)
         swept = sweep(store, folder)
     except BaseException:
         folder.release()

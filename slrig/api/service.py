@@ -28,11 +28,11 @@ from slrig.jobs.worker import Worker
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
 from slrig.schedule.notices import NoticedHealth, tell_run
+from slrig.schedule.receivers import senders_of
 from slrig.schedule.records import Run
 from slrig.schedule.scheduler import Scheduler
 from slrig.schedule.store import ScheduleStore
 from slrig.schedule.tasks import Tasks
-from slrig.schedule.webhook import Webhook, key_of_file, signing_key
 from slrig.verify.job import VerificationDesk
 from slrig.verify.verification import verification_tools
 
@@ -54,8 +54,8 @@ class Service:
     StorageError
         The disk refused. What was given is still the caller's to close.
     ConfigError
-        The environment asks for traces, and the library that sends them is not installed. Or the webhook's secret is
-        none.
+        The environment asks for traces, and the library that sends them is not installed. Or a receiver of notices
+        cannot be told: see `senders_of`.
     """
 
     def __init__(
@@ -81,9 +81,7 @@ class Service:
         self.refuse_when_stale = refuse_when_stale
         self.hurry = threading.Event()
         database, outbox, spare_bytes = store.database, store.outbox, settings.min_free_bytes
-        self.webhook = None
-        if settings.webhook_url is not None:
-            self.webhook = Webhook(outbox, settings.webhook_url, _webhook_key(settings))
+        self.senders = senders_of(settings, outbox)
         self.keys = RequestKeys(database, life_s=settings.idempotency_keep_s)
         self.keys.release_all()
         self.audit = Audit(database)
@@ -148,8 +146,8 @@ class Service:
 
     def start(self) -> None:
         """Open the rig, look at the clock, send what waits, and remove what is old."""
-        if self.webhook is not None:
-            self.webhook.start()
+        for sender in self.senders:
+            sender.start()
         self.runner.start()
         self.scheduler.start()
         # It reads the report of every scan, and nobody waits for it.
@@ -176,18 +174,12 @@ class Service:
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""
         self.end_work()
-        if self.webhook is not None:
-            self.webhook.close()
+        for sender in self.senders:
+            sender.close()
         if self.traces is not None:
             self.traces.close()
         self.store.database.close()
         self.folder.release()
-
-
-def _webhook_key(settings: ServiceSettings) -> bytes | None:
-    if settings.webhook_secret is not None:
-        return signing_key(settings.webhook_secret.get_secret_value(), "webhook_secret")
-    return None if settings.webhook_secret_file is None else key_of_file(settings.webhook_secret_file)
 
 
 async def _of_request(request: Request) -> Service:

@@ -64,11 +64,7 @@ class _Figures(Collector):
         yield GaugeMetricFamily("slrig_rig_waiting", "How many wait for the rig.", status.waiting)
         yield from self._calibration()
         yield from self._schedule()
-        outbox = self._service.store.outbox
-        waiting, oldest_s = outbox.waiting()
-        yield GaugeMetricFamily("slrig_notices_waiting", "Notices that the webhook has not taken yet.", waiting)
-        yield GaugeMetricFamily("slrig_notices_oldest_age_seconds", "How long the oldest of them has waited.", oldest_s)
-        yield CounterMetricFamily("slrig_notices_dropped", "Notices that were never sent.", outbox.dropped)
+        yield from self._notices()
 
     def _calibration(self) -> Iterator[Metric]:
         health, latest, calibration = self._service.verifications.health()
@@ -90,6 +86,17 @@ class _Figures(Collector):
             "What the calibration in use says of the error of a point in its volume: a standard deviation.",
             solved.expected_error_mm,
         )
+
+    def _notices(self) -> Iterator[Metric]:
+        outbox, labels = self._service.store.outbox, ["receiver"]
+        waiting = GaugeMetricFamily("slrig_notices_waiting", "Notices that are not taken yet.", labels=labels)
+        ages = GaugeMetricFamily("slrig_notices_oldest_age_seconds", "How long the oldest has waited.", labels=labels)
+        for receiver in outbox.news:
+            count, oldest_s = outbox.waiting(receiver)
+            waiting.add_metric([receiver], count)
+            ages.add_metric([receiver], oldest_s)
+        yield from (waiting, ages)
+        yield CounterMetricFamily("slrig_notices_dropped", "Notices that were never sent.", outbox.dropped)
 
     def _schedule(self) -> Iterator[Metric]:
         counts = self._service.schedules.counts()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -26,18 +27,24 @@ _log = structlog.get_logger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """One notice. number : their order; id : the same at each try; body : JSON values."""
+    """One notice. number : their order; id : the same at each try, to each receiver; body : JSON values."""
 
     number: int
     id: str
     body: Mapping[str, Any]
 
+    @property
+    def content(self) -> bytes:
+        """The body as it is sent: JSON in UTF-8."""
+        return json.dumps(self.body, separators=(",", ":"), ensure_ascii=False).encode()
+
 
 class Outbox:
-    """What waits, from old to new. Any thread may call.
+    """What waits for each receiver, from old to new. Any thread may call.
 
-    rig : the name that notices bear. kinds : of notices that are wanted; all others are let go. most : may wait; the
-    oldest make room. `news` is set when one more waits, `dropped` counts those that were never sent.
+    rig : the name that notices bear. wanted : the kinds that each receiver wants, by its name; all others are let go.
+    most : may wait for one; the oldest make room. `news` is set when one more waits, `dropped` counts those that were
+    never sent.
     """
 
     def __init__(
@@ -45,30 +52,28 @@ class Outbox:
         database: Database,
         *,
         rig: str = "",
-        kinds: Collection[NoticeKind] = (),
+        wanted: Mapping[str, Collection[NoticeKind]] | None = None,
         clock: Clock = utc_now,
         most: int = MOST_WAITING,
     ) -> None:
         self.database = database
         self._rig = rig
-        self._kinds = frozenset(kinds)
+        self._wanted = wanted or {}
         self._clock = clock
         self._most = most
-        self.news = threading.Event()
+        self.news = {receiver: threading.Event() for receiver in self._wanted}
         self.dropped = 0
 
     def put(self, session: Session, kind: NoticeKind, words: str, /, **members: Mapping[str, Any]) -> None:
         """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
-        if kind not in self._kinds:
-            return
         notice_id, at = f"msg_{uuid4().hex}", stamp(self._clock())
         body = {"id": notice_id, "kind": kind, "at": at, "rig": self._rig, "words": f"rig '{self._rig}': {words}"}
-        row = NoticeRow(id=notice_id, at=at, kind=kind, body={**body, **members})
-        session.add(row)
-        session.flush()
-        # Numbers rise by one, and only the oldest are ever taken away.
-        self._drop(session, NoticeRow.number <= row.number - self._most, f"more than {self._most} wait")
-        event.listen(session, "after_commit", lambda _: self.news.set(), once=True)
+        for receiver in (name for name, kinds in self._wanted.items() if kind in kinds):
+            session.add(NoticeRow(receiver=receiver, id=notice_id, at=at, kind=kind, body={**body, **members}))
+            numbers = select(NoticeRow.number).where(NoticeRow.receiver == receiver).order_by(NoticeRow.number.desc())
+            surplus = NoticeRow.number <= numbers.offset(self._most).limit(1).scalar_subquery()
+            self._drop(session, receiver, surplus, f"more than {self._most} wait")
+            event.listen(session, "after_commit", lambda _, news=self.news[receiver]: news.set(), once=True)
 
     def ended(self, session: Session, job: JobRecord) -> None:
         """Tell of a job that comes to its end."""
@@ -82,36 +87,37 @@ class Outbox:
         state = job.state if job.state in {JobState.SUCCEEDED, JobState.FAILED} else f"was {job.state}"
         self.put(session, "job.ended", f"{job.kind} {job.id} {state}{more}", job=told)
 
-    def oldest(self) -> Notice | None:
+    def oldest(self, receiver: str) -> Notice | None:
         """The notice to send next. Drops those that have waited for too long."""
         while True:
             with self.database.reading() as session:
-                row = session.scalar(select(NoticeRow).order_by(NoticeRow.number).limit(1))
+                waiting = select(NoticeRow).where(NoticeRow.receiver == receiver)
+                row = session.scalar(waiting.order_by(NoticeRow.number).limit(1))
             if row is None:
                 return None
             limit = stamp(self._clock() - KEPT_FOR)
             if row.at >= limit:
                 return Notice(row.number, row.id, row.body)
             with self.database.changing() as session:
-                self._drop(
-                    session, NoticeRow.at < limit, f"they have waited for {KEPT_FOR // timedelta(hours=1)} hours"
-                )
+                hours = KEPT_FOR // timedelta(hours=1)
+                self._drop(session, receiver, NoticeRow.at < limit, f"they have waited for {hours} hours")
 
     def sent(self, notice: Notice) -> None:
         """Forget a notice that its receiver has."""
         with self.database.changing() as session:
             session.execute(delete(NoticeRow).where(NoticeRow.number == notice.number))
 
-    def waiting(self) -> tuple[int, float]:
+    def waiting(self, receiver: str) -> tuple[int, float]:
         """How many wait, and for how many seconds the oldest does."""
+        query = select(func.count(), func.min(NoticeRow.at)).where(NoticeRow.receiver == receiver)
         with self.database.reading() as session:
-            count, oldest = session.execute(select(func.count(), func.min(NoticeRow.at))).one()
+            count, oldest = session.execute(query).one()
         if count == 0:
             return 0, 0.0
         return count, max((self._clock() - datetime.fromisoformat(oldest)).total_seconds(), 0.0)
 
-    def _drop(self, session: Session, which: ColumnElement[bool], cause: str) -> None:
-        gone = list(session.scalars(delete(NoticeRow).where(which).returning(NoticeRow.id)))
-        if gone:
+    def _drop(self, session: Session, receiver: str, which: ColumnElement[bool], cause: str) -> None:
+        query = delete(NoticeRow).where(NoticeRow.receiver == receiver, which).returning(NoticeRow.id)
+        if gone := list(session.scalars(query)):
             self.dropped += len(gone)
-            _log.error("notices were dropped", count=len(gone), first=gone[0], cause=cause)
+            _log.error("notices were dropped", receiver=receiver, count=len(gone), first=gone[0], cause=cause)

@@ -97,11 +97,12 @@ class AuditRow(Base):
 
 
 class NoticeRow(Base):
-    """One notice that waits to be sent; `number` is their order, `id` what its receiver knows it by."""
+    """One notice that waits to be sent to one receiver; `number` is their order, `id` what it is known by there."""
 
     __tablename__ = "notice"
 
     number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    receiver: Mapped[str] = mapped_column(String(16))
     id: Mapped[str] = mapped_column(String(36))
     at: Mapped[str] = mapped_column(String(32))
     kind: Mapped[str] = mapped_column(String(32))

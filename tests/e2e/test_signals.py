@@ -1,4 +1,4 @@
-"""What tells others that a job is done: notices to a webhook, and one stream of the events of all jobs."""
+"""What tells others that a job is done: notices to a webhook and a broker, and one stream of the events of all jobs."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from tests.e2e.test_calibration_walk import BOARD, SLOW, Caller
 from tests.e2e.test_schedule_walk import calibrated_rig
 from tests.e2e.test_survival import ended, followed_to
 from tests.unit.schedule.hook import PATH, SECRET, Hook, signed
+from tests.unit.schedule.mosquitto import LOGIN, PREFIX, Mosquitto, Subscriber
 
 pytestmark = pytest.mark.slow
 
@@ -45,15 +46,24 @@ def hook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[
         each.close()
 
 
-def waiting(caller: Caller) -> float:
-    """How many notices wait, by the service's metrics."""
+@pytest.fixture
+def broker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mosquitto]:
+    """One that services of this test are told of, and that does not listen yet."""
+    made = Mosquitto(tmp_path)
+    monkeypatch.setenv("SLRIG_MQTT_URL", made.url)
+    monkeypatch.setenv("SLRIG_MQTT_LOGIN", LOGIN)
+    yield made
+    made.stop()
+
+
+def waiting(caller: Caller) -> list[float]:
+    """How many notices wait for each receiver, by the service's metrics."""
     lines = caller.http.get("/metrics").text.splitlines()
-    (line,) = [line for line in lines if line.startswith("slrig_notices_waiting ")]
-    return float(line.split()[1])
+    return [float(line.split()[1]) for line in lines if line.startswith("slrig_notices_waiting{")]
 
 
 def test_every_end_is_told_once_in_order_and_signed_through_a_kill(
-    start: Start, tmp_path: Path, hook: Callable[[], Hook]
+    start: Start, tmp_path: Path, hook: Callable[[], Hook], broker: Mosquitto
 ) -> None:
     rig = write_rig(tmp_path / "rig", head=SLOW)
     first = start(rig)
@@ -67,24 +77,31 @@ def test_every_end_is_told_once_in_order_and_signed_through_a_kill(
         cut_off = client.scans.start(label="cut off")
         followed_to(client, cut_off, "capture")
         # Nobody listened so far, and nothing was held up by that.
-        assert waiting(caller) == 2
+        assert waiting(caller) == [2, 2]
         assert "a notice was not delivered" in first.log.read_text()
         first.kill()
     second = start(rig)
     with second.client() as client, Caller(second) as caller:
         assert ended(client, client.scans.start(label="later"))["state"] == "succeeded"
-        assert waiting(caller) == 4
+        assert waiting(caller) == [4, 4]
         receiver = hook()
+        broker.start()
+        subscriber = Subscriber(broker)
         came = [receiver.next() for _ in range(4)]
-        awaited(lambda: waiting(caller) == 0, "the end of the outbox")
+        awaited(lambda: waiting(caller) == [0, 0], "the end of the outbox")
         second.kill()
     third = start(rig)
     with third.client() as client, Caller(third) as caller:
         assert ended(client, client.scans.start(label="last"))["state"] == "succeeded"
         came.append(receiver.next())
-        awaited(lambda: waiting(caller) == 0, "the end of the outbox")
+        awaited(lambda: waiting(caller) == [0, 0], "the end of the outbox")
         assert third.stop() == 0
     assert receiver.came.empty(), "something was told twice"
+    told = [subscriber.next() for _ in range(5)]
+    subscriber.close()
+    assert subscriber.came.empty(), "something was told twice"
+    assert {topic for topic, _ in told} == {f"{PREFIX}/job.ended"}
+    assert [body for _, body in told] == [json.loads(each["raw"]) for each in came]
     assert [(each["job"]["label"], each["job"]["state"]) for each in came] == [
         ("done", "succeeded"),
         ("cancelled", "cancelled"),
@@ -100,7 +117,7 @@ def test_every_end_is_told_once_in_order_and_signed_through_a_kill(
     assert len({each["id"] for each in came}) == 5
     log = first.log.read_text()
     assert "notice" in log
-    for secret in (PATH.rsplit("/", 1)[1], SECRET, SECRET.removeprefix("whsec_")):
+    for secret in (PATH.rsplit("/", 1)[1], SECRET, SECRET.removeprefix("whsec_"), LOGIN.partition(":")[2]):
         assert secret not in log
 
 

@@ -16,7 +16,7 @@ from slrig.schedule.webhook import Webhook
 
 def outbox_of(folder: Path) -> Outbox:
     """The outbox of a data folder."""
-    return Outbox(Database(folder / "slrig.sqlite"), rig="bench", kinds=get_args(NoticeKind))
+    return Outbox(Database(folder / "slrig.sqlite"), rig="bench", wanted={"webhook": get_args(NoticeKind)})
 
 
 def end_jobs(folder: Path, url: str, ready: Connection) -> None:

@@ -36,13 +36,13 @@ def database(tmp_path: Path) -> Iterator[Database]:
 
 @pytest.fixture
 def outbox(database: Database) -> Outbox:
-    return Outbox(database, rig="bench", kinds=get_args(NoticeKind), clock=lambda: DUE)
+    return Outbox(database, rig="bench", wanted={"webhook": get_args(NoticeKind)}, clock=lambda: DUE)
 
 
 def told(outbox: Outbox) -> list[dict[str, Any]]:
     """All that waits, which then waits no longer."""
     found = []
-    while (notice := outbox.oldest()) is not None:
+    while (notice := outbox.oldest("webhook")) is not None:
         found.append(dict(notice.body))
         outbox.sent(notice)
     return found
@@ -73,7 +73,7 @@ def test_runs_that_a_person_has_to_know_of_are_told_and_no_others(database: Data
 
 def test_run_that_fails_by_the_clock_is_told_with_its_row(tmp_path: Path) -> None:
     desk = Desk(tmp_path / "slrig.sqlite")
-    outbox = Outbox(desk.store.database, rig="bench", kinds=get_args(NoticeKind), clock=lambda: desk.now)
+    outbox = Outbox(desk.store.database, rig="bench", wanted={"webhook": get_args(NoticeKind)}, clock=lambda: desk.now)
     desk.store = ScheduleStore(
         desk.store.database, notice=lambda session, schedule, run: tell_run(outbox, session, schedule, run)
     )
@@ -173,14 +173,14 @@ def test_end_that_cannot_be_recorded_is_not_told_and_notice_that_cannot_be_writt
         patch.setattr(outbox, "ended", cut_off)
         with pytest.raises(PowerCutError):
             jobs.finish(job.id, JobState.SUCCEEDED)
-    assert (told(outbox), outbox.news.is_set()) == ([], False)
+    assert (told(outbox), outbox.news["webhook"].is_set()) == ([], False)
     jobs.finish(job.id, JobState.SUCCEEDED)
-    assert outbox.news.is_set()
+    assert outbox.news["webhook"].is_set()
     assert [each["job"]["state"] for each in told(outbox)] == ["succeeded"]
 
 
 def test_kinds_that_are_not_wanted_are_not_kept(database: Database) -> None:
-    outbox = Outbox(database, rig="bench", kinds=["run.failed"])
+    outbox = Outbox(database, rig="bench", wanted={"webhook": ["run.failed"]})
     jobs = JobStore(database, JobKind.SCAN, outbox=outbox)
     jobs.finish(jobs.create({}, rig="bench", label=None).id, JobState.SUCCEEDED)
     with database.changing() as session:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,9 +17,10 @@ from slrig.config import NoticeKind, ServiceSettings, read_settings
 from slrig.errors import ConfigError, StorageError
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Notice, Outbox
-from slrig.schedule.webhook import Webhook, key_of_file, signature, signing_key
+from slrig.schedule.receivers import senders_of
+from slrig.schedule.webhook import Webhook, signature, signing_key
 from tests.unit.scan.fakes import WAIT_S, SetClock
-from tests.unit.schedule.hook import PATH, SECRET, Hook, signed
+from tests.unit.schedule.hook import PATH, SECRET, Hook, own_certificate, signed
 
 KEY = signing_key(SECRET, "here")
 BODY = b'{"test": 2432232314}'
@@ -32,9 +32,8 @@ class Bench:
     def __init__(self, folder: Path, hook: Hook, *, most: int = 10_000) -> None:
         self.clock = SetClock()
         self.database = Database(folder / "slrig.sqlite")
-        self.outbox = Outbox(
-            self.database, rig="bench", kinds=get_args(NoticeKind), clock=self.clock, most=most
-        )  # fmt: skip
+        wanted = {"webhook": get_args(NoticeKind)}
+        self.outbox = Outbox(self.database, rig="bench", wanted=wanted, clock=self.clock, most=most)
         self.webhook = Webhook(self.outbox, hook.url, KEY, clock=self.clock, timeout_s=0.5)
 
     def put(self, *names: str) -> None:
@@ -128,12 +127,12 @@ def test_receiver_that_is_down_for_an_hour_is_told_all_once_and_in_order(bench: 
     # The first one is tried again and again, and none passes it.
     assert set(names(hook)) == {"1"}
     bench.put("3")
-    count, age_s = bench.outbox.waiting()
+    count, age_s = bench.outbox.waiting("webhook")
     assert (count, age_s >= 3600) == (3, True)
     hook.status = 204
     bench.empty()
     assert names(hook) == ["1", "2", "3"]
-    assert (bench.outbox.waiting(), bench.outbox.dropped) == ((0, 0.0), 0)
+    assert (bench.outbox.waiting("webhook"), bench.outbox.dropped) == ((0, 0.0), 0)
     # What fails next begins with a short wait again.
     hook.status = 500
     bench.put("4")
@@ -143,7 +142,7 @@ def test_receiver_that_is_down_for_an_hour_is_told_all_once_and_in_order(bench: 
 def test_what_waits_outlives_the_process(tmp_path: Path, bench: Bench, hook: Hook) -> None:
     hook.status = 500
     bench.put("1", "2")
-    ids = [bench.outbox.oldest()]
+    ids = [bench.outbox.oldest("webhook")]
     bench.webhook.step()
     came(hook)
     again = Bench(tmp_path, hook)
@@ -180,7 +179,7 @@ def test_no_more_wait_than_may_and_the_oldest_go(tmp_path: Path, hook: Hook) -> 
     with structlog.testing.capture_logs() as log:
         bench.put("1", "2", "3", "4", "5")
     assert [each["cause"] for each in log] == 2 * ["more than 3 wait"]
-    assert (bench.outbox.waiting()[0], bench.outbox.dropped) == (3, 2)
+    assert (bench.outbox.waiting("webhook")[0], bench.outbox.dropped) == (3, 2)
     bench.empty()
     assert names(hook) == ["3", "4", "5"]
     bench.database.close()
@@ -192,7 +191,7 @@ def test_receiver_that_is_gone_is_told_nothing_more_by_this_process(tmp_path: Pa
     with structlog.testing.capture_logs() as log:
         assert bench.webhook.step() == 300
     assert [each["event"] for each in log] == [
-        "the webhook is gone: nothing is sent before the next start of the service"
+        "the receiver is gone: nothing is sent before the next start of the service"
     ]
     hook.status = 200
     bench.put("2")
@@ -239,17 +238,11 @@ def test_receiver_that_gives_no_answer_costs_one_try(bench: Bench, hook: Hook, h
     (line,) = log
     assert (line["event"], line["host"], line["tries"]) == ("a notice was not delivered", "127.0.0.1", 1)
     assert "hidden-part" not in str(log)
-    assert bench.outbox.waiting()[0] == 1
+    assert bench.outbox.waiting("webhook")[0] == 1
 
 
 def test_certificate_that_nobody_vouches_for_is_refused(tmp_path: Path) -> None:
-    pem = tmp_path / "own.pem"
-    subprocess.run(  # noqa: S603 - our own command
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", pem, "-out", tmp_path / "crt",  # noqa: S607 - whichever there is
-         "-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1", "-days", "2"],
-        check=True, capture_output=True,
-    )  # fmt: skip
-    pem.write_text(pem.read_text() + (tmp_path / "crt").read_text())
+    pem = own_certificate(tmp_path)
     hook = Hook(certificate=pem)
     bench = Bench(tmp_path, hook)
     bench.put("1")
@@ -290,7 +283,7 @@ def test_thread_sends_what_waits_and_what_comes_and_ends_at_once(bench: Bench, h
     bench.webhook.close()
     assert time.monotonic() - began_s < 5
     assert hook.next()["words"].endswith("4")
-    assert bench.outbox.waiting()[0] == 0
+    assert bench.outbox.waiting("webhook")[0] == 0
 
 
 @pytest.mark.parametrize("how", [_refuses, _hangs])
@@ -309,39 +302,43 @@ def test_end_of_the_service_waits_a_second_at_most_for_a_receiver(
     assert time.monotonic() - began_s < 1, "whoever tells waits for nobody"
     bench.webhook.close()
     assert time.monotonic() - began_s < 4
-    assert bench.outbox.waiting()[0] == 2
+    assert bench.outbox.waiting("webhook")[0] == 2
     hook.close()
     for thread in threading.enumerate():
         if thread.name == "slrig-notices":
             thread.join(WAIT_S)
             assert not thread.is_alive()
-    assert bench.outbox.waiting()[0] == 2, "what is answered later is for the next start"
+    assert bench.outbox.waiting("webhook")[0] == 2, "what is answered later is for the next start"
     bench.database.close()
 
 
 @pytest.mark.parametrize("secret", ["whsec_c2hvcnQ=", "whsec_" + "A" * 88, "no base64!", "whsec_", "ß"])
-def test_secret_that_is_none_is_refused_and_not_repeated(secret: str, tmp_path: Path) -> None:
+def test_secret_that_is_none_is_refused_and_not_repeated(secret: str, tmp_path: Path, bench: Bench) -> None:
     path = tmp_path / "secret"
     path.write_text(secret)
     path.chmod(0o600)
     with pytest.raises(ConfigError, match=r"^webhook_secret: expected whsec_") as of_text:
-        signing_key(secret, "webhook_secret")
+        senders_of(ServiceSettings(webhook_url="http://host", webhook_secret=SecretStr(secret)), bench.outbox)
     with pytest.raises(ConfigError, match=r"^webhook_secret_file: ") as of_file:
-        key_of_file(path)
+        senders_of(ServiceSettings(webhook_url="http://host", webhook_secret_file=path), bench.outbox)
     if hidden := secret.removeprefix("whsec_"):
         assert hidden not in f"{of_text.value} {of_file.value}"
 
 
-def test_secret_may_lie_in_a_file_that_nobody_else_may_read(tmp_path: Path) -> None:
+def test_secret_may_lie_in_a_file_that_nobody_else_may_read(tmp_path: Path, bench: Bench, hook: Hook) -> None:
     path = tmp_path / "secret"
+    settings = ServiceSettings(webhook_url=hook.url, webhook_secret_file=path)
     with pytest.raises(ConfigError, match="cannot be read: No such file"):
-        key_of_file(path)
+        senders_of(settings, bench.outbox)
     path.write_text(f"{SECRET}\n")
     path.chmod(0o600)
-    assert key_of_file(path) == KEY == signing_key(SECRET.removeprefix("whsec_"), "here")
+    (webhook,) = senders_of(settings, bench.outbox)
+    assert webhook.refusal(Notice(1, "msg_1", {})) is None
+    assert signed(hook.next())
     path.chmod(0o640)
-    with pytest.raises(ConfigError, match=r"others may read .*chmod 600"):
-        key_of_file(path)
+    with pytest.raises(ConfigError, match=r"may be read by others.*chmod 600"):
+        senders_of(settings, bench.outbox)
+    assert signing_key(SECRET.removeprefix("whsec_"), "here") == KEY
 
 
 def test_settings_choose_kinds_and_hide_the_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

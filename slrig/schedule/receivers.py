@@ -1,0 +1,51 @@
+"""Which receivers the service's settings name, and what each of them is told."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import get_args
+
+from pydantic import SecretStr
+
+from slrig.config import NoticeKind, ServiceSettings
+from slrig.errors import ConfigError
+from slrig.jobs.outbox import Outbox
+from slrig.schedule.mqtt import Broker
+from slrig.schedule.sending import Sender
+from slrig.schedule.webhook import Webhook, signing_key
+
+
+def wanted_kinds(settings: ServiceSettings) -> Mapping[str, Collection[NoticeKind]]:
+    """The kinds of notices that each receiver wants, by its name. Those who subscribe at a broker choose by topic."""
+    kinds = {"webhook": settings.webhook_kinds, "mqtt": get_args(NoticeKind)}
+    return {name: kinds[name] for name in kinds if getattr(settings, f"{name}_url") is not None}
+
+
+def senders_of(settings: ServiceSettings, outbox: Outbox) -> list[Sender]:
+    """One for each receiver. Raises ConfigError: an address or a secret is none, or an extra is not installed."""
+    found: list[Sender] = []
+    if settings.webhook_url is not None:
+        secret, source = _secret(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
+        found.append(Webhook(outbox, settings.webhook_url, None if secret is None else signing_key(secret, source)))
+    if settings.mqtt_url is not None:
+        login, _ = _secret(settings.mqtt_login, settings.mqtt_login_file, "mqtt_login")
+        found.append(Broker(outbox, settings.mqtt_url, login))
+    return found
+
+
+def _secret(given: SecretStr | None, path: Path | None, name: str) -> tuple[str | None, str]:
+    """A secret, or what a file holds that nobody but its owner may read; and which it was. Raises ConfigError."""
+    if given is not None or path is None:
+        return None if given is None else given.get_secret_value(), name
+    source = f"{name}_file: {path}"
+    try:
+        mode, secret = path.stat().st_mode, path.read_text("utf-8")
+    except (OSError, ValueError) as cause:
+        message = f"{source} cannot be read: {getattr(cause, 'strerror', None) or 'it is no text'}"
+        raise ConfigError(message) from cause
+    if os.name == "posix" and mode & 0o077:
+        message = f"{source} may be read by others. Take that from them: chmod 600 {path}"
+        raise ConfigError(message)
+    return secret, source
