@@ -2,7 +2,7 @@
 import {html, useRef, useState} from "./vendor/preact-htm.js";
 import {Poses, Shooting} from "./poses.js";
 import {ask, useAction, useValue} from "./service.js";
-import {Action, Badge, Choice, Confirm, Facts, Refusal, length, moment} from "./ui.js";
+import {Action, Badge, Choice, Confirm, Facts, Field, Refusal, length, moment} from "./ui.js";
 
 const USUAL = {kind: "charuco", columns: "11", rows: "8", square: "12", marker: "", dictionary: "", across: "", down: ""};
 const KINDS = [["charuco", "ChArUco"], ["chessboard", "Chessboard"], ["circles", "Circles"]];
@@ -44,10 +44,6 @@ function Calibrations({rig, able}) {
 }
 
 const States = ({of}) => html`<span>${of.active && html`<${Badge} kind="good">in use<//> `}<${Badge} kind=${STATES[of.state][0]}>${of.imported ? "imported" : STATES[of.state][1]}<//></span>`;
-
-function Field({label, value, change, ...given}) {
-  return html`<label>${label}<input type="number" step="any" min="0" value=${value} onInput=${(event) => change(event.target.value)} ...${given} /></label>`;
-}
 
 /** The board: printed, measured, and then calibrated with. What was typed last is there again the next time. */
 function Opening({able}) {

@@ -16,8 +16,8 @@ export const loadDrawing = () => {
   return drawing;
 };
 
-/** `other`: a scan shown in the same view, or null. `report` may come later. */
-export function Mesh({scan, other, report}) {
+/** `other`: a scan shown in the same view, or null. `report` may come later. `again` takes the box of what is seen, or is null. */
+export function Mesh({scan, other, report, again}) {
   const canvas = useRef();
   const [view, setView] = useState(null);
   const [scale, setScale] = useState("");
@@ -89,6 +89,7 @@ export function Mesh({scan, other, report}) {
     ${other && mode === "shaded" && html`<p class="legend"><span class="swatch" style=${{background: PLAIN[0]}}></span>this scan <span class="swatch" style=${{background: PLAIN[1]}}></span>the other; key B shows one in place of the other</p>`}
     ${measuring && html`<p>${points.length % 2 ? "Now the second point." : "Choose the first point: click on the mesh, or turn it and press Enter for the point in the middle."}</p>`}
     ${pairs.length > 0 && html`<${Distances} pairs=${pairs} cleared=${() => setPoints([])} />`}
+    ${again && html`<${Action} disabled=${!view} onClick=${() => again(view.seen())}>Scan only what is seen here<//>`}
     <p class="quiet" id="keys">Drag turns, two fingers or the right button move, the wheel zooms. Keys: arrows turn, + and − zoom, F fits, R is the front.</p>`;
 }
 

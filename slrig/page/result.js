@@ -1,5 +1,6 @@
 // A scan's result: its mesh, its figures, why pixels are missing, its files, and another scan beside it.
 import {Causes} from "./causes.js";
+import {limitToBox, limits} from "./limits.js";
 import {Mesh, loadDrawing} from "./mesh.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, Confirm, Facts, JobBadge, Progress, Refusal, count, length, moment, percent} from "./ui.js";
@@ -57,7 +58,7 @@ function Result({scan, again, may}) {
         ${!over && html`<div class="box">
           ${hasMesh && html`<p role="status">The mesh is there and can be downloaded. The rest is computed still.</p>`}
           <${Progress} label=${told.stage} fraction=${told.fraction} detail=${told.detail} /></div>`}
-        ${hasMesh && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} />`}
+        ${hasMesh && html`<${Mesh} key=${scan.id} scan=${scan} other=${other} report=${report} again=${may("scan") ? limitToBox : null} />`}
         ${over && !hasMesh && html`<${Ended} scan=${scan} may=${may} />`}
         ${over && hasMesh && html`<${Compare} scan=${scan} other=${other} chosen=${setOther} />`}
       </section>
@@ -107,18 +108,6 @@ function Figures({scan, report}) {
       ["Against the known truth, rms", summary.truth && length(summary.truth.rms_mm)],
     ]} />
     <p><a href=${scan.links.files["report.json"]}>The whole report</a></p>`;
-}
-
-/** What a scan was asked for, in words; null for everything. */
-function limits(region) {
-  if (!region) return null;
-  const {box_mm: box, depth_mm: depth, polygons_px: polygons, masks, least_contrast: contrast, most_sigma_mm: sigma} = region;
-  return [
-    box && `a box, ${["x", "y", "z"].map((axis, at) => `${axis} ${box[0][at]} to ${box[1][at]}`).join(", ")} mm`,
-    depth && `depths of ${depth[0]} to ${depth[1]} mm`,
-    ...Object.keys({...polygons, ...masks}).map((camera) => `a part of camera ${camera}'s image`),
-    contrast && `contrasts above ${percent(contrast)}`, sigma && `σ up to ${length(sigma)}`,
-  ].filter((each) => each).join("; ");
 }
 
 /** [name, value, how it is written] of the figures that two scans are compared by. */

@@ -1,5 +1,6 @@
 // Scan: what the cameras see, one large button, how far the scan is, and the scans so far.
 import {html, useEffect, useState} from "./vendor/preact-htm.js";
+import {Limits, useLimits} from "./limits.js";
 import {Live} from "./live.js";
 import {ask, follow, once, useAction, useValue} from "./service.js";
 import {Action, JobBadge, Progress, Refusal, count, length, moment} from "./ui.js";
@@ -10,11 +11,12 @@ const over = (scan) => !["queued", "capturing", "computing"].includes(scan.state
 export function ScanScreen({rig, may}) {
   const [list, problem, again] = useValue(`/scan?limit=${SHOWN}`, 5);
   const [bracket, setBracket] = useState(null);
+  const [typed, region, change] = useLimits();
   const scans = list?.scans ?? [];
   // The oldest that is not over holds the rig, whoever asked for it, and also after this page was loaded anew.
   const active = scans.filter((scan) => !over(scan)).at(-1);
   const [start, busy, refused] = useAction(async () => {
-    const body = {if_busy: "queue", ...(bracket ? {exposures_s: bracket} : {})};
+    const body = {if_busy: "queue", ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {})};
     const scan = await ask("POST", "/scan", {body, headers: once()});
     sessionStorage.setItem("asked", scan.id);
     await again();
@@ -26,6 +28,7 @@ export function ScanScreen({rig, may}) {
     </section>
     <section aria-label="Scan">
       <${Action} kind="primary large" busy=${busy} disabled=${!may("scan")} onClick=${start}>Scan<//>
+      ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} />`}
       ${!may("scan") && html`<p class="quiet">Your key is for looking only.</p>`}
       ${blocked && html`<p class="warning">${blocked} ${rig?.calibrated === false && html`<a href="#/calibrate">Calibrate</a>`}</p>`}
       <${Refusal} problem=${refused} />

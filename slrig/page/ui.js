@@ -68,6 +68,11 @@ export function Choice({label, value, options, chosen}) {
   </div>`;
 }
 
+/** A number that somebody types. */
+export function Field({label, value, change, ...given}) {
+  return html`<label>${label}<input type="number" step="any" min="0" value=${value} onInput=${(event) => change(event.target.value)} ...${given} /></label>`;
+}
+
 /** A question that stands in the way until it is answered. */
 export function Confirm({question, yes, onYes, onNo}) {
   return html`<div class="refusal" role="alertdialog" aria-label=${question}>

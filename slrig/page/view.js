@@ -280,6 +280,20 @@ export class View {
     return nearest;
   }
 
+  /** The least and the greatest corner of a box in whole mm about what of this scan's mesh is on the canvas; null for nothing. */
+  seen() {
+    const {mesh, object} = this.slots[0]?.full ?? this.slots[0]?.coarse ?? {};
+    const {array, width} = mesh?.attributes.POSITION ?? {array: []};
+    const box = new Box3();
+    const [point, at] = [new Vector3(), new Vector3()];
+    for (let start = 0; start < array.length; start += width) {
+      at.copy(point.fromArray(array, start).applyMatrix4(object.matrix)).project(this.camera);
+      if (Math.abs(at.x) < 1 && Math.abs(at.y) < 1) box.expandByPoint(point);
+    }
+    const {min, max} = box;
+    return box.isEmpty() ? null : [[min.x, -max.y, -max.z].map(Math.floor), [max.x, -min.y, -min.z].map((mm) => Math.floor(mm) + 1)];
+  }
+
   /** Where a point of the scan, mm, stands on the canvas, CSS px. */
   place([x, y, z]) {
     const at = new Vector3(x, -y, -z).project(this.camera);

@@ -159,13 +159,41 @@ def test_what_a_scan_was_limited_to_is_told_and_drawn(start: Start, tmp_path: Pa
     with service.client() as client:
         scan = ended(client, client.scans.start(reconstruction={"region": region}))
     assert scan["state"] == "succeeded", scan
-    page = visit(service, scan["links"]["self"][1:], size=(1280, 1100), ignored="404")
+    page = visit(service, scan["links"]["self"][1:], size=(1280, 1100), ignored="status of 4")
     page.get_by_text("a box, x -20 to 20, y -25 to 15, z -40 to 40 mm; contrasts above 2 %").wait_for()
     page.get_by_text("outside the region that the scan was asked for").wait_for()
     page.get_by_role("button", name="Front").click()
     shown = picture(page).astype(int)
     # The lines are blue, and a grey plate is not.
     assert ((shown[..., 0] - shown[..., 2]) > 100).sum() > 200
+
+    # What is seen of it is in the next scan's region, with what somebody types.
+    page.get_by_role("button", name="Scan only what is seen here").click()
+    page.get_by_label("Nearest depth, mm").fill("900")
+    page.get_by_label("Farthest depth, mm").fill("300")
+    page.get_by_role("button", name="Scan", exact=True).click()
+    page.get_by_role("alert").get_by_text("region.depth_mm: expected two rising numbers").wait_for()
+    page.get_by_label("Nearest depth, mm").fill("100")
+    page.get_by_label("Farthest depth, mm").fill("1000")
+    page.get_by_label("Least contrast, %").fill("4")
+    page.get_by_label("Greatest σ, mm").fill("0.5")
+    page.get_by_text(
+        re.compile(
+            r"a box, x -20 to 20, y -25 to 15, z .* mm; depths of 100 to 1000 mm; contrasts above 4 %; σ up to 0.5 mm"
+        )
+    ).wait_for()
+    assert violations(page) == []
+    page.get_by_role("button", name="Scan", exact=True).click()
+    page.wait_for_url("**/#/scan/*-*")
+    with service.client() as client:
+        asked = client.get(page.url.rpartition("#")[2])["plan"]["reconstruction"]["region"]
+    least, most = asked["box_mm"]
+    assert (asked["depth_mm"], asked["least_contrast"], asked["most_sigma_mm"]) == ([100, 1000], 0.04, 0.5)
+    assert (least[:2], most[:2]) == ([-20, -25], [20, 15])
+    assert -40 < least[2] < most[2] < 40, "no further than the surface"
+    page.go_back()
+    page.get_by_role("button", name="Without the box").click()
+    count(page.get_by_text("a box"), 0)
 
 
 def test_a_scan_without_a_mesh_says_why_and_what_next(start: Start, tmp_path: Path, visit: Visit) -> None:
