@@ -96,12 +96,16 @@ def read_toml(path: Path, most_bytes: int) -> dict[str, Any]:
         raise ConfigError(f"{path}: expected TOML, found a fault: {cause}; correct that line") from cause
 
 
-def checked(model: type[Described], data: object, what: str, *, hint: str = "") -> Described:
-    """Return `data` as a `model`. Raises ConfigError: says `what` is wrong, lists every fault, and ends with `hint`."""
+def checked(
+    model: type[Described], data: object, what: str, *, hint: str = "", error: type[InvalidInputError] = ConfigError
+) -> Described:
+    """Return `data` as a `model`.
+    Raises InvalidInputError, of the class `error`: says `what` is wrong, lists every fault, and ends with `hint`.
+    """
     try:
         return model.model_validate(dict(data) if isinstance(data, Mapping) else data)
     except ValidationError as cause:
-        raise ConfigError(f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}") from cause
+        raise error(f"{what} is wrong:\n{explain(cause, data, keys_of(model))}{hint}") from cause
 
 
 def read_description_of(

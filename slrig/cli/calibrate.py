@@ -312,8 +312,7 @@ def export(
     if Path(calibration).exists() or to is not None:
         import tempfile
 
-        from slrig.cli.foreign import write_form
-        from slrig.foreign.calibrations import read_any_calibration
+        from slrig.foreign.calibrations import read_any_calibration, write_any_calibration
 
         with tempfile.TemporaryDirectory() as folder:
             source = Path(calibration)
@@ -321,17 +320,17 @@ def export(
                 source = Path(folder) / "calibration.json"
                 with service.client() as client:
                     _fetch(client, calibration, source.name, source)
-            write_form(read_any_calibration(source), file, to)
-        return
-    name = FILES.get(file.suffix.lower())
-    if name is None:
-        message = (
-            f"{file}: expected a name that ends in .json (slrig's own), .yml or .xml (OpenCV's) or .html (the report), "
-            f"found '{file.suffix}'"
-        )
-        raise ConfigError(message)
-    with service.client() as client:
-        _fetch(client, calibration, name, file)
+            write_any_calibration(file, read_any_calibration(source), to)
+    else:
+        name = FILES.get(file.suffix.lower())
+        if name is None:
+            message = (
+                f"{file}: expected a name that ends in .json (slrig's own), .yml or .xml (OpenCV's) or .html (the "
+                f"report), found '{file.suffix}'"
+            )
+            raise ConfigError(message)
+        with service.client() as client:
+            _fetch(client, calibration, name, file)
     typer.echo(f"{'written':<10}{file}")
 
 

@@ -1,17 +1,13 @@
-"""`slrig import`, captures of other programs become bundles, and calibrations written in other programs' forms."""
+"""`slrig import`: captures of other programs become bundles."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from slrig.errors import ConfigError
-
-if TYPE_CHECKING:
-    from slrig.foreign.calibrations import Form
-    from slrig.model import Calibration
 
 
 def import_images(
@@ -98,17 +94,3 @@ def import_images(
     how = "" if used is not None else " --decode-only"
     typer.echo(f"{'calibrated':<11}{used or 'no: it can only be decoded'}")
     typer.echo(f"To go on: slrig reconstruct {output} --output {output.name}-mesh{how}")
-
-
-def write_form(calibration: Calibration, file: Path, to: Form | None) -> None:
-    """Write a calibration in one of the forms; by the ending of `file` where none is named.
-    Raises ConfigError: the ending says none; CalibrationError, StorageError.
-    """
-    from slrig.foreign.calibrations import write_any_calibration
-
-    endings: dict[str, Form] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
-    form = to or endings.get(file.suffix.lower())
-    if form is None:
-        raise ConfigError(f"{file}: expected a name that ends in .json, .yml or .xml, or --to; found '{file.suffix}'")
-    write_any_calibration(file, calibration, form)
-    typer.echo(f"{'written':<10}{file}")

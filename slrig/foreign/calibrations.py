@@ -17,6 +17,7 @@ from slrig.foreign.ros import read_ros, write_ros
 from slrig.model import Axis, Calibration, Gray, Size
 
 Form = Literal["slrig", "opencv", "ros", "kalibr"]
+ENDINGS: Mapping[str, Form] = {".json": "slrig", ".yml": "opencv", ".xml": "opencv"}
 
 
 def read_any_calibration(
@@ -44,9 +45,14 @@ def read_any_calibration(
     return read_pair(root, path, cameras=cameras or {}, projector=projector, shown=shown or {})
 
 
-def write_any_calibration(path: Path, calibration: Calibration, form: Form) -> None:
-    """Write a calibration in one of the forms; ROS's is a new folder.
-    Raises CalibrationError: the form cannot hold it; StorageError: the disk refused.
+def write_any_calibration(path: Path, calibration: Calibration, form: Form | None = None) -> None:
+    """Write a calibration in one of the forms, by the ending of `path` where none is named; ROS's is a new folder.
+    Raises CalibrationError: the ending says none, or the form cannot hold it; StorageError: the disk refused.
     """
+    form = form or ENDINGS.get(path.suffix.lower())
+    if form is None:
+        raise CalibrationError(
+            f"{path}: expected a name that ends in .json, .yml or .xml, or --to; found '{path.suffix}'"
+        )
     writers = {"slrig": write_calibration, "opencv": write_opencv_calibration, "ros": write_ros, "kalibr": write_kalibr}
     writers[form](path, calibration)

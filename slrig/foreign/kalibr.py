@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from slrig.bundle.description import CAMERA_NAME
-from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.bundle.faults import Strict, checked
 from slrig.bundle.storage import write_file
 from slrig.errors import CalibrationError
 from slrig.foreign.ros import Side
@@ -78,10 +78,7 @@ def read_kalibr(path: Path) -> Calibration:
 
 
 def _entry(path: Path, key: str, data: object) -> ChainEntry:
-    try:
-        entry = ChainEntry.model_validate(data)
-    except ValidationError as cause:
-        raise CalibrationError(f"{path}: {key} is wrong:\n{explain(cause, data, keys_of(ChainEntry))}") from cause
+    entry = checked(ChainEntry, data, f"{path}: {key}", error=CalibrationError)
     models = (entry.camera_model, entry.distortion_model)
     if models != ("pinhole", "radtan") or (len(entry.intrinsics), len(entry.distortion_coeffs)) != (4, 4):
         raise CalibrationError(

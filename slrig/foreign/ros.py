@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from slrig.bundle.description import MOST_SIDE_PX
-from slrig.bundle.faults import Strict, explain, keys_of
+from slrig.bundle.faults import Strict, checked
 from slrig.bundle.storage import sync_folder, write_durably
 from slrig.disk import refusals_of, staging_name
 from slrig.errors import CalibrationError
@@ -121,7 +121,7 @@ def read_ros(folder: Path) -> Calibration:
 
 
 def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: str) -> Pinhole:
-    info = _checked(path, CameraInfo)
+    info = checked(CameraInfo, read_yaml(path), str(path), error=CalibrationError)
     terms = info.distortion_coefficients.array(f"{path}: distortion_coefficients").ravel()
     if info.distortion_model not in ("plumb_bob", "rational_polynomial") or terms[5:].any() or len(terms) < 4:
         raise CalibrationError(
@@ -146,7 +146,7 @@ def _device(path: Path, poses: dict[str, tuple[FloatArray, FloatArray]], name: s
 
 def _poses(path: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
     """World to frame of each frame: rotation, and translation in mm. Raises CalibrationError."""
-    listed = _checked(path, Transforms).transforms
+    listed = checked(Transforms, read_yaml(path), str(path), error=CalibrationError).transforms
     parents = {each.child_frame_id: each for each in listed}
     if len(parents) < len(listed):
         raise CalibrationError(f"{path}: expected one parent for each frame, found two; keep one of them")
@@ -225,11 +225,3 @@ def _info(name: str, device: Pinhole) -> dict[str, Any]:
         "rectification_matrix": matrix(sees["r"]),
         "projection_matrix": matrix(sees["p"]),
     }
-
-
-def _checked(path: Path, model: type[Any]) -> Any:
-    data = read_yaml(path)
-    try:
-        return model.model_validate(data)
-    except ValidationError as cause:
-        raise CalibrationError(f"{path} is wrong:\n{explain(cause, data, keys_of(model))}") from cause
