@@ -25,7 +25,7 @@ from slrig.client.endpoints import (
     System,
 )
 from slrig.client.events import Event
-from slrig.client.operations import Operation, Remote, Stream
+from slrig.client.operations import Operation, Remote
 from slrig.client.scans import ScanJob, ScanResult, Told
 from slrig.client.wire import Awaited, Blocking
 from slrig.errors import ConfigError, ServiceError
@@ -56,7 +56,8 @@ class _Service(Remote[W]):
 
     start_scan = Operation(_start_scan)
 
-    async def _scan(self, *, progress: Told | None = None, **options: Unpack[ScanOptions]) -> ScanResult[W]:
+    @Operation
+    async def scan(self, *, progress: Told | None = None, **options: Unpack[ScanOptions]) -> ScanResult[W]:
         """Scan, and wait for the end; of a series, for that of its first scan. Ctrl-C, or the end of the task that
         waits, cancels it. See `start_scan`, `ScanJob.result`.
         """
@@ -70,43 +71,41 @@ class _Service(Remote[W]):
                 await self.core.send("POST", job.scan["links"]["cancel"])
             raise
 
-    scan = Operation(_scan)
-
     async def _job(self, scan_id: str) -> ScanJob[W]:
         return ScanJob(self.core, await self.core.content("Json", "GET", f"/scan/{scan_id}"))
 
     job = Operation(_job, doc="A scan on record, to be followed.")
 
-    async def _result(self, scan_id: str) -> ScanResult[W]:
+    @Operation
+    async def result(self, scan_id: str) -> ScanResult[W]:
+        """What came of a scan on record; waits for its end."""
         return await (await self._job(scan_id)).awaited()
 
-    result = Operation(_result, doc="What came of a scan on record; waits for its end.")
-
-    async def _get(self, link: str) -> Json:
+    @Operation
+    async def get(self, link: str) -> Json:
+        """The JSON that a link of an answer leads to, such as `next` of a page."""
         return await self.core.content("Json", "GET", link)  # type: ignore[no-any-return]
 
-    get = Operation(_get, doc="The JSON that a link of an answer leads to, such as `next` of a page.")
-
-    async def _post(self, link: str, request: Mapping[str, Any] | None = None) -> Json:
+    @Operation
+    async def post(self, link: str, request: Mapping[str, Any] | None = None) -> Json:
+        """Do what a link of an answer names, such as `cancel`, and return the answer."""
         body = {} if request is None else {"json": request}
         return await self.core.content("Json", "POST", link, **body)  # type: ignore[no-any-return]
 
-    post = Operation(_post, doc="Do what a link of an answer names, such as `cancel`, and return the answer.")
-
-    async def _delete(self, link: str) -> None:
+    @Operation
+    async def delete(self, link: str) -> None:
+        """Delete what a link of an answer leads to."""
         await self.core.send("DELETE", link)
 
-    delete = Operation(_delete, doc="Delete what a link of an answer leads to.")
-
-    async def _fetch(self, link: str, path: str | Path) -> None:
+    @Operation
+    async def fetch(self, link: str, path: str | Path) -> None:
+        """Write the file that a link of an answer leads to, whole or not at all."""
         await self.core.fetch(link, Path(path))
 
-    fetch = Operation(_fetch, doc="Write the file that a link of an answer leads to, whole or not at all.")
-
-    def _follow(self, link: str) -> AsyncGenerator[Event]:
+    @Operation
+    def follow(self, link: str) -> AsyncGenerator[Event]:
+        """What happens to the job whose `events` link this is, until it is over."""
         return self.core.follow(link)
-
-    follow = Stream(_follow, doc="What happens to the job whose `events` link this is, until it is over.")
 
 
 class Client(_Service[Blocking]):

@@ -299,7 +299,8 @@ class System(Remote[W]):
         "GET /readyz", _told, "Whether it can scan. A RefusedError tells what is not ready; `readiness` returns it."
     )
 
-    async def _readiness(self) -> Json:
+    @Operation
+    async def readiness(self) -> Json:
         """The `checks` of `ready`, each "ok" or what it lacks, and those `pending`, that get there by themselves."""
         try:
             found: Json = await self.core.content("Json", "GET", "/readyz")
@@ -308,8 +309,6 @@ class System(Remote[W]):
                 raise
             found = error.problem
         return {"checks": dict(found["checks"]), "pending": list(found.get("pending", ()))}
-
-    readiness = Operation(_readiness)
 
     metrics = entry("GET /metrics", _text, "Figures for Prometheus.")
     audit = entry("GET /audit", _paged, "A page of who did what, from new to old.")

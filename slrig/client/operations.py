@@ -15,6 +15,8 @@ from slrig.client.wire import Awaited, Blocking
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Called = TypeVar("Called")
+Asked = TypeVar("Asked")
 
 
 class Remote(Generic[W]):
@@ -27,7 +29,8 @@ class Remote(Generic[W]):
 @dataclass(frozen=True, slots=True)
 class Spec:
     """The request of an operation. line : method and path. query : what goes there, all there is of a GET. content :
-    the parameter that is the body as it is. once : see `Core.send`. kind : what comes back, by the name of its type.
+    the parameter that is the body as it is. once : see `Core.send`. kind : what comes back, by the name of its type;
+    or "stream".
     """
 
     line: str
@@ -63,73 +66,56 @@ class Spec:
         return request | ({"json": told} if has_body else {})
 
 
-class _Declared(Generic[T]):
-    """An attribute of what is remote, made of a function of it. spec : its request, if it is one."""
+class Operation(Generic[P, Called, Asked]):
+    """A function as an attribute of what is remote: a coroutine function, or an asynchronous generator function for a
+    stream. spec : its request, if it is one. doc : in place of the function's own.
+    """
 
-    def __init__(self, function: Callable[..., T], spec: Spec | None = None, doc: str | None = None) -> None:
+    @overload
+    def __init__(
+        self: Operation[P, T, Coroutine[Any, Any, T]],
+        function: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]],
+        spec: Spec | None = None,
+        doc: str | None = None,
+    ) -> None: ...
+    @overload
+    def __init__(
+        self: Operation[P, Iterator[T], AsyncIterator[T]],
+        function: Callable[Concatenate[Any, P], AsyncGenerator[T]],
+        spec: Spec | None = None,
+        doc: str | None = None,
+    ) -> None: ...
+    def __init__(self, function: Callable[..., Any], spec: Spec | None = None, doc: str | None = None) -> None:
         self.function = function
         self.spec = spec
         self.__doc__ = doc or function.__doc__
 
-    def called(self, owner: Remote[Any], drive: Callable[[T], Any]) -> Callable[..., Any]:
-        """The function as a method of `owner` that gives what `drive` makes of its result."""
-        method = MethodType(self.function, owner)
+    @overload
+    def __get__(self, owner: None, kind: type) -> Self: ...
+    @overload
+    def __get__(self, owner: Remote[Blocking], kind: type) -> Callable[P, Called]: ...
+    @overload
+    def __get__(self, owner: Remote[Awaited], kind: type) -> Callable[P, Asked]: ...
+    def __get__(self, owner: Remote[Any] | None, kind: type) -> Any:
+        if owner is None:
+            return self
+        method, wire = MethodType(self.function, owner), owner.core.wire
 
         @wraps(method)
         def call(*args: Any, **options: Any) -> Any:
-            return drive(method(*args, **options))
+            steps = method(*args, **options)
+            return wire.drive_each(steps) if isinstance(steps, AsyncGenerator) else wire.drive(steps)
 
         call.__doc__ = self.__doc__
         return call
 
 
-class Operation(_Declared[Any], Generic[P, T]):
-    """A coroutine function as such an attribute."""
-
-    def __init__(
-        self,
-        function: Callable[Concatenate[Any, P], Coroutine[Any, Any, T]],
-        spec: Spec | None = None,
-        doc: str | None = None,
-    ) -> None:
-        super().__init__(function, spec, doc)
-
-    @overload
-    def __get__(self, owner: None, kind: type) -> Self: ...
-    @overload
-    def __get__(self, owner: Remote[Blocking], kind: type) -> Callable[P, T]: ...
-    @overload
-    def __get__(self, owner: Remote[Awaited], kind: type) -> Callable[P, Coroutine[Any, Any, T]]: ...
-    def __get__(self, owner: Remote[Any] | None, kind: type) -> Any:
-        return self if owner is None else self.called(owner, owner.core.wire.drive)
-
-
-class Stream(_Declared[Any], Generic[P, T]):
-    """An asynchronous generator function as such an attribute: an iterator, asynchronous on an `AsyncClient`."""
-
-    def __init__(
-        self,
-        function: Callable[Concatenate[Any, P], AsyncGenerator[T]],
-        spec: Spec | None = None,
-        doc: str | None = None,
-    ) -> None:
-        super().__init__(function, spec, doc)
-
-    @overload
-    def __get__(self, owner: None, kind: type) -> Self: ...
-    @overload
-    def __get__(self, owner: Remote[Blocking], kind: type) -> Callable[P, Iterator[T]]: ...
-    @overload
-    def __get__(self, owner: Remote[Awaited], kind: type) -> Callable[P, AsyncIterator[T]]: ...
-    def __get__(self, owner: Remote[Any] | None, kind: type) -> Any:
-        return self if owner is None else self.called(owner, owner.core.wire.drive_each)
-
-
-class Fetched(_Declared[Any], Generic[T]):
+class Fetched(Generic[T]):
     """A value that is fetched when it is asked for: an attribute on a `Client`, to be awaited on an `AsyncClient`."""
 
     def __init__(self, function: Callable[[Any], Coroutine[Any, Any, T]], doc: str | None = None) -> None:
-        super().__init__(function, None, doc)
+        self.function = function
+        self.__doc__ = doc or function.__doc__
 
     @overload
     def __get__(self, owner: None, kind: type) -> Self: ...
@@ -143,7 +129,7 @@ class Fetched(_Declared[Any], Generic[T]):
 
 def entry(
     line: str, declared: Callable[Concatenate[Any, P], T], doc: str | None = None, **details: Any
-) -> Operation[P, T]:
+) -> Operation[P, T, Coroutine[Any, Any, T]]:
     """One request as an operation. declared : a function that says its parameters and what it answers, and does
     nothing. doc : in place of that function's own. details : see `Spec`.
     """
@@ -157,18 +143,20 @@ def entry(
     return Operation(call, spec, doc)
 
 
-def endpoint(line: str, **details: Any) -> Callable[[Callable[Concatenate[Any, P], T]], Operation[P, T]]:
+def endpoint(
+    line: str, **details: Any
+) -> Callable[[Callable[Concatenate[Any, P], T]], Operation[P, T, Coroutine[Any, Any, T]]]:
     """`entry` as a decorator."""
     return lambda declared: entry(line, declared, **details)
 
 
 def stream(
     line: str, of: Callable[..., AsyncGenerator[T]]
-) -> Callable[[Callable[Concatenate[Any, P], T]], Stream[P, T]]:
+) -> Callable[[Callable[Concatenate[Any, P], T]], Operation[P, Iterator[T], AsyncIterator[T]]]:
     """One request as a stream of what `of`, a method of `Core`, makes of its answer; declared as for `entry`."""
 
-    def made(declared: Callable[Concatenate[Any, P], T]) -> Stream[P, T]:
-        spec = Spec(line, declared)
+    def made(declared: Callable[Concatenate[Any, P], T]) -> Operation[P, Iterator[T], AsyncIterator[T]]:
+        spec = Spec(line, declared, kind="stream")
 
         @wraps(declared)
         def call(remote: Remote[Any], /, *args: P.args, **options: P.kwargs) -> AsyncGenerator[T]:
@@ -176,7 +164,7 @@ def stream(
             del request["method"]
             return of(remote.core, **request)
 
-        return Stream(call, spec)
+        return Operation(call, spec)
 
     return made
 

@@ -12,7 +12,7 @@ from slrig.client.core import Core, Json, W
 from slrig.client.errors import ScanFailedError
 from slrig.client.events import Event, Progress, StateChange
 from slrig.client.notebook import shown
-from slrig.client.operations import Fetched, Operation, Remote, Stream
+from slrig.client.operations import Fetched, Operation, Remote
 from slrig.client.wire import Awaited, Blocking
 from slrig.errors import ScanCancelledError, ServiceError
 
@@ -84,32 +84,32 @@ class ScanResult(Remote[W]):
 
     mesh = Fetched(_mesh, "The mesh, in mm, with `vertex_attributes` such as sigma_mm.")
 
-    async def _image(self, name: str) -> Picture:
+    @Operation
+    async def image(self, name: str) -> Picture:
+        """A PNG of the scan as an array, such as preview.png."""
         return await self.core.content("Picture", "GET", self._path(name))  # type: ignore[no-any-return]
 
-    image = Operation(_image, doc="A PNG of the scan as an array, such as preview.png.")
-
-    async def _fetch(self, name: str, path: str | Path) -> None:
+    @Operation
+    async def fetch(self, name: str, path: str | Path) -> None:
+        """Write a file of the scan to a path, whole or not at all."""
         await self.core.fetch(self._path(name), Path(path))
 
-    fetch = Operation(_fetch, doc="Write a file of the scan to a path, whole or not at all.")
-
-    async def _save(self, name: str, folder: str | Path) -> Path:
+    @Operation
+    async def save(self, name: str, folder: str | Path) -> Path:
+        """Write a file of the scan into a folder, and return its path."""
         target = Path(folder) / Path(name).name
         await self.core.fetch(self._path(name), target)
         return target
 
-    save = Operation(_save, doc="Write a file of the scan into a folder, and return its path.")
-
-    async def _pin(self, *, pinned: bool = True) -> None:
+    @Operation
+    async def pin(self, *, pinned: bool = True) -> None:
+        """Keep the scan, whatever the settings say of old ones; with pinned=False, no more."""
         await self.core.send("PUT" if pinned else "DELETE", f"{self.scan['links']['self']}/pin")
 
-    pin = Operation(_pin, doc="Keep the scan, whatever the settings say of old ones; with pinned=False, no more.")
-
-    async def _delete(self) -> None:
+    @Operation
+    async def delete(self) -> None:
+        """Delete the scan with all its files."""
         await self.core.send("DELETE", self.scan["links"]["self"])
-
-    delete = Operation(_delete, doc="Delete the scan with all its files.")
 
     async def _once(self, name: str, read: Callable[[bytes], Any]) -> Any:
         if name not in self._kept:
@@ -148,7 +148,7 @@ class ScanJob(Remote[W]):
     def _events(self) -> AsyncGenerator[Event]:
         return self.core.follow(self.scan["links"]["events"])
 
-    events = Stream(_events)
+    events = Operation(_events)
 
     def __iter__(self: ScanJob[Blocking]) -> Iterator[Event]:
         return self.events()
@@ -156,10 +156,10 @@ class ScanJob(Remote[W]):
     def __aiter__(self: ScanJob[Awaited]) -> AsyncIterator[Event]:
         return self.events()
 
-    async def _cancel(self) -> None:
+    @Operation
+    async def cancel(self) -> None:
+        """Ask the scan to stop between two frames."""
         await self.core.send("POST", self.scan["links"]["cancel"])
-
-    cancel = Operation(_cancel, doc="Ask the scan to stop between two frames.")
 
     async def awaited(self, progress: Told | None = None) -> ScanResult[W]:
         """Wait for the end, and return what came of it.
@@ -190,14 +190,14 @@ class ScanJob(Remote[W]):
 
     result = Operation(awaited)
 
-    async def _series(self) -> list[ScanJob[W]]:
+    @Operation
+    async def series(self) -> list[ScanJob[W]]:
+        """All scans of the series that it belongs to, itself included."""
         series = self.scan["links"].get("series")
         if series is None:
             return [self]
         scans = (await self.core.content("Json", "GET", series))["scans"]
         return [ScanJob(self.core, scan) for scan in scans]
-
-    series = Operation(_series, doc="All scans of the series that it belongs to, itself included.")
 
     def __repr__(self) -> str:
         return f"<scan {self.id}>"
