@@ -6,73 +6,29 @@ import ipaddress
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic import ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, EnvSettingsSource, NoDecode, SettingsConfigDict
 
 from slrig.bundle.description import CameraName
 from slrig.bundle.faults import Strict, checked, explain, read_toml
-from slrig.bundle.region_file import RegionTable, with_masks
+from slrig.bundle.region_file import with_masks
+from slrig.bundle.scan_options import ExposureSeconds, Preset, PresetName, ScanDefaults
 from slrig.errors import ConfigError
-from slrig.model import FEWEST_EXPOSURES, MOST_EXPOSURES, Axis, FlipRule, bracket_fault
 
 MOST_CONFIG_BYTES = 2**20
 
 
-def _a_bracket(exposures_s: tuple[float, ...]) -> tuple[float, ...]:
-    fault = bracket_fault(exposures_s)
-    if fault is not None:
-        raise ValueError(fault)
-    return exposures_s
-
-
-ExposureSeconds = Annotated[float, Field(gt=0, le=60)]
-BracketSeconds = Annotated[
-    tuple[ExposureSeconds, ...],
-    # A list in TOML and in JSON. Its length is checked with the rest, or one wrong time would be told as two faults.
-    Field(strict=False, json_schema_extra={"minItems": FEWEST_EXPOSURES, "maxItems": MOST_EXPOSURES}),
-    AfterValidator(_a_bracket),
-]
 LineSeconds = Annotated[float, Field(ge=0, le=0.1)]
 Gain = Annotated[float, Field(gt=0, le=1000)]
 DriverName = Annotated[str, Field(min_length=1)]
 NoticeKind = Literal[
     "run.missed", "run.skipped", "run.failed", "run.interrupted", "health.changed", "job.ended"
 ]  # fmt: skip
-
-
-class ScanDefaults(Strict):
-    """What a scan on this rig does unless its request says otherwise. The keys are those of a scan's plan."""
-
-    line_shift: bool | None = None
-    line_shift_period_px: Annotated[int, Field(ge=4)] | None = None
-    line_width_px: Annotated[int, Field(ge=1)] | None = None
-    gray_cell_px: Annotated[int, Field(ge=1)] | None = None
-    gray_offset_px: Annotated[int, Field(ge=0)] | None = None
-    rows: bool | None = None
-    keep_holes: bool | None = None
-    depth_edge_ratio: Annotated[float, Field(gt=1)] | None = None
-    max_code_gap: Annotated[int, Field(ge=1)] | None = None
-    flip_rule: Annotated[FlipRule, Field(strict=False)] | None = None
-    smooth_boundary: bool | None = None
-    axis: Annotated[Axis, Field(strict=False)] | None = None
-    region: RegionTable | None = None
-    exposure_s: ExposureSeconds | None = None
-    exposures_s: BracketSeconds | None = Field(
-        default=None,
-        description="a bracket: play the sequence once for each of these exposures, and fuse the frames. On a video "
-        "projector, whole refresh periods",
-    )
-    colour: bool | None = Field(
-        default=None, description="keep white and black frames in colour. Default: where a camera has it"
-    )
-    coloured_light: bool | None = Field(
-        default=None, description="play white in red, green and blue too, for cameras without colour. Default: false"
-    )
 
 
 class DriverTable(Strict, use_attribute_docstrings=True):
@@ -163,6 +119,10 @@ class RigTable(Strict):
     verification: VerificationTable = VerificationTable()
     accuracy: AccuracyTable = AccuracyTable()
     scan: ScanDefaults = ScanDefaults()
+    presets: Annotated[
+        dict[PresetName, Preset],
+        Field(default_factory=dict, description="options for a kind of object, by the name that a request gives"),
+    ]
 
     @model_validator(mode="after")
     def _one_kind_of_rig(self) -> Self:
@@ -206,6 +166,7 @@ class RigConfig:
     synchronisation: SynchronisationTable | None = None
     refuse_when_stale: bool = False
     wanted_mm: float | None = None
+    presets: Mapping[str, Preset] = field(default_factory=dict)
 
 
 def read_rig(path: Path) -> RigConfig:
@@ -217,9 +178,11 @@ def read_rig(path: Path) -> RigConfig:
         The file is missing or not TOML, or any of its keys is unknown or wrong; all faults in one message.
     """
     data = read_toml(path, MOST_CONFIG_BYTES)
-    scan = data.get("scan")
-    if isinstance(scan, Mapping) and isinstance(scan.get("region"), Mapping):
-        data["scan"] = {**scan, "region": with_masks(scan["region"], path.parent)}
+    presets = data.get("presets")
+    for tables, name in ((data, "scan"), *((presets, name) for name in presets or () if isinstance(presets, dict))):
+        options = tables.get(name)
+        if isinstance(options, Mapping) and isinstance(options.get("region"), Mapping):
+            tables[name] = {**options, "region": with_masks(options["region"], path.parent)}
     return rig_of(data, path)
 
 
@@ -244,6 +207,7 @@ def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
         synchronisation=table.synchronisation,
         refuse_when_stale=table.verification.refuse_when_stale,
         wanted_mm=table.accuracy.wanted_mm,
+        presets=table.presets,
     )
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import geometric_mean
 from types import TracebackType
 from typing import Self
 
@@ -25,7 +26,7 @@ from slrig.bundle.refused import FOLDER, Refused
 from slrig.capture.exposure import whole_refreshes_s
 from slrig.capture.sequencer import choose_triggers
 from slrig.capture.session import SETTINGS_TOLERANCE
-from slrig.devices import Rig, Trigger
+from slrig.devices import Camera, Rig, Trigger
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink
 from slrig.model import Shot, Truth
@@ -175,7 +176,7 @@ def capture_frames(
         recorded=rig.projector.info.recorded,
         coloured_light=plan.coloured_light,
     )
-    rig, exposures_s, told = _steady(rig, plan.rising_exposures_s)
+    rig, exposures_s, told = exposed(rig, plan)
     told += _of_the_rig(rig)
     for words in told:
         _log.info(words, rig=rig.name)
@@ -227,26 +228,41 @@ def _detail(exposing: Exposing) -> str:
     return f"frame {exposing.done} of {exposing.total}" + (f", {again} shot again" if again else "")
 
 
-def _steady(rig: Rig, exposures_s: tuple[float, ...]) -> tuple[Rig, tuple[float, ...], list[str]]:
-    """The rig and the exposures asked for, in whole refresh periods of its projector, and words for what changed."""
-    refresh_s = rig.projector.info.refresh_s
-    if refresh_s is None:
-        return rig, exposures_s, []
-    told: list[str] = []
+def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]]:
+    """The rig as a plan exposes it: its cameras' settings, or exposures for all cameras, from short to long, in whole
+    refresh periods of its projector; and words for what is not as it was asked for.
 
-    def snapped(asked_s: float, whose: str) -> float:
-        exposure_s = whole_refreshes_s(asked_s, refresh_s)
+    One factor is times each camera's own exposure; those of a bracket, which all cameras share, are times the geometric
+    mean. What a camera cannot do of them becomes the nearest that it can.
+    """
+    refresh_s = rig.projector.info.refresh_s
+    told = [] if plan.preset is None else [f"the scan was asked for by {plan.preset}"]
+
+    def instead(exposure_s: float, asked_s: float, whose: str, why: str) -> float:
         if abs(exposure_s - asked_s) > SETTINGS_TOLERANCE * asked_s:
-            told.append(
-                f"{whose} exposes for {exposure_s:.6g} s instead of {asked_s:.6g} s: whole periods of the projector "
-                f"({refresh_s:.6g} s)"
-            )
+            told.append(f"{whose} exposes for {exposure_s:.6g} s instead of {asked_s:.6g} s: {why}")
         return exposure_s
 
+    def scaled(asked_s: float, whose: str, cameras: Iterable[Camera]) -> float:
+        least_s, most_s = zip(*(camera.info.exposure_range_s for camera in cameras), strict=True)
+        return instead(min(max(asked_s, *least_s), *most_s), asked_s, whose, "what it can do")
+
+    def snapped(asked_s: float, whose: str) -> float:
+        if refresh_s is None:
+            return asked_s
+        why = f"whole periods of the projector ({refresh_s:.6g} s)"
+        return instead(whole_refreshes_s(asked_s, refresh_s), asked_s, whose, why)
+
+    own_s = {name: each.exposure_s for name, each in rig.settings.items()}
+    exposures_s, every, factors = plan.rising_exposures_s, "every camera", sorted(plan.exposure_factors or ())
+    if len(factors) > 1:
+        mean_s = geometric_mean(own_s.values())
+        exposures_s = tuple(scaled(factor * mean_s, every, rig.cameras.values()) for factor in factors)
     if exposures_s:
-        return rig, tuple(dict.fromkeys(snapped(each, "every camera") for each in exposures_s)), told
+        return rig, tuple(dict.fromkeys(snapped(each, every) for each in exposures_s)), told
+    for name in own_s if factors else ():
+        own_s[name] = scaled(factors[0] * own_s[name], f"camera '{name}'", [rig.cameras[name]])
     settings = {
-        name: replace(each, exposure_s=snapped(each.exposure_s, f"camera '{name}'"))
-        for name, each in rig.settings.items()
+        name: replace(each, exposure_s=snapped(own_s[name], f"camera '{name}'")) for name, each in rig.settings.items()
     }
     return replace(rig, settings=settings), (), told

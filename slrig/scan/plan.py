@@ -105,33 +105,52 @@ class SeriesPlace:
 
 
 @dataclass(frozen=True, slots=True)
+class PresetUse:
+    """The preset that a scan was asked for by: its name, the version of its format, and a digest of its options."""
+
+    name: str
+    version: int
+    digest: str
+
+    def __str__(self) -> str:
+        return f"preset '{self.name}' (version {self.version}, {self.digest})"
+
+
+@dataclass(frozen=True, slots=True)
 class ScanPlan:
     """One scan: patterns, exposure, reconstruction. `exposure_s` None keeps what the rig file says per camera.
 
-    exposures_s : a bracket, for an object that is dark here and shines there: the sequence is played once for each of
-    these exposure times, and the frames are fused. They are times and not multiples of what each camera has, like
-    `exposure_s`: so every one can be a whole number of a projector's refreshes (of 1/60 s, say), and is checked against
-    what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order. colour : keep white
-    and black frames in colour, None where a camera has it. coloured_light : play white in red, green and blue as well,
-    for the cameras that have no colour. series : None for a scan alone.
+    exposures_s : a bracket, for an object that is dark here and shines there: the sequence is played once for each
+    of these exposure times, and the frames are fused. They are times and not multiples of what each camera has,
+    like `exposure_s`: so every one can be a whole number of a projector's refreshes (of 1/60 s, say), and is
+    checked against what the cameras can do before anything moves. Two to six, at least a tenth apart, in any order.
+    exposure_factors : one or a bracket, in place of both, times the exposures that the cameras have by themselves;
+    see `slrig.scan.acquisition.exposed`. preset : where some of this came from, None where no preset was named.
+    colour : keep white and black frames in colour, None where a camera has it. coloured_light : play white in red,
+    green and blue as well, for the cameras that have no colour. series : None for a scan alone.
 
     Raises
     ------
     ConfigError
-        exposure_s is not above 0 and finite, exposures_s is no bracket, or both are given.
+        exposure_s is not above 0 and finite, exposures_s is no bracket, or more than one of the three is given.
     """
 
     patterns: PatternPlan = field(default_factory=PatternPlan)
     reconstruction: ReconstructionPlan = field(default_factory=ReconstructionPlan)
     exposure_s: float | None = None
     exposures_s: tuple[float, ...] | None = None
+    exposure_factors: tuple[float, ...] | None = None
     colour: bool | None = None
     coloured_light: bool = False
     series: SeriesPlace | None = None
+    preset: PresetUse | None = None
 
     def __post_init__(self) -> None:
         if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
             message = f"exposure_s: expected a finite time above 0 s, found {self.exposure_s:g} s; 0.0167 is usual"
+            raise ConfigError(message)
+        if self.exposure_factors is not None and (self.exposure_s or self.exposures_s):
+            message = "expected exposure_factors alone, found exposure times beside them; keep one of them"
             raise ConfigError(message)
         if self.exposures_s is None:
             return
@@ -142,6 +161,11 @@ class ScanPlan:
         if fault is not None:
             message = f"exposures_s: {fault}"
             raise ConfigError(message)
+
+    @property
+    def exposure_count(self) -> int:
+        """How often the sequence is played."""
+        return len(self.exposures_s or self.exposure_factors or (None,))
 
     @property
     def rising_exposures_s(self) -> tuple[float, ...]:

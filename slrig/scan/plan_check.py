@@ -92,8 +92,8 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
         plan.patterns, projector.size, calibration, facts.cameras, axis=axis, recorded=projector.recorded,
         coloured_light=plan.coloured_light,
     )  # fmt: skip
-    count, coloured = len(sequence) * max(len(exposures_s), 1), in_colour(plan, facts.cameras, projector)
-    ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * max(len(exposures_s), 1)
+    count, coloured = len(sequence) * plan.exposure_count, in_colour(plan, facts.cameras, projector)
+    ends = sum(isinstance(each, White | Black) for each in sequence.patterns) * plan.exposure_count
     key = "exposure_s" if plan.exposures_s is None else "exposures_s"
     total = 0
     for name, camera in facts.cameras.items():

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from slrig.config import ScanDefaults, ServiceSettings, is_loopback, read_rig, read_settings
+from slrig.bundle.scan_options import ScanDefaults
+from slrig.config import ServiceSettings, is_loopback, read_rig, read_settings
 from slrig.errors import ConfigError
 from slrig.model import FlipRule
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
@@ -90,8 +91,8 @@ def test_every_rig_of_the_repository_is_read(path: Path) -> None:
 
 def test_scan_defaults_are_the_fields_of_a_plan() -> None:
     plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
-    # A pose may be shot without codes, a scan may not; a request makes a series, no rig file.
-    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes", "series"}
+    # A pose may be shot without codes, a scan may not; a request makes a series and names a preset, no rig file.
+    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes", "series", "preset"}
 
 
 @pytest.mark.parametrize(

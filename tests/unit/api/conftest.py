@@ -13,7 +13,8 @@ from fastapi.testclient import TestClient
 from slrig.api.app import create_app
 from slrig.api.keys import KeyRing
 from slrig.api.service import Service
-from slrig.config import ScanDefaults, ServiceSettings
+from slrig.bundle.scan_options import ScanDefaults
+from slrig.config import ServiceSettings
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.records import JobKind

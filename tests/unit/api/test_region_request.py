@@ -15,9 +15,10 @@ from typer.testing import CliRunner
 
 from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.bundle.region_file import read_region
+from slrig.bundle.scan_options import ScanDefaults
 from slrig.cli import scan as scan_module
 from slrig.cli.commands import app
-from slrig.config import ScanDefaults, read_rig
+from slrig.config import read_rig
 from slrig.devices import CameraInfo, ProjectorInfo, Trigger
 from slrig.errors import ConfigError
 from slrig.model import CameraFormat, Region, Size

@@ -15,7 +15,7 @@ from slrig.bundle import read_bundle
 from slrig.bundle.notes import read_notes
 from slrig.bundle.refused import read_refused
 from slrig.capture.evidence import EvidenceSummary, check_capture
-from slrig.devices import Synchronisation, Trigger
+from slrig.devices import CameraSettings, Synchronisation, Trigger
 from slrig.errors import (
     BundleError,
     DeviceGoneError,
@@ -27,8 +27,8 @@ from slrig.errors import (
 from slrig.jobs.frame_feed import Abandon, FrameFeed
 from slrig.model import Calibration, Shot
 from slrig.model.header import CaptureHeader
-from slrig.scan.acquisition import capture_frames
-from slrig.scan.plan import ScanPlan
+from slrig.scan.acquisition import capture_frames, exposed
+from slrig.scan.plan import PresetUse, ScanPlan
 from slrig.scan.report import capture_report
 from slrig.scan.stream import ScanStream
 from tests.contract.benches import PROJECTOR, simulated
@@ -222,7 +222,7 @@ def test_a_cancel_after_a_refusal_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def steady(folder: Path, *, exposures_s: tuple[float, ...] | None = None) -> tuple[set[float | None], list[str]]:
+def steady(folder: Path, **exposing: tuple[float, ...]) -> tuple[set[float | None], list[str]]:
     """The exposures of a scan on a rendered display of 250 Hz, and what it told."""
     display = {
         "size_px": [PROJECTOR.width_px, PROJECTOR.height_px],
@@ -236,7 +236,7 @@ def steady(folder: Path, *, exposures_s: tuple[float, ...] | None = None) -> tup
     with simulated(folder, projector=display).head() as head:
         capture_frames(
             rig_of(head),
-            ScanPlan(exposures_s=exposures_s),
+            ScanPlan(**exposing),  # type: ignore[arg-type]
             folder / "bundle",
             progress=lambda _stage, _fraction, detail: told.append(detail),
             cancelled=lambda: False,
@@ -256,3 +256,29 @@ def test_exposures_of_a_bracket_that_become_one_are_played_once(tmp_path: Path) 
     exposures_s, told = steady(tmp_path, exposures_s=(0.0075, 0.0085, 0.02))
     assert exposures_s == {0.008, 0.02}
     assert sum("instead of" in words for words in told) == 2
+
+
+def test_factors_are_of_the_rigs_own_exposure_as_far_as_the_projector_lets(tmp_path: Path) -> None:
+    exposures_s, told = steady(tmp_path, exposure_factors=(1.8, 0.12))
+    # Of 1/60 s, in whole periods of 4 ms.
+    assert exposures_s == {0.004, 0.032}
+    assert sum("instead of" in words for words in told) == 2
+
+
+def test_factors_are_of_each_camera_alone_and_of_their_mean_in_a_bracket(tmp_path: Path) -> None:
+    with simulated(tmp_path).head() as head:
+        rig, (name, camera) = rig_of(head), next(iter(head.cameras.items()))
+        two = replace(
+            rig,
+            cameras={name: camera, "other": camera},
+            settings={name: CameraSettings(0.01), "other": CameraSettings(0.04)},
+        )
+        longest_s = camera.info.exposure_range_s[1]
+        scaled, none, told = exposed(two, ScanPlan(exposure_factors=(2.0,), preset=PresetUse("dark", 1, "abc")))
+        assert {each: settings.exposure_s for each, settings in scaled.settings.items()} == {name: 0.02, "other": 0.08}
+        assert (none, told) == ((), ["the scan was asked for by preset 'dark' (version 1, abc)"])
+        _, bracket_s, _ = exposed(two, ScanPlan(exposure_factors=(4.0, 0.5)))
+        assert bracket_s == pytest.approx((0.01, 0.08))
+        _, bracket_s, told = exposed(two, ScanPlan(exposure_factors=(1.0, 900.0)))
+        assert bracket_s == pytest.approx((0.02, longest_s))
+        assert told == [f"every camera exposes for {longest_s:.6g} s instead of 18 s: what it can do"]
