@@ -180,6 +180,10 @@ class JobNotFoundError(SlrigError, code="job-not-found"):
     """No scan of this id is on record here."""
 
 
+class PresetNotFoundError(SlrigError, code="preset-not-found"):
+    """No preset has this name here, or none that could be deleted. Name those that there are."""
+
+
 class ArtefactNotReadyError(SlrigError, code="artefact-not-ready"):
     """The scan exists, and the file asked for does not exist yet or never will (the scan failed)."""
 

@@ -30,7 +30,8 @@ def start_scan(
     idempotency_key: IdempotencyKey = None,
 ) -> ScanBody:
     """Start a scan. The answer comes at once; follow `links.events` for the rest."""
-    plan = scan_plan(request, service.scan_defaults)
+    preset = None if request.preset is None else service.presets.get(request.preset)
+    plan = scan_plan(request, service.scan_defaults, preset)
 
     def start(key: str | None) -> UUID:
         health, _, _ = service.verifications.health()

@@ -8,17 +8,33 @@ from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
 from uuid import UUID
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationInfo, WithJsonSchema, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+)
 
 from slrig.api.problems import fault_problem
 from slrig.bundle.faults import Strict
 from slrig.bundle.free_text import FreeText
 from slrig.bundle.region_file import RegionTable
-from slrig.config import BracketSeconds, ScanDefaults
+from slrig.bundle.scan_options import (
+    EXPOSURE_KEYS,
+    BracketSeconds,
+    ExposureFactors,
+    PresetDocument,
+    PresetName,
+    ScanDefaults,
+    alone,
+)
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule, Size
-from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.plan import PatternPlan, PresetUse, ReconstructionPlan, ScanPlan
 
 MOST_EXPOSURE_S = 60.0
 MOST_REPEATS = 500
@@ -82,6 +98,11 @@ class ScanRequest(Strict):
     """A scan. An empty request is a scan as the rig file describes it."""
 
     label: FreeText | None = Field(default=None, description="free text, to find the scan again")
+    preset: PresetName | None = Field(
+        default=None,
+        description="options by name, as GET /preset lists them. What is said beside it stands above it, and it stands "
+        "above the rig file's `[scan]`",
+    )
     patterns: PatternRequest = Field(default_factory=PatternRequest)
     reconstruction: ReconstructionRequest = Field(default_factory=ReconstructionRequest)
     exposure_s: Annotated[float, Field(gt=0, le=MOST_EXPOSURE_S)] | None = Field(
@@ -92,6 +113,11 @@ class ScanRequest(Strict):
         description="a bracket, for what is dark here and shines there: the sequence is played once for each of these "
         "exposure times of every camera, seconds, and the frames are fused. Two to six in place of exposure_s; on a "
         "video projector, whole refresh periods. Default: as the rig file says",
+    )
+    exposure_factors: ExposureFactors | None = Field(
+        default=None,
+        description="in place of both, times the exposure that the rig's cameras have by themselves: one, or two to "
+        "six for a bracket, which where cameras differ is of their geometric mean",
     )
     colour: bool | None = Field(
         default=None,
@@ -125,13 +151,7 @@ class ScanRequest(Strict):
             raise ValueError(message)
         return every_s
 
-    @field_validator("exposures_s")
-    @classmethod
-    def _alone(cls, exposures_s: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-        if exposures_s is not None and info.data.get("exposure_s") is not None:
-            message = "expected exposure_s or exposures_s, found both; keep exposures_s for a bracket"
-            raise ValueError(message)
-        return exposures_s
+    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
 
 
 def filled(body: type[Body], source: object, /, **others: Any) -> Body:
@@ -140,25 +160,28 @@ def filled(body: type[Body], source: object, /, **others: Any) -> Body:
     return body.model_validate({**own, **others}, from_attributes=True)
 
 
-def scan_plan(request: ScanRequest, defaults: ScanDefaults) -> ScanPlan:
-    """The plan that a request means on a rig with these defaults.
+def scan_plan(request: ScanRequest, defaults: ScanDefaults, preset: PresetDocument | None = None) -> ScanPlan:
+    """The plan that a request means on a rig with these defaults. preset : the one that the request names.
 
     The rig file's exposure is no part of it: it is among the settings that each camera was opened with. Its bracket is,
-    unless the request asks for one exposure.
+    unless the request or the preset says how long to expose.
 
     >>> scan_plan(ScanRequest(), ScanDefaults(line_shift_period_px=12)).patterns.line_shift_period_px
     12
     >>> scan_plan(ScanRequest(exposure_s=0.02), ScanDefaults(exposures_s=(0.01, 0.04))).exposures_s is None
     True
     """
-    usual = defaults.exposures_s if request.exposure_s is None else None
+    usual, use = defaults.model_copy(update={"exposure_s": None}), None
+    if preset is not None and request.preset is not None:
+        usual, use = preset.scan.over(usual), PresetUse(request.preset, preset.version, preset.digest)
+    exposing: BaseModel = request if any(getattr(request, key) is not None for key in EXPOSURE_KEYS) else usual
     return ScanPlan(
-        patterns=pattern_plan(request.patterns, defaults),
-        reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, defaults)),
-        exposure_s=request.exposure_s,
-        exposures_s=request.exposures_s if request.exposures_s is not None else usual,
-        colour=request.colour if request.colour is not None else defaults.colour,
-        coloured_light=bool(defaults.coloured_light if request.coloured_light is None else request.coloured_light),
+        patterns=pattern_plan(request.patterns, usual),
+        reconstruction=ReconstructionPlan(**_chosen(ReconstructionPlan, request.reconstruction, usual)),
+        **{key: getattr(exposing, key) for key in EXPOSURE_KEYS},
+        colour=request.colour if request.colour is not None else usual.colour,
+        coloured_light=bool(usual.coloured_light if request.coloured_light is None else request.coloured_light),
+        preset=use,
     )
 
 

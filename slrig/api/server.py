@@ -107,6 +107,7 @@ def open_service(
             rig_name=rig.name,
             refuse_when_stale=rig.refuse_when_stale,
             wanted_mm=rig.wanted_mm,
+            presets=rig.presets,
         )
     except BaseException:
         store.database.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, TypeVar
 
@@ -13,11 +13,12 @@ from fastapi import Depends, Query, Request, Response
 from slrig.accept.desk import AcceptanceDesk
 from slrig.api.latency import Durations
 from slrig.api.traces import traces_by_environment
+from slrig.bundle.scan_options import Preset, ScanDefaults
 from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
-from slrig.config import ScanDefaults, ServiceSettings
+from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.feed import JobFeed
@@ -25,6 +26,7 @@ from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
+from slrig.scan.presets import Presets
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
 from slrig.schedule.notices import NoticedHealth, tell_run
@@ -47,7 +49,7 @@ class Service:
 
     Until `start` nothing works. store : of scans; all jobs tell of their ends where those do. worker : the runner's,
     which computes for all of them. refuse_when_stale : whether the rig file has scans refused then. wanted_mm : what it
-    wants of a point's error.
+    wants of a point's error. presets : the rig file's.
 
     Raises
     ------
@@ -71,9 +73,11 @@ class Service:
         calibration_tools: CalibrationTools | None = None,
         refuse_when_stale: bool = False,
         wanted_mm: float | None = None,
+        presets: Mapping[str, Preset] | None = None,
     ) -> None:
         self.settings = settings
         self.scan_defaults = scan_defaults
+        self.presets = Presets(folder.root / "presets", presets or {})
         self.folder = folder
         self.store = store
         self.runner = runner

@@ -6,6 +6,7 @@ DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
+DATA/presets/NAME.json  presets that were put: see `slrig.scan.presets`
 DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.jobs.examinations`
 DATA/.incoming/ID/   a scan, a pose or a solve being made; swept at the next start
 DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work

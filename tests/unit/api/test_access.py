@@ -83,7 +83,7 @@ def test_every_operation_has_a_scope_that_its_path_tells() -> None:
             if method.upper() in READING:
                 moving = path.startswith("/preview/")
                 assert scope is (Scope.SCAN if moving else Scope.ADMINISTER if path == "/audit" else Scope.LOOK)
-            elif not path.startswith(("/session", "/schedule")):
+            elif not path.startswith(("/session", "/schedule", "/preset")):
                 assert scope in {Scope.SCAN, Scope.CALIBRATE}, (method, path)
 
 
