@@ -22,11 +22,11 @@ from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.capture.sampling import Sampler
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
-_NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
+NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
 _MOST_SATURATED = 0.9  # of what is lit, as `checks.lighting` has it
 _LEAST_LIT = 40  # samples, as `checks` has it
-_LEAST_CLEAR = 12.0  # noises that white lies above black
-_LEAST_CLEAR_DN = 4.0  # rounding hides the shares of less
+LEAST_CLEAR = 12.0  # noises that white lies above black
+LEAST_CLEAR_DN = 4.0  # rounding hides the shares of less
 _LEAST_COMPARED = 300  # samples, as many as a band needs to be judged
 _MOST_MOVED = 0.05  # of the pixels, as `checks.drift_fault` has it
 _MOVED = 0.3  # of white, as `checks.drift` has it
@@ -67,7 +67,7 @@ def verdict(white: Pixels, black: Pixels, form: CameraFormat) -> Verdict | None:
     Too bright: all but a tenth of what the projector lights is saturated, or half of the image is under black. Too
     dark: nothing is lit, or noise hides a good part of what is.
     """
-    sampler, nearly_full = Sampler.of(form.size), _NEARLY_FULL * form.full_scale
+    sampler, nearly_full = Sampler.of(form.size), NEARLY_FULL * form.full_scale
     lit_frame, dark_frame = sampler.take(white), sampler.take(black)
     contrast = lit_frame - dark_frame
     high, low = float(np.percentile(contrast, 99.5)), -float(np.percentile(contrast, 0.5))
@@ -82,7 +82,7 @@ def verdict(white: Pixels, black: Pixels, form: CameraFormat) -> Verdict | None:
     if low > 3 * max(high, 1.0):
         return None
     clear = float(np.median(contrast[lit])) if np.count_nonzero(lit) >= _LEAST_LIT else max(high, 0.0)
-    if np.count_nonzero(lit) < _LEAST_LIT or clear < _LEAST_CLEAR * noise:
+    if np.count_nonzero(lit) < _LEAST_LIT or clear < LEAST_CLEAR * noise:
         words = f"white is {clear:.1f} DN above black, and noise is {noise:.1f} DN"
         return Verdict(Unfit.TOO_DARK, words)
     return None
@@ -112,7 +112,7 @@ def movement_between(
             return None
         white, black = ends[0], ends[1]
         contrast = np.maximum(white - black, np.float32(1))
-        clear = (contrast >= max(_LEAST_CLEAR_DN, _LEAST_CLEAR * each.noise_dn)) & (white < _NEARLY_FULL * full_scale)
+        clear = (contrast >= max(LEAST_CLEAR_DN, LEAST_CLEAR * each.noise_dn)) & (white < NEARLY_FULL * full_scale)
         usable = clear if usable is None else usable & clear
         relative.append({i: (frame - black) / contrast for i, frame in each.frames.items()})
         doubt.append(2**0.5 * each.noise_dn / contrast)

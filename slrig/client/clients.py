@@ -17,6 +17,7 @@ from slrig.client.core import Core, Json, W
 from slrig.client.endpoints import (
     Acceptance,
     Calibrations,
+    Presets,
     RigHealth,
     RigState,
     ScanOptions,
@@ -42,6 +43,7 @@ class _Service(Remote[W]):
     def __init__(self, wire: W) -> None:
         super().__init__(Core(wire))
         self.scans = Scans(self.core)
+        self.presets = Presets(self.core)
         self.rig = RigState(self.core)
         self.calibration = Calibrations(self.core)
         self.health = RigHealth(self.core)
@@ -70,6 +72,11 @@ class _Service(Remote[W]):
             with suppress(ServiceError):
                 await self.core.send("POST", job.scan["links"]["cancel"])
             raise
+
+    @Operation
+    async def exposure(self, /, **options: Any) -> Json:
+        """Look at the object, and propose exposures; `scan(**answer["scan"])` scans with them. See `Scans.exposure`."""
+        return await self.core.content("Json", "POST", "/exposure", json=options)  # type: ignore[no-any-return]
 
     async def _job(self, scan_id: str) -> ScanJob[W]:
         return ScanJob(self.core, await self.core.content("Json", "GET", f"/scan/{scan_id}"))

@@ -26,8 +26,10 @@ class ScanOptions(TypedDict, total=False):
     """What a scan may be asked for. exposure_s, exposures_s, every_s in seconds."""
 
     label: str | None
+    preset: str | None
     exposure_s: float | None
     exposures_s: Sequence[float] | None
+    exposure_factors: Sequence[float] | None
     patterns: Mapping[str, Any] | None
     reconstruction: Mapping[str, Any] | None
     colour: bool | None
@@ -57,6 +59,16 @@ class Scans(Remote[W]):
     def start(self, **options: Unpack[ScanOptions]) -> Json:
         """Start a scan, and return it as it is on record; `Client.start_scan` returns one to follow."""
 
+    @endpoint("POST /exposure")
+    def exposure(
+        self,
+        *,
+        budget_s: float | None = None,
+        preset: str | None = None,
+        patterns: Mapping[str, Any] | None = None,
+    ) -> Json:
+        """Look at the object, and propose exposures: `scan` of the answer is what `start` takes. budget_s : seconds."""
+
     list = entry(
         "GET /scan", _paged, "A page of scans from new to old: `scans`, and `next`, the path of the page after it."
     )
@@ -72,6 +84,18 @@ class Scans(Remote[W]):
     @stream("GET /scan/{scan_id}/events", Core.follow)
     def follow(self, scan_id: str) -> Event:
         """What happens to a scan until it is over, from its beginning."""
+
+
+class Presets(Remote[W]):
+    """Options of scans by name."""
+
+    list = entry("GET /preset", _told, "The presets: shipped, of the rig file, and kept by the service.")
+    look = entry("GET /preset/{name}", _told_of, "A preset as a document, which another service takes as it is.")
+    delete = entry("DELETE /preset/{name}", _done_to, "Delete a preset that was put.")
+
+    @endpoint("PUT /preset/{name}", content="document")
+    def put(self, name: str, document: Mapping[str, Any] | str | bytes) -> Json:
+        """Keep a preset by this name."""
 
 
 class RigState(Remote[W]):

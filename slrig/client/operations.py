@@ -57,7 +57,7 @@ class Spec:
         for part, name in zip(rest, names, strict=False):
             head += quote(str(given.pop(name)), safe="") + part.partition("}")[2]
         request: Json = {"method": method, "path": head, **({"once": True} if self.once else {})}
-        has_body = method == "POST" and bool(given.keys() - set(self.query))
+        has_body = method in {"POST", "PUT"} and bool(given.keys() - set(self.query))
         told = {name: value for name, value in given.items() if value is not None}
         if params := {name: told.pop(name) for name in (self.query if has_body else tuple(told)) if name in told}:
             request["params"] = params

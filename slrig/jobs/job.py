@@ -16,12 +16,12 @@ from slrig.rig.session import RigSession
 @dataclass(frozen=True, slots=True)
 class Holder:
     """Who holds the rig. name : what an answer calls it, the id of a scan; words : the same for a person; path : where
-    it is found over HTTP, below which `cancel` ends it.
+    it is found over HTTP, below which `cancel` ends it; None for what is over in seconds.
     """
 
     name: str
     words: str
-    path: str
+    path: str | None
 
 
 @dataclass(slots=True, eq=False)
@@ -75,8 +75,9 @@ class Job:
 def busy(job: Job) -> RigBusyError:
     """The error that names who holds the rig."""
     since = job.since.isoformat(timespec="seconds")
+    cancel = "" if job.holder.path is None else f"cancel it with POST {job.holder.path}/cancel, "
     message = (
-        f"The rig is held by {job.holder.words} since {since}. Wait for it, cancel it with "
-        f'POST {job.holder.path}/cancel, or send "if_busy": "queue" to wait in line.'
+        f'The rig is held by {job.holder.words} since {since}. Wait for it, {cancel}or send "if_busy": "queue" to wait '
+        "in line."
     )
     return RigBusyError(message, holder=job.holder.name, since=since)

@@ -141,3 +141,29 @@ def test_the_rest_of_the_interface_answers(service: ServiceProcess) -> None:
         assert client.system.explain("rig-busy")["title"] == "Rig busy"
         assert "slrig" in client.system.metrics()
         assert client.system.audit(limit=1)["entries"]
+
+
+def test_exposures_proposed_and_kept_as_a_preset_are_those_of_the_scan(service: ServiceProcess) -> None:
+    with service.client() as client:
+        found = client.exposure(budget_s=20.0)
+        assert found["completeness"] > 0.95
+        assert found["lit"] > 0.2
+        (cover,) = found["exposures"]
+        assert found["scan"] == {"exposure_s": cover["exposure_s"]}
+        assert {each["exposure_s"] for each in found["others"]}.isdisjoint({cover["exposure_s"]})
+        with pytest.raises(InvalidRequestError, match=r"budget_s: found 0\.01 s"):
+            client.exposure(budget_s=0.01, patterns={"rows": True})
+        # The rig is free again at once.
+        client.presets.put("plate", {"format": "slrig-preset", "version": 1, "scan": found["scan"]})
+        result = client.scan(preset="plate", if_busy="reject")
+        assert result.scan["plan"]["exposure_s"] == cover["exposure_s"]
+        use = result.scan["plan"]["preset"]
+        assert (use["name"], use["version"]) == ("plate", 1)
+        assert f"the scan was asked for by preset 'plate' (version 1, {use['digest']})" in result.report["notes"]
+        factors = {"exposure_factors": [1.0, 0.25], "line_shift": False}
+        client.presets.put("plate", {"format": "slrig-preset", "version": 1, "scan": factors})
+        bracket = client.scan(preset="plate", reconstruction={"smooth_boundary": False})
+        exposures_s = [each["exposure_s"] for each in bracket.report["cameras"]["left"]["exposures"]]
+        assert exposures_s == pytest.approx([0.25 / 60, 1 / 60])
+        client.presets.delete("plate")
+        assert "plate" not in {each["name"] for each in client.presets.list()["presets"]}
