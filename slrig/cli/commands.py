@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 import typer.core
 
-from slrig.cli import calibrate, key, schedule
+from slrig.cli import calibrate, key, preset, schedule
 from slrig.cli.backup import backup, restore
 from slrig.cli.foreign import import_images
 from slrig.cli.model import model
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
-from slrig.cli.scan_options import ColourOptions
+from slrig.cli.scan_options import ScanOptions
 from slrig.errors import SlrigError
 
 INTERRUPTED = 130
@@ -140,14 +139,14 @@ def scan(
     rows: Annotated[
         bool, typer.Option("--rows", help="Play columns and rows. Default: the axis the calibration asks for.")
     ] = False,
-    colour: ColourOptions,
+    asked: ScanOptions,
     mesh: MeshOptions,
     queue: Annotated[bool, typer.Option("--queue", help="Wait in line if the rig is held.")] = False,
     repeat: Annotated[int, typer.Option(min=1, help="So many scans in a row, each into a folder of its number.")] = 1,
     every_s: Annotated[float | None, typer.Option(help="From the start of one to that of the next, seconds.")] = None,
 ) -> None:
     """Scan with a running service, and fetch the mesh."""
-    from slrig.cli.scan import FILES, scan_with, series_with, tell_result
+    from slrig.cli.scan import FILES, assisted, scan_with, series_with, tell_result
 
     request = given(
         label=label,
@@ -155,7 +154,9 @@ def scan(
         exposure_s=exposure_s[0] if exposure_s and len(exposure_s) == 1 else None,
         exposures_s=exposure_s if exposure_s and len(exposure_s) > 1 else None,
         if_busy="queue" if queue else "reject",
-        **asdict(colour),
+        preset=asked.preset,
+        colour=asked.colour,
+        coloured_light=asked.coloured_light,
         repeat=repeat if repeat > 1 else None,
         every_s=every_s,
         patterns=given(
@@ -166,6 +167,8 @@ def scan(
     )  # fmt: skip
     files = tuple(file or FILES)
     with service.client() as client:
+        if asked.assist:
+            request = assisted(client, request, budget_s=asked.budget_s)
         if repeat > 1:
             series_with(client, request, output, files=files)
             return
@@ -380,6 +383,7 @@ app.command()(backup)
 app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
+app.add_typer(preset.app, name="preset")
 app.add_typer(key.app, name="key")
 
 

@@ -11,6 +11,7 @@ import typer
 from rich.table import Column
 
 from slrig.cli.display import print_table, progress_shown
+from slrig.cli.options import given
 from slrig.cli.quality import quality_lines
 from slrig.client import Client, ScanJob
 from slrig.client.wire import Blocking
@@ -97,6 +98,21 @@ def series_with(
     if failures:
         message = f"{len(failures)} of {len(scans)} scans did not succeed: {', '.join(failures)}."
         raise ServiceError(message)
+
+
+def assisted(client: Client, request: Mapping[str, Any], *, budget_s: float | None = None) -> dict[str, Any]:
+    """The request with the exposures that the object needs, which are told. Raises ServiceError: the service refused;
+    ConfigError: the request has exposures of its own.
+    """
+    if request.keys() & {"exposure_s", "exposures_s"}:
+        message = "--assist: it finds the exposures itself, and --exposure-s gives some. Leave out one of the two."
+        raise ConfigError(message)
+    found = client.exposure(**given(budget_s=budget_s, preset=request.get("preset"), patterns=request.get("patterns")))
+    times = " and ".join(f"{1000 * each['exposure_s']:.3g} ms" for each in found["exposures"])
+    typer.echo(f"{'exposure':<9} {times}: {found['completeness']:.1%} of what is lit, in {found['seconds']:.1f} s")
+    for note in found["notes"]:
+        typer.echo(f"{'':<9} {note}")
+    return {**request, **found["scan"]}
 
 
 def _started(client: Client, request: Mapping[str, Any]) -> ScanJob[Blocking]:
