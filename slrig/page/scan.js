@@ -11,12 +11,14 @@ const over = (scan) => !["queued", "capturing", "computing"].includes(scan.state
 export function ScanScreen({rig, may}) {
   const [list, problem, again] = useValue(`/scan?limit=${SHOWN}`, 5);
   const [bracket, setBracket] = useState(null);
+  const [known] = useValue("/preset");
+  const [preset, setPreset] = useState("");
   const [typed, region, change] = useLimits();
   const scans = list?.scans ?? [];
   // The oldest that is not over holds the rig, whoever asked for it, and also after this page was loaded anew.
   const active = scans.filter((scan) => !over(scan)).at(-1);
   const [start, busy, refused] = useAction(async () => {
-    const body = {if_busy: "queue", ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {})};
+    const body = {if_busy: "queue", ...(preset ? {preset} : {}), ...(bracket ? {exposures_s: bracket} : {}), ...(region ? {reconstruction: {region}} : {})};
     const scan = await ask("POST", "/scan", {body, headers: once()});
     sessionStorage.setItem("asked", scan.id);
     await again();
@@ -28,6 +30,8 @@ export function ScanScreen({rig, may}) {
     </section>
     <section aria-label="Scan">
       <${Action} kind="primary large" busy=${busy} disabled=${!may("scan")} onClick=${start}>Scan<//>
+      ${may("scan") && known && html`<label>For an object that is <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
+        <option value="">as the rig is set</option>${known.presets.map(({name}) => html`<option value=${name}>${name}</option>`)}</select></label>`}
       ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} />`}
       ${!may("scan") && html`<p class="quiet">Your key is for looking only.</p>`}
       ${blocked && html`<p class="warning">${blocked} ${rig?.calibrated === false && html`<a href="#/calibrate">Calibrate</a>`}</p>`}
