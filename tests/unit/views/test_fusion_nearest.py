@@ -1,0 +1,140 @@
+"""The nearest triangles about a sparse grid, and the mean of distances to them, against plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from slrig.meshing.search_tree import SearchTree
+from slrig.model import FloatArray
+from slrig.views.fusion_grid import corners_mm, grid_about, wanted_corners
+from slrig.views.fusion_mean import AGREEING_SIGMAS, Rule, mean_values
+from slrig.views.fusion_nearest import nearest_to_corners, nearest_within
+from slrig.views.fusion_sheets import Sheets, sheets
+from tests.unit.views.known_views import around, plate_on_box, views_of
+
+VOXEL_MM = 1.1
+RULE = Rule(correlated_mm=0.01, shared_mm=0.002, beyond_mm=0.6, inset_mm=4.0)
+
+
+@pytest.fixture(scope="module")
+def seen() -> Sheets:
+    views = views_of(plate_on_box(), around(4), 0.9)
+    return sheets([view.mesh for view in views], [view.pose for view in views], inset_mm=RULE.inset_mm)
+
+
+def plain_nearest(point: FloatArray, triangle: FloatArray) -> tuple[float, FloatArray]:
+    """Distance to a triangle and the weights of its corners there: the best of its plane, its sides and its corners."""
+    found = [(float(np.linalg.norm(point - triangle[k])), np.eye(3)[k]) for k in range(3)]
+    for free in ((0, 1, 2), (0, 1), (1, 2), (0, 2)):
+        basis = (triangle[list(free[1:])] - triangle[free[0]]).T
+        part = np.linalg.lstsq(basis, point - triangle[free[0]], rcond=None)[0]
+        weights = np.zeros(3)
+        weights[list(free)] = [1 - part.sum(), *part]
+        if (weights >= 0).all():
+            found.append((float(np.linalg.norm(point - weights @ triangle)), weights))
+    return min(found, key=lambda each: each[0])
+
+
+def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[float, float, int]:
+    """Mean value, σ and number of views, by the rules of the module's docstring."""
+    rows = []
+    for face in (each for each in nearest if each >= 0):
+        corners = seen.faces[face]
+        gap, weights = plain_nearest(point, seen.points_mm[corners])
+        normal = weights @ seen.normals[corners].astype(float)
+        normal /= np.linalg.norm(normal)
+        offset = point - weights @ seen.points_mm[corners]
+        inset = weights @ seen.inset_mm[corners].astype(float)
+        zero = weights == 0
+        border = any(zero[k] and seen.open_edges[face] >> k & 1 for k in range(3)) or (zero.sum() == 2 and inset == 0)
+        along = float(normal @ offset)
+        beyond = np.sqrt(max(gap**2 - along**2, 0)) if border else 0.0
+        if beyond <= RULE.beyond_mm:
+            sigma = weights * seen.sigma_mm[corners]
+            share = max(min(inset / RULE.inset_mm, 1), 0.01)
+            w = share / (sigma.sum() ** 2 + RULE.correlated_mm**2)
+            value = along if border else np.copysign(gap, along)
+            rows.append((value, gap, w, (sigma**2).sum(), normal, beyond))
+    if not rows:
+        return np.nan, np.nan, 0
+    first = min(rows, key=lambda row: row[1])
+    rows = sorted((row for row in rows if row[4] @ first[4] > 0.5), key=lambda row: row[0])
+    sums = np.cumsum([row[2] for row in rows])
+    middle = rows[int(np.searchsorted(sums, sums[-1] / 2))]
+    common = 2 * RULE.correlated_mm**2
+    rows = [row for row in rows if abs(row[0] - middle[0]) <= AGREEING_SIGMAS * np.sqrt(row[3] + middle[3] + common)]
+    w = np.array([row[2] for row in rows])
+    variance = (w**2 * [row[3] + RULE.correlated_mm**2 for row in rows]).sum() / w.sum() ** 2 + RULE.shared_mm**2
+    value = float((w * [row[0] for row in rows]).sum() / w.sum())
+    return value, float(np.sqrt(variance)), max(1, sum(row[5] == 0 for row in rows))
+
+
+def distances(seen: Sheets, view: int, points: FloatArray) -> FloatArray:
+    faces = seen.faces[seen.first_face[view] : seen.first_face[view + 1]]
+    return SearchTree.over(seen.points_mm, faces).distances_mm(points)
+
+
+def told(seen: Sheets, points: FloatArray, nearest: np.ndarray) -> FloatArray:
+    """Distance to the triangle that is said to be nearest, infinite for none."""
+    return np.array(
+        [
+            plain_nearest(point, seen.points_mm[seen.faces[face]])[0] if face >= 0 else np.inf
+            for point, face in zip(points, nearest, strict=True)
+        ]
+    )
+
+
+def test_the_nearest_triangle_is_that_of_the_search_tree(seen: Sheets) -> None:
+    grid = grid_about(seen, VOXEL_MM)
+    cells = wanted_corners(seen, grid)
+    corners = corners_mm(grid, cells)
+    nearest = nearest_to_corners(seen, grid, corners, cells)
+    random = np.random.default_rng(0)
+    inside = corners + VOXEL_MM * random.uniform(0, 1, corners.shape)
+    within = nearest_within(seen, grid, inside, cells, reach_mm=VOXEL_MM)
+    some = random.choice(len(cells), 400, replace=False)
+    for view in range(len(nearest)):
+        true = distances(seen, view, corners[some])
+        near = true < 0.86 * VOXEL_MM
+        assert near.sum() > 50
+        got = told(seen, corners[some], nearest[view, some])
+        assert got[near] == pytest.approx(true[near], abs=1e-9)
+        # Further off it is one of those about, and never one that is nearer than the nearest.
+        assert (got[~near] >= true[~near] - 1e-9).all()
+        true, got = distances(seen, view, inside[some]), told(seen, inside[some], within[view, some])
+        assert got == pytest.approx(np.where(true < VOXEL_MM, true, np.inf), abs=1e-9)
+
+
+def test_every_cell_that_a_triangle_passes_through_is_known_in_full(seen: Sheets) -> None:
+    grid = grid_about(seen, VOXEL_MM)
+    cells = wanted_corners(seen, grid)
+    nearest = nearest_to_corners(seen, grid, corners_mm(grid, cells), cells)
+    random = np.random.default_rng(1)
+    weights = random.dirichlet(np.ones(3), len(seen.faces))
+    steps = np.floor(
+        (np.einsum("fk,fkd->fd", weights, seen.points_mm[seen.faces]) - grid.origin_mm) / VOXEL_MM
+    ) + np.argwhere(np.ones((2, 2, 2))).reshape(8, 1, 3)
+    place = {
+        tuple(step): at
+        for at, step in enumerate(np.rint((corners_mm(grid, cells) - grid.origin_mm) / VOXEL_MM).astype(int).tolist())
+    }
+    for view in range(len(nearest)):
+        for face in range(seen.first_face[view], seen.first_face[view + 1]):
+            assert all(nearest[view, place[tuple(steps[corner, face].astype(int))]] >= 0 for corner in range(8))
+
+
+def test_the_mean_is_that_of_plain_numpy(seen: Sheets) -> None:
+    grid = grid_about(seen, VOXEL_MM)
+    cells = wanted_corners(seen, grid)
+    corners = corners_mm(grid, cells)
+    nearest = nearest_to_corners(seen, grid, corners, cells)
+    means = mean_values(seen, corners, nearest, RULE, values_only=False)
+    some = np.random.default_rng(2).choice(len(cells), 500, replace=False)
+    expected = [plain_value(seen, corners[at], nearest[:, at].tolist()) for at in some]
+    value, sigma, views = (np.array(each) for each in zip(*expected, strict=True))
+    assert 5 < np.isnan(value).sum() < 400
+    assert (views > 1).sum() > 50
+    np.testing.assert_allclose(means.value_mm[some], value, atol=1e-9)
+    np.testing.assert_allclose(means.sigma_mm[some], sigma, atol=1e-9)
+    assert means.views[some].tolist() == views.tolist()
