@@ -1,0 +1,157 @@
+"""Several views of one object, their poses known, to one mesh of their mean surface: watertight where it was seen.
+
+The views' signed distances are averaged on a sparse grid (after Curless and Levoy 1996, "A volumetric method for
+building complex models from range images", with exact distances to triangles and σ as weight), the surface where the
+mean is zero is netted, and each vertex moved onto the mean surface along its normal: the grid decides how the mesh
+hangs together, and not where it lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slrig.errors import NothingToReconstructError
+from slrig.meshing.boundary import smoothed
+from slrig.meshing.normals import vertex_normals
+from slrig.meshing.optimisation import optimised
+from slrig.meshing.topology import component_sizes, used_vertices
+from slrig.model import FloatArray, IntArray, Mesh
+from slrig.model.arrays import require
+from slrig.model.srgb import srgb_of
+from slrig.views.fusion_edges import sharpened
+from slrig.views.fusion_grid import SEEN_BEYOND, Grid, corners_mm, grid_about, wanted_corners
+from slrig.views.fusion_mean import AGREEING_SIGMAS, Means, Rule, correlated_mm, mean_values
+from slrig.views.fusion_nearest import nearest_to_corners, nearest_within
+from slrig.views.fusion_net import Net, net
+from slrig.views.fusion_sheets import Sheets, sampling_mm, sheets
+
+NO_STRIPE = -1
+"""The stripe of a vertex that several views have found."""
+LEAST_CORRELATED_MM = 0.001  # where views say nothing of one another; the line's centre is not known better
+SHARED_MM = 0.002
+"""The least that a calibration bends all views of a rig alike, which none of them tells; chosen, for a good rig."""
+_CORNER_BEYOND = 1.5  # voxels: corners of the cells that are within what is seen
+_TELLING = 0.5  # voxels: as near as this to the surface, distances to two views of it may be compared
+_VERTEX_REACH = 0.5  # voxels: a cell's vertex is nearer to the mean surface
+_COARSER = 1.25  # than the views' points lie apart: 0.1 µm of 5.5 more error, 0.6 of the time; 1.7 is 1.2 µm more
+_FINEST = 0.2  # of the views' sampling; work and memory rise with its square
+_FURTHEST = 0.75  # voxels from a cell's vertex to a sharp edge through the cell
+_BORDER = 4.0  # voxels over which a view's weight rises from its border: no step where it ends, and edges are worse
+_LONGEST_EDGE = 3.0  # voxels; a cell's vertex and those beside it are at most 2√2 apart
+_FEWEST_TRIANGLES = 20  # of a piece: fewer are dust, and of a false layer: fewer are folds
+
+
+@dataclass(frozen=True, slots=True)
+class FusedModel:
+    """One mesh in the model's frame, with stripe -1, and what supports it.
+
+    views : (V,) int32, how many views each vertex was averaged from. voxel_mm : of the grid. correlated_mm : standard
+    deviation of the error that neighbouring points of one view, poses included, were found to have in common.
+    """
+
+    mesh: Mesh
+    views: IntArray
+    voxel_mm: float
+    correlated_mm: float
+
+    def __post_init__(self) -> None:
+        require(self.views, "FusedModel.views", (len(self.mesh.vertices_mm),), "i")
+
+
+def fused(
+    views: Sequence[Mesh],
+    poses: Sequence[FloatArray],
+    /,
+    *,
+    voxel_mm: float | None = None,
+    shared_mm: float = SHARED_MM,
+) -> FusedModel:
+    """The mean surface of the views, where at least one has seen it.
+
+    views : each in a frame of its own. poses : (4, 4) float64 each, X_model = R X_view + t. voxel_mm : side of the
+    grid's cells, about the length of the mesh's edges; 1.25 times as far as the views' vertices are apart unless given.
+    shared_mm : standard deviation of the error that all views have in common, which no comparison of them can show.
+
+    Raises
+    ------
+    ValueError
+        A pose is not rigid, a view no manifold, or the voxels too small for what memory is meant for.
+    NothingToReconstructError
+        No view has a triangle, or the voxels are larger than what was seen.
+    """
+    sampled = sampling_mm(views)
+    voxel = _COARSER * sampled if voxel_mm is None else voxel_mm
+    if voxel_mm is not None and not _FINEST * sampled <= voxel_mm < np.inf:
+        message = (
+            f"voxel_mm: expected at least {_FINEST * sampled:.2g}, as the views have a point each {sampled:.2g} mm, "
+            f"found {voxel_mm:g}; finer cells hold nothing more"
+        )
+        raise ValueError(message)
+    border = _BORDER * voxel
+    seen = sheets(views, poses, inset_mm=border)
+    grid = grid_about(seen, voxel)
+    rule, rough = _netted(seen, grid, Rule(LEAST_CORRELATED_MM, shared_mm, _CORNER_BEYOND * voxel, border))
+    rule = rule._replace(beyond_mm=SEEN_BEYOND * voxel)
+    reach = _VERTEX_REACH * voxel + AGREEING_SIGMAS * float(np.nanmedian(seen.sigma_mm))
+    nearest = nearest_within(seen, grid, rough.points_mm, rough.cells, reach_mm=reach)
+    means = mean_values(seen, rough.points_mm, nearest, rule, values_only=False)
+    del seen, grid, nearest  # as large as all views
+    points = rough.points_mm - means.value_mm[:, None] * means.normals
+    faces = _sound(points, rough.quads, means)
+    points = sharpened(points, means.normals, rough.quads, furthest_mm=_FURTHEST * voxel)
+    faces = _mended(points, faces, voxel)
+    if not len(faces):
+        message = f"no surface was found with voxels of {voxel:g} mm; ask for smaller ones than what is to be seen"
+        raise NothingToReconstructError(message)
+    used = used_vertices(faces, len(points))
+    numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    mesh = Mesh(
+        points[used].astype(np.float32), numbers[faces], vertex_normals(points, faces)[used],
+        srgb_of(means.light[used]), means.mark[used],
+        means.sigma_mm[used].astype(np.float32), np.full(int(used.sum()), NO_STRIPE, dtype=np.int32),
+    )  # fmt: skip
+    return FusedModel(mesh, means.views[used], voxel, rule.correlated_mm)
+
+
+def _netted(seen: Sheets, grid: Grid, rule: Rule) -> tuple[Rule, Net]:
+    """The rule with c as the views tell it, and the surface as the grid has it."""
+    cells = wanted_corners(seen, grid)
+    corners = corners_mm(grid, cells)
+    nearest = nearest_to_corners(seen, grid, corners, cells)
+    rule = rule._replace(correlated_mm=correlated_mm(seen, corners, nearest, rule, within_mm=_TELLING * grid.voxel_mm))
+    values = np.full(512 * len(grid.keys), np.nan, dtype=np.float32)
+    values[cells] = mean_values(seen, corners, nearest, rule, values_only=True).value_mm
+    return rule, net(grid, values)
+
+
+def _sound(points: FloatArray, quads: IntArray, means: Means) -> IntArray:
+    """(F, 3) int32: two triangles of each quadrangle, along its shorter diagonal, without those that are no surface.
+
+    Those are beyond what was seen, or run through a place where the views' field jumps: they face the wrong way.
+    """
+    a, b, c, d = quads.T
+    across = ((points[a] - points[c]) ** 2).sum(axis=1) <= ((points[b] - points[d]) ** 2).sum(axis=1)
+    halves = np.where(across[:, None, None], quads[:, [[0, 1, 2], [0, 2, 3]]], quads[:, [[0, 1, 3], [1, 2, 3]]])
+    faces = halves.reshape(-1, 3)
+    a, b, c = faces.T
+    facing = np.cross(points[b] - points[a], points[c] - points[a])
+    along = np.stack([np.einsum("ij,ij->i", facing, means.normals[each]) for each in (a, b, c)])
+    # NaN, where no view counts, makes the largest NaN. A few triangles folded over at a sharp edge are no false layer.
+    seen, facing_out = np.isfinite(along).all(axis=0), along.max(axis=0) > 0
+    folded = seen & ~facing_out
+    return np.ascontiguousarray(faces[facing_out | folded & (component_sizes(faces, folded) < _FEWEST_TRIANGLES)])
+
+
+def _mended(points: FloatArray, faces: IntArray, voxel_mm: float) -> IntArray:
+    """Flipped to the shape of the surface, its border smoothed, without dust."""
+    points = np.nan_to_num(points)
+    best = optimised(points, faces)
+    allowed: NDArray[np.float64] = np.full(len(points), _LONGEST_EDGE * voxel_mm)
+    smooth = smoothed(points, best.faces, allowed, adjacency=best.adjacency)
+    faces = optimised(points, smooth.faces, among=smooth.added, adjacency=smooth.adjacency).faces
+    sizes = component_sizes(faces, np.ones(len(faces), dtype=np.bool_))
+    return np.ascontiguousarray(faces[sizes >= _FEWEST_TRIANGLES])
