@@ -163,6 +163,15 @@ def displacement_mm(view: Mesh, pose: FloatArray, true: FloatArray) -> float:
     return float(np.sqrt(((view.vertices_mm @ apart[:, :3].T + apart[:, 3]) ** 2).sum(axis=1).mean()))
 
 
+def off_surface_mm(radius: Radius, mesh: Mesh) -> FloatArray:
+    """(n,): how far the vertices of a mesh in the first view's frame lie from the surface, along the normal."""
+    at = (mesh.vertices_mm.astype(np.float64) - MIDDLE_MM) @ _UP.as_matrix()
+    distance = np.linalg.norm(at, axis=1)
+    outwards = at / distance[:, None]
+    slope = (mesh.normals @ _UP.as_matrix() * outwards).sum(axis=1)
+    return np.asarray((distance - radius(outwards)) * np.abs(slope))
+
+
 def wrong_axis(angles_deg: Sequence[float]) -> list[FloatArray]:
     """Starts by an axis that is 0.5° and 1 mm wrong, and a stage that is 0.05° wrong."""
     random = np.random.default_rng(3)

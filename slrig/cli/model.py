@@ -1,4 +1,4 @@
-"""`slrig model`: scans of one object from several sides, put into one frame. Loads nothing heavy before it runs."""
+"""`slrig model`: scans of one object from several sides, made one mesh. Loads nothing heavy before it runs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from slrig.errors import ConfigError, InvalidInputError
 
 if TYPE_CHECKING:
     from slrig.model import FloatArray, Mesh
+    from slrig.views.fusion import FusedModel
     from slrig.views.registration import Registration
     from slrig.views.turntable import FoundAxis
 
-POSES, PLACED = "poses.json", "placed.ply"
+MODEL, POSES, PLACED = "model.ply", "poses.json", "placed.ply"
 Vector = tuple[float, float, float]
 
 
@@ -44,10 +45,15 @@ def model(
     start_error_mm: Annotated[
         float, typer.Option(min=0.01, max=100.0, help="How far a surface may be from where angle or poses put it.")
     ] = 3.0,
+    voxel_mm: Annotated[
+        float | None,
+        typer.Option(min=0.001, help="Length of the model's edges; by default 1.25 times that of the scans'."),
+    ] = None,
 ) -> None:
-    """Put scans of an object from several sides into one frame.
+    """Make one mesh of scans of an object from several sides.
 
-    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle or poses.
+    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle or poses. Where
+    no scan has seen the object, the mesh is open.
     """
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
@@ -60,6 +66,7 @@ def model(
     names = list(files)
     starts, start_axis = _starts(names, angle, _axis(axis, axis_point, axis_direction), poses)
     with progress_shown() as display:
+        from slrig.views.fusion import fused
         from slrig.views.registration import registered
         from slrig.views.turntable import found_axis
 
@@ -68,13 +75,16 @@ def model(
         display("registering", 0.2, "")
         found = registered(views, starts, names=names, start_error_mm=start_error_mm)
         turned = None if start_axis is None else found_axis(found, start_axis)
-        display("writing", 0.8, "")
-        made = _files(names, views, found, turned, angle)
+        display("fusing", 0.4, "")
+        whole = fused(views, found.poses, voxel_mm=voxel_mm)
+        display("writing", 0.9, "")
+        made = _files(names, views, found, turned, angle, whole)
         with staged_folder(output) as folder:
             for name, data in made.items():
                 (folder / name).write_bytes(data)
         display("done", 1.0, "")
     _tell(names, views, found, turned, angle)
+    _tell_fused(whole)
     for name in made:
         typer.echo(f"{Path(name).stem:<10}{output / name}")
 
@@ -85,18 +95,21 @@ def _files(
     found: Registration,
     turned: FoundAxis | None,
     angle_deg: float | None,
+    whole: FusedModel,
 ) -> dict[str, bytes]:
-    """What the folder gets, by name: everything that is made of views and their poses is made here."""
+    """What the folder gets, by name."""
     from slrig.bundle.poses_file import Poses, encode_poses
     from slrig.scan.artefacts import REPORT, encode_mesh_ply, encode_report
     from slrig.views.placing import put_together
 
     poses = dict(zip(names, found.poses, strict=True))
     axis = None if turned is None else (turned.point_mm, turned.direction)
+    report = {**_report(names, views, found, turned, angle_deg), "model": _of_model(whole)}
     return {
+        MODEL: encode_mesh_ply(whole.mesh),
         PLACED: encode_mesh_ply(put_together(views, found.poses)),
         POSES: encode_poses(Poses(poses, axis)),
-        REPORT: encode_report(_report(names, views, found, turned, angle_deg)),
+        REPORT: encode_report(report),
     }
 
 
@@ -127,6 +140,31 @@ def _report(
         "free": [{**asdict(each), "view": names[each.view]} for each in found.free],
         "axis": None if turned is None else {**asdict(turned), "stage_error_deg": _stage_errors_deg(turned, angle_deg)},
     }
+
+
+def _of_model(whole: FusedModel) -> dict[str, Any]:
+    """What report.json says of the fused mesh. seen_by : share of its vertices by how many views each is the mean of."""
+    import numpy as np
+
+    shares = np.bincount(whole.views) / len(whole.views)
+    return {
+        "vertices": len(whole.mesh.vertices_mm),
+        "triangles": len(whole.mesh.faces),
+        "voxel_mm": whole.voxel_mm,
+        "correlated_mm": whole.correlated_mm,
+        "sigma_mm": float(np.median(whole.mesh.sigma_mm)),
+        "seen_by": {int(count): float(shares[count]) for count in np.flatnonzero(shares)},
+    }
+
+
+def _tell_fused(whole: FusedModel) -> None:
+    of = _of_model(whole)
+    once = of["seen_by"].get(1, 0.0)
+    typer.echo(
+        f"{'mesh':<10}{of['vertices']:,} vertices, {of['triangles']:,} triangles of {of['voxel_mm']:.2g} mm; σ "
+        f"{of['sigma_mm']:.4f} mm; neighbours in one view err alike by {of['correlated_mm']:.4f} mm; {once:.0%} seen "
+        "by one view only"
+    )
 
 
 def _tell(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.errors import NothingToReconstructError
+from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.meshing.boundary import smoothed
 from slrig.meshing.normals import vertex_normals
 from slrig.meshing.optimisation import optimised
@@ -79,7 +79,9 @@ def fused(
     Raises
     ------
     ValueError
-        A pose is not rigid, a view no manifold, or the voxels too small for what memory is meant for.
+        A pose is not rigid.
+    InvalidInputError
+        A view is no manifold, or the voxels are finer than the views or than memory is meant for.
     NothingToReconstructError
         No view has a triangle, or the voxels are larger than what was seen.
     """
@@ -90,7 +92,7 @@ def fused(
             f"voxel_mm: expected at least {_FINEST * sampled:.2g}, as the views have a point each {sampled:.2g} mm, "
             f"found {voxel_mm:g}; finer cells hold nothing more"
         )
-        raise ValueError(message)
+        raise InvalidInputError(message)
     border = _BORDER * voxel
     seen = sheets(views, poses, inset_mm=border)
     grid = grid_about(seen, voxel)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slrig.errors import InvalidInputError
 from slrig.kernels import in_bands, kernel, kernel_part
 from slrig.meshing.topology import used_vertices
 from slrig.model import FloatArray, IntArray
@@ -40,7 +41,7 @@ def grid_about(sheets: Sheets, voxel_mm: float) -> Grid:
 
     Raises
     ------
-    ValueError
+    InvalidInputError
         There are more than memory is meant for.
     """
     used = sheets.points_mm[used_vertices(sheets.faces, len(sheets.points_mm))]
@@ -56,7 +57,7 @@ def grid_about(sheets: Sheets, voxel_mm: float) -> Grid:
             f"voxels of {voxel_mm:g} mm are too small for views that reach over {np.ptp(used, axis=0).max():.0f} mm: "
             f"they take more than {_MOST_BRICKS} bricks of {BRICK}³; ask for larger ones, or cut stray points away"
         )
-        raise ValueError(message)
+        raise InvalidInputError(message)
     steps = np.array([-1, 0, 1])
     offsets = ((steps[:, None, None] << 2 * _AXIS_BITS) + (steps[:, None] << _AXIS_BITS) + steps).ravel()
     around = np.full((len(keys), 27), -1, dtype=np.int32)

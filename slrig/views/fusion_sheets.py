@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slrig.errors import NothingToReconstructError
+from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.kernels import kernel
 from slrig.meshing.adjacency import neighbours
 from slrig.model import FloatArray, IntArray, Mesh
 
-_RIGID = 1e-6  # a product of many poses in double precision keeps to 1e-12; what was typed or in float32 to 1e-7
+_RIGID = 3e-5  # what was written with five digits, as poses.json may be; over 100 mm it is 3 µm
 _SAMPLED_FACES = 20_000  # of each view: their median area is known to a per cent
 _SWEEPS = 4  # two each way follow any border over the few edges that an inset is wide
 
@@ -57,7 +57,9 @@ def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray], /, *, inset_mm: f
     Raises
     ------
     ValueError
-        The poses are not one for each view and rigid, or a view is no manifold (`neighbours`).
+        The poses are not one for each view and rigid.
+    InvalidInputError
+        A view is no manifold (`neighbours`).
     NothingToReconstructError
         No view has a triangle.
     """
@@ -73,8 +75,8 @@ def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray], /, *, inset_mm: f
         try:
             across = neighbours(kept, vertex_count=len(placed))
         except ValueError as error:
-            message = f"view {number} is no manifold: {error}"
-            raise ValueError(message) from error
+            message = f"view {number} is no manifold: {error}; take its mesh as slrig wrote it"
+            raise InvalidInputError(message) from error
         a, b, c = (across < 0).astype(np.uint8).T
         border = a | b << 1 | c << 2
         inset = np.full(len(placed), inset_mm, dtype=np.float32)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray
+from slrig.views.fusion import fused
 from slrig.views.registration import Registration, registered
 from slrig.views.turntable import found_axis
-from tests.turned_views import AXIS, bumpy, displacement_mm, seen, vase, wrong_axis
+from tests.turned_views import AXIS, bumpy, displacement_mm, off_surface_mm, seen, vase, wrong_axis
 
 ANGLES = [45.0 * number for number in range(8)]
 WITHIN_MM = 0.010
@@ -16,7 +18,7 @@ SEEDS = 20
 
 
 @pytest.mark.slow
-def test_eight_views_come_within_ten_micrometres() -> None:
+def test_eight_views_come_within_ten_micrometres_and_are_fused_to_less_error_than_one_has() -> None:
     turned = seen(bumpy, ANGLES, pitch_mm=0.5)
     # An error of 4 µm that is alike over 3 mm, beside noise of 8 to 50 µm.
     views = turned.noisy(0, length_mm=3.0)
@@ -27,6 +29,18 @@ def test_eight_views_come_within_ten_micrometres() -> None:
     axis = found_axis(found, AXIS)
     assert axis is not None
     assert np.linalg.norm(np.cross(axis.direction, AXIS)) < np.deg2rad(0.005)
+    whole = fused(views, found.poses)
+    one, all_of_them = off_surface_mm(bumpy, views[0]), off_surface_mm(bumpy, whole.mesh)
+    over = float(np.quantile(np.abs(all_of_them) / whole.mesh.sigma_mm, 0.68))
+    rms = np.sqrt(np.mean(all_of_them**2))
+    print(  # noqa: T201
+        f"rms {1e3 * rms:.1f} µm of {1e3 * np.sqrt(np.mean(one**2)):.1f}, p99 "
+        f"{1e3 * np.quantile(np.abs(all_of_them), 0.99):.0f}, error over σ {over:.2f}, alike {whole.correlated_mm:.4f}"
+    )
+    assert rms < 0.8 * np.sqrt(np.mean(one**2))
+    assert np.quantile(np.abs(all_of_them), 0.99) < 0.040
+    assert 0.8 < over < 1.25
+    assert topology_counts(whole.mesh.faces).nonmanifold_edges == 0
 
 
 @pytest.mark.slow

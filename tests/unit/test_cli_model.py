@@ -12,8 +12,9 @@ from typer.testing import CliRunner, Result
 from slrig.bundle.poses_file import Poses, encode_poses, read_poses
 from slrig.cli.commands import app
 from slrig.errors import ConfigError
+from slrig.meshing.topology import topology_counts
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
-from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, seen, vase
+from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen, vase
 
 ANGLE = 40.0
 STAGE = [
@@ -61,6 +62,15 @@ def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Pat
     pose = known.poses["scan-10"]
     wanted = views[1].vertices_mm @ pose[:3, :3].T + pose[:3, 3]
     assert placed.vertices_mm[first : first + second] == pytest.approx(wanted, abs=1e-4)
+    # The same surface once, and nothing where no scan has seen it.
+    whole = decode_mesh_ply((tmp_path / "model" / "model.ply").read_bytes())
+    assert report["model"]["triangles"] == len(whole.faces) < len(placed.faces)
+    assert sum(report["model"]["seen_by"].values()) == pytest.approx(1)
+    assert set(report["model"]["seen_by"]) == {"1", "2", "3"}
+    # Edges of 1.9 mm cut the bumps by so much.
+    assert np.sqrt(np.mean(off_surface_mm(bumpy, whole) ** 2)) < 0.06
+    assert topology_counts(whole.faces).boundary_edges > 0
+    assert any(line.startswith("mesh ") and "seen by one view only" in line for line in table)
     # Two of them, the other way round, from the poses that were written.
     names = ["scan-11", "scan-10"]
     again = model(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from slrig.errors import NothingToReconstructError
+from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.meshing.search_tree import SearchTree
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray, Mesh
@@ -149,14 +149,14 @@ def test_what_cannot_be_fused_is_refused() -> None:
         fused([view], [pose, pose])
     with pytest.raises(ValueError, match="pose 0 is not rigid"):
         fused([view], [np.diag([1.1, 1, 1, 1])])
-    with pytest.raises(ValueError, match=r"voxel_mm: expected at least 0.08, .* 0.4 mm, found -1"):
+    with pytest.raises(InvalidInputError, match=r"voxel_mm: expected at least 0.08, .* 0.4 mm, found -1"):
         fused([view], [pose], voxel_mm=-1.0)
     stray = view.vertices_mm.copy()
     stray[0, 0] = 1e6
-    with pytest.raises(ValueError, match=r"voxels of 0.1 mm are too small for views that reach over 1000004 mm"):
+    with pytest.raises(InvalidInputError, match=r"voxels of 0.1 mm are too small for views that reach over 1000004 mm"):
         fused([replace(view, vertices_mm=stray)], [pose], voxel_mm=0.1)
     crossed = replace(view, faces=np.concatenate((view.faces, view.faces[:1])))
-    with pytest.raises(ValueError, match="view 0 is no manifold"):
+    with pytest.raises(InvalidInputError, match="view 0 is no manifold"):
         fused([crossed], [pose])
     with pytest.raises(NothingToReconstructError, match="1 views, and none has a triangle"):
         fused([replace(view, sigma_mm=np.full_like(view.sigma_mm, np.nan))], [pose])
