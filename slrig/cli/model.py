@@ -143,7 +143,7 @@ def _report(
 
 
 def _of_model(whole: FusedModel) -> dict[str, Any]:
-    """What report.json says of the fused mesh. seen_by : share of its vertices by how many views each is the mean of."""
+    """What report.json says of the fused mesh. seen_by : share of its vertices by how many views tell of each."""
     import numpy as np
 
     shares = np.bincount(whole.views) / len(whole.views)

@@ -64,7 +64,7 @@ class FusedModel:
 
 def fused(
     views: Sequence[Mesh],
-    poses: Sequence[FloatArray],
+    poses: Sequence[FloatArray] | FloatArray,
     /,
     *,
     voxel_mm: float | None = None,

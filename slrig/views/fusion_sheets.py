@@ -49,7 +49,7 @@ def sampling_mm(views: Sequence[Mesh]) -> float:
     return float(np.median(sides)) if sides else float("nan")
 
 
-def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray], /, *, inset_mm: float) -> Sheets:
+def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray, /, *, inset_mm: float) -> Sheets:
     """Take the views into the model's frame. Triangles with a vertex that has no place, normal or σ are left out.
 
     inset_mm : the insets are cut here.
@@ -102,7 +102,7 @@ def _sampled(faces: IntArray) -> IntArray:
     return faces[:: max(1, len(faces) // _SAMPLED_FACES)]
 
 
-def _require_rigid(count: int, poses: Sequence[FloatArray]) -> None:
+def _require_rigid(count: int, poses: Sequence[FloatArray] | FloatArray) -> None:
     if count != len(poses):
         message = f"expected one pose for each of the {count} views, found {len(poses)}"
         raise ValueError(message)
