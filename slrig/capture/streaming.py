@@ -63,6 +63,30 @@ class _Showing:
 
 
 @dataclass(slots=True)
+class _Lead:
+    """How much earlier than its light a pattern may be asked for, so that the light does not begin before it is due.
+
+    A display takes a picture at its next refresh and returns then; so the wait for that, of up to `refresh_ns`, is no
+    part of it. Of several patterns the longest that is sure for one and possible for all.
+    """
+
+    refresh_ns: int
+    sure_ns: int = 0
+    possible_ns: int | None = None
+
+    def note(self, asked_ns: int, returned_ns: int, begins_ns: int) -> None:
+        """Take note of a pattern that was shown. begins_ns : when its light begins at the earliest."""
+        possible_ns = max(begins_ns - asked_ns, 0)
+        self.possible_ns = possible_ns if self.possible_ns is None else min(possible_ns, self.possible_ns)
+        self.sure_ns = max(self.sure_ns, possible_ns - min(returned_ns - asked_ns, self.refresh_ns))
+
+    @property
+    def ns(self) -> int:
+        """Nothing before the first pattern."""
+        return min(self.sure_ns, self.possible_ns or 0)
+
+
+@dataclass(slots=True)
 class _Eye:
     """What is known of one camera. waiting : frames whose pattern is still shown, and what each says against itself."""
 
@@ -109,7 +133,7 @@ class _Stream:
         }
         self._showings: deque[_Showing] = deque()
         self._paired: deque[tuple[int, Frame, str | None]] = deque()
-        self._lead_ns: int | None = None
+        self._lead = _Lead(round((session.rig.projector.info.refresh_s or 0.0) * 1e9))
         self._index = 0
         self._shown: _Showing | None = None
 
@@ -138,12 +162,12 @@ class _Stream:
         self._session.stop_if_cancelled(index)
         asked_ns = self._clock.now_ns()
         shown = self._session.rig.projector.show(index)
+        returned_ns = self._clock.now_ns()
         stable_ns = stable_from_ns(shown, self._session.rig.synchronisation)
         begins_ns = shown.t_visible_ns + self._earliest_ns
         if self._shown is not None:
             self._shown.end_ns = begins_ns
-        lead_ns = max(begins_ns - asked_ns, 0)
-        self._lead_ns = lead_ns if self._lead_ns is None else min(lead_ns, self._lead_ns)
+        self._lead.note(asked_ns, returned_ns, begins_ns)
         for name in names:
             self._retries.begin(name, index)
         self._shown = _Showing(shown, stable_ns, list(names), held)
@@ -197,7 +221,7 @@ class _Stream:
                 return None
             start_ns, spare_ns = foretold
             span_ns = eye.end_ns(eye.last) - eye.last.t_start_ns
-            due_ns = max(due_ns, start_ns + spare_ns + span_ns - (self._lead_ns or 0))
+            due_ns = max(due_ns, start_ns + spare_ns + span_ns - self._lead.ns)
         return due_ns
 
     def _judged(self) -> Iterator[Shot]:
