@@ -100,8 +100,11 @@ class LightEngine(HeldLight[Engine]):
         entry = self._entry(self._places[index], 1, self._colours[index], HELD_US)
         # A repeat more or less than counted is within what it is left alone for.
         repeats = min(round(LEFT_ALONE_S * 1e6) // entry.lasts_us - 1, MOST_REPEATS)
-        started_ns = self._run((entry,), repeats)
-        self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=LEFT_ALONE_S / 2)
+        with self._lock:
+            started_ns = self._run((entry,), repeats)
+            self._begin_holding(repeats * entry.lasts_us / 1e6, again_s=LEFT_ALONE_S / 2)
+            # Whether LEDs stay dark after the last repeat is not documented.
+            self._dark_at_s = self._held_until_s + LEFT_ALONE_S
         return self._shown(index, started_ns, time.monotonic_ns() + round(self._options.start_s * 1e9))
 
     def play(self, exposure_s: float, period_s: float) -> None:
@@ -131,9 +134,10 @@ class LightEngine(HeldLight[Engine]):
             lit = self._entry(self._places[begin], end - begin, self._colours[begin], wanted_us)
             dark_us = round(period_s * 1e6) - wanted_us - lit.before_us + (END_US if end == len(sequence) else 0)
             entries.append(replace(lit, after_us=dark_us))
-        self._run(tuple(entries), 1)
         lasts_us = sum(entry.lasts_us for entry in entries)
-        self._dark_at_s = time.monotonic() + options.start_s + (lasts_us - END_US / 2) / 1e6
+        with self._lock:
+            self._run(tuple(entries), 1)
+            self._dark_at_s = time.monotonic() + options.start_s + (lasts_us - END_US / 2) / 1e6
 
     def _breaks(self, at: int) -> bool:
         """Whether pattern `at` needs an entry of its own: it is not the next one in the flash, or lit otherwise."""
