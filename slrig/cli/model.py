@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from slrig.views.turntable import FoundAxis
 
 MODEL, POSES, PLACED = "model.ply", "poses.json", "placed.ply"
+REPORT_FORMAT = "slrig-model"
+"""Of its report, which is not that of a scan: a model never takes the place of one."""
 Vector = tuple[float, float, float]
 
 
@@ -65,7 +67,8 @@ def model(
     files = _named_meshes(scans)
     names = list(files)
     starts, start_axis = _starts(names, angle, _axis(axis, axis_point, axis_direction), poses)
-    with progress_shown() as display:
+    _require_apart(output, [*files.values(), *(each for each in (axis, poses) if each and each.name != POSES)])
+    with staged_folder(output, REPORT_FORMAT) as folder, progress_shown() as display:
         from slrig.views.fusion import fused
         from slrig.views.registration import registered
         from slrig.views.turntable import found_axis
@@ -79,9 +82,8 @@ def model(
         whole = fused(views, found.poses, voxel_mm=voxel_mm)
         display("writing", 0.9, "")
         made = _files(names, views, found, turned, angle, whole)
-        with staged_folder(output) as folder:
-            for name, data in made.items():
-                (folder / name).write_bytes(data)
+        for name, data in made.items():
+            (folder / name).write_bytes(data)
         display("done", 1.0, "")
     _tell(names, views, found, turned, angle)
     _tell_fused(whole)
@@ -120,8 +122,6 @@ def _report(
     turned: FoundAxis | None,
     angle_deg: float | None,
 ) -> dict[str, Any]:
-    from slrig.scan.artefacts import REPORT_FORMAT
-
     return {
         "format": REPORT_FORMAT,
         "version": 1,
@@ -264,6 +264,13 @@ def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> 
     if not np.linalg.norm(direction) > 0:
         raise ConfigError("--axis-direction: expected a vector with a length, found 0 0 0")
     return np.array(point), np.array(direction)
+
+
+def _require_apart(output: Path, read: Sequence[Path]) -> None:
+    """Raises ConfigError: the folder to write, which replaces an earlier one, holds what is read."""
+    inside = next((file for file in read if file.resolve().is_relative_to(output.resolve())), None)
+    if inside is not None:
+        raise ConfigError(f"--output {output}: {inside} lies in it and would be replaced; name another folder")
 
 
 def _named_meshes(asked: Sequence[Path]) -> dict[str, Path]:

@@ -247,8 +247,10 @@ def _plain(value: object, where: str) -> object:
 
 
 @contextmanager
-def staged_folder(output: Path) -> Iterator[Path]:
+def staged_folder(output: Path, replaces: str = REPORT_FORMAT) -> Iterator[Path]:
     """Yield a folder to write into; on success it becomes `output` by one rename, on error it is removed.
+
+    replaces : the format of the report of what it may take the place of.
 
     Raises
     ------
@@ -258,7 +260,7 @@ def staged_folder(output: Path) -> Iterator[Path]:
         The disk refused.
     """
     output = output.absolute()
-    _require_replaceable(output)
+    _require_replaceable(output, replaces)
     staging = staging_name(output)
     with refusals_of(output):
         staging.mkdir(parents=True)
@@ -286,18 +288,18 @@ def _put_in_place(staging: Path, output: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _require_replaceable(output: Path) -> None:
+def _require_replaceable(output: Path, replaces: str) -> None:
     if not output.exists():
         return
-    if output.is_dir() and (not any(output.iterdir()) or _is_report(output / REPORT)):
+    if output.is_dir() and (not any(output.iterdir()) or _is_report(output / REPORT, replaces)):
         return
     what = "a folder with other files in it" if output.is_dir() else "a file"
     message = f"{output}: results go into a folder of their own, and this is {what}; name a new folder"
     raise InvalidInputError(message)
 
 
-def _is_report(path: Path) -> bool:
+def _is_report(path: Path, of: str) -> bool:
     try:
-        return bool(json.loads(path.read_bytes()).get("format") == REPORT_FORMAT)
+        return bool(json.loads(path.read_bytes()).get("format") == of)
     except (OSError, ValueError, AttributeError):
         return False

@@ -19,6 +19,8 @@ from slrig.views.matching import Terms
 
 _LEAST_SHARE = 0.5
 """Of the information along a direction, what both surfaces have to agree on."""
+_ROUNDING = 1e-9
+"""Of all information: less than this is rounding."""
 _LEAST_PART = 0.5
 """Of a free motion of all views, what one view has to have in it to be named."""
 _TELLING = 0.2
@@ -62,7 +64,8 @@ class FreeMotion:
 def directions(terms: Terms) -> tuple[FloatArray, FloatArray]:
     """Orthonormal columns (p, p - f) that the surfaces determine, and (p, f) that they leave free."""
     value, vectors = np.linalg.eigh(terms.agreed)
-    free = value <= _LEAST_SHARE * np.einsum("ik,ij,jk->k", vectors, terms.information, vectors)
+    apparent = np.einsum("ik,ij,jk->k", vectors, terms.information, vectors)
+    free = value <= np.maximum(_LEAST_SHARE * apparent, _ROUNDING * np.trace(terms.information))
     return vectors[:, ~free], vectors[:, free]
 
 

@@ -13,7 +13,7 @@ from slrig.kernels import kernel
 from slrig.meshing.adjacency import neighbours
 from slrig.model import FloatArray, IntArray, Mesh
 
-_RIGID = 3e-5  # what was written with five digits, as poses.json may be; over 100 mm it is 3 µm
+_RIGID = 1e-6  # a product of many poses in double precision keeps to 1e-12; what was typed or in float32 to 1e-7
 _SAMPLED_FACES = 20_000  # of each view: their median area is known to a per cent
 _SWEEPS = 4  # two each way follow any border over the few edges that an inset is wide
 

@@ -262,7 +262,7 @@ def _result(
         """Mean square of a view's residuals over their deviations after a motion of it; infinite without a match."""
         motions = np.zeros((len(poses) - 1, 6))
         motions[view - 1] = motion
-        mine = [pair for pair in matches if pair[0] == view]
+        mine = [pair for pair in matches if view in pair]
         tried = problem.matches(mine, problem.stepped(poses, motions.ravel()), reach_mm, _FIRST_SAMPLE)
         scaled = [each.residual_mm / each.sigma_mm for each in tried.values()]
         return float(np.mean(np.concatenate(scaled) ** 2)) if scaled else float("inf")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from slrig.bundle.poses_file import Poses, encode_poses, read_poses
@@ -111,6 +112,26 @@ def test_what_is_missing_is_said(scans: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
+def test_nothing_that_is_read_is_replaced(scans: Path, tmp_path: Path) -> None:
+    own = tmp_path / "model"
+    own.mkdir()
+    (own / "report.json").write_text('{"format": "slrig-model"}')
+    by_hand = own / "by-hand.json"
+    by_hand.write_bytes(encode_poses(Poses({f"scan-{number}": np.eye(4) for number in (9, 10, 11)})))
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    (scan / "report.json").write_text('{"format": "slrig-report"}')
+    for words, expected in (
+        ([scans / "all", "--output", scans / "all", *STAGE], "would be replaced"),
+        ([scans / "all", "--output", scans / "all" / "scan-9", *STAGE], "would be replaced"),
+        ([scans / "all", "--output", own, "--poses", by_hand], "would be replaced"),
+        ([scans / "all", "--output", scan, *STAGE], "a folder with other files in it"),
+    ):
+        refused = model(*words)
+        assert (refused.exit_code, expected in refused.stderr) == (2, True), (words, refused.output)
+    assert by_hand.exists()
+
+
 def test_a_file_of_poses_says_what_is_wrong_with_it(tmp_path: Path) -> None:
     file = tmp_path / "poses.json"
     for pose, expected in (
@@ -120,6 +141,13 @@ def test_a_file_of_poses_says_what_is_wrong_with_it(tmp_path: Path) -> None:
         file.write_bytes(encode_poses(Poses({"front": pose})))
         with pytest.raises(ConfigError, match=expected):
             read_poses(file)
+    for rotation in Rotation.random(50, rng=np.random.default_rng(2)):
+        pose = np.eye(4)
+        pose[:3, :3] = np.round(rotation.as_matrix(), 5)
+        file.write_bytes(encode_poses(Poses({"front": pose})))
+        turn = read_poses(file).poses["front"][:3, :3]
+        assert np.abs(turn @ turn.T - np.eye(3)).max() < 1e-12
+        assert np.abs(turn - pose[:3, :3]).max() < 3e-5
     file.write_bytes(encode_poses(Poses({}, (np.zeros(3), np.zeros(3)))))
     with pytest.raises(ConfigError, match="vector with a length"):
         read_poses(file)

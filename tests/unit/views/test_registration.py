@@ -63,9 +63,11 @@ def test_a_vase_may_turn_about_its_axis_and_is_held_at_the_angle_told() -> None:
         assert across < np.deg2rad(0.02)
 
 
-def test_two_planes_have_three_free_motions() -> None:
+@pytest.mark.parametrize("noisy", [True, False])
+def test_two_planes_have_three_free_motions(*, noisy: bool) -> None:
     turned = plane([0.0, 3.0])
-    found = registered(turned.noisy(0, length_mm=2.0), turned.poses)
+    views = turned.noisy(0, length_mm=2.0) if noisy else turned.exact
+    found = registered(views, turned.poses)
     assert sorted(each.motion for each in found.free) == [Motion.SHIFT, Motion.SHIFT, Motion.TURN]
     assert displacement_mm(turned.exact[1], found.poses[1], turned.poses[1]) < 0.01
 
