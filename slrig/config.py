@@ -179,7 +179,8 @@ def read_rig(path: Path) -> RigConfig:
     """
     data = read_toml(path, MOST_CONFIG_BYTES)
     presets = data.get("presets")
-    for tables, name in ((data, "scan"), *((presets, name) for name in presets or () if isinstance(presets, dict))):
+    named = [(presets, name) for name in presets] if isinstance(presets, dict) else []
+    for tables, name in [(data, "scan"), *named]:
         options = tables.get(name)
         if isinstance(options, Mapping) and isinstance(options.get("region"), Mapping):
             tables[name] = {**options, "region": with_masks(options["region"], path.parent)}
@@ -296,6 +297,11 @@ class ServiceSettings(BaseSettings):
             message = "expected a text; put it in quotes"
             raise ValueError(message)  # noqa: TRY004 - what pydantic collects
         return secret or None
+
+    @field_validator("mqtt_url")
+    @classmethod
+    def _empty_is_none(cls, url: str | None) -> str | None:
+        return url or None
 
     @field_validator("webhook_url")
     @classmethod

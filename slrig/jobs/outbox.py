@@ -68,6 +68,9 @@ class Outbox:
         """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
         notice_id, at = f"msg_{uuid4().hex}", stamp(self._clock())
         body = {"id": notice_id, "kind": kind, "at": at, "rig": self._rig, "words": f"rig '{self._rig}': {words}"}
+        # Those of receivers that are no longer in the settings wait for as long, in case these come back.
+        old = NoticeRow.at < stamp(self._clock() - KEPT_FOR)
+        session.execute(delete(NoticeRow).where(NoticeRow.receiver.not_in(self._wanted), old))
         for receiver in (name for name, kinds in self._wanted.items() if kind in kinds):
             session.add(NoticeRow(receiver=receiver, id=notice_id, at=at, kind=kind, body={**body, **members}))
             numbers = select(NoticeRow.number).where(NoticeRow.receiver == receiver).order_by(NoticeRow.number.desc())

@@ -185,3 +185,14 @@ def test_settings_name_a_broker_and_hide_the_login(tmp_path: Path, monkeypatch: 
         ConfigError, match=r"^mqtt_url needs a library.* pip install 'slrig\[mqtt\]', or leave mqtt_url out$"
     ):
         senders_of(settings, outbox)
+
+
+def test_what_waits_for_a_receiver_that_is_no_longer_named_is_dropped_as_late_as_any(tmp_path: Path) -> None:
+    clock, database = SetClock(), Database(tmp_path / "slrig.sqlite")
+    both, one = ({name: get_args(NoticeKind) for name in names} for names in (("mqtt", "webhook"), ("webhook",)))
+    for wanted, hours, left in ((both, 0, 1), (one, 71, 1), (one, 2, 0)):
+        clock.now += timedelta(hours=hours)
+        outbox = Outbox(database, rig="bench", wanted=wanted, clock=clock)
+        with database.changing() as session:
+            outbox.put(session, "run.failed", "a run")
+        assert outbox.waiting("mqtt")[0] == left
