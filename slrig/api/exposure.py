@@ -16,6 +16,8 @@ from slrig.scan.exposure_look import proposed_exposures
 
 router = APIRouter(prefix="/exposure", tags=["scan"])
 
+_SAME = ("preset", "patterns", "coloured_light")  # as in the scan that is going to be asked for
+
 
 class ExposureRequest(Strict):
     """What the scan is going to be like, as far as it is known."""
@@ -25,6 +27,7 @@ class ExposureRequest(Strict):
     )
     preset: PresetName | None = Field(default=None, description="as in POST /scan; its exposures do not count")
     patterns: PatternRequest = Field(default_factory=PatternRequest)
+    coloured_light: bool | None = Field(default=None, description="as in POST /scan: it takes more frames")
 
 
 class CoverBody(BaseModel):
@@ -58,10 +61,10 @@ def propose_exposures(
 ) -> ExposureBody:
     """Look at the object under white and black light for some seconds, and propose exposures for a scan of it."""
     preset = None if request.preset is None else service.presets.get(request.preset)
-    asked = ScanRequest(preset=request.preset, patterns=request.patterns)
+    asked = ScanRequest(**{key: getattr(request, key) for key in _SAME})
     plan = scan_plan(asked, service.scan_defaults, preset)
     found = proposed_exposures(service.runner.queue, plan, budget_s=request.budget_s)
     times_s = [each.exposure_s for each in found.exposures]
     exposing: dict[str, Any] = {"exposure_s": times_s[0]} if len(times_s) == 1 else {"exposures_s": times_s}
-    same = request.model_dump(exclude_unset=True, include={"preset", "patterns"})
+    same = request.model_dump(exclude_unset=True, include=set(_SAME))
     return filled(ExposureBody, found, scan={**same, **exposing})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Path
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from slrig.api.openapi import problems
 from slrig.api.schemas import filled
@@ -24,7 +24,8 @@ class PresetLine(BaseModel):
     name: str
     source: PresetSource
     description: str | None
-    digest: str
+    digest: str | None
+    fault: str | None = Field(description="what is wrong with its file; it cannot be used then")
 
 
 class PresetList(BaseModel):
@@ -33,7 +34,7 @@ class PresetList(BaseModel):
     presets: list[PresetLine]
 
 
-@router.get("", responses=problems(422))
+@router.get("", responses=problems())
 def list_presets(service: Serving) -> PresetList:
     """List the presets: shipped ones, those of the rig file, and those kept here."""
     return PresetList(presets=[filled(PresetLine, each) for each in service.presets.listed()])

@@ -44,7 +44,8 @@ ExposureFactors = Annotated[
     Field(strict=False, json_schema_extra={"minItems": 1, "maxItems": MOST_EXPOSURES}),
     AfterValidator(_factors),
 ]
-PresetName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,39}$")]
+PRESET_NAME = r"[a-z][a-z0-9_-]{0,39}"
+PresetName = Annotated[str, Field(pattern=f"^{PRESET_NAME}$")]
 
 
 def alone(asked: T, info: ValidationInfo, keys: Sequence[str] = EXPOSURE_KEYS) -> T:

@@ -10,7 +10,8 @@ Pure functions on frames and samples of frames.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -23,6 +24,7 @@ from slrig.capture.sampling import Sampler
 from slrig.model import Black, CameraFormat, Capture, Pattern, Pixels, White, exposure_groups
 
 NEARLY_FULL = 0.97  # of full scale: some sensors saturate a little below it, and not everywhere alike
+_ROUNDED = 1e-6  # of a refresh period: a range that is stated as whole ones is
 _MOST_SATURATED = 0.9  # of what is lit, as `checks.lighting` has it
 _LEAST_LIT = 40  # samples, as `checks` has it
 LEAST_CLEAR = 12.0  # noises that white lies above black
@@ -32,18 +34,25 @@ _MOST_MOVED = 0.05  # of the pixels, as `checks.drift_fault` has it
 _MOVED = 0.3  # of white, as `checks.drift` has it
 
 
-def whole_refreshes_s(exposure_s: float, refresh_s: float | None) -> float:
-    """The exposure of whole refresh periods, one at least, that is nearest to what was asked.
+def whole_refreshes_s(exposure_s: float, refresh_s: float | None, ranges_s: Iterable[tuple[float, float]]) -> float:
+    """The exposure of whole refresh periods, one at least, that is nearest to what was asked and that cameras of these
+    ranges can do; the nearest of one period and more where they can do none.
 
     A video projector's light is steady over whole ones only: a colour wheel, dithering and the scan-out of the picture
     average out in them. `refresh_s` None leaves the exposure as it is.
 
-    >>> whole_refreshes_s(0.02, 1 / 60), whole_refreshes_s(0.005, 0.01), whole_refreshes_s(0.005, None)
+    >>> whole_refreshes_s(0.02, 1 / 60, []), whole_refreshes_s(0.005, 0.01, []), whole_refreshes_s(0.005, None, [])
     (0.016666666666666666, 0.01, 0.005)
+    >>> whole_refreshes_s(0.0317, 1 / 60, [(0.001, 0.0317)])
+    0.016666666666666666
     """
     if refresh_s is None:
         return exposure_s
-    return max(1, round(exposure_s / refresh_s)) * refresh_s
+    least, most = 1, round(exposure_s / refresh_s)
+    for low_s, high_s in ranges_s:
+        least = max(least, math.ceil(low_s / refresh_s - _ROUNDED))
+        most = min(most, math.floor(high_s / refresh_s + _ROUNDED))
+    return max(least, most) * refresh_s
 
 
 class Unfit(StrEnum):

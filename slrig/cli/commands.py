@@ -20,7 +20,7 @@ from slrig.cli.model import model
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
 from slrig.cli.scan_options import ScanOptions
-from slrig.errors import SlrigError
+from slrig.errors import ConfigError, SlrigError
 
 INTERRUPTED = 130
 
@@ -166,6 +166,8 @@ def scan(
         reconstruction=mesh.asked(),
     )  # fmt: skip
     files = tuple(file or FILES)
+    if asked.budget_s is not None and not asked.assist:
+        raise ConfigError("--budget-s: it is for --assist, which finds exposures within it. Give both, or neither.")
     with service.client() as client:
         if asked.assist:
             request = assisted(client, request, budget_s=asked.budget_s)

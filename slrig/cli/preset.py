@@ -28,7 +28,7 @@ def list_presets(service: Service, as_json: AsJson = False) -> None:
     if as_json:
         print_json(found)
         return
-    rows = [(each["name"], each["source"], each["description"] or "") for each in found["presets"]]
+    rows = [(each["name"], each["source"], each["fault"] or each["description"] or "") for each in found["presets"]]
     print_table(("preset", "from", "for"), rows)
 
 

@@ -11,7 +11,6 @@ import typer
 from rich.table import Column
 
 from slrig.cli.display import print_table, progress_shown
-from slrig.cli.options import given
 from slrig.cli.quality import quality_lines
 from slrig.client import Client, ScanJob
 from slrig.client.wire import Blocking
@@ -107,7 +106,11 @@ def assisted(client: Client, request: Mapping[str, Any], *, budget_s: float | No
     if request.keys() & {"exposure_s", "exposures_s"}:
         message = "--assist: it finds the exposures itself, and --exposure-s gives some. Leave out one of the two."
         raise ConfigError(message)
-    found = client.exposure(**given(budget_s=budget_s, preset=request.get("preset"), patterns=request.get("patterns")))
+    if request["if_busy"] == "queue":
+        message = "--assist: it looks at the object at once, and --queue waits in line. Leave out one of the two."
+        raise ConfigError(message)
+    same = {key: request.get(key) for key in ("preset", "patterns", "coloured_light")}
+    found = client.scans.exposure(budget_s=budget_s, **same)
     times = " and ".join(f"{1000 * each['exposure_s']:.3g} ms" for each in found["exposures"])
     typer.echo(f"{'exposure':<9} {times}: {found['completeness']:.1%} of what is lit, in {found['seconds']:.1f} s")
     for note in found["notes"]:

@@ -73,11 +73,6 @@ class _Service(Remote[W]):
                 await self.core.send("POST", job.scan["links"]["cancel"])
             raise
 
-    @Operation
-    async def exposure(self, /, **options: Any) -> Json:
-        """Look at the object, and propose exposures; `scan(**answer["scan"])` scans with them. See `Scans.exposure`."""
-        return await self.core.content("Json", "POST", "/exposure", json=options)  # type: ignore[no-any-return]
-
     async def _job(self, scan_id: str) -> ScanJob[W]:
         return ScanJob(self.core, await self.core.content("Json", "GET", f"/scan/{scan_id}"))
 

@@ -66,6 +66,7 @@ class Scans(Remote[W]):
         budget_s: float | None = None,
         preset: str | None = None,
         patterns: Mapping[str, Any] | None = None,
+        coloured_light: bool | None = None,
     ) -> Json:
         """Look at the object, and propose exposures: `scan` of the answer is what `start` takes. budget_s : seconds."""
 

@@ -21,19 +21,23 @@ export function useLimits() {
   return [typed, limits(region) ? region : null, change];
 }
 
-/** Have the next scan measure only what is in a box, mm, beside what else it is limited to. */
+/** Have the next scan measure only what is in a box, mm, beside what else is typed; null, where nothing is seen, changes nothing. */
 export function limitToBox(box) {
+  if (!box) return;
   sessionStorage.setItem(KEPT, JSON.stringify({...JSON.parse(sessionStorage.getItem(KEPT) ?? "{}"), box}));
   location.hash = "#/scan";
 }
 
-export function Limits({typed, region, change}) {
+/** others: what the rig limits a scan to where nothing is typed here. */
+export function Limits({typed, region, change, others, preset}) {
   const [open] = useState(region !== null);
   const of = (name) => ({value: typed[name] ?? "", change: (value) => change({[name]: value})});
   return html`<details open=${open}><summary>Limit the scan</summary>
     <div class="row numbers"><${Field} label="Nearest depth, mm" ...${of("near")} /><${Field} label="Farthest depth, mm" ...${of("far")} /></div>
     <div class="row numbers"><${Field} label="Least contrast, %" ...${of("contrast")} max="100" /><${Field} label="Greatest σ, mm" ...${of("sigma")} /></div>
-    <p class="quiet">${region ? `The next scan measures: ${limits(region)}.` : "The next scan measures all that it sees."}
+    <p class="quiet">${region ? `The next scan measures: ${limits(region)}. Other limits of the rig or a preset do not count then.`
+      : limits(others) ? `As the rig is set, the next scan measures: ${limits(others)}.`
+      : preset ? `The next scan measures what ${preset} says.` : "The next scan measures all that it sees."}
       ${typed.box && html` <${Action} onClick=${() => change({box: null})}>Without the box<//>`}</p></details>`;
 }
 

@@ -31,8 +31,8 @@ export function ScanScreen({rig, may}) {
     <section aria-label="Scan">
       <${Action} kind="primary large" busy=${busy} disabled=${!may("scan")} onClick=${start}>Scan<//>
       ${may("scan") && known && html`<label>For an object that is <select value=${preset} onChange=${(event) => setPreset(event.target.value)}>
-        <option value="">as the rig is set</option>${known.presets.map(({name}) => html`<option value=${name}>${name}</option>`)}</select></label>`}
-      ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} />`}
+        <option value="">as the rig is set</option>${known.presets.filter(({fault}) => !fault).map(({name}) => html`<option value=${name}>${name}</option>`)}</select></label>`}
+      ${may("scan") && html`<${Limits} typed=${typed} region=${region} change=${change} others=${preset ? null : rig?.scan_defaults?.region} preset=${preset} />`}
       ${!may("scan") && html`<p class="quiet">Your key is for looking only.</p>`}
       ${blocked && html`<p class="warning">${blocked} ${rig?.calibrated === false && html`<a href="#/calibrate">Calibrate</a>`}</p>`}
       <${Refusal} problem=${refused} />

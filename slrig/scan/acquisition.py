@@ -247,11 +247,12 @@ def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]
         least_s, most_s = zip(*(camera.info.exposure_range_s for camera in cameras), strict=True)
         return instead(min(max(asked_s, *least_s), *most_s), asked_s, whose, "what it can do")
 
-    def snapped(asked_s: float, whose: str) -> float:
+    def snapped(asked_s: float, whose: str, cameras: Iterable[Camera]) -> float:
         if refresh_s is None:
             return asked_s
         why = f"whole periods of the projector ({refresh_s:.6g} s)"
-        return instead(whole_refreshes_s(asked_s, refresh_s), asked_s, whose, why)
+        ranges_s = [camera.info.exposure_range_s for camera in cameras]
+        return instead(whole_refreshes_s(asked_s, refresh_s, ranges_s), asked_s, whose, why)
 
     own_s = {name: each.exposure_s for name, each in rig.settings.items()}
     exposures_s, every, factors = plan.rising_exposures_s, "every camera", sorted(plan.exposure_factors or ())
@@ -259,10 +260,12 @@ def exposed(rig: Rig, plan: ScanPlan) -> tuple[Rig, tuple[float, ...], list[str]
         mean_s = geometric_mean(own_s.values())
         exposures_s = tuple(scaled(factor * mean_s, every, rig.cameras.values()) for factor in factors)
     if exposures_s:
-        return rig, tuple(dict.fromkeys(snapped(each, every) for each in exposures_s)), told
+        cameras = rig.cameras.values()
+        return rig, tuple(dict.fromkeys(snapped(each, every, cameras) for each in exposures_s)), told
     for name in own_s if factors else ():
         own_s[name] = scaled(factors[0] * own_s[name], f"camera '{name}'", [rig.cameras[name]])
     settings = {
-        name: replace(each, exposure_s=snapped(own_s[name], f"camera '{name}'")) for name, each in rig.settings.items()
+        name: replace(each, exposure_s=snapped(own_s[name], f"camera '{name}'", [rig.cameras[name]]))
+        for name, each in rig.settings.items()
     }
     return replace(rig, settings=settings), (), told

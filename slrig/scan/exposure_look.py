@@ -16,7 +16,7 @@ from slrig.capture.exposure import whole_refreshes_s
 from slrig.capture.sampling import Sampler
 from slrig.capture.sequencer import capture
 from slrig.devices import CameraSettings, Rig
-from slrig.errors import UnsupportedByDeviceError
+from slrig.errors import RigBusyError, UnsupportedByDeviceError
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import utc_now
@@ -50,6 +50,7 @@ class Looking:
         self._cancelled = cancelled
         self._samplers = {name: Sampler.of(camera.info.format.size) for name, camera in rig.cameras.items()}
         self._looks: dict[float, Mapping[str, Look]] = {}
+        self._refused_shorter = False
         self.overheads_s: list[float] = []
 
     def seen(self) -> Mapping[str, SeenObject]:
@@ -74,14 +75,19 @@ class Looking:
                 try:
                     self._take(next_s)
                 except UnsupportedByDeviceError:
-                    # Between two that it can use.
+                    # Between two that it can use, or beyond what the projector can.
+                    self._refused_shorter |= step < 1
                     break
                 exposure_s = next_s
 
     def candidates_s(self) -> list[float]:
-        """The exposures that were looked at, and those in the middle between them and beyond them by half a step."""
+        """The exposures that were looked at, those in the middle between them, and one shorter by half a step, for
+        little time. None is longer than what was looked at, nor shorter where that was refused: a projector may not do
+        it, and only a look tells.
+        """
         around = (each * factor for each in self._looks for factor in (_STEP**-0.5, 1.0, _STEP**0.5))
-        rising = sorted({self._fitting(each) for each in around})
+        least_s = min(self._looks) if self._refused_shorter else 0.0
+        rising = sorted(each for each in set(map(self._fitting, around)) if least_s <= each <= max(self._looks))
         return [each for before, each in pairwise([0.0, *rising]) if each > 1.05 * before]
 
     def _fitting(self, exposure_s: float) -> float:
@@ -89,7 +95,7 @@ class Looking:
         ranges_s = [camera.info.exposure_range_s for camera in self._rig.cameras.values()]
         least_s, most_s = max(low for low, _ in ranges_s), min(LONGEST_S, *(high for _, high in ranges_s))
         within_s = min(max(exposure_s, least_s), most_s)
-        return whole_refreshes_s(within_s, self._rig.projector.info.refresh_s)
+        return whole_refreshes_s(within_s, self._rig.projector.info.refresh_s, ranges_s)
 
     def _take(self, exposure_s: float) -> None:
         rig, size = self._rig, self._rig.projector.info.size
@@ -136,7 +142,7 @@ def proposed_exposures(queue: JobQueue, plan: ScanPlan, *, budget_s: float | Non
     Raises
     ------
     RigBusyError
-        Somebody has the rig.
+        Somebody has the rig: it is looked at at once, or not at all.
     ConfigError
         See `proposal`.
     DeviceError, ScanInterruptedError
@@ -169,7 +175,14 @@ def proposed_exposures(queue: JobQueue, plan: ScanPlan, *, budget_s: float | Non
         over.set()
 
     job = Job(uuid4(), Holder("exposure", "a look at exposures, which takes seconds", None), utc_now(), work, ended)
-    queue.submit(lambda: [job], wait=False)
+    try:
+        queue.submit(lambda: [job], wait=False)
+    except RigBusyError as error:
+        message = (
+            f"The rig is held by {error.holder} since {error.since}, and an object is looked at at once or not at all. "
+            "Ask again when the rig is free"
+        )
+        raise RigBusyError(message, holder=error.holder, since=error.since) from error
     over.wait()
     if errors[0] is not None:
         raise errors[0]

@@ -33,9 +33,8 @@ _LEAST_STEP = 1.1  # as a bracket has it
 _ENOUGH_COMPLETE = 0.01  # of the lit pixels that may be given up for time,
 _ENOUGH_WELL = 0.02  # and of the way to covering all of them well
 _WORTH_A_WORD = _ENOUGH_COMPLETE
-_FAINT = (
-    0.025  # of the middle lit pixel: less is glow, which carries no pattern; rubber beside white paper is twice that
-)
+_FAINT = 0.025
+"""Of the middle lit pixel: less is glow, which carries no pattern; rubber beside white paper is twice that."""
 _MEDIAN_OF_SQUARE = 0.4549  # of a normal deviate, over its variance
 
 
@@ -89,7 +88,8 @@ def seen_object(looks: Sequence[Look], full_scale: int) -> SeenObject:
     rising = tuple(sorted(looks, key=lambda look: look.exposure_s))
     noise = fitted_noise(_noise_samples(look, full_scale) for look in rising)
     shape, full = rising[0].white.shape[1], NEARLY_FULL * full_scale
-    lit, rate = np.zeros(shape, np.bool_), np.full(shape, np.inf)
+    # DN per second; of what every look saturates so much is known.
+    lit, rate = np.zeros(shape, np.bool_), np.full(shape, full / rising[0].exposure_s)
     for look in rising:
         white, black = look.white.mean(axis=0), look.black.mean(axis=0)
         # Two of each were taken.

@@ -5,13 +5,14 @@ A name that is kept stands for what is kept, one of the rig file before one that
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 from slrig.bundle.faults import read_description_of
-from slrig.bundle.scan_options import Preset, PresetDocument
+from slrig.bundle.scan_options import PRESET_NAME, Preset, PresetDocument
 from slrig.bundle.storage import json_bytes, write_file
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, PresetNotFoundError
@@ -50,12 +51,15 @@ _WORDS = {PresetSource.SHIPPED: "slrig itself", PresetSource.RIG: "the rig file"
 
 @dataclass(frozen=True, slots=True)
 class NamedPreset:
-    """A preset by its name. digest : of its options; see `PresetDocument`."""
+    """A preset by its name. digest : of its options; see `PresetDocument`. fault : what is wrong with its file; there
+    are no options then.
+    """
 
     name: str
     source: PresetSource
-    description: str | None
-    digest: str
+    description: str | None = None
+    digest: str | None = None
+    fault: str | None = None
 
 
 class Presets:
@@ -72,13 +76,20 @@ class Presets:
         }
 
     def listed(self) -> list[NamedPreset]:
-        """All that there are, by name. Raises ConfigError: see `get`."""
-        kept = {path.stem for path in self._folder.glob("*.json")}
+        """All that there are, by name."""
+        kept = self._kept()
         found = []
         for name in sorted(kept | set(self._given)):
-            document = self.get(name)
             source = PresetSource.KEPT if name in kept else self._given[name][0]
-            found.append(NamedPreset(name, source, document.scan.description, document.digest))
+            try:
+                document = self.get(name)
+            except PresetNotFoundError:
+                # It was deleted meanwhile.
+                continue
+            except ConfigError as error:
+                found.append(NamedPreset(name, source, fault=str(error)))
+            else:
+                found.append(NamedPreset(name, source, document.scan.description, document.digest))
         return found
 
     def get(self, name: str) -> PresetDocument:
@@ -95,8 +106,8 @@ class Presets:
         if path.is_file():
             return read_description_of(path, PresetDocument, "preset", most_bytes=MOST_PRESET_BYTES, error=ConfigError)
         if name not in self._given:
-            kept = {each.stem for each in self._folder.glob("*.json")}
-            message = f"There is no preset '{name}' here. There are: {', '.join(sorted(kept | set(self._given)))}."
+            names = ", ".join(sorted(self._kept() | set(self._given)))
+            message = f"There is no preset '{name}' here. There are: {names}."
             raise PresetNotFoundError(message)
         return PresetDocument(scan=self._given[name][1])
 
@@ -126,6 +137,10 @@ class Presets:
             raise PresetNotFoundError(message)
         with refusals_of(path):
             path.unlink(missing_ok=True)
+
+    def _kept(self) -> set[str]:
+        """The names of those that were put; a file of another name was put there by hand, and nobody can ask for it."""
+        return {path.stem for path in self._folder.glob("*.json") if re.fullmatch(PRESET_NAME, path.stem)}
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.json"

@@ -145,14 +145,14 @@ def test_the_rest_of_the_interface_answers(service: ServiceProcess) -> None:
 
 def test_exposures_proposed_and_kept_as_a_preset_are_those_of_the_scan(service: ServiceProcess) -> None:
     with service.client() as client:
-        found = client.exposure(budget_s=20.0)
+        found = client.scans.exposure(budget_s=20.0)
         assert found["completeness"] > 0.95
         assert found["lit"] > 0.2
         (cover,) = found["exposures"]
         assert found["scan"] == {"exposure_s": cover["exposure_s"]}
         assert {each["exposure_s"] for each in found["others"]}.isdisjoint({cover["exposure_s"]})
         with pytest.raises(InvalidRequestError, match=r"budget_s: found 0\.01 s"):
-            client.exposure(budget_s=0.01, patterns={"rows": True})
+            client.scans.exposure(budget_s=0.01, patterns={"rows": True})
         # The rig is free again at once.
         client.presets.put("plate", {"format": "slrig-preset", "version": 1, "scan": found["scan"]})
         result = client.scan(preset="plate", if_busy="reject")

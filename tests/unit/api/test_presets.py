@@ -86,6 +86,11 @@ def test_a_file_of_another_version_is_told_and_hides_no_other(tmp_path: Path) ->
     with pytest.raises(ConfigError, match=r"dark\.json is not a valid preset[^$]*found 3; bring slrig up to date"):
         presets.get("dark")
     assert presets.get("matt").scan == SHIPPED["matt"]
+    (tmp_path / "By hand.json").write_text(json.dumps(document()))
+    listed = {each.name: each for each in presets.listed()}
+    assert set(listed) == set(SHIPPED)
+    assert (listed["dark"].digest, listed["matt"].fault) == (None, None)
+    assert "bring slrig up to date" in (listed["dark"].fault or "")
     presets.delete("dark")
     assert presets.get("dark").scan == SHIPPED["dark"]
 
@@ -125,7 +130,11 @@ def test_a_rig_file_may_hold_presets(tmp_path: Path) -> None:
     presets = Presets(tmp_path / "presets", of_rig)
     assert presets.get("dark").scan.exposure_factors == (4.0,)
     assert [each.source for each in presets.listed() if each.name in {"dark", "matt"}] == ["rig", "shipped"]
-    for wrong in ("[presets.Dark]\nrows = true", "[presets.dark]\nrow = true", "[presets]\ndark = 1", "presets = 1"):
+    for wrong in ("[presets.Dark]\nrows = true", "[presets.dark]\nrow = true", "[presets]\ndark = 1"):
         path.write_text(rig + wrong)
+        with pytest.raises(ConfigError):
+            read_rig(path)
+    for wrong in ("presets = 1", 'presets = ["dark"]'):
+        path.write_text(f"{wrong}\n{rig}")
         with pytest.raises(ConfigError):
             read_rig(path)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from slrig.bundle import read_bundle
 from slrig.bundle.notes import read_notes
 from slrig.bundle.refused import read_refused
 from slrig.capture.evidence import EvidenceSummary, check_capture
-from slrig.devices import CameraSettings, Synchronisation, Trigger
+from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
 from slrig.errors import (
     BundleError,
     DeviceGoneError,
@@ -282,3 +283,24 @@ def test_factors_are_of_each_camera_alone_and_of_their_mean_in_a_bracket(tmp_pat
         _, bracket_s, told = exposed(two, ScanPlan(exposure_factors=(1.0, 900.0)))
         assert bracket_s == pytest.approx((0.02, longest_s))
         assert told == [f"every camera exposes for {longest_s:.6g} s instead of 18 s: what it can do"]
+
+
+def test_whole_periods_of_the_projector_are_those_that_the_camera_can_do(tmp_path: Path) -> None:
+    with simulated(tmp_path).head() as head:
+        rig, (name, camera) = rig_of(head), next(iter(head.cameras.items()))
+        longest_s = camera.info.exposure_range_s[1]
+        period_s = longest_s / 1.9
+        slow = replace(rig, projector=cast("Projector", Refreshing(rig.projector, period_s)))
+        scaled, _, told = exposed(slow, ScanPlan(exposure_factors=(900.0,)))
+        # The nearest number of periods to the longest exposure is two, and the camera cannot do that.
+        assert scaled.settings[name].exposure_s == period_s
+        assert len(told) == 2 * len(rig.cameras)
+        _, bracket_s, _ = exposed(slow, ScanPlan(exposures_s=(0.6 * longest_s, longest_s)))
+        assert bracket_s == (period_s,)
+
+
+class Refreshing:
+    """The information of a projector with another refresh period."""
+
+    def __init__(self, projector: Projector, refresh_s: float) -> None:
+        self.info = replace(projector.info, refresh_s=refresh_s)

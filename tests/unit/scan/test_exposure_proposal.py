@@ -83,6 +83,12 @@ def test_a_mirror_that_no_exposure_can_do_is_told_of() -> None:
     assert any("saturated even at" in note for note in found.notes)
 
 
+def test_what_is_clear_counts_where_most_of_the_object_is_saturated_at_every_look() -> None:
+    found = proposed(object_seen([(1e6, 0.6), (4000.0, 0.4)], [0.0167, 0.05]), 0.0167, 0.05)
+    assert found.completeness == pytest.approx(0.4, abs=0.01)
+    assert found.saturated == pytest.approx(0.6, abs=0.01)
+
+
 def test_no_light_and_no_time_are_refused_in_words() -> None:
     with pytest.raises(ConfigError, match="nothing that the projector lights"):
         proposed(object_seen([(0.0, 1.0)], [0.02]), 0.02)
