@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
+from contextlib import suppress
 
 from starlette.datastructures import MutableHeaders
 from starlette.middleware.body_limit import RequestBodyLimitMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOCAL_NAMES = ("localhost", "127.0.0.1", "[::1]")
+
+_TOO_LONG = 413
+_PASS_OVER_S = 1.0
+"""A body of 100 MB is here by then on a usual network; who sends more, or slowly, may find the connection reset."""
 
 _HEADERS = {
     # What is sent as a picture or as text is never run.
@@ -55,4 +61,22 @@ class BodyLimits:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         limited = self._longer.get(scope["path"], self._usual) if scope["type"] == "http" else self._usual
-        await limited(scope, receive, send)
+
+        async def after_the_body(message: Message) -> None:
+            if message["type"] == "http.response.start" and message["status"] == _TOO_LONG:
+                await _pass_over(scope, receive)
+            await send(message)
+
+        await limited(scope, receive, after_the_body)
+
+
+async def _pass_over(scope: Scope, receive: Receive) -> None:
+    """Take what a client is still sending, for a moment: a connection that is closed with bytes unread is reset, and
+    a proxy then loses the answer. One that waits to be told to send has sent nothing.
+    """
+    if any(name == b"expect" for name, _ in scope["headers"]):
+        return
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_PASS_OVER_S):
+            while (await receive()).get("more_body", False):
+                pass
