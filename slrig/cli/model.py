@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -81,12 +81,14 @@ def model(
         display("fusing", 0.4, "")
         whole = fused(views, found.poses, voxel_mm=voxel_mm)
         display("writing", 0.9, "")
-        made = _files(names, views, found, turned, angle, whole)
+        told = _of_model(whole)
+        report = {**_report(names, views, found, turned, angle), "model": told}
+        made = _files(names, views, found, turned, whole.mesh, report)
         for name, data in made.items():
             (folder / name).write_bytes(data)
         display("done", 1.0, "")
     _tell(names, views, found, turned, angle)
-    _tell_fused(whole)
+    _tell_fused(told)
     for name in made:
         typer.echo(f"{Path(name).stem:<10}{output / name}")
 
@@ -96,8 +98,8 @@ def _files(
     views: Sequence[Mesh],
     found: Registration,
     turned: FoundAxis | None,
-    angle_deg: float | None,
-    whole: FusedModel,
+    mesh: Mesh,
+    report: Mapping[str, Any],
 ) -> dict[str, bytes]:
     """What the folder gets, by name."""
     from slrig.bundle.poses_file import Poses, encode_poses
@@ -106,9 +108,8 @@ def _files(
 
     poses = dict(zip(names, found.poses, strict=True))
     axis = None if turned is None else (turned.point_mm, turned.direction)
-    report = {**_report(names, views, found, turned, angle_deg), "model": _of_model(whole)}
     return {
-        MODEL: encode_mesh_ply(whole.mesh),
+        MODEL: encode_mesh_ply(mesh),
         PLACED: encode_mesh_ply(put_together(views, found.poses)),
         POSES: encode_poses(Poses(poses, axis)),
         REPORT: encode_report(report),
@@ -157,8 +158,7 @@ def _of_model(whole: FusedModel) -> dict[str, Any]:
     }
 
 
-def _tell_fused(whole: FusedModel) -> None:
-    of = _of_model(whole)
+def _tell_fused(of: Mapping[str, Any]) -> None:
     once = of["seen_by"].get(1, 0.0)
     typer.echo(
         f"{'mesh':<10}{of['vertices']:,} vertices, {of['triangles']:,} triangles of {of['voxel_mm']:.2g} mm; σ "

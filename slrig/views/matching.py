@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,7 @@ def side_of(view: Mesh) -> Side:
     )
 
 
-def moved(pose: FloatArray, points_mm: FloatArray) -> FloatArray:
+def moved(pose: FloatArray, points_mm: NDArray[np.floating[Any]]) -> FloatArray:
     """Points (n, 3) where a pose (4, 4) takes them."""
     return np.asarray(points_mm @ pose[:3, :3].T + pose[:3, 3])
 

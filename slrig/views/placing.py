@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slrig.model import FloatArray, Mesh
+from slrig.views.matching import moved
 
 
 def put_together(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray) -> Mesh:
@@ -14,10 +15,7 @@ def put_together(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray
     first = np.cumsum([0, *(len(view.vertices_mm) for view in views)])[:-1]
     return Mesh(
         vertices_mm=np.concatenate(
-            [
-                (view.vertices_mm @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32)
-                for view, pose in zip(views, poses, strict=True)
-            ]
+            [moved(pose, view.vertices_mm).astype(np.float32) for view, pose in zip(views, poses, strict=True)]
         ),
         faces=np.concatenate([view.faces + np.int32(begin) for view, begin in zip(views, first, strict=True)]),
         normals=np.concatenate(
