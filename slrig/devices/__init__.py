@@ -3,8 +3,9 @@
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
+from slrig.devices.positioner import Positioner, Positions, Turntable
 from slrig.devices.projector import FlashedProjector, Projector, ProjectorInfo, ProjectorState, Shown, UnprovenLight
-from slrig.devices.rig import FoundDevice, Head, Positioner, Positions, Rig, Synchronisation
+from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
 __all__ = [
     "COMPUTED",
@@ -30,6 +31,7 @@ __all__ = [
     "Synchronisation",
     "SystemClock",
     "Trigger",
+    "Turntable",
     "UnprovenLight",
     "progress_heard",
     "progress_reporter",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
 
 from slrig.devices.camera import Camera, CameraSettings
 from slrig.devices.clock import Clock, SystemClock
+from slrig.devices.positioner import Positioner
 from slrig.devices.projector import Projector
 from slrig.model import Calibration, Truth
 
@@ -34,38 +35,6 @@ class Head(Protocol):
 
     def truth(self) -> Truth | None:
         """What the instrument knows of the scene before it; None on metal."""
-        ...
-
-
-class Positioner(Protocol):
-    """Moves a calibration board without a person: a motorised stage, a robot, the rendered rig's script.
-
-    It puts an object where it is told. One thread uses it, the one that owns the rig.
-    """
-
-    @property
-    def poses(self) -> Sequence[str]:
-        """The poses that it can take, by name, in the order in which they are meant to be taken."""
-        ...
-
-    def move(self, index: int) -> None:
-        """Take a pose and return when the object stands still.
-        Raises UnsupportedByDeviceError: there is no such pose. Name those there are; DeviceError: it did not get there.
-        """
-        ...
-
-    def close(self) -> None:
-        """Let it go. Idempotent."""
-        ...
-
-
-@runtime_checkable
-class Positions(Protocol):
-    """A head that has a positioner."""
-
-    @property
-    def positioner(self) -> Positioner | None:
-        """What moves the object before it; None where a person does."""
         ...
 
 

@@ -20,6 +20,7 @@ from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
 from slrig.model.region import Region
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
+from slrig.model.stage import StageAxis
 from slrig.model.surfaces import (
     AlbedoMark,
     CameraTruth,
@@ -64,6 +65,7 @@ __all__ = [
     "Size",
     "Solved",
     "Source",
+    "StageAxis",
     "Surface",
     "Truth",
     "White",

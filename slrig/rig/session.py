@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import structlog
 
 from slrig.bundle.calibration_file import check_calibration, check_rays
-from slrig.devices import CameraInfo, ProjectorInfo, Rig
+from slrig.devices import CameraInfo, ProjectorInfo, Rig, Turntable
 from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
 from slrig.failure import UNEXPECTED, JobFailure, failure_of
 from slrig.model import Calibration, Size
@@ -27,13 +27,14 @@ class RigFacts:
     """What an open rig declares about itself: data that any thread may read.
 
     calibration : of the rig file, or of the head. positions : the poses that what moves the board can take, by name;
-    none where a person does.
+    none where a person does. turntable : whether it turns what stands on it to any angle.
     """
 
     cameras: Mapping[str, CameraInfo]
     projector: ProjectorInfo
     calibration: Calibration | None
     positions: tuple[str, ...] = ()
+    turntable: bool = False
 
     @property
     def sizes(self) -> Mapping[str, Size]:
@@ -214,4 +215,4 @@ class RigSession:
 def _facts(rig: Rig) -> RigFacts:
     cameras = {name: camera.info for name, camera in rig.cameras.items()}
     positions = () if rig.positioner is None else tuple(rig.positioner.poses)
-    return RigFacts(cameras, rig.projector.info, rig.calibration, positions)
+    return RigFacts(cameras, rig.projector.info, rig.calibration, positions, isinstance(rig.positioner, Turntable))

@@ -30,6 +30,7 @@ from slrig.devices import (
     Rig,
     Shown,
     Trigger,
+    Turntable,
     progress_heard,
 )
 from slrig.errors import (
@@ -41,7 +42,7 @@ from slrig.errors import (
     SlrigError,
     UnsupportedByDeviceError,
 )
-from slrig.model import Frame, PatternSequence
+from slrig.model import Frame, PatternSequence, StageAxis
 from slrig.rig.settings import SettingsInUse
 
 OPEN = "open"
@@ -224,8 +225,14 @@ def guarded(rig: Rig, calls: Calls, settings: dict[str, SettingsInUse]) -> Rig:
         rig,
         cameras={name: _GuardedCamera(camera, name, calls, settings) for name, camera in rig.cameras.items()},
         projector=_GuardedProjector(rig.projector, f"projector '{rig.projector.info.name}'", calls),
-        positioner=None if rig.positioner is None else GuardedPositioner(rig.positioner, calls),
+        positioner=_guarded_positioner(rig.positioner, calls),
     )
+
+
+def _guarded_positioner(positioner: Positioner | None, calls: Calls) -> GuardedPositioner | None:
+    if isinstance(positioner, Turntable):
+        return GuardedTurntable(positioner, calls)
+    return None if positioner is None else GuardedPositioner(positioner, calls)
 
 
 class _Guarded(Generic[_Device]):
@@ -324,6 +331,28 @@ class GuardedPositioner:
     def close(self) -> None:
         """See `Positioner`."""
         self._made("close", USUAL.call_s, self._positioner.close)
+
+
+class GuardedTurntable(GuardedPositioner):
+    """Implements `slrig.devices.Turntable` by another one, all calls by way of `calls`."""
+
+    def __init__(self, turntable: Turntable, calls: Calls) -> None:
+        super().__init__(turntable, calls)
+        self._turntable = turntable
+
+    @property
+    def axis(self) -> StageAxis | None:
+        """See `Turntable`."""
+        return self._turntable.axis
+
+    @property
+    def angles_deg(self) -> Sequence[float]:
+        """See `Turntable`."""
+        return self._turntable.angles_deg
+
+    def turn(self, angle_deg: float) -> None:
+        """See `Turntable`."""
+        self._made("turn", MOVE_LIMIT_S, lambda: self._turntable.turn(angle_deg))
 
 
 def _of_the_system(error: OSError, call: Call) -> DeviceError:

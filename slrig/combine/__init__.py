@@ -1,0 +1,1 @@
+"""Models: scans from several sides, shot or at hand, made one mesh; their jobs, their report."""
