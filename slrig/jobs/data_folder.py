@@ -6,9 +6,10 @@ DATA/slrig.sqlite    the records
 DATA/scans/ID/       a finished scan: bundle/, mesh.ply, report.json ...
 DATA/calibrations/   calibrations and their sessions: see `slrig.calibrate.store`
 DATA/acceptance/     acceptance tests: see `slrig.accept.store`
+DATA/models/         models of several scans: see `slrig.combine.store`
 DATA/presets/NAME.json  presets that were put: see `slrig.scan.presets`
 DATA/doctor.json     what `slrig doctor` found last, and conform.json: see `slrig.jobs.examinations`
-DATA/.incoming/ID/   a scan, a pose or a solve being made; swept at the next start
+DATA/.incoming/ID/   a scan, a pose, a solve or a model being made; swept at the next start
 DATA/.orphans/ID/    files found at start that no record knows; kept, because they may be somebody's work
 DATA/cache/          compiled kernels, where the package's own folder cannot be written
 """
@@ -232,9 +233,15 @@ class DataFolder:
                 for file in sorted(result.iterdir()):
                     file.rename(staged / file.name)
                 result.rmdir()
+        self.put(scan_id, self.scan(scan_id))
+
+    def put(self, job_id: UUID, place: Path) -> None:
+        """Move what is staged for a job to its place, by one rename, durable: all but a bundle, which is so already."""
+        staged = self.staging(job_id)
+        with disk_errors(staged):
             sync_tree(staged, but=BUNDLE)
-            staged.rename(self.scan(scan_id))
-            sync_folder(self.scans)
+            staged.rename(place)
+            sync_folder(place.parent)
             sync_folder(self.incoming)
 
     def keep_bundle(self, scan_id: UUID) -> None:

@@ -48,6 +48,7 @@ class JobKind(StrEnum):
     POSE = "pose"
     SOLVE = "solve"
     POSITION = "position"
+    MODEL = "model"
 
 
 class JobState(StrEnum):

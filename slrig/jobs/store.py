@@ -22,6 +22,7 @@ from slrig.jobs.tables import EventRow, JobRow, KeyRow
 _LISTED = {
     JobKind.SCAN: "GET /scan lists those that are.",
     JobKind.VERIFICATION: "GET /rig/health/history lists past ones.",
+    JobKind.MODEL: "GET /model lists those that are.",
 }
 
 _PROGRESS_PATIENCE_S = 0.2  # the work waits meanwhile

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from uuid import UUID, uuid4
@@ -82,6 +83,7 @@ class Runner:
         self.queue = JobQueue(rig, queue_length=queue_length, backlog_length=backlog_length, give_up=give_up)
         self._work = RigJobs(store, self.queue, folder)
         self._tools = ScanTools(folder, worker, capture, spare_bytes)
+        self._unused: Callable[[UUID], AbstractContextManager[None]] = lambda _: nullcontext()
 
     def start(self) -> None:
         """Start the owner thread, which opens the rig, and the worker, which loads its kernels."""
@@ -159,6 +161,10 @@ class Runner:
         """Have scans that begin from now on carry the health of their calibration, and tell what they find of it."""
         self._tools.health = health
 
+    def spare_what_is_used(self, unused: Callable[[UUID], AbstractContextManager[None]]) -> None:
+        """Have scans deleted only within what `unused` gives of each: it raises ScanStateError for one that is used."""
+        self._unused = unused
+
     def use_calibration(self, active: ActiveCalibration | None) -> None:
         """Have what is begun from now on use a calibration; None has it use the rig's own.
 
@@ -187,7 +193,7 @@ class Runner:
         JobNotFoundError
             There is no such scan.
         ScanStateError
-            It is not finished.
+            It is not finished, or something that is under way uses it.
         """
         self._work.endings.settle()
         record = self._store.get(scan_id)
@@ -196,9 +202,10 @@ class Runner:
                 f"Scan {scan_id} is {record.state}. Cancel it first (POST /scan/{scan_id}/cancel), then delete it."
             )
             raise ScanStateError(message)
-        self._folder.discard(scan_id)
-        self._folder.withdraw(scan_id)
-        self._store.delete(scan_id)
+        with self._unused(scan_id):
+            self._folder.discard(scan_id)
+            self._folder.withdraw(scan_id)
+            self._store.delete(scan_id)
         self._folder.discard(scan_id)
         _log.info("scan deleted", scan=str(scan_id))
 

@@ -1,0 +1,167 @@
+"""The model itself: meshes of several views registered, fused, and written with a report. Run by the worker and by
+`slrig model`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slrig.bundle.poses_file import Poses, encode_poses
+from slrig.bundle.storage import write_file
+from slrig.combine.offered import MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT
+from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses
+from slrig.disk import refusals_of
+from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
+from slrig.kernels import compilations_told
+from slrig.model import FloatArray, Mesh
+from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
+from slrig.scan.mesh_formats import encode_mesh_glb
+from slrig.scan.plan import Progress
+from slrig.views.fusion import FusedModel, fused
+from slrig.views.placing import put_together
+from slrig.views.registration import Registration, registered
+from slrig.views.turntable import FoundAxis, found_axis, turntable
+
+
+def combine_into(
+    meshes: Mapping[str, Path],
+    folder: Path,
+    poses: StartingPoses,
+    *,
+    start_error_mm: float = START_ERROR_MM,
+    voxel_mm: float | None = None,
+    progress: Progress,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> None:
+    """Make one model of the meshes of several views, in the frame of the first, and write its files into a folder that
+    only its maker knows yet; see `slrig.combine.offered`.
+
+    meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near where they belong; of
+    a turntable, with its axis and angles. start_error_mm : how far a surface may be from there. voxel_mm : length of
+    the model's edges; None is 1.25 times that of the views'.
+
+    Raises
+    ------
+    ConfigError
+        The turntable's axis or angles are not told.
+    RegistrationRefusedError
+        A view overlaps no other, or does not agree with them.
+    InvalidInputError
+        A mesh is not as slrig wrote it, is no manifold, or the voxels are too fine for it.
+    NothingToReconstructError
+        No view has a triangle, or the voxels are larger than what was seen.
+    ScanCancelledError
+        `cancelled()` became true.
+    StorageError
+        The disk refused.
+    """
+    at = ("", 0.0)
+
+    def entered(stage: str, fraction: float, detail: str = "") -> None:
+        nonlocal at
+        if cancelled():
+            message = f"the model was cancelled before '{stage}'"
+            raise ScanCancelledError(message)
+        at = (stage, fraction)
+        progress(stage, fraction, detail)
+
+    def compiling(kernel: str) -> None:
+        progress(*at, f"preparing kernels, first time only: {kernel}")
+
+    with compilations_told(compiling):
+        names, views = list(meshes), []
+        for number, (name, file) in enumerate(meshes.items()):
+            entered("reading", 0.2 * number / len(meshes), name)
+            views.append(_mesh(file))
+        entered("registering", 0.2, f"{len(views)} views")
+        starts = _starts(poses)
+        found = registered(views, starts, names=names, start_error_mm=start_error_mm)
+        axis = None
+        if isinstance(poses, TurntablePoses) and poses.axis is not None:
+            axis = found_axis(found, np.array(poses.axis.direction))
+        entered("fusing", 0.4)
+        whole = fused(views, found.poses, voxel_mm=voxel_mm)
+        entered("writing", 0.9, f"{len(whole.mesh.faces)} triangles")
+        known = Poses(
+            dict(zip(names, found.poses, strict=True)), None if axis is None else (axis.point_mm, axis.direction)
+        )
+        report = _report(names, views, found, None if axis is None else _axis(axis, poses), whole)
+        # One at a time: each is as large as all meshes.
+        files: dict[str, Callable[[], bytes]] = {
+            MODEL: lambda: encode_mesh_ply(whole.mesh),
+            MODEL_GLB: lambda: encode_mesh_glb(whole.mesh),
+            PLACED: lambda: encode_mesh_ply(put_together(views, found.poses)),
+            POSES: lambda: encode_poses(known),
+            REPORT: lambda: encode_report(report),
+        }
+        for name, encoded in files.items():
+            write_file(folder / name, encoded(), durable=False)
+    progress("done", 1.0, f"{len(whole.mesh.faces)} triangles")
+
+
+def _mesh(file: Path) -> Mesh:
+    """Raises InvalidInputError: the file is not as slrig wrote it; StorageError: it cannot be read."""
+    with refusals_of(file):
+        data = file.read_bytes()
+    try:
+        return decode_mesh_ply(data)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{file}: {error}") from error
+
+
+def _starts(poses: StartingPoses) -> FloatArray:
+    """(N, 4, 4). Raises ConfigError."""
+    if isinstance(poses, GivenPoses):
+        return np.array(poses.matrices)
+    if poses.axis is None or poses.angles_deg is None:
+        raise ConfigError("poses: expected a turntable's axis and the angle of each view, found one of them at most")
+    return turntable(np.array(poses.axis.point_mm), np.array(poses.axis.direction), np.deg2rad(poses.angles_deg))
+
+
+def _report(
+    names: Sequence[str], views: Sequence[Mesh], found: Registration, axis: Mapping[str, Any] | None, whole: FusedModel
+) -> dict[str, Any]:
+    return {
+        "format": REPORT_FORMAT,
+        "version": 1,
+        "views": [
+            {"name": name, "vertices": len(view.vertices_mm), "sigma_mm": sigma}
+            for name, view, sigma in zip(names, views, found.sigma_mm.tolist(), strict=True)
+        ],
+        "registration": {
+            "steps": found.steps,
+            "inflation": found.inflation,
+            "middle_mm": found.middle_mm,
+            "radius_mm": found.radius_mm,
+            "covariance": found.covariance,
+        },
+        "pairs": [{**asdict(pair), "first": names[pair.first], "second": names[pair.second]} for pair in found.pairs],
+        "free": [{**asdict(each), "view": names[each.view], "words": str(each)} for each in found.free],
+        "axis": axis,
+        "model": _of_model(whole),
+    }
+
+
+def _axis(found: FoundAxis, told: StartingPoses) -> dict[str, Any]:
+    """The axis as the views have it. stage_error_deg : (N,), angles as found less those told, within half a turn."""
+    stated_deg = np.array(told.angles_deg if isinstance(told, TurntablePoses) else ())
+    off_deg = np.rad2deg(found.angles_rad) - (stated_deg - stated_deg[0])
+    return {**asdict(found), "stage_error_deg": (off_deg + 180) % 360 - 180}
+
+
+def _of_model(whole: FusedModel) -> dict[str, Any]:
+    """What report.json says of the fused mesh. seen_by : share of its vertices by how many views tell of each."""
+    shares = np.bincount(whole.views) / len(whole.views)
+    return {
+        "vertices": len(whole.mesh.vertices_mm),
+        "triangles": len(whole.mesh.faces),
+        "voxel_mm": whole.voxel_mm,
+        "correlated_mm": whole.correlated_mm,
+        "sigma_mm": float(np.median(whole.mesh.sigma_mm)),
+        "seen_by": {int(count): float(shares[count]) for count in np.flatnonzero(shares)},
+    }

@@ -1,0 +1,288 @@
+"""Models as jobs: made of scans on record, in the worker, while the rig does other work."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+from uuid import UUID
+
+import structlog
+
+from slrig.combine.offered import missing_files
+from slrig.combine.plan import ModelPlan, StartingPoses, StatedAxis, TurntablePoses, plan_from_json, plan_json
+from slrig.combine.store import ModelStore, summary
+from slrig.errors import ConfigError, JobNotFoundError, QueueFullError, ScanStateError, StorageError
+from slrig.failure import failure_of
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.job import Holder, Job
+from slrig.jobs.progress import ProgressRecorder
+from slrig.jobs.queue import JobQueue
+from slrig.jobs.records import JobRecord, JobState
+from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
+from slrig.jobs.store import JobStore
+from slrig.model import StageAxis
+from slrig.scan.artefacts import MESH
+from slrig.scan.plan import Progress
+
+_FILES_OF_MESHES = 3
+"""A model's files over the meshes of its scans: placed.ply is as large as all of them, model.ply and model.glb less."""
+
+_log = structlog.get_logger(__name__)
+
+
+class CombineInto(Protocol):
+    """`slrig.combine.combining.combine_into`."""
+
+    def __call__(
+        self,
+        meshes: Mapping[str, Path],
+        folder: Path,
+        poses: StartingPoses,
+        /,
+        *,
+        start_error_mm: float,
+        voxel_mm: float | None,
+        progress: Progress,
+        cancelled: Callable[[], bool],
+    ) -> None:
+        """Write the files of a model."""
+        ...
+
+
+class ModelDesk:
+    """Has models made, and keeps the newest. Any thread may call.
+
+    scans : those on record. combine : see `CombineInto`. axis : gives the stage's own, None where it is not known.
+    keep : so many models are kept. spare_bytes : left free on the disk.
+    """
+
+    def __init__(
+        self,
+        folder: DataFolder,
+        queue: JobQueue,
+        jobs: JobStore,
+        *,
+        scans: JobStore,
+        combine: CombineInto,
+        axis: Callable[[], StageAxis | None] = lambda: None,
+        keep: int,
+        spare_bytes: int = 0,
+    ) -> None:
+        self.jobs = jobs
+        self.store = ModelStore(folder)
+        self._folder = folder
+        self._queue = queue
+        self._scans = scans
+        self._combine = combine
+        self._axis = axis
+        self._keep = keep
+        self._spare_bytes = spare_bytes
+        self._work = RigJobs(jobs, queue, folder)
+        # Held while scans are looked up and named by a job, and while one is deleted.
+        self._naming = threading.Lock()
+
+    def take_up(self) -> None:
+        """Bring records and files together again after whatever ended the last run of the service.
+
+        - A model that waited is made; so is one that was being made, once more, unless its files are in place.
+        - A deletion that was cut off is completed.
+        - A model that succeeded and lacks a file is recorded as failed.
+        - Files without a record are put aside in `.orphans`.
+        """
+        for record in self.jobs.unfinished():
+            place = self.store.place(record.id)
+            if missing_files(place):
+                self._work.take_up(record, self._parts(record), holder=_holder(record.id), resumes=True)
+            else:
+                self.jobs.finish(record.id, JobState.SUCCEEDED, summary=summary(place))
+        states = self.jobs.states()
+        for name in self.store.withdrawn():
+            for model_id in [each for each in states if str(each) == name]:
+                self.jobs.delete(model_id)
+                del states[model_id]
+            self.store.discard(name)
+        for model_id, state in states.items():
+            if state is JobState.SUCCEEDED and (missing := missing_files(self.store.place(model_id))):
+                message = (
+                    f"{' and '.join(missing)} of this model is gone from {self.store.place(model_id)}. Make it again."
+                )
+                self.jobs.lose_files(model_id, failure_of(StorageError(message)))
+                _log.warning("left by the last run", model=str(model_id), found="without files")
+        for name in self.store.put_aside(set(states)):
+            _log.warning("left by the last run", model=name, found="put aside")
+        self._remove_old()
+
+    def combine(self, plan: ModelPlan, *, label: str | None = None, key: str | None = None) -> JobRecord:
+        """Have a model made. Returns at once. key : the idempotency key of the request, reserved.
+
+        Raises
+        ------
+        JobNotFoundError
+            A scan is not on record.
+        ScanStateError
+            A scan did not succeed, or not yet.
+        ConfigError
+            The poses are to be a turntable's, and the axis or an angle is not known.
+        QueueFullError
+            As many models wait as may.
+        StorageError
+            There is too little room, or the disk refused.
+        """
+        with self._naming:
+            used = self.settled(plan)
+            if len(self.jobs.unfinished()) >= self._queue.backlog_length:
+                message = (
+                    f"{self._queue.backlog_length} models are made or wait for that, as many as may. Try again later."
+                )
+                raise QueueFullError(message)
+            mesh_bytes = sum(self._mesh(scan).stat().st_size for scan in used.scans)
+            self._folder.require_space(_FILES_OF_MESHES * mesh_bytes + self._spare_bytes)
+            record = self.jobs.create(plan_json(used), rig=self._queue.rig.name, label=label, key=key)
+        self._work.take_up(record, self._parts(record), holder=_holder(record.id))
+        self._remove_old()
+        return self.jobs.get(record.id)
+
+    def settled(self, plan: ModelPlan) -> ModelPlan:
+        """The plan with the stage's axis and angles in it, where it leaves them to the stage. Raises as `combine`."""
+        for scan in plan.scans:
+            found = self._scans.get(scan)
+            if found.state is not JobState.SUCCEEDED:
+                message = (
+                    f"Scan {scan} is {found.state}. A model takes scans that succeeded: wait for it, or leave it out."
+                )
+                raise ScanStateError(message)
+        poses = plan.poses
+        if not isinstance(poses, TurntablePoses):
+            return plan
+        if poses.axis is None:
+            axis = self._axis()
+            if axis is None:
+                message = (
+                    "axis: expected that of the stage, and none is known here; say axis, with point_mm and direction "
+                    "in the scans' frame, or give the poses"
+                )
+                raise ConfigError(message)
+            point, direction = axis.point_mm.tolist(), axis.direction.tolist()
+            poses = replace(poses, axis=StatedAxis(tuple(point), tuple(direction)))
+        if poses.angles_deg is None:
+            told = {scan: self._stage_angle_deg(scan) for scan in plan.scans}
+            untold = [str(scan) for scan, angle in told.items() if angle is None]
+            if untold:
+                message = (
+                    "angles_deg: expected the stage's angle in the report of each scan, found none in "
+                    f"{', '.join(untold)}; say angles_deg, one for each scan in their order, or give the poses"
+                )
+                raise ConfigError(message)
+            poses = replace(poses, angles_deg=tuple(angle for angle in told.values() if angle is not None))
+        return replace(plan, poses=poses)
+
+    def cancel(self, model_id: UUID) -> JobRecord:
+        """Ask a model to end early. Returns at once; one that is over stays so. Raises JobNotFoundError."""
+        self._work.cancel(model_id)
+        return self.jobs.get(model_id)
+
+    def delete(self, model_id: UUID) -> None:
+        """Remove a model that is over: its record, its events, its files.
+
+        Raises
+        ------
+        JobNotFoundError
+            There is no such model.
+        ScanStateError
+            It is not over.
+        """
+        self._work.endings.settle()
+        record = self.jobs.get(model_id)
+        if not record.state.final:
+            message = (
+                f"Model {model_id} is {record.state}. Cancel it first (POST /model/{model_id}/cancel), then delete it."
+            )
+            raise ScanStateError(message)
+        self.store.withdraw(model_id)
+        self.jobs.delete(model_id)
+        self.store.discard(model_id)
+        _log.info("model deleted", model=str(model_id))
+
+    @contextmanager
+    def unused(self, scan_id: UUID) -> Iterator[None]:
+        """A scan that no model needs, which none comes to need within the block.
+
+        Raises
+        ------
+        ScanStateError
+            A model that waits or is being made needs it.
+        """
+        with self._naming:
+            for record in self.jobs.unfinished():
+                if str(scan_id) in record.plan["scans"]:
+                    message = (
+                        f"Scan {scan_id} is needed by model {record.id}, which is {record.state}. Wait for it, or "
+                        f"cancel it first (POST /model/{record.id}/cancel), then delete the scan."
+                    )
+                    raise ScanStateError(message)
+            yield
+
+    def close(self) -> None:
+        """Put on record what the disk refused before. Idempotent."""
+        self._work.close()
+
+    def _parts(self, record: JobRecord) -> Parts:
+        return Parts(lambda job, progress: self._make(record, job, progress), capture_share=0.0)
+
+    def _make(self, record: JobRecord, job: Job, progress: ProgressRecorder) -> Outcome:
+        plan = plan_from_json(record.plan)
+        staged = self.store.stage(record.id)
+        self._combine(
+            {str(scan): self._mesh(scan) for scan in plan.scans},
+            staged,
+            plan.poses,
+            start_error_mm=plan.start_error_mm,
+            voxel_mm=plan.voxel_mm,
+            progress=progress,
+            cancelled=job.stop.is_set,
+        )
+        missing = missing_files(staged)
+        if missing:
+            message = (
+                f"The model was made, and {' and '.join(missing)} is not on the disk. Check the disk; make it again."
+            )
+            raise StorageError(message)
+        found = summary(staged)
+        self.store.commit(record.id)
+        return Outcome(found)
+
+    def _mesh(self, scan_id: UUID) -> Path:
+        mesh = self._folder.scan(scan_id) / MESH
+        if not self._folder.owns(mesh):
+            message = f"{mesh} is gone, or a link. Leave scan {scan_id} out, or bring its files back."
+            raise StorageError(message)
+        return mesh
+
+    def _stage_angle_deg(self, scan_id: UUID) -> float | None:
+        """Where the stage stood, as the report of a scan says; None where it says nothing of one."""
+        try:
+            report = json.loads(self._folder.read(self._folder.scan(scan_id) / "report.json"))
+            return float(report["stage"]["angle_deg"])
+        except (FileNotFoundError, ValueError, KeyError, TypeError):
+            return None
+
+    def _remove_old(self) -> None:
+        """Remove the oldest models beyond those that are kept, and say so in the log."""
+        for record in self.jobs.finished()[self._keep :]:
+            try:
+                self.delete(record.id)
+            except JobNotFoundError:
+                # Deleted by somebody meanwhile.
+                continue
+            except StorageError as error:
+                _log.warning("an old model could not be removed", model=str(record.id), cause=str(error))
+
+
+def _holder(model_id: UUID) -> Holder:
+    words = f"model {model_id}"
+    return Holder(words, words, f"/model/{model_id}")

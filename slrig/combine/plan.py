@@ -1,0 +1,116 @@
+"""What a model of several scans is asked to do: frozen data, and its JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+from uuid import UUID
+
+from pydantic import Field, TypeAdapter
+
+from slrig.errors import ConfigError
+
+START_ERROR_MM = 3.0
+"""See `slrig.views.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
+
+Vector = tuple[float, float, float]
+Row = tuple[float, float, float, float]
+Matrix = tuple[Row, Row, Row, Row]
+
+
+@dataclass(frozen=True, slots=True)
+class StatedAxis:
+    """A stage's axis in the scans' frame: a point of it, mm, and its direction, of any length, about which angles count
+    right-handed.
+
+    Raises ConfigError: the direction has no length.
+    """
+
+    point_mm: Vector
+    direction: Vector
+
+    def __post_init__(self) -> None:
+        if not 0 < math.hypot(*self.direction) < math.inf:
+            message = f"direction: expected a vector with a length, found {self.direction}; a stage turns about one"
+            raise ConfigError(message)
+
+
+@dataclass(frozen=True, slots=True)
+class TurntablePoses:
+    """A stage turned the object. axis : None is the stage's own. angles_deg : where it stood at each scan; None is as
+    the scans' reports say.
+    """
+
+    axis: StatedAxis | None = None
+    angles_deg: tuple[float, ...] | None = None
+    kind: Literal["turntable"] = "turntable"
+
+
+@dataclass(frozen=True, slots=True)
+class GivenPoses:
+    """Somebody knows about where the scans belong. matrices : of each scan one that takes its mm to a common frame."""
+
+    matrices: tuple[Matrix, ...]
+    kind: Literal["given"] = "given"
+
+
+StartingPoses = TurntablePoses | GivenPoses
+
+
+@dataclass(frozen=True, slots=True)
+class ModelPlan:
+    """One model. scans : in the frame of the first one it is. poses : where their registration starts from.
+
+    start_error_mm : how far a surface may be from where `poses` put it. voxel_mm : length of the model's edges; None is
+    1.25 times that of the scans'.
+
+    Raises
+    ------
+    ConfigError
+        There are fewer than two scans, or one comes twice; angles or poses are not as many; or a length is not above 0
+        and finite.
+    """
+
+    scans: tuple[UUID, ...]
+    poses: Annotated[StartingPoses, Field(discriminator="kind")] = field(default_factory=TurntablePoses)
+    start_error_mm: float = START_ERROR_MM
+    voxel_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.scans) < 2:
+            message = f"scans: expected two or more, found {len(self.scans)}; scan the object turned"
+            raise ConfigError(message)
+        twice = next((scan for scan in self.scans if self.scans.count(scan) > 1), None)
+        if twice is not None:
+            message = f"scans: expected each once, found {twice} twice; leave one out"
+            raise ConfigError(message)
+        told = self.poses.matrices if isinstance(self.poses, GivenPoses) else self.poses.angles_deg
+        if told is not None and len(told) != len(self.scans):
+            name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"
+            message = f"{name}: expected one for each of {len(self.scans)} scans, in their order, found {len(told)}"
+            raise ConfigError(message)
+        for name, length_mm in (("start_error_mm", self.start_error_mm), ("voxel_mm", self.voxel_mm)):
+            if length_mm is not None and not 0 < length_mm < math.inf:
+                message = f"{name}: expected a finite length above 0 mm, found {length_mm:g}; left out, it is as usual"
+                raise ConfigError(message)
+
+
+_adapter = TypeAdapter(ModelPlan)
+
+
+def plan_json(plan: ModelPlan) -> dict[str, Any]:
+    """The plan as JSON values.
+
+    >>> plan = ModelPlan((UUID(int=1), UUID(int=2)), TurntablePoses(angles_deg=(0.0, 45.0)))
+    >>> plan_from_json(plan_json(plan)) == plan
+    True
+    """
+    document: dict[str, Any] = _adapter.dump_python(plan, mode="json")
+    return document
+
+
+def plan_from_json(document: Mapping[str, Any]) -> ModelPlan:
+    """The inverse of `plan_json`."""
+    return _adapter.validate_python(document)

@@ -1,0 +1,133 @@
+"""Models over a tame bench: scans that are on record, and a combination that writes what a test says."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from uuid import UUID, uuid4
+
+from slrig.combine.desk import ModelDesk
+from slrig.combine.offered import MEDIA_TYPES, REPORT
+from slrig.combine.plan import StartingPoses
+from slrig.errors import ScanCancelledError
+from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.records import JobKind, JobRecord, utc_now
+from slrig.jobs.store import JobStore
+from slrig.model import StageAxis
+from slrig.scan.plan import Progress, ScanPlan
+from slrig.scan.records import plan_json
+from slrig.scan.sweep import sweep
+from tests.unit.scan.bench import Bench
+from tests.unit.scan.fakes import WAIT_S
+
+
+def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = None, mesh: bytes = b"ply") -> UUID:
+    """A scan that succeeded, on a stage if an angle is told."""
+    scan_id = uuid4()
+    folder.scan(scan_id).mkdir()
+    (folder.scan(scan_id) / "mesh.ply").write_bytes(mesh)
+    stage = {} if angle_deg is None else {"stage": {"angle_deg": angle_deg, "turned_by": "table"}}
+    (folder.scan(scan_id) / "report.json").write_text(json.dumps({"format": "slrig-report", **stage}))
+    store.restore(
+        scan_id, plan_json(ScanPlan()), {}, rig="bench", label=None, created_at=utc_now(), started_at=utc_now()
+    )
+    store.pin(scan_id, pinned=False)
+    return scan_id
+
+
+class TameCombining:
+    """Combines nothing. asked : what it was told of each model, meshes, poses. error : raised in place of the next one.
+    While `gate` is clear it goes on; `began` is set when one does.
+    """
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Mapping[str, Path], StartingPoses, float, float | None]] = []
+        self.error: Exception | None = None
+        self.gate = threading.Event()
+        self.gate.set()
+        self.began = threading.Event()
+
+    def __call__(
+        self,
+        meshes: Mapping[str, Path],
+        folder: Path,
+        poses: StartingPoses,
+        /,
+        *,
+        start_error_mm: float,
+        voxel_mm: float | None,
+        progress: Progress,
+        cancelled: Callable[[], bool],
+    ) -> None:
+        self.asked.append((meshes, poses, start_error_mm, voxel_mm))
+        assert list(folder.iterdir()) == []
+        progress("registering", 0.2, f"{len(meshes)} views")
+        self.began.set()
+        while not self.gate.wait(0.01):
+            if cancelled():
+                message = "the model was cancelled"
+                raise ScanCancelledError(message)
+        if self.error is not None:
+            error, self.error = self.error, None
+            raise error
+        model_files(folder, list(meshes))
+
+
+def model_files(folder: Path, names: list[str]) -> None:
+    """The files of a model, as far as they are looked at."""
+    for name in MEDIA_TYPES:
+        (folder / name).write_bytes(name.encode())
+    told = {
+        "format": "slrig-model",
+        "views": [{"name": name, "sigma_mm": 0.002 * number} for number, name in enumerate(names)],
+        "pairs": [{"first": names[0], "second": name} for name in names[1:]],
+        "free": [],
+        "model": {"vertices": 9, "triangles": 12, "voxel_mm": 0.5, "sigma_mm": 0.01},
+    }
+    (folder / REPORT).write_text(json.dumps(told))
+
+
+class ModelBench(Bench):
+    """A desk for models beside a runner of scans. start : begin at once; else what is taken up waits for that."""
+
+    def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: StageAxis | None = None) -> None:
+        super().__init__(root)
+        self.tame = TameCombining()
+        self.models = JobStore(self.store.database, JobKind.MODEL)
+        sweep(self.store, self.folder)
+        self.desk = ModelDesk(
+            self.folder,
+            self.runner.queue,
+            self.models,
+            scans=self.store,
+            combine=self.tame,
+            axis=lambda: axis,
+            keep=keep,
+        )
+        self.runner.spare_what_is_used(self.desk.unused)
+        if start:
+            self.desk.take_up()
+            self.runner.start()
+
+    def kept_scans(self, *angles_deg: float | None) -> tuple[UUID, ...]:
+        return tuple(kept_scan(self.store, self.folder, angle_deg=angle) for angle in angles_deg)
+
+    def over(self, model_id: UUID) -> JobRecord:
+        """The model once it is in a final state."""
+        ended = threading.Event()
+
+        def look() -> None:
+            if self.models.get(model_id).state.final:
+                ended.set()
+
+        unwatch = self.models.watch(model_id, look)
+        look()
+        assert ended.wait(WAIT_S)
+        unwatch()
+        return self.models.get(model_id)
+
+    def close(self) -> None:
+        self.tame.gate.set()
+        super().close()
