@@ -229,11 +229,11 @@ class ServiceSettings(BaseSettings):
     newest `keep_calibrations`, calibrations are removed with their poses, but for the one in use and those that a scan
     or an acceptance test names. Scans are kept unless `keep_scans` (how many), `keep_scans_days` or `keep_scans_bytes`
     sets a limit: beyond it the oldest are removed, but for pinned ones and those whose files were asked for in the last
-    quarter of an hour. `backlog_length` is how many scans may be reconstructed, or wait for that, while the rig shoots
-    the next one; what else computes counts, too. `drain_s` is how long, after SIGTERM, the job that has the rig and
-    those that compute may take to come to their end before they are interrupted; what waits, and what has its frames,
-    goes on at the next start. Nobody but the service's own user may read the data, and the users of `data_group`, if it
-    is set. `log_format` auto is text on a terminal, and JSON lines elsewhere.
+    quarter of an hour. The newest `keep_models` are kept. `backlog_length` is how many scans may be reconstructed, or
+    wait for that, while the rig shoots the next one; what else computes counts, too. `drain_s` is how long, after
+    SIGTERM, the job that has the rig and those that compute may take to come to their end before they are interrupted;
+    what waits, and what has its frames, goes on at the next start. Nobody but the service's own user may read the data,
+    and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, and JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -262,6 +262,8 @@ class ServiceSettings(BaseSettings):
     idempotency_keep_s: Annotated[float, Field(gt=0)] = 86400.0
     page_limit: Annotated[int, Field(ge=1, le=1000)] = 200
     keep_calibrations: Annotated[int, Field(ge=1, le=100_000)] = 100
+    # Some dozen MB each, of scans that may be gone.
+    keep_models: Annotated[int, Field(ge=1, le=100_000)] = 100
     keep_scans: Annotated[int, Field(ge=1)] | None = None
     keep_scans_days: Annotated[float, Field(gt=0)] | None = None
     keep_scans_bytes: Annotated[int, Field(ge=1)] | None = None

@@ -22,7 +22,7 @@ from slrig.bundle.description import CAMERA_NAME
 from slrig.bundle.reading import CALIBRATION
 from slrig.errors import ArtefactNotReadyError
 from slrig.jobs.data_folder import BUNDLE, DataFolder
-from slrig.jobs.records import JobRecord, JobState
+from slrig.jobs.records import JobKind, JobRecord, JobState
 from slrig.scan.artefacts import MESH, ON_REQUEST, converted, write_converted
 from slrig.scan.offered import (
     BAG,
@@ -73,17 +73,20 @@ def _known_files(place: Path) -> set[str]:
     return {path.name for path in known if not path.is_symlink()}
 
 
-def _refuse_absent(record: JobRecord, name: str) -> None:
+def refuse_absent(record: JobRecord, name: str) -> None:
+    """Raise ArtefactNotReadyError, which says why a scan or a model has no such file, or not yet."""
+    kind, here = record.kind, f"/{record.kind}/{record.id}"
     if not record.state.final:
         message = (
-            f"{name} of scan {record.id} is not ready: the scan is {record.state}. "
-            f"Follow /scan/{record.id}/events until it is over."
+            f"{name} of {kind} {record.id} is not ready: the {kind} is {record.state}. "
+            f"Follow {here}/events until it is over."
         )
     elif record.state is JobState.SUCCEEDED:
-        message = f"Scan {record.id} has no file {name}. GET /scan/{record.id} names those it has."
+        message = f"{kind.capitalize()} {record.id} has no file {name}. GET {here} names those it has."
     else:
         why = "" if record.fault is None else f" ({record.fault.message})"
-        message = f"Scan {record.id} was {record.state}, so {name} will never be made{why}. Scan again."
+        again = "Scan again." if kind is JobKind.SCAN else "Make it again."
+        message = f"{kind.capitalize()} {record.id} was {record.state}, so {name} will never be made{why}. {again}"
     raise ArtefactNotReadyError(message)
 
 
@@ -99,7 +102,7 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
             write_converted(place, name)
         made = _made_so_far(service.folder, record, name)
     if made is None and not (record.state.final and service.folder.owns(path)):
-        _refuse_absent(record, path.name)
+        refuse_absent(record, path.name)
     headers = _headers(scan_id, name)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
@@ -107,6 +110,16 @@ def _file(service: Service, scan_id: UUID, name: str, media_type: str, known: st
         headers["Content-Disposition"] = f'inline; filename="{path.name}"'
         return Response(made, media_type=media_type, headers=headers)
     return _kept(path, media_type, headers)
+
+
+def kept_file(path: Path, media_type: str, job_id: UUID, known: str | None) -> Response:
+    """A file that never changes, of a job that is over; 304 where the client knows it."""
+    headers = _headers(job_id, path.name)
+    return (
+        Response(status_code=304, headers=headers)
+        if _still_known(known, headers["ETag"])
+        else _kept(path, media_type, headers)
+    )
 
 
 def _kept(path: Path, media_type: str, headers: dict[str, str]) -> Response:
@@ -122,14 +135,14 @@ def _cloud(service: Service, scan_id: UUID, form: str, camera: str | None, known
     record = service.store.get(scan_id)
     service.scan_retention.reading(scan_id)
     if not record.state.final or not has_sources(service.folder, place, camera):
-        _refuse_absent(record, path.name)
+        refuse_absent(record, path.name)
     headers = _headers(scan_id, path.name)
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)
     if not os.path.lexists(path):
         make_cloud(service, scan_id, form, camera)
     if not service.folder.owns(path):
-        _refuse_absent(record, path.name)
+        refuse_absent(record, path.name)
     return _kept(path, ON_DEMAND[form], headers)
 
 
@@ -145,9 +158,9 @@ def _made_so_far(folder: DataFolder, record: JobRecord, name: str) -> bytes | No
     return None
 
 
-def _headers(scan_id: UUID, name: str) -> dict[str, str]:
-    # A scan's files never change once they are there, and an id is never given twice.
-    return {"ETag": f'"{scan_id}/{name}"', "Cache-Control": "private, no-cache"}
+def _headers(job_id: UUID, name: str) -> dict[str, str]:
+    # A job's files never change once they are there, and an id is never given twice.
+    return {"ETag": f'"{job_id}/{name}"', "Cache-Control": "private, no-cache"}
 
 
 def _still_known(known: str | None, tag: str) -> bool:
@@ -172,7 +185,8 @@ def _serve(name: str, media_type: str) -> Callable[..., Response]:
 _UNCHANGED: dict[int | str, dict[str, Any]] = {304: {"description": "the file is the one whose ETag was sent"}}
 
 
-def _answers(media_type: str, *further: int) -> dict[int | str, dict[str, Any]]:
+def file_answers(media_type: str, *further: int) -> dict[int | str, dict[str, Any]]:
+    """The `responses` of a route that answers with a file that never changes."""
     # A part of a JSON file is no JSON.
     part = {"description": "the range that was asked for", "content": {media_type: {"schema": BYTES}}}
     return {**file_of(media_type, 409, 416, *further), 206: part, **_UNCHANGED}
@@ -185,7 +199,7 @@ for _name, _media_type in MEDIA_TYPES.items():
         _fetch,
         methods=["GET"],
         response_class=Response,
-        responses=_answers(_media_type),
+        responses=file_answers(_media_type),
         operation_id=f"fetch_{_name.replace('.', '_')}",
         summary=f"Fetch {_name}",
     )
@@ -208,13 +222,13 @@ for _form, _media_type in CLOUDS.items():
         _serve_cloud(_form),
         methods=["GET"],
         response_class=Response,
-        responses=_answers(_media_type, 501, 503, 507),
+        responses=file_answers(_media_type, 501, 503, 507),
         operation_id=f"fetch_camera_{_form.replace('-{camera}.', '_')}",
         summary=f"Fetch {_form}",
     )
 
 
-@router.get(f"/{BAG}", response_class=Response, responses=_answers(ON_DEMAND[BAG], 501, 503, 507))
+@router.get(f"/{BAG}", response_class=Response, responses=file_answers(ON_DEMAND[BAG], 501, 503, 507))
 def fetch_bag(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return a finished scan as a ROS 2 bag: points of each camera, white images, and where the devices stand.
 
@@ -223,13 +237,13 @@ def fetch_bag(service: Serving, scan_id: UUID, known: KnownTag = None) -> Respon
     return _cloud(service, scan_id, BAG, None, known)
 
 
-@router.get(f"/{CALIBRATION_USED}", response_class=Response, responses=_answers("application/json"))
+@router.get(f"/{CALIBRATION_USED}", response_class=Response, responses=file_answers("application/json"))
 def fetch_calibration_used(service: Serving, scan_id: UUID, known: KnownTag = None) -> Response:
     """Return the calibration that a finished scan was made with: lenses and poses of its devices."""
     return _file(service, scan_id, f"{BUNDLE}/{CALIBRATION}", "application/json", known)
 
 
-@router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
+@router.get(f"/{rejected_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))
 def fetch_rejected(
     service: Serving,
     scan_id: UUID,
@@ -240,7 +254,7 @@ def fetch_rejected(
     return _file(service, scan_id, rejected_picture(camera), "image/png", known)
 
 
-@router.get(f"/{causes_picture('{camera}')}", response_class=Response, responses=_answers("image/png"))
+@router.get(f"/{causes_picture('{camera}')}", response_class=Response, responses=file_answers("image/png"))
 def fetch_causes(
     service: Serving,
     scan_id: UUID,
@@ -261,7 +275,7 @@ def fetch_bundle(service: Serving, scan_id: UUID, known: KnownTag = None) -> Res
     service.scan_retention.reading(scan_id)
     bundle = service.folder.scan(scan_id) / BUNDLE
     if not record.state.final or not service.folder.owns(bundle):
-        _refuse_absent(record, BUNDLE_ZIP)
+        refuse_absent(record, BUNDLE_ZIP)
     headers = {**_headers(scan_id, BUNDLE_ZIP), "Content-Disposition": f'attachment; filename="{scan_id}.zip"'}
     if _still_known(known, headers["ETag"]):
         return Response(status_code=304, headers=headers)

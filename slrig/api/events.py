@@ -174,10 +174,10 @@ class SharedLooks:
 
 
 _EVERYTHING = _answers(
-    "the events of scans, verifications, poses, solves and positions, as the streams of their own have them, each with "
-    "`job`: its `id`, `kind` and `label`, the `series`, `calibration` or `acceptance` that it belongs to, and `links`. "
-    "Event numbers rise, with gaps. Without a number to begin after, the stream begins with what comes from now on, "
-    "and says first after which number that is. It ends with the service."
+    "the events of scans, verifications, poses, solves, positions and models, as the streams of their own have them, "
+    "each with `job`: its `id`, `kind` and `label`, the `series`, `calibration` or `acceptance` that it belongs to, "
+    "and `links`. Event numbers rise, with gaps. Without a number to begin after, the stream begins with what comes "
+    "from now on, and says first after which number that is. It ends with the service."
 )
 _JOB = _answers(
     "`progress` events with stage, fraction and detail; `captured` when the rig is free of the job, whose "
@@ -206,6 +206,14 @@ async def follow_verification(
 ) -> Response:
     """Follow a verification until it is over. Events that happened before come first."""
     return await _follow_job(place, service, service.verifications.jobs, verification_id, last_event_id)
+
+
+@router.get("/model/{model_id}/events", tags=["model"], response_class=Response, responses=_JOB)
+async def follow_model(
+    place: StreamPlace, service: Serving, model_id: UUID, last_event_id: LastEventId = 0
+) -> Response:
+    """Follow a model until it is over. Events that happened before come first."""
+    return await _follow_job(place, service, service.models.jobs, model_id, last_event_id)
 
 
 @router.get(

@@ -202,21 +202,26 @@ def _chosen(plan: type[Any], request: BaseModel, defaults: ScanDefaults) -> dict
 
 
 class ProgressBody(BaseModel):
-    """How far a scan is: 0 to 1 of the whole."""
+    """How far a job is: 0 to 1 of the whole."""
 
     stage: str
     fraction: Annotated[float, AfterValidator(lambda fraction: round(fraction, 4))]
     detail: str
 
 
-class ScanLinks(BaseModel):
+class JobLinks(BaseModel):
     """Where to go from here. `files` holds those that are ready."""
 
     self: str
     events: str
     cancel: str
-    series: str | None = Field(description="all scans of the series that this one belongs to; null for one alone")
     files: dict[str, str]
+
+
+class ScanLinks(JobLinks):
+    """Where to go from here. `files` holds those that are ready."""
+
+    series: str | None = Field(description="all scans of the series that this one belongs to; null for one alone")
 
 
 def _shown_fault(fault: object) -> object:
@@ -230,12 +235,12 @@ FaultBody = Annotated[
     AnyFault,
     # Already a document, without the members that do not apply; described as what it is.
     WithJsonSchema({"anyOf": [{"$ref": "#/components/schemas/Problem"}, {"type": "null"}]}),
-    Field(description="why the scan did not succeed"),
+    Field(description="why it did not succeed"),
 ]
 
 
-class ScanBody(BaseModel):
-    """A scan on record."""
+class JobBody(BaseModel):
+    """A job on record."""
 
     id: UUID
     state: JobState
@@ -244,12 +249,17 @@ class ScanBody(BaseModel):
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
-    plan: ScanPlan
     progress: ProgressBody
     error: FaultBody
     summary: dict[str, Any] | None = Field(description="the plain figures and the notes of report.json")
-    pinned: bool = Field(description="kept, whatever the settings say of old scans")
     requested_by: str | None = Field(description="the name of the key, or the schedule, that asked for it")
+
+
+class ScanBody(JobBody):
+    """A scan on record."""
+
+    plan: ScanPlan
+    pinned: bool = Field(description="kept, whatever the settings say of old scans")
     links: ScanLinks
 
 

@@ -18,6 +18,7 @@ READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _SCOPES = {
     "session": Scope.LOOK,
     "scan": Scope.SCAN,
+    "model": Scope.SCAN,
     "exposure": Scope.SCAN,
     "calibration": Scope.CALIBRATE,
     "acceptance": Scope.CALIBRATE,

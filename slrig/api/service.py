@@ -18,6 +18,7 @@ from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
+from slrig.combine.desk import CombineInto, ModelDesk
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.data_folder import DataFolder
@@ -71,6 +72,7 @@ class Service:
         *,
         rig_name: str,
         calibration_tools: CalibrationTools | None = None,
+        combine: CombineInto | None = None,
         refuse_when_stale: bool = False,
         wanted_mm: float | None = None,
         presets: Mapping[str, Preset] | None = None,
@@ -115,13 +117,28 @@ class Service:
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
             wanted_mm=wanted_mm,
         )
+        self.models = ModelDesk(
+            folder,
+            runner.queue,
+            JobStore(database, JobKind.MODEL, outbox=outbox),
+            scans=store,
+            combine=combine or worker.task("slrig.combine.combining:combine_into", "model"),
+            keep=settings.keep_models,
+            spare_bytes=spare_bytes,
+        )
+        runner.spare_what_is_used(self.models.unused)
         self.durations = Durations()
         self.traces = traces_by_environment()
-        stores = (store, self.calibrations.register.jobs, self.verifications.jobs, self.acceptance.jobs)
+        self._desks = (self.verifications, self.calibrations, self.acceptance, self.models)
+        stores = (
+            store,
+            self.calibrations.register.jobs,
+            *(each.jobs for each in (self.verifications, self.acceptance, self.models)),
+        )
         self.feed = JobFeed(*stores)
         for jobs in stores:
             jobs.after_end = partial(self._ended, jobs)
-        for desk in (self.verifications, self.calibrations, self.acceptance):
+        for desk in self._desks:
             desk.take_up()
         self.retention = Retention(
             self.calibrations,
@@ -171,7 +188,7 @@ class Service:
         self.runner.close(timeout_s=self.settings.shutdown_s)
         # A run that held a deaf driver has its answer now.
         self.scheduler.close(timeout_s=_SCHEDULE_END_S)
-        for desk in (self.verifications, self.calibrations, self.acceptance):
+        for desk in self._desks:
             desk.close()
         self.feed.end()
 

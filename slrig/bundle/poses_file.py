@@ -10,13 +10,13 @@ be absent: who knows the axis alone writes that.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from slrig.bundle.calibration_file import Vector3
 from slrig.bundle.faults import Strict, read_description_of
@@ -45,22 +45,24 @@ class AxisEntry(Strict):
         return self
 
 
+def _rigid(rows: list[Row]) -> list[Row]:
+    pose = np.array(rows)
+    turn = pose[:3, :3]
+    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROUNDED and np.linalg.det(turn) > 0
+    if not rigid or (pose[3] != [0, 0, 0, 1]).any():
+        raise ValueError(f"expected a rotation and a shift, and 0 0 0 1 below, found {rows}")
+    return rows
+
+
+PoseEntry = Annotated[list[Row], Field(min_length=4, max_length=4), AfterValidator(_rigid)]
+"""A rigid motion, 4 x 4, to the digits that it is written with."""
+
+
 class ViewEntry(Strict):
     """One view and its pose."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
-    pose: Annotated[list[Row], Field(min_length=4, max_length=4)]
-
-    @model_validator(mode="after")
-    def _is_rigid(self) -> Self:
-        pose = np.array(self.pose)
-        turn = pose[:3, :3]
-        rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROUNDED and np.linalg.det(turn) > 0
-        if not rigid or (pose[3] != [0, 0, 0, 1]).any():
-            raise ValueError(
-                f"pose of {self.name}: expected a rotation and a shift, and 0 0 0 1 below, found {self.pose}"
-            )
-        return self
+    pose: PoseEntry
 
 
 class PosesEntry(Strict):
@@ -88,11 +90,12 @@ def read_poses(path: Path) -> Poses:
         twice = next(name for name in names if names.count(name) > 1)
         raise ConfigError(f"{path}: expected each view once, found two poses of '{twice}'; leave one out")
     axis = None if entry.axis is None else (np.array(entry.axis.point_mm), np.array(entry.axis.direction))
-    return Poses({view.name: _rotating(np.array(view.pose)) for view in entry.views}, axis)
+    return Poses({view.name: rotating(view.pose) for view in entry.views}, axis)
 
 
-def _rotating(pose: FloatArray) -> FloatArray:
-    """The pose with the nearest rotation to what was written of it: the two agree to the digits that were."""
+def rotating(entry: Sequence[Sequence[float]]) -> FloatArray:
+    """(4, 4): the pose with the nearest rotation to what was written of it: the two agree to the digits that were."""
+    pose = np.array(entry)
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right
     return pose

@@ -141,7 +141,7 @@ def _starts(names: Sequence[str], angle: float | None, axis: StatedAxis | None, 
     if missing:
         message = f"{file}: expected a pose of every scan, found none of {', '.join(missing)}; there are: "
         raise ConfigError(message + (", ".join(known) or "none"))
-    return GivenPoses(tuple(known[name].tolist() for name in names))
+    return GivenPoses.of(known[name] for name in names)
 
 
 def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> StatedAxis | None:
@@ -155,7 +155,7 @@ def _axis(file: Path | None, point: Vector | None, direction: Vector | None) -> 
         axis = read_poses(file).axis
         if axis is None:
             raise ConfigError(f"{file}: expected the key axis, with point_mm and direction, found none; write it there")
-        return StatedAxis(*(tuple(each.tolist()) for each in axis))
+        return StatedAxis.of(*axis)
     return None if point is None or direction is None else StatedAxis(point, direction)
 
 

@@ -17,6 +17,7 @@ from slrig.client.core import Core, Json, W
 from slrig.client.endpoints import (
     Acceptance,
     Calibrations,
+    Models,
     Presets,
     RigHealth,
     RigState,
@@ -43,6 +44,7 @@ class _Service(Remote[W]):
     def __init__(self, wire: W) -> None:
         super().__init__(Core(wire))
         self.scans = Scans(self.core)
+        self.models = Models(self.core)
         self.presets = Presets(self.core)
         self.rig = RigState(self.core)
         self.calibration = Calibrations(self.core)

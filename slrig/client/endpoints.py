@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 from slrig.client.core import Core, Json, W
-from slrig.client.errors import RefusedError
+from slrig.client.errors import ModelFailedError, RefusedError
 from slrig.client.events import Event
 from slrig.client.operations import Operation, Remote, endpoint, entry, stream
 
@@ -85,6 +85,51 @@ class Scans(Remote[W]):
     @stream("GET /scan/{scan_id}/events", Core.follow)
     def follow(self, scan_id: str) -> Event:
         """What happens to a scan until it is over, from its beginning."""
+
+
+class Models(Remote[W]):
+    """Models: several scans of one object, made one mesh."""
+
+    @endpoint("POST /model", once=True)
+    def start(
+        self,
+        scans: Sequence[str],
+        *,
+        poses: Literal["turntable"] | Sequence[Sequence[Sequence[float]]] | None = None,
+        angles_deg: Sequence[float] | None = None,
+        axis: Mapping[str, Any] | None = None,
+        start_error_mm: float | None = None,
+        voxel_mm: float | None = None,
+        label: str | None = None,
+    ) -> Json:
+        """Have scans made one mesh, and return the model as it is on record; `wait` returns it when it is over."""
+
+    list = entry("GET /model", _paged, "A page of models from new to old: `models`, and `next`.")
+    look = entry("GET /model/{model_id}", _told_of, "A model: its state, how far it is, and where its files are.")
+    delete = entry("DELETE /model/{model_id}", _done_to, "Delete a model that is over with all its files.")
+    cancel = entry("POST /model/{model_id}/cancel", _told_of, "Ask a model to stop.")
+    file = entry("GET /model/{model_id}/{name}", _file_of, "A file of a model, by its name.")
+
+    @stream("GET /model/{model_id}/events", Core.follow)
+    def follow(self, model_id: str) -> Event:
+        """What happens to a model until it is over, from its beginning."""
+
+    @Operation
+    async def wait(self, model_id: str) -> Json:
+        """The model once it is over. `Client.fetch` writes a file of its `links`.
+
+        Raises
+        ------
+        ModelFailedError
+            It did not succeed.
+        """
+        path = f"/model/{model_id}"
+        async for _ in self.core.follow(f"{path}/events"):
+            pass
+        model: Json = await self.core.content("Json", "GET", path)
+        if model["state"] != "succeeded":
+            raise ModelFailedError(model)
+        return model
 
 
 class Presets(Remote[W]):

@@ -70,6 +70,15 @@ class ScanFailedError(RefusedError):
         self.scan = dict(scan)
 
 
+class ModelFailedError(RefusedError):
+    """A model was not made, or cancelled. model : as it is on record."""
+
+    def __init__(self, model: Mapping[str, Any]) -> None:
+        fault = model["error"]
+        super().__init__({**fault, "detail": f"Model {model['id']} {model['state']}: {fault['detail']}"})
+        self.model = dict(model)
+
+
 _KINDS = {
     401: UnauthorizedError,
     403: UnauthorizedError,

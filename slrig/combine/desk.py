@@ -167,8 +167,7 @@ class ModelDesk:
                     "in the scans' frame, or give the poses"
                 )
                 raise ConfigError(message)
-            point, direction = axis.point_mm.tolist(), axis.direction.tolist()
-            poses = replace(poses, axis=StatedAxis(tuple(point), tuple(direction)))
+            poses = replace(poses, axis=StatedAxis.of(axis.point_mm, axis.direction))
         if poses.angles_deg is None:
             told = {scan: self._stage_angle_deg(scan) for scan in plan.scans}
             untold = [str(scan) for scan, angle in told.items() if angle is None]

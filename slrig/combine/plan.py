@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self, cast
 from uuid import UUID
 
 from pydantic import Field, TypeAdapter
 
 from slrig.errors import ConfigError
+from slrig.model import FloatArray
 
 START_ERROR_MM = 3.0
 """See `slrig.views.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
@@ -36,6 +37,12 @@ class StatedAxis:
             message = f"direction: expected a vector with a length, found {self.direction}; a stage turns about one"
             raise ConfigError(message)
 
+    @classmethod
+    def of(cls, point_mm: Iterable[float], direction: Iterable[float]) -> Self:
+        """The same of any three numbers each."""
+        (x, y, z), (a, b, c) = map(float, point_mm), map(float, direction)
+        return cls((x, y, z), (a, b, c))
+
 
 @dataclass(frozen=True, slots=True)
 class TurntablePoses:
@@ -54,6 +61,11 @@ class GivenPoses:
 
     matrices: tuple[Matrix, ...]
     kind: Literal["given"] = "given"
+
+    @classmethod
+    def of(cls, poses: Iterable[FloatArray]) -> Self:
+        """The same of (4, 4) each."""
+        return cls(tuple(cast("Matrix", tuple(map(tuple, pose.tolist()))) for pose in poses))
 
 
 StartingPoses = TurntablePoses | GivenPoses

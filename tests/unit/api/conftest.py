@@ -23,6 +23,7 @@ from slrig.jobs.worker import Worker
 from slrig.rig.session import RigSession
 from slrig.scan.runner import Runner
 from tests.unit.calibrate.calibration_bench import TameCalibrating
+from tests.unit.combine.model_bench import TameCombining
 from tests.unit.scan.fakes import WAIT_S, TameBench
 
 KEY = "the key of the tests"
@@ -44,6 +45,7 @@ class ServedBench(TameBench):
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)
         defaults = ScanDefaults(line_shift_period_px=6, exposure_s=0.5)
         self.tame = TameCalibrating(self)
+        self.combining = TameCombining()
         self.service = Service(
             chosen,
             defaults,
@@ -53,6 +55,7 @@ class ServedBench(TameBench):
             self.worker,
             rig_name="bench",
             calibration_tools=self.tame.tools(),
+            combine=self.combining,
         )
         self.app: FastAPI = create_app(self.service, ring=KeyRing(root / "keys.json", given=KEY))
 

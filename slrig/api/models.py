@@ -1,0 +1,156 @@
+"""/model: have scans of one object from several sides made one mesh, follow that, and fetch it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal, Self
+from uuid import UUID
+
+from fastapi import APIRouter, Response
+from pydantic import BaseModel, Field, model_validator
+
+from slrig.api.artefacts import KnownTag, file_answers, kept_file, refuse_absent
+from slrig.api.idempotency import IdempotencyKey, started_once
+from slrig.api.openapi import problems
+from slrig.api.schemas import JobBody, JobLinks, filled
+from slrig.api.service import Cursor, PageLength, Service, Serving, paged
+from slrig.bundle.faults import Strict
+from slrig.bundle.free_text import FreeText
+from slrig.bundle.poses_file import MOST_VIEWS, AxisEntry, PoseEntry, rotating
+from slrig.combine.offered import MEDIA_TYPES
+from slrig.combine.plan import START_ERROR_MM, GivenPoses, ModelPlan, StartingPoses, StatedAxis, TurntablePoses
+from slrig.jobs.records import JobRecord, JobState
+
+router = APIRouter(prefix="/model", tags=["model"])
+
+
+class ModelRequest(Strict):
+    """A model of scans on record."""
+
+    scans: Annotated[list[Annotated[UUID, Field(strict=False)]], Field(min_length=2, max_length=MOST_VIEWS)] = Field(
+        description="ids of scans that succeeded; the model is in the frame of the first"
+    )
+    poses: Literal["turntable"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = Field(
+        default="turntable",
+        description='about where the scans belong. "turntable": a stage turned the object. Or of each scan a motion, '
+        "4 × 4, that takes its mm to a common frame",
+    )
+    angles_deg: Annotated[list[float], Field(max_length=MOST_VIEWS)] | None = Field(
+        default=None,
+        description="of a turntable: where the stage stood at each scan, right-handed about its axis. Default: as the "
+        "scans' reports say",
+    )
+    axis: AxisEntry | None = Field(
+        default=None, description="of a turntable, in the scans' frame. Default: the stage's own, where it is known"
+    )
+    start_error_mm: Annotated[float, Field(ge=0.01, le=100)] = Field(
+        default=START_ERROR_MM, description="how far a surface may be from where poses, or angles and axis, put it"
+    )
+    voxel_mm: Annotated[float, Field(ge=0.001, le=1000)] | None = Field(
+        default=None, description="length of the model's edges. Default: 1.25 times that of the scans'"
+    )
+    label: FreeText | None = Field(default=None, description="free text, to find the model again")
+
+    @model_validator(mode="after")
+    def _of_a_turntable(self) -> Self:
+        told = [name for name in ("angles_deg", "axis") if getattr(self, name) is not None]
+        if self.poses != "turntable" and told:
+            message = f'{told[0]}: expected "poses": "turntable" beside it, found poses; leave one of them out'
+            raise ValueError(message)
+        return self
+
+    def plan(self) -> ModelPlan:
+        """What is asked for. Raises ConfigError: see `ModelPlan`."""
+        poses: StartingPoses
+        if self.poses != "turntable":
+            poses = GivenPoses.of(map(rotating, self.poses))
+        else:
+            axis = None if self.axis is None else StatedAxis.of(self.axis.point_mm, self.axis.direction)
+            poses = TurntablePoses(axis, None if self.angles_deg is None else tuple(self.angles_deg))
+        return ModelPlan(tuple(self.scans), poses, start_error_mm=self.start_error_mm, voxel_mm=self.voxel_mm)
+
+
+class ModelBody(JobBody):
+    """A model on record. `plan` has the axis and the angles that it is made with."""
+
+    plan: ModelPlan
+    links: JobLinks
+
+
+class ModelPage(BaseModel):
+    """Models from new to old. `next` asks for the page after this one, null on the last."""
+
+    models: list[ModelBody]
+    next: str | None
+
+
+@router.post("", status_code=202, responses=problems(404, 409, 429, 503, 507))
+def start_model(
+    service: Serving, response: Response, request: ModelRequest, idempotency_key: IdempotencyKey = None
+) -> ModelBody:
+    """Make one mesh of scans. It takes no rig, and the answer comes at once; follow `links.events` for the rest."""
+    desk = service.models
+
+    def start(key: str | None) -> UUID:
+        return desk.combine(request.plan(), label=request.label, key=key).id
+
+    record = started_once(service.keys, desk.jobs, idempotency_key, "/model", request, start)
+    response.headers["Location"] = f"/model/{record.id}"
+    return _body(service, record)
+
+
+@router.get("")
+def list_models(service: Serving, response: Response, cursor: Cursor = None, limit: PageLength = 50) -> ModelPage:
+    """List models from new to old."""
+    jobs = service.models.jobs
+    shown, following = paged(lambda most: jobs.page(before=cursor, limit=most), limit, "/model", service, response)
+    return ModelPage(models=[_body(service, record) for record in shown], next=following)
+
+
+@router.get("/{model_id}")
+def look_at_model(service: Serving, model_id: UUID) -> ModelBody:
+    """Return a model: its state, how far it is, and where its files are."""
+    return _body(service, service.models.jobs.get(model_id))
+
+
+@router.post("/{model_id}/cancel", status_code=202)
+def cancel_model(service: Serving, model_id: UUID) -> ModelBody:
+    """Ask a model to stop. May be repeated; one that is over stays as it is."""
+    return _body(service, service.models.cancel(model_id))
+
+
+@router.delete("/{model_id}", status_code=204, responses=problems(409, 507))
+def delete_model(service: Serving, model_id: UUID) -> None:
+    """Delete a model that is over with all its files. Its scans stay."""
+    service.models.delete(model_id)
+
+
+def _serve(name: str, media_type: str) -> Callable[..., Response]:
+    def fetch(service: Serving, model_id: UUID, known: KnownTag = None) -> Response:
+        record, path = service.models.jobs.get(model_id), service.models.store.place(model_id) / name
+        if record.state is not JobState.SUCCEEDED or not service.folder.owns(path):
+            refuse_absent(record, name)
+        return kept_file(path, media_type, model_id, known)
+
+    fetch.__doc__ = f"Return {name} of a model that succeeded. ETags and ranges are honoured."
+    return fetch
+
+
+for _name, _media_type in MEDIA_TYPES.items():
+    router.add_api_route(
+        f"/{{model_id}}/{_name}",
+        _serve(_name, _media_type),
+        methods=["GET"],
+        response_class=Response,
+        responses=file_answers(_media_type),
+        operation_id=f"fetch_model_{_name.removeprefix('model.').replace('.', '_')}",
+        summary=f"Fetch {_name} of a model",
+    )
+
+
+def _body(service: Service, record: JobRecord) -> ModelBody:
+    here, place = f"/model/{record.id}", service.models.store.place(record.id)
+    ready = [name for name in MEDIA_TYPES if record.state is JobState.SUCCEEDED and service.folder.owns(place / name)]
+    files = {name: f"{here}/{name}" for name in ready}
+    links = JobLinks(self=here, events=f"{here}/events", cancel=f"{here}/cancel", files=files)
+    return filled(ModelBody, record, error=record.fault, links=links)
