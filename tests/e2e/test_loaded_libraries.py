@@ -44,6 +44,10 @@ def worked(service: ServiceProcess) -> None:
         for name in (each for each in scan["links"]["files"] if each.startswith(("points-", "depth-", "mesh."))):
             assert caller.http.get(scan["links"]["files"][name]).status_code == 200, name
         assert caller.http.get("/calibration/board.pdf").content[:4] == b"%PDF"
+        still = [[float(row == column) for column in range(4)] for row in range(4)]
+        model = caller.post("/model", 202, scans=[scan["id"], scanned(service)["id"]], poses=[still, still])
+        caller.http.get(model["links"]["events"])
+        assert caller.get(model["links"]["self"])["state"] == "succeeded", caller.get(model["links"]["self"])["error"]
         made = caller.post("/calibration", 201, board=BOARD)
         caller.post(made["links"]["pose"], 202)
         (pose,) = caller.settled(made)["shot"]

@@ -12,9 +12,11 @@ from typer.testing import CliRunner, Result
 
 from slrig.bundle.poses_file import Poses, encode_poses, read_poses
 from slrig.cli.commands import app
+from slrig.combine import plan
 from slrig.errors import ConfigError
 from slrig.meshing.topology import topology_counts
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
+from slrig.views import registration
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen, vase
 
 ANGLE = 40.0
@@ -82,6 +84,10 @@ def test_scans_of_a_stage_are_placed_and_their_poses_place_them_again(scans: Pat
     two = read_poses(tmp_path / "two" / "poses.json").poses
     back = np.linalg.inv(known.poses["scan-11"]) @ known.poses["scan-10"]
     assert displacement_mm(views[1], two["scan-10"], back) < 0.02
+
+
+def test_how_far_starts_may_be_off_is_said_once() -> None:
+    assert plan.START_ERROR_MM == registration.START_ERROR_MM
 
 
 def test_a_vase_is_told_to_be_free(scans: Path, tmp_path: Path) -> None:
