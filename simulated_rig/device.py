@@ -14,9 +14,10 @@ from simulated_rig.projector import SimulatedProjector
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import read_scene
 from simulated_rig.staging import Script, Staging
+from simulated_rig.turning import RenderedTurntable
 from simulated_rig.world import Flicker, VirtualClock
 from slrig.bundle.faults import checked
-from slrig.devices import Camera, Clock, Head, SystemClock, progress_reporter
+from slrig.devices import Camera, Clock, Head, Positioner, SystemClock, progress_reporter
 from slrig.kernels import compilations_told
 from slrig.model import Calibration, Surface, Truth
 
@@ -55,6 +56,9 @@ class SimulatedHead:
             for camera in options.camera
         }
         self._staging = Staging(options, script, self._stage, self._views, self.clock)
+        self._positioner: Positioner | None = self._staging if self._staging.poses else None
+        if options.turntable is not None:
+            self._positioner = RenderedTurntable(options.turntable, self._staging.turn_table, seed=options.seed)
         self._projector = SimulatedProjector(
             options.projector, self.clock, faults=options.faults, seed=options.seed, staging=self._staging
         )
@@ -102,9 +106,9 @@ class SimulatedHead:
                 view.prepare(told=partial(_tell_traced, tell, name))
 
     @property
-    def positioner(self) -> Staging | None:
-        """See `slrig.devices.Positions`. None where the options have no poses."""
-        return self._staging if self._staging.poses else None
+    def positioner(self) -> Positioner | None:
+        """See `slrig.devices.Positions`. None where the options have neither poses nor a turntable."""
+        return self._positioner
 
     def truth(self) -> Truth:
         """See `Head`. Of what stands there now. Works in every state, also after close."""

@@ -13,14 +13,14 @@ from simulated_rig.light import Response
 from simulated_rig.optics import look_at
 from simulated_rig.poses import Pose, PoseSeries
 from simulated_rig.sensor import Sensor
-from simulated_rig.tables import Fraction, NotNegative, Pair, Positive, Triple, at_least_one
+from simulated_rig.tables import Fraction, Names, NotNegative, Pair, Positive, Triple, at_least_one
+from simulated_rig.turning import TurntableOptions
 from slrig.bundle.faults import Strict
 from slrig.errors import CalibrationError
 from slrig.model import Pinhole, Size
 
 Count = Annotated[int, Field(ge=0)]
 Counts = Annotated[tuple[Count, ...], Field(strict=False)]
-Names = Annotated[tuple[str, ...], Field(strict=False)]
 PixelExtent = Annotated[int, Field(ge=16, le=16384)]
 Row = Triple
 
@@ -359,6 +359,9 @@ class HeadOptions(Strict, use_attribute_docstrings=True):
 
     poses: PoseSeries | None = None
     """The same, made up; after those that are listed."""
+
+    turntable: TurntableOptions | None = None
+    """What turns the scene's objects, instead of a script."""
 
     drift: Annotated[tuple[Drift, ...], Field(strict=False)] = ()
     """Devices that move slowly."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -70,6 +70,16 @@ class Placed(Standing):
     def colours(self) -> tuple[Colour, Colour]:
         """See `Standing`."""
         return self.colour, self.colour if self.texture.colour is None else self.texture.colour
+
+
+Thing = TypeVar("Thing", bound=Standing)
+
+
+def put(thing: Thing, position_mm: FloatArray, rotation: FloatArray) -> Thing:
+    """The same object in another pose. rotation : (3, 3), object to world."""
+    x, y, z = (float(each) for each in position_mm)
+    a, b, c = (float(each) for each in Rotation.from_matrix(rotation).as_euler("xyz", degrees=True))
+    return thing.model_copy(update={"position_mm": (x, y, z), "rotation_deg": (a, b, c)})
 
 
 def turned_by(rotation_deg: Triple) -> FloatArray:

@@ -11,14 +11,16 @@ from scipy.spatial.transform import Rotation
 from simulated_rig.boards import Board
 from simulated_rig.disturbing import PROJECTOR, Moving, Push, pushed
 from simulated_rig.options import HeadOptions
-from simulated_rig.placed import Standing, turned_by
+from simulated_rig.placed import Standing, put, turned_by
 from simulated_rig.poses import Pose, made_up
 from simulated_rig.rendering import Stage, View
 from simulated_rig.scene import Scene, SceneSurface, surface_of
 from simulated_rig.world import NS_PER_S
 from slrig.devices import Clock
 from slrig.errors import ConfigError, DeviceStateError, UnsupportedByDeviceError
-from slrig.model import Pinhole
+from slrig.model import FloatArray, Pinhole
+
+_BACKDROP = "backdrop"
 
 
 class Script:
@@ -29,7 +31,7 @@ class Script:
         self._folder = folder
         self.poses: tuple[Pose, ...] = options.pose
         boards = [thing for thing in scene.object if isinstance(thing, Board)]
-        self._mover: Standing | None = boards[0] if boards else scene.object[0]
+        self._mover: Standing = boards[0] if boards else scene.object[0]
         faults: list[str] = []
         if options.poses is not None:
             if boards:
@@ -48,6 +50,17 @@ class Script:
                 faults.append(f"pose {number + 1}: there is no object {pose.object!r}; the scene has {sorted(names)}")
             else:
                 self._moved.append(boards[0] if pose.object is None else names[pose.object])
+        table = options.turntable
+        if table is not None and (options.pose or options.poses is not None):
+            faults.append(
+                "[head.turntable] beside [[head.pose]] or [head.poses]: what stands there moves by one of them"
+            )
+        wanted = set(names) - {_BACKDROP} if table is None or table.objects is None else set(table.objects)
+        faults += [
+            f"turntable.objects: there is no object {name!r}; the scene has {sorted(names)}"
+            for name in sorted(wanted - set(names))
+        ]
+        self._on_table = tuple(thing.name in wanted for thing in scene.object)
         count = len(self.poses)
         for what, at in (
             *(("faults.bump", bump.pose) for bump in options.faults.bump),
@@ -64,23 +77,32 @@ class Script:
         """The poses by name."""
         return tuple(pose.name or f"pose {number + 1}" for number, pose in enumerate(self.poses))
 
-    def surface(self, index: int, movings: Sequence[tuple[Moving, float]] = ()) -> SceneSurface:
-        """The scene at a pose, after a share of each movement. Without poses: as the scene file has it."""
+    def surface(
+        self, index: int, movings: Sequence[tuple[Moving, float]] = (), *, turn: FloatArray | None = None
+    ) -> SceneSurface:
+        """The scene at a pose, after a share of each movement, and after the turntable's turn, (4, 4) in the world.
+        Without poses: as the scene file has it.
+        """
         scripted = self.poses[index] if self.poses else None
         mover = self._moved[index] if self.poses else self._mover
-        if mover is None or (scripted is None and not movings):
-            return surface_of(self._scene, self._folder)
-        stand = scripted if scripted is not None else mover
-        position, turn = np.array(stand.position_mm), turned_by(stand.rotation_deg)
-        for moving, share in movings:
-            position = position + share * np.array(moving.shift_mm)
-            turn = Rotation.from_rotvec(share * np.deg2rad(moving.turn_deg)).as_matrix() @ turn
-        x, y, z = (float(each) for each in position)
-        a, b, c = (float(each) for each in Rotation.from_matrix(turn).as_euler("xyz", degrees=True))
-        if scripted is not None and not movings:
-            a, b, c = scripted.rotation_deg
-        placed = {"position_mm": (x, y, z), "rotation_deg": (a, b, c)}
-        things = tuple(each.model_copy(update=placed) if each is mover else each for each in self._scene.object)
+        things = self._scene.object
+        if scripted is not None or movings:
+            stand = scripted if scripted is not None else mover
+            position, rotation = np.array(stand.position_mm), turned_by(stand.rotation_deg)
+            for moving, share in movings:
+                position = position + share * np.array(moving.shift_mm)
+                rotation = Rotation.from_rotvec(share * np.deg2rad(moving.turn_deg)).as_matrix() @ rotation
+            exact = {} if scripted is None or movings else {"rotation_deg": scripted.rotation_deg}
+            things = tuple(
+                put(each, position, rotation).model_copy(update=exact) if each is mover else each for each in things
+            )
+        if turn is not None:
+            things = tuple(
+                put(each, turn[:3, :3] @ each.position_mm + turn[:3, 3], turn[:3, :3] @ turned_by(each.rotation_deg))
+                if on_table
+                else each
+                for each, on_table in zip(things, self._on_table, strict=True)
+            )
         return surface_of(self._scene.model_copy(update={"object": things}), self._folder)
 
 
@@ -107,6 +129,7 @@ class Staging:
         self._pattern_count = 1
         self._shows = 0
         self._step: tuple[int, ...] = ()
+        self._turn: FloatArray | None = None
         self._closed = False
         self._set_devices()
 
@@ -133,6 +156,11 @@ class Staging:
         self._set_objects()
         self._set_devices()
 
+    def turn_table(self, turn: FloatArray) -> None:
+        """Have what stands on the turntable stand turned, (4, 4) in the world, from where the scene file has it."""
+        self._turn = turn
+        self._set_objects()
+
     def close(self) -> None:
         """See `Positioner`."""
         self._closed = True
@@ -154,7 +182,7 @@ class Staging:
             step = tuple(done * moving.steps // self._pattern_count for moving in movings)
             if step != (self._step or (0,) * len(step)):
                 shares = [at / (moving.steps - 1) for at, moving in zip(step, movings, strict=True)]
-                surface = self._script.surface(self._index, list(zip(movings, shares, strict=True)))
+                surface = self._script.surface(self._index, list(zip(movings, shares, strict=True)), turn=self._turn)
                 self._stage.change(surface=surface)
             self._step = step
         self._shows += 1
@@ -165,7 +193,7 @@ class Staging:
 
     def _set_objects(self) -> None:
         self._step = ()
-        self._stage.change(surface=self._script.surface(self._index))
+        self._stage.change(surface=self._script.surface(self._index, turn=self._turn))
 
     def _set_devices(self) -> None:
         time_s = (self._clock.now_ns() - self._t_opened_ns) / NS_PER_S

@@ -3,7 +3,7 @@
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
-from slrig.devices.positioner import Positioner, Positions, Turntable
+from slrig.devices.positioner import EvenPoses, Positioner, Positions, Turntable
 from slrig.devices.projector import FlashedProjector, Projector, ProjectorInfo, ProjectorState, Shown, UnprovenLight
 from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
@@ -17,6 +17,7 @@ __all__ = [
     "CameraSettings",
     "CameraState",
     "Clock",
+    "EvenPoses",
     "FlashedProjector",
     "FoundDevice",
     "Head",

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+from slrig.errors import UnsupportedByDeviceError
 from slrig.model import StageAxis
 
 
@@ -59,3 +61,34 @@ class Positions(Protocol):
     def positioner(self) -> Positioner | None:
         """What moves the object before it; None where a person does."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class EvenPoses:
+    """The poses that a turntable offers where it can turn to any angle: `count` of them, evenly round the axis."""
+
+    count: int
+
+    @property
+    def angles_deg(self) -> tuple[float, ...]:
+        """From 0 on."""
+        return tuple(360.0 * number / self.count for number in range(self.count))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The angles, as text.
+
+        >>> EvenPoses(3).names
+        ('0°', '120°', '240°')
+        """
+        return tuple(f"{angle_deg:g}°" for angle_deg in self.angles_deg)
+
+    def angle_deg(self, index: int) -> float:
+        """The angle of a pose. Raises UnsupportedByDeviceError: there is no such pose."""
+        if not 0 <= index < self.count:
+            message = (
+                f"asked for pose {index}, the turntable has poses 0 to {self.count - 1}: {', '.join(self.names)}; take "
+                "one of them, or another number of `poses` in the rig file"
+            )
+            raise UnsupportedByDeviceError(message)
+        return self.angles_deg[index]

@@ -13,8 +13,11 @@ from slrig.scan.plan import ScanPlan
 from tests.golden.test_bundles import reconstructed
 
 _ALL = (Path(__file__).parents[2] / "config" / "rigs").glob("*.toml")
-# Those that calibrate carry no calibration, and a board; those without a head are examples for live devices.
-RIGS = sorted(path for path in _ALL if not path.stem.startswith("rendered-") and read_rig(path).head is not None)
+# Those that calibrate carry no calibration, and a board; those without a head are examples for live devices; and of the
+# figure on the turntable, small and seen by few pixels, most lies beside an edge.
+RIGS = sorted(
+    path for path in _ALL if not path.stem.startswith(("rendered-", "turntable")) and read_rig(path).head is not None
+)
 FIRST = "two_cameras"
 
 
