@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from simulated_rig.tables import Names, NotNegative, Triple
 from slrig.bundle.faults import Strict
-from slrig.devices import EvenPoses
+from slrig.devices import AnyAngle
 from slrig.errors import DeviceStateError, UnsupportedByDeviceError
 from slrig.model import FloatArray, StageAxis
 
@@ -74,16 +74,16 @@ class TurntableOptions(Strict, use_attribute_docstrings=True):
         return motion
 
 
-class RenderedTurntable:
+class RenderedTurntable(AnyAngle):
     """Implements `slrig.devices.Turntable` on the rendered world.
 
     turn_objects : has what stands on the table stand turned, by a motion (4, 4) from where the scene file has it.
     """
 
     def __init__(self, options: TurntableOptions, turn_objects: Callable[[FloatArray], None], *, seed: int) -> None:
+        super().__init__(options.poses)
         self._options = options
         self._turn_objects = turn_objects
-        self._even = EvenPoses(options.poses)
         self._rng = np.random.default_rng((seed, _SEED))
         self._asked_deg = 0.0
         self._closed = False
@@ -92,20 +92,6 @@ class RenderedTurntable:
     def axis(self) -> StageAxis | None:
         """See `Turntable`. Without the errors."""
         return self._options.axis if self._options.knows_axis else None
-
-    @property
-    def poses(self) -> Sequence[str]:
-        """See `Positioner`."""
-        return self._even.names
-
-    @property
-    def angles_deg(self) -> Sequence[float]:
-        """See `Turntable`."""
-        return self._even.angles_deg
-
-    def move(self, index: int) -> None:
-        """See `Positioner`."""
-        self.turn(self._even.angle_deg(index))
 
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`. It is there at once, and stays where it is when it is there already."""

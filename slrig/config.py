@@ -108,13 +108,14 @@ class AccuracyTable(Strict, use_attribute_docstrings=True):
 
 
 class RigTable(Strict):
-    """A rig file: either `[head]`, or `[projector]` and one `[[camera]]` or more."""
+    """A rig file: either `[head]`, or `[projector]` and one `[[camera]]` or more. `[positioner]` moves the object."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     calibration: Annotated[str, Field(min_length=1, description="path, relative to the rig file")] | None = None
     head: HeadTable | None = None
     projector: DriverTable | None = None
     camera: Annotated[list[CameraTable], Field(default_factory=list)]
+    positioner: DriverTable | None = None
     synchronisation: SynchronisationTable | None = None
     verification: VerificationTable = VerificationTable()
     accuracy: AccuracyTable = AccuracyTable()
@@ -153,7 +154,7 @@ class RigTable(Strict):
 class RigConfig:
     """A checked rig file. `folder` is where it lies: paths in it are relative to that folder.
 
-    Either `head` is given, or `projector` and `cameras`.
+    Either `head` is given, or `projector` and `cameras`. positioner : what moves the object, but for a head's own.
     """
 
     name: str
@@ -167,6 +168,7 @@ class RigConfig:
     refuse_when_stale: bool = False
     wanted_mm: float | None = None
     presets: Mapping[str, Preset] = field(default_factory=dict)
+    positioner: DriverTable | None = None
 
 
 def read_rig(path: Path) -> RigConfig:
@@ -209,6 +211,7 @@ def rig_of(data: Mapping[str, Any], path: Path) -> RigConfig:
         refuse_when_stale=table.verification.refuse_when_stale,
         wanted_mm=table.accuracy.wanted_mm,
         presets=table.presets,
+        positioner=table.positioner,
     )
 
 

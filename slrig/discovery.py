@@ -2,8 +2,9 @@
 
 A driver package declares factories in the groups below; slrig names no driver. A camera's factory is
 `open_camera(name, options, folder) -> Camera`, a projector's `open_projector(options, folder) -> Projector`, a head's
-`open_head(options, folder) -> Head`; `options` are the driver's own keys of the rig file, `folder` is where that file
-lies. A finder is `find_devices() -> tuple[FoundDevice, ...]`.
+`open_head(options, folder) -> Head`, a positioner's `open_positioner(options, folder) -> Positioner`; `options` are the
+driver's own keys of the rig file, `folder` is where that file lies. A finder is
+`find_devices() -> tuple[FoundDevice, ...]`.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ GROUPS: Mapping[str, str] = {
     "camera": "slrig.cameras",
     "projector": "slrig.projectors",
     "head": "slrig.heads",
+    "positioner": "slrig.positioners",
     "finder": "slrig.finders",
 }
 USUAL_EXPOSURE_S = 1 / 60
@@ -148,20 +150,10 @@ def open_rig(config: RigConfig) -> Rig:
     made for devices of another size; DeviceError: a device cannot be opened.
     """
     with ExitStack() as opened:
-        head: Head | None = None
-        cameras: Mapping[str, Camera]
+        head, projector, cameras, positioner = _open_each(config, opened)
         if config.head is not None:
-            head = _open("head", config.head, Head, config.folder)
-            projector, cameras = head.projector, dict(head.cameras)
-            devices: list[Camera | Projector] = [projector, *cameras.values()]
-            for device in devices:
-                opened.callback(_close_quietly, device)
             asked = dict.fromkeys(cameras, (config.head.exposure_s, config.head.gain))
         else:
-            if config.projector is None:
-                message = f"rig '{config.name}' has neither a head nor a projector; add one of the tables to its file"
-                raise ConfigError(message)
-            projector, cameras = _open_each(config, config.projector, opened)
             asked = {table.name: (table.exposure_s, table.gain) for table in config.cameras}
         settings = {
             name: CameraSettings(_exposure_s(camera.info, asked[name][0], config), asked[name][1])
@@ -177,16 +169,16 @@ def open_rig(config: RigConfig) -> Rig:
             head,
             _synchronisation(config, cameras),
             _clock(head),
-            _positioner(head),
+            positioner,
         )
         opened.pop_all()
         return rig
 
 
 def _open_each(
-    config: RigConfig, projector_table: DriverTable, opened: ExitStack
-) -> tuple[Projector, Mapping[str, Camera]]:
-    """A projector and its cameras, closed again by `opened`. Raises as `open_rig`."""
+    config: RigConfig, opened: ExitStack
+) -> tuple[Head | None, Projector, Mapping[str, Camera], Positioner | None]:
+    """Every device of a rig, closed again by `opened`. Raises as `open_rig`."""
     faults: list[ConfigError] = []
 
     def attempt(kind: str, table: DriverTable, protocol: type[Any], *name: str) -> Any:
@@ -200,18 +192,32 @@ def _open_each(
             if faults:
                 return None
             raise
-        opened.callback(_close_quietly, device)
+        for each in (device.projector, *device.cameras.values()) if kind == "head" else (device,):
+            opened.callback(_close_quietly, each)
         return device
 
-    projector = attempt("projector", projector_table, Projector)
-    cameras = {table.name: attempt("camera", table, Camera, table.name) for table in config.cameras}
+    head: Head | None = None if config.head is None else attempt("head", config.head, Head)
+    if config.head is None:
+        if config.projector is None:
+            message = f"rig '{config.name}' has neither a head nor a projector; add one of the tables to its file"
+            raise ConfigError(message)
+        projector = attempt("projector", config.projector, Projector)
+        cameras = {table.name: attempt("camera", table, Camera, table.name) for table in config.cameras}
+    positioner = _positioner(head)
+    if config.positioner is not None:
+        if positioner is not None:
+            message = f"rig '{config.name}': its head has a positioner, and its file names another; leave one out"
+            faults.append(ConfigError(message))
+        positioner = attempt("positioner", config.positioner, Positioner)
     if len(faults) == 1:
         raise faults[0]
     if faults:
         told = "\n".join(str(fault) for fault in faults)
         message = f"rig '{config.name}': {len(faults)} of its tables are wrong; correct each and try again:\n{told}"
         raise ConfigError(message)
-    return projector, cameras
+    if head is not None:
+        return head, head.projector, dict(head.cameras), positioner
+    return None, projector, cameras, positioner
 
 
 def _exposure_s(camera: CameraInfo, asked_s: float | None, config: RigConfig) -> float:
@@ -261,7 +267,7 @@ def _calibration(
     return calibration
 
 
-def _close_quietly(device: Camera | Projector) -> None:
+def _close_quietly(device: Camera | Projector | Positioner) -> None:
     # The error that made us close is the one to tell, whatever a driver raises on the way out.
     with suppress(Exception):
         device.close()

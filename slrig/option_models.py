@@ -17,7 +17,7 @@ OPTIONS_GROUP = "slrig.options"
 
 
 def kinds_of(driver: str) -> tuple[str, ...]:
-    """What a driver of that name opens: "camera", "projector", "head".
+    """What a driver of that name opens: "camera", "projector", "head", "positioner".
 
     Raises
     ------

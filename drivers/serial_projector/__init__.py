@@ -193,14 +193,14 @@ def open_projector(options: Mapping[str, object], folder: Path) -> Projector:
     DeviceError
         Nothing on the port speaks SLTP/1, or it may not be opened.
     """
+    from drivers.serial_port import SerialPort
     from drivers.serial_projector.options import SerialProjectorOptions
-    from drivers.serial_projector.port import SerialPort
     from drivers.serial_projector.projector import SerialProjector
 
     table = checked(SerialProjectorOptions, options, "the [projector] table of a serial projector")
 
     def open_port() -> SerialPort:
-        return SerialPort(table.port, baud=table.baud)
+        return SerialPort(table.port, baud=table.baud, device="trigger box", driver="serial_projector")
 
     return SerialProjector(open_port, table, export_folder=folder / table.export_folder)
 

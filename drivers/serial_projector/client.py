@@ -9,11 +9,11 @@ from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, TypeVar
 
+from drivers.serial_port import Port
 from drivers.serial_projector.clock import DeviceClock
 from drivers.serial_projector.frames import Event, Mode, Refused
 from drivers.serial_projector.link import Link, RefusedError, Reply, SilentError
 from drivers.serial_projector.pattern_set import crc32_of_all
-from drivers.serial_projector.port import Port
 from slrig.errors import DeviceBusyError, DeviceError, SlrigError, UnsupportedByDeviceError
 
 PROTOCOL = 1

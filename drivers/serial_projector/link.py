@@ -12,8 +12,8 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
+from drivers.serial_port import SLICE_S, Port
 from drivers.serial_projector.frames import NUMBERS, Answer, Event, Refused, Splitter, Unread, framed, parsed
-from drivers.serial_projector.port import SLICE_S, Port
 from slrig.errors import DeviceError, DeviceStateError
 
 MOST_TRIES = 12

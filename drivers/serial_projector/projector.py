@@ -7,13 +7,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+from drivers.serial_port import Port
 from drivers.serial_projector.client import Client, Limits
 from drivers.serial_projector.frames import Fault, Mode, Refused
 from drivers.serial_projector.keeping import KeepAlive
 from drivers.serial_projector.link import Link, RefusedError
 from drivers.serial_projector.options import SerialProjectorOptions
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each, export
-from drivers.serial_projector.port import Port
 from slrig.devices import ProjectorInfo, ProjectorState, Shown, SystemClock
 from slrig.errors import DeviceBusyError, DeviceError, DeviceGoneError, DeviceStateError, UnsupportedByDeviceError
 from slrig.model import PatternSequence, Size

@@ -15,8 +15,9 @@ from slrig.option_models import kinds_of, option_model
 
 Schema = Mapping[str, Any]
 
-_TABLES = {"camera": "[[camera]]", "projector": "[projector]", "head": "[head]"}
-_OWN = {"camera": "name, driver, exposure_s and gain", "projector": "driver", "head": "driver, exposure_s and gain"}
+_TABLES = {"camera": "[[camera]]", "projector": "[projector]", "head": "[head]", "positioner": "[positioner]"}
+_HEADS = "driver, exposure_s and gain"
+_OWN = {"camera": f"name, {_HEADS}", "projector": "driver", "head": _HEADS, "positioner": "driver"}
 # The end of an option's name, the longer first, and its unit.
 _UNITS = {
     **{"px_s": "px/s", "mm_s": "mm/s", "bytes": "bytes", "deg": "°", "dn": "DN", "hz": "Hz", "mm": "mm", "ms": "ms"},

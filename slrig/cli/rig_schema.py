@@ -18,7 +18,7 @@ from slrig.option_models import described_drivers, kinds_of, option_model
 
 PACKAGE = "slrig"
 _NULL = {"type": "null"}
-_TABLES = {"camera": "CameraTable", "projector": "DriverTable", "head": "HeadTable"}
+_TABLES = {"camera": "CameraTable", "projector": "DriverTable", "head": "HeadTable", "positioner": "DriverTable"}
 
 
 def rig_schema() -> str:

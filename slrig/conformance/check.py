@@ -22,6 +22,7 @@ class Need(Enum):
     HARDWARE = "a camera that is triggered by wire"
     PLAYS = "a projector that plays sequences by itself, and a camera that it triggers by wire"
     WHITE_AND_BLACK = "a sequence that begins with white and black"
+    POSITIONER = "a positioner"
 
     def unmet(self, rig: Rig, sequence: PatternSequence) -> str | None:
         """Why the check does not apply to this rig, in words; None if it does."""
@@ -40,6 +41,8 @@ class Need(Enum):
                 met = rig.projector.info.plays and Trigger.HARDWARE in declared
             case Need.WHITE_AND_BLACK:
                 met = sequence.patterns[:2] == (White(), Black())
+            case Need.POSITIONER:
+                met = rig.positioner is not None
         return None if met else f"it needs {self.value}"
 
 

@@ -14,7 +14,7 @@ from enum import StrEnum
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
-from slrig.conformance import declared, frames, freshness, sequences, settings, shutdown, states
+from slrig.conformance import declared, frames, freshness, positioners, sequences, settings, shutdown, states
 from slrig.conformance.bench import RigBench
 from slrig.conformance.check import Check
 from slrig.conformance.expectation import ExpectationError, Failure, NotApplicableError, failure_of
@@ -24,7 +24,7 @@ from slrig.model import PatternSequence
 
 CHECKS = tuple(
     each
-    for module in (declared, states, settings, frames, freshness, sequences, shutdown)
+    for module in (declared, states, settings, frames, freshness, sequences, positioners, shutdown)
     for each in vars(module).values()
     if isinstance(each, Check)
 )

@@ -3,13 +3,14 @@
 from slrig.devices.camera import AppliedSettings, Camera, CameraInfo, CameraSettings, CameraState, Trigger
 from slrig.devices.clock import Clock, KeepsTime, SystemClock
 from slrig.devices.limits import COMPUTED, USUAL, CallLimits, progress_heard, progress_reporter
-from slrig.devices.positioner import EvenPoses, Positioner, Positions, Turntable
+from slrig.devices.positioner import AnyAngle, Positioner, Positions, Turntable
 from slrig.devices.projector import FlashedProjector, Projector, ProjectorInfo, ProjectorState, Shown, UnprovenLight
 from slrig.devices.rig import FoundDevice, Head, Rig, Synchronisation
 
 __all__ = [
     "COMPUTED",
     "USUAL",
+    "AnyAngle",
     "AppliedSettings",
     "CallLimits",
     "Camera",
@@ -17,7 +18,6 @@ __all__ = [
     "CameraSettings",
     "CameraState",
     "Clock",
-    "EvenPoses",
     "FlashedProjector",
     "FoundDevice",
     "Head",

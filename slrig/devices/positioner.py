@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from slrig.errors import UnsupportedByDeviceError
 from slrig.model import StageAxis
 
 
+@runtime_checkable
 class Positioner(Protocol):
     """Moves an object, a calibration board among others, without a person.
 
@@ -63,32 +64,35 @@ class Positions(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class EvenPoses:
-    """The poses that a turntable offers where it can turn to any angle: `count` of them, evenly round the axis."""
+class AnyAngle(ABC):
+    """A turntable that turns to any angle, and offers `count` of them as poses, evenly round the axis from 0° on. What
+    it is made of turns.
+    """
 
-    count: int
-
-    @property
-    def angles_deg(self) -> tuple[float, ...]:
-        """From 0 on."""
-        return tuple(360.0 * number / self.count for number in range(self.count))
+    def __init__(self, count: int) -> None:
+        self._angles_deg = tuple(360.0 * number / count for number in range(count))
+        self._names = tuple(f"{angle_deg:g}°" for angle_deg in self._angles_deg)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The angles, as text.
+    def poses(self) -> Sequence[str]:
+        """See `Positioner`. The angles, as text."""
+        return self._names
 
-        >>> EvenPoses(3).names
-        ('0°', '120°', '240°')
-        """
-        return tuple(f"{angle_deg:g}°" for angle_deg in self.angles_deg)
+    @property
+    def angles_deg(self) -> Sequence[float]:
+        """See `Turntable`."""
+        return self._angles_deg
 
-    def angle_deg(self, index: int) -> float:
-        """The angle of a pose. Raises UnsupportedByDeviceError: there is no such pose."""
-        if not 0 <= index < self.count:
+    def move(self, index: int) -> None:
+        """See `Positioner`."""
+        if not 0 <= index < len(self._names):
             message = (
-                f"asked for pose {index}, the turntable has poses 0 to {self.count - 1}: {', '.join(self.names)}; take "
-                "one of them, or another number of `poses` in the rig file"
+                f"asked for pose {index}, the turntable has poses 0 to {len(self._names) - 1}: "
+                f"{', '.join(self._names)}; take one of them, or set another number of `poses` in the rig file"
             )
             raise UnsupportedByDeviceError(message)
-        return self.angles_deg[index]
+        self.turn(self._angles_deg[index])
+
+    @abstractmethod
+    def turn(self, angle_deg: float) -> None:
+        """See `Turntable`."""

@@ -8,7 +8,7 @@ from typing import Any, cast
 import pytest
 
 from slrig.conformance import CHECKS, Check, Examination, Outcome
-from slrig.devices import Camera, Head, Projector
+from slrig.devices import Camera, Head, Positioner, Projector, Turntable
 from tests.contract.benches import BENCHES
 from tests.contract.suite import Bench
 
@@ -52,6 +52,9 @@ ABOUT = {
     ),
     "a_played_sequence_gives_every_frame_in_order": "Projector.play Projector.stop Camera.arm Camera.read",
     "a_play_can_be_stopped": "Projector.play Projector.stop",
+    "a_positioner_takes_its_poses_and_no_others": (
+        "Positioner.poses Positioner.move Positioner.close Turntable.axis Turntable.angles_deg Turntable.turn"
+    ),
     "the_projector_is_dark_unless_it_shows": "Projector.blank Projector.stop Projector.load Projector.show",
     "the_projector_is_dark_after_opening_and_close": "Projector.close",
     "close_may_be_called_twice": "Camera.disarm Camera.close Projector.stop Projector.blank Projector.close",
@@ -132,4 +135,5 @@ def test_the_suite_asks_for_every_member_of_every_protocol(tmp_path_factory: pyt
                 assert asked >= set(ABOUT[check.name].split()), check.name
     assert set(ABOUT) == {check.name for check in CHECKS}
     asked_for = {member for about in ABOUT.values() for member in about.split()}
-    assert asked_for == members(Camera) | members(Projector) | members(Head)
+    protocols = (Camera, Projector, Head, Positioner, Turntable)
+    assert asked_for == set().union(*map(members, protocols))

@@ -120,6 +120,26 @@ class FakeHead:
         return None
 
 
+class FakeStage(FakeDevice):
+    """A positioner that moves nothing."""
+
+    poses = ("home",)
+
+    def __init__(self, options: Mapping[str, object], folder: Path) -> None:
+        super().__init__("stage", options, folder)
+
+    def move(self, index: int) -> None:
+        del index
+
+
+class FakeStagedHead(FakeHead):
+    """An instrument with a positioner of its own."""
+
+    def __init__(self, options: Mapping[str, object], folder: Path) -> None:
+        super().__init__(options, folder)
+        self.positioner = FakeStage(options, folder)
+
+
 class _Options(BaseModel):
     model_config = ConfigDict(extra="forbid")
     port: int
@@ -175,6 +195,9 @@ constant = {HERE}:HERE
 fake = {HERE}:open_projector
 [slrig.heads]
 fake = {HERE}:FakeHead
+staged = {HERE}:FakeStagedHead
+[slrig.positioners]
+fake = {HERE}:FakeStage
 [slrig.finders]
 fake = {HERE}:find_devices
 lost = {HERE}:find_crashing
@@ -235,6 +258,30 @@ def test_a_head_brings_its_cameras_and_calibration(tmp_path: Path) -> None:
     assert rig.calibration is not None
     assert rig.head is not None
     assert dict(OPENED[0].options) == {"seed": 1}
+
+
+STAGE = '[positioner]\ndriver = "fake"\nport = "a"\n'
+
+
+def test_either_kind_of_rig_may_have_a_positioner(tmp_path: Path) -> None:
+    rig = _open(tmp_path, _camera("left"), STAGE)
+    assert isinstance(rig.positioner, FakeStage)
+    assert dict(OPENED[-1].options) == {"port": "a"}
+    rig.close()
+    assert [device.closed for device in OPENED] == [1, 1, 1]
+    (tmp_path / "rig.toml").write_text(f'name = "demo"\n[head]\ndriver = "fake"\n{STAGE}')
+    assert isinstance(open_rig(read_rig(tmp_path / "rig.toml")).positioner, FakeStage)
+
+
+def test_a_second_positioner_is_refused_and_all_is_closed_again(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(f'name = "demo"\n[head]\ndriver = "staged"\n{STAGE}')
+    with pytest.raises(ConfigError, match="its head has a positioner, and its file names another; leave one out"):
+        open_rig(read_rig(tmp_path / "rig.toml"))
+    assert [device.closed for device in OPENED if device.options] == [1]
+    OPENED.clear()
+    with pytest.raises(ConfigError, match=r"(?s)2 of its tables.*camera driver 'fkae'.*positioner driver 'tabel'"):
+        _open(tmp_path, _camera("left", "fkae"), STAGE.replace("fake", "tabel"))
+    assert [device.closed for device in OPENED] == [1]
 
 
 def test_the_rig_files_calibration_comes_before_the_heads(tmp_path: Path) -> None:
@@ -344,7 +391,7 @@ def test_a_driver_provided_twice_is_refused(tmp_path: Path) -> None:
 
 def test_a_broken_driver_does_not_hide_the_others() -> None:
     drivers = {(one.kind, one.name): one for one in installed_drivers() if one.package == "fake_drivers"}
-    assert len(drivers) == 11
+    assert len(drivers) == 13
     faulty = {key for key, one in drivers.items() if one.fault is not None}
     assert faulty == {("camera", "broken"), ("camera", "constant")}
     broken = drivers["camera", "broken"]

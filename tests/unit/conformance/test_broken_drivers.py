@@ -51,6 +51,25 @@ class Incomplete(Maker):
         return replace(rig, projector=WithoutStop(rig.projector), head=None)  # type: ignore[arg-type]
 
 
+class TakesEveryPose:
+    """A positioner that has one pose and refuses no other."""
+
+    poses = ("home",)
+
+    def move(self, index: int) -> None:
+        del index
+
+    def close(self) -> None:
+        return
+
+
+class Moved(Maker):
+    """Its positioner is such a one."""
+
+    def __call__(self) -> Rig:
+        return replace(super().__call__(), positioner=TakesEveryPose())
+
+
 BROKEN: list[tuple[Maker, str, str]] = [
     (Incomplete(), "devices_implement_the_protocols", "without stop"),
     (Maker(cameras.HasAnotherName), "devices_implement_the_protocols", "'camera0'"),
@@ -152,6 +171,7 @@ BROKEN: list[tuple[Maker, str, str]] = [
     (Maker(cameras.MissesAPulse), "a_played_sequence_gives_every_frame_in_order", "pulses make"),
     (Maker(projector=projectors.PulsesOnceMore), "a_played_sequence_gives_every_frame_in_order", "no error"),
     (Maker(projector=projectors.PlaysOn), "a_play_can_be_stopped", "frames"),
+    (Moved(), "a_positioner_takes_its_poses_and_no_others", "pose -1 of 1 is refused"),
     (Maker(projector=projectors.StaysLit), "the_projector_is_dark_unless_it_shows", "after blank"),
     (Maker(projector=projectors.StaysLitWhileLoading), "the_projector_is_dark_unless_it_shows", "after load"),
     (Maker(projector=projectors.StaysLitAfterClose), "the_projector_is_dark_after_opening_and_close", "after close"),
@@ -194,11 +214,11 @@ def test_every_check_finds_a_broken_driver() -> None:
 @pytest.mark.parametrize(
     ("triggers", "plays", "not_applicable"),
     [
-        (ALL, True, 0),
-        ({Trigger.SOFTWARE, Trigger.FREE}, False, 3),
-        ({Trigger.FREE}, False, 3),
-        ({Trigger.SOFTWARE}, False, 4),
-        ({Trigger.HARDWARE}, True, 17),
+        (ALL, True, 1),
+        ({Trigger.SOFTWARE, Trigger.FREE}, False, 4),
+        ({Trigger.FREE}, False, 4),
+        ({Trigger.SOFTWARE}, False, 5),
+        ({Trigger.HARDWARE}, True, 18),
     ],
     ids=lambda value: "-".join(sorted(value)) if isinstance(value, set | frozenset) else str(value),
 )

@@ -193,7 +193,8 @@ def test_a_score_is_100_only_if_nothing_failed() -> None:
 def test_a_report_can_be_written_as_json() -> None:
     document = json.loads(json.dumps(run(Maker(DeliversStale, StaysLit), sequence()).document()))
     assert document["conforms"] is False
-    assert document["passed"] < document["applicable"] == len(CHECKS)
+    # The model has no positioner.
+    assert document["passed"] < document["applicable"] == len(CHECKS) - 1
     failed = [each for each in document["checks"] if each["outcome"] == "failed"]
     assert {"asked", "found", "do", "where"} == set(failed[0]["failure"])
 

@@ -24,7 +24,7 @@ from slrig.errors import (
 )
 from slrig.rig.session import RigSession
 from slrig.rig.settings import SettingsInUse
-from slrig.rig.watchdog import OPEN, Call, Calls, Watchdog, guarded
+from slrig.rig.watchdog import MOVE_LIMIT_S, OPEN, Call, Calls, GuardedPositioner, GuardedTurntable, Watchdog, guarded
 from tests.unit.scan.fakes import WAIT_S, TameBench, TameCamera, TameProjector
 
 
@@ -336,3 +336,53 @@ def test_calls_of_several_threads_are_looked_after_at_once() -> None:
     assert found[1] is not None
     assert (found[1].device, found[1].step) == ("camera 'left'", "read")
     assert calls.stuck is None
+
+
+def test_a_turn_that_hangs_is_told_as_a_move_that_hangs() -> None:
+    time_s = Time()
+    calls = Calls(now_s=time_s)
+    asked: list[float] = []
+    found: list[Call | None] = []
+
+    class Table:
+        poses, angles_deg, axis = ("0°", "180°"), (0.0, 180.0), None
+
+        def move(self, index: int) -> None:
+            self.turn(self.angles_deg[index])
+
+        def turn(self, angle_deg: float) -> None:
+            asked.append(angle_deg)
+            if angle_deg > 90:
+                time_s.now_s += MOVE_LIMIT_S + 1
+                found.extend((calls.overdue(), calls.overdue()))
+
+        def close(self) -> None:
+            return
+
+    table = guarded(Rig("bench", {}, TameProjector(), {}, positioner=Table()), calls, {}).positioner
+    assert isinstance(table, GuardedTurntable)
+    assert (table.axis, table.angles_deg, table.poses) == (None, (0.0, 180.0), ("0°", "180°"))
+    table.turn(45.0)
+    with pytest.raises(DeviceError, match=r"^the positioner: its driver has not come back from turn for 120 s and"):
+        table.turn(100.0)
+    with pytest.raises(DeviceError, match=r"^the positioner: its driver has not come back from move for 120 s and"):
+        table.move(1)
+    assert asked == [45.0, 100.0, 180.0]
+    assert [None if call is None else call.step for call in found] == [None, "turn", None, "move"]
+    table.close()
+
+
+def test_a_positioner_that_turns_nothing_is_guarded_as_one() -> None:
+    class Stage:
+        poses = ("home",)
+
+        def move(self, index: int) -> None:
+            raise OSError(errno.ENODEV, f"no such device {index}")
+
+        def close(self) -> None:
+            return
+
+    stage = guarded(Rig("bench", {}, TameProjector(), {}, positioner=Stage()), Calls(), {}).positioner
+    assert type(stage) is GuardedPositioner
+    with pytest.raises(DeviceGoneError, match="the positioner is gone"):
+        stage.move(0)

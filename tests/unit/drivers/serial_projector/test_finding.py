@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from drivers.serial_port import resolved
 from drivers.serial_projector import find_devices, finding, open_projector
-from drivers.serial_projector.port import resolved
 from slrig.errors import LibraryMissingError
 
 

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from drivers.serial_port import SerialPort
 from drivers.serial_projector import open_projector
 from drivers.serial_projector.client import Client, Limits
 from drivers.serial_projector.device import protocol
 from drivers.serial_projector.frames import Mode
 from drivers.serial_projector.link import Link
 from drivers.serial_projector.pattern_set import crc32_of_all, crc32_of_each
-from drivers.serial_projector.port import SerialPort
 from drivers.serial_projector.projector import SerialProjector
 from slrig.devices import FlashedProjector
 from slrig.errors import (

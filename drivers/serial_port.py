@@ -29,7 +29,7 @@ _ABSENT = {errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.EIO}
 
 
 class Port(Protocol):
-    """Bytes to and from a box."""
+    """Bytes to and from a device."""
 
     def read(self, timeout_s: float) -> bytes:
         """Return what came in, as soon as there is something; nothing after the time-out. Raises DeviceGoneError."""
@@ -47,6 +47,8 @@ class Port(Protocol):
 class SerialPort:
     """Implements `Port` with pyserial, on a port's name or a pyserial URL (`socket://…`, `rfc2217://…`).
 
+    device : what is behind it, in words, as "trigger box"; driver : whose port it is; both for errors.
+
     Raises
     ------
     LibraryMissingError
@@ -59,9 +61,9 @@ class SerialPort:
         It cannot be opened.
     """
 
-    def __init__(self, name: str, *, baud: int) -> None:
-        serial = _library()
-        self._name = name
+    def __init__(self, name: str, *, baud: int, device: str, driver: str) -> None:
+        serial = _library(driver)
+        self._name, self._device, self._driver = name, device, driver
         target = resolved(name)
         # Two programs on one port read one another's answers; a URL's handler has no lock.
         exclusive = {} if "://" in target else {"exclusive": True}
@@ -70,7 +72,7 @@ class SerialPort:
                 target, baudrate=baud, timeout=SLICE_S, write_timeout=_WRITE_S, **exclusive
             )
         except (serial.SerialException, OSError, ValueError) as error:
-            raise _unopened(name, target, error) from error
+            raise _unopened(name, target, error, device) from error
         with suppress(Exception):
             # FTDI bridges hold bytes back for 16 ms otherwise. Others have no such mode, and say so in many ways.
             self._serial.set_low_latency_mode(True)
@@ -99,7 +101,7 @@ class SerialPort:
     def _read(self) -> bytes:
         try:
             data: bytes = self._serial.read(max(1, self._serial.in_waiting))
-        except _library().SerialException:
+        except _library(self._driver).SerialException:
             # Raised alike when another program read first what this one was told of, and when the port is gone.
             if not self._alive():
                 raise
@@ -120,11 +122,11 @@ class SerialPort:
     def _told(self, what: str) -> Iterator[None]:
         try:
             if not self._serial.is_open:
-                raise _library().PortNotOpenError
+                raise _library(self._driver).PortNotOpenError
             yield
-        except (_library().SerialException, OSError, _line_discipline_error()) as error:
+        except (_library(self._driver).SerialException, OSError, _line_discipline_error()) as error:
             message = (
-                f"asked to {what} the trigger box on {self._name}, found it gone ({error}): it was unplugged, lost "
+                f"asked to {what} the {self._device} on {self._name}, found it gone ({error}): it was unplugged, lost "
                 "its power or reset itself; plug it in and open the rig again"
             )
             raise DeviceGoneError(message) from error
@@ -136,12 +138,12 @@ def resolved(name: str) -> str:
     return str(link) if "/" not in name and link.exists() else name
 
 
-def _library() -> Any:
+def _library(driver: str) -> Any:
     try:
         return importlib.import_module("serial")
     except ImportError as missing:
         install = "pip install pyserial"
-        message = f"driver 'serial_projector' needs pyserial, which is not installed ({missing}); {install}"
+        message = f"driver '{driver}' needs pyserial, which is not installed ({missing}); {install}"
         raise LibraryMissingError(message, install=install) from missing
 
 
@@ -153,7 +155,7 @@ def _line_discipline_error() -> type[Exception]:
     return termios.error
 
 
-def _unopened(name: str, target: str, error: Exception) -> DeviceError:
+def _unopened(name: str, target: str, error: Exception, device: str) -> DeviceError:
     """What it means that a port does not open."""
     number = _error_number(error)
     if number in _BUSY or "exclusively lock" in str(error):
@@ -161,8 +163,8 @@ def _unopened(name: str, target: str, error: Exception) -> DeviceError:
         return DeviceBusyError(f"port {name} is held by {holders}; end that, or use another port")
     if number in _ABSENT or "could not find" in str(error).lower():
         return DeviceGoneError(
-            f"asked to open port {name}, there is none such ({error}); plug the box in, and see which port it has: "
-            "slrig devices"
+            f"asked to open port {name}, there is none such ({error}); plug the {device} in, and see which port it "
+            "has: slrig devices"
         )
     if number == errno.EACCES and os.name == "posix":
         return DeviceError(f"you may not open port {name} ({error}); sudo usermod -aG dialout $USER, and log in again")

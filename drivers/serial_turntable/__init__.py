@@ -1,0 +1,84 @@
+"""Turntables on a serial line: a controller that takes G-code as GRBL 1.1 does, or a board with a protocol of lines.
+
+The protocol of lines, version 1
+--------------------------------
+ASCII, 115 200 baud unless the rig file says otherwise, lines end with a line feed; a carriage return before it is
+passed over. Numbers are degrees with up to three decimals. The host sends one command and waits for its answer; STOP
+alone may come while the board turns.
+
+    ID?             slrig-turntable 1 <steps of the motor in a turn of the table, a whole number>
+    TURN <angle>    go to this angle, counted from where the board was started, the short way or the long: 370 is ten
+                    degrees beyond a whole turn. Once it stands: OK <angle reached>, the nearest whole step
+    STOP            stop, if it turns, and answer OK <angle where it stands>; a TURN that is stopped is not answered
+    anything else   ERR <what is wrong, in words>; so is a TURN that cannot be obeyed
+
+When it starts, also when it is reset, the board sends START: its angle is 0 again, wherever it stands. The host asks
+ID? until it is answered, then STOP to learn the angle. Lines that are neither are passed over, so a board may chat.
+
+A session, `>` to the board, `<` from it:
+
+    < START
+    > ID?
+    < slrig-turntable 1 3200
+    > STOP
+    < OK 0.000
+    > TURN 45.000
+    < OK 45.000
+    > TURN 10.000
+    < OK 10.012
+    > SPIN
+    < ERR unknown command SPIN
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from slrig.bundle.faults import checked
+from slrig.devices import Clock, SystemClock, Turntable
+
+
+def open_turntable(options: Mapping[str, object], folder: Path, *, clock: Clock | None = None) -> Turntable:
+    """Open a turntable that speaks the protocol of lines, from a rig file's `[positioner]` table without its `driver`.
+
+    Parameters
+    ----------
+    options
+        `drivers.serial_turntable.options.LineOptions`.
+    folder
+        The rig file's own; nothing counts from it.
+    clock
+        By which it settles and gives up; else the system's.
+
+    Raises what `drivers.serial_port.SerialPort` does, ConfigError with all faults of the options, and
+    UnsupportedByDeviceError or DeviceError where what answers is another controller, or none.
+    """
+    from drivers.serial_port import SerialPort
+    from drivers.serial_turntable.options import LineOptions
+    from drivers.serial_turntable.simple import SimpleController
+    from drivers.serial_turntable.turntable import SerialTurntable
+
+    del folder
+    table = checked(LineOptions, options, "the [positioner] table of a serial turntable")
+    port = SerialPort(table.port, baud=table.baud, device="turntable", driver="serial_turntable")
+    return SerialTurntable(port, table, lambda lines: SimpleController(lines, table), clock or SystemClock())
+
+
+def open_grbl(options: Mapping[str, object], folder: Path, *, clock: Clock | None = None) -> Turntable:
+    """Open a turntable behind GRBL; its options are `drivers.serial_turntable.options.GrblOptions`.
+
+    Parameters and errors are those of `open_turntable`.
+    """
+    from drivers.serial_port import SerialPort
+    from drivers.serial_turntable.grbl import Grbl
+    from drivers.serial_turntable.options import GrblOptions
+    from drivers.serial_turntable.turntable import SerialTurntable
+
+    del folder
+    table = checked(GrblOptions, options, "the [positioner] table of a turntable behind GRBL")
+    port = SerialPort(table.port, baud=table.baud, device="turntable", driver="grbl_turntable")
+    return SerialTurntable(port, table, lambda lines: Grbl(lines, table), clock or SystemClock())
+
+
+__all__ = ["open_grbl", "open_turntable"]

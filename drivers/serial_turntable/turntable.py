@@ -1,0 +1,140 @@
+"""A turntable behind a controller on a serial line: where it stands, how it gets there, and when that is not known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Protocol
+
+from drivers.serial_port import Port
+from drivers.serial_turntable.lines import Lines
+from drivers.serial_turntable.options import LineOptions
+from slrig.devices import AnyAngle, Clock
+from slrig.errors import DeviceError, DeviceStateError, SlrigError, UnsupportedByDeviceError
+from slrig.model import StageAxis
+
+
+class Controller(Protocol):
+    """What moves the motor. Places are in its own units."""
+
+    step: float
+    """Its smallest move; 0 where it tells none."""
+
+    def place(self) -> float:
+        """Where it stands. Raises DeviceError."""
+        ...
+
+    def go(self, place: float, until_ns: int) -> float:
+        """Go there, and return where it stands when it stands still. Raises DeviceError: it did not, or not in time."""
+        ...
+
+    def halt(self) -> None:
+        """Stop now, wherever that is. Raises DeviceError."""
+        ...
+
+
+class SerialTurntable(AnyAngle):
+    """Implements `slrig.devices.Turntable`.
+
+    A controller that restarts begins to count anew. So before each turn it is asked where it stands, and after whatever
+    went wrong in a turn nothing is turned any more: the rig has to be opened again, and angles count from there.
+
+    Parameters
+    ----------
+    port
+        Open; the turntable closes it, also when it cannot be opened.
+    options
+        Checked.
+    controlled
+        Returns the controller at the other end of the line.
+    clock
+        By which it settles and gives up.
+    """
+
+    def __init__(
+        self, port: Port, options: LineOptions, controlled: Callable[[Lines], Controller], clock: Clock
+    ) -> None:
+        super().__init__(options.poses)
+        self._options = options
+        self._units_per_deg = -options.units_per_deg if options.reversed else options.units_per_deg
+        self._lines = Lines(port, clock, f"the turntable on {options.port}")
+        try:
+            self._controller = controlled(self._lines)
+            self._origin = self._place = self._controller.place()
+        except BaseException:
+            port.close()
+            raise
+        self._approached_deg: float | None = None
+        self._turning = False
+        self._lost: str | None = None
+
+    @property
+    def axis(self) -> StageAxis | None:
+        """See `Turntable`. Nobody has told it."""
+        return None
+
+    def turn(self, angle_deg: float) -> None:
+        """See `Turntable`. Raises DeviceError, also ever after, once it is not known where the table stands."""
+        if self._lines.closing.is_set():
+            message = f"{self._lines.label} is closed; open the rig again"
+            raise DeviceStateError(message)
+        if self._lost is not None:
+            message = f"it is not known where {self._lines.label} stands since a turn failed ({self._lost}); "
+            raise DeviceError(message + "open the rig again: angles count from there, so begin its views anew")
+        if not math.isfinite(angle_deg):
+            message = f"asked {self._lines.label} for {angle_deg}°; ask for a number of degrees"
+            raise UnsupportedByDeviceError(message)
+        until_ns = self._lines.after(self._options.turn_s)
+        self._turning = True
+        try:
+            self._require_in_place()
+            for stop_deg in self._stops_deg(angle_deg):
+                self._go(stop_deg, until_ns)
+            self._lines.wait(self._options.settle_s)
+        except BaseException as error:
+            self._lost = str(error) or type(error).__name__
+            raise
+        finally:
+            self._turning = self._lost is not None
+        self._approached_deg = angle_deg
+
+    def close(self) -> None:
+        """See `Positioner`. From any thread; a turn that is under way is stopped."""
+        if self._lines.closing.is_set():
+            return
+        self._lines.closing.set()
+        if self._turning:
+            with suppress(SlrigError):
+                self._controller.halt()
+        self._lines.port.close()
+
+    def _stops_deg(self, angle_deg: float) -> tuple[float, ...]:
+        """The way to an angle: there, or by way of the side from which angles are approached."""
+        approach_deg = self._options.approach_deg
+        here_deg = (self._place - self._origin) / self._units_per_deg
+        straight = approach_deg == 0 or angle_deg == self._approached_deg or (angle_deg - here_deg) / approach_deg >= 1
+        return (angle_deg,) if straight else (angle_deg - approach_deg, angle_deg)
+
+    def _go(self, angle_deg: float, until_ns: int) -> None:
+        self._place = self._controller.go(self._origin + angle_deg * self._units_per_deg, until_ns)
+        reached_deg = (self._place - self._origin) / self._units_per_deg
+        if abs(reached_deg - angle_deg) > self._options.tolerance_deg:
+            step_deg = self._controller.step / self._options.units_per_deg
+            steps = f", whose steps are {step_deg:.3g}°," if step_deg else ""
+            message = (
+                f"asked {self._lines.label}{steps} for {angle_deg:.3f}°, it stands at {reached_deg:.3f}°, which is off "
+                f"by more than tolerance_deg = {self._options.tolerance_deg:g}; see what holds it, ask for whole "
+                "steps, or allow more"
+            )
+            raise DeviceError(message)
+
+    def _require_in_place(self) -> None:
+        """Raise DeviceError unless it stands where it was left."""
+        place = self._controller.place()
+        if abs(place - self._place) > self._options.tolerance_deg * self._options.units_per_deg:
+            message = (
+                f"{self._lines.label} was left at {self._place:.3f} of its controller's units and now says "
+                f"{place:.3f}: it was moved by somebody else, or restarted and counts anew; see to its power and cable"
+            )
+            raise DeviceError(message)
