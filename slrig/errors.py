@@ -168,6 +168,12 @@ class RegistrationRefusedError(SlrigError, code="registration-refused"):
     """
 
 
+class StageRefusedError(SlrigError, code="stage-refused"):
+    """What was shot of a stage does not tell its axis or its planes, or a cut by them leaves nothing of a view.
+    Name the pose or the view, and what to shoot instead.
+    """
+
+
 class CalibrationNotFoundError(SlrigError, code="calibration-not-found"):
     """No calibration, or no pose of one, of this id is on record here."""
 

@@ -20,7 +20,7 @@ from slrig.model.missing_bits import without_missing_bits
 from slrig.model.patterns import Black, Gray, LineShift, Pattern, PatternSequence, Primary, White
 from slrig.model.region import Region
 from slrig.model.rig import DEVICE_PARAMETERS, Axis, Calibration, LightMap, Pinhole, Size, Solved
-from slrig.model.stage import StageAxis
+from slrig.model.stage import MeasuredAxis, PlaneKind, StageAxis, StagePlane
 from slrig.model.surfaces import (
     AlbedoMark,
     CameraTruth,
@@ -52,11 +52,13 @@ __all__ = [
     "IntArray",
     "LightMap",
     "LineShift",
+    "MeasuredAxis",
     "Mesh",
     "Pattern",
     "PatternSequence",
     "Pinhole",
     "Pixels",
+    "PlaneKind",
     "PointCurves",
     "Primary",
     "Refusal",
@@ -66,6 +68,7 @@ __all__ = [
     "Solved",
     "Source",
     "StageAxis",
+    "StagePlane",
     "Surface",
     "Truth",
     "White",

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from slrig.model import FloatArray
+from slrig.model import FloatArray, MeasuredAxis
 from slrig.views.registration import Registration
 
 _EXACT_MM = 1e-3
@@ -37,7 +37,8 @@ class FoundAxis:
 
     point_mm : (3,), the point of it nearest to the object's middle; direction : (3,), unit; angles_rad : (N,), of the
     stage, as the poses have them, within half a turn of 0. point_sigma_mm, direction_sigma_rad : standard deviations
-    across the axis, rms of both directions. rms_mm : how far from a pure turn the poses are, at the object's radius.
+    across the axis, rms of both directions. rms_mm : how far from a pure turn the poses are, at the object's radius;
+    rms_over_sigma : that by their covariance, about 1 where they are within it. covariance : as that of `MeasuredAxis`.
     """
 
     point_mm: FloatArray
@@ -46,14 +47,29 @@ class FoundAxis:
     point_sigma_mm: float
     direction_sigma_rad: float
     rms_mm: float
+    rms_over_sigma: float
+    covariance: FloatArray
+
+    @property
+    def measured(self) -> MeasuredAxis:
+        """The axis alone."""
+        return MeasuredAxis(self.point_mm, self.direction, self.covariance)
 
 
 def found_axis(registration: Registration, towards: FloatArray) -> FoundAxis | None:
+    """The axis and angles of a turntable that fit a registration's poses best; see `axis_of`."""
+    return axis_of(registration.poses, registration.covariance, registration.middle_mm, registration.radius_mm, towards)
+
+
+def axis_of(
+    poses: FloatArray, covariance: FloatArray, middle_mm: FloatArray, radius_mm: float, towards: FloatArray
+) -> FoundAxis | None:
     """The axis and angles of a turntable that fit poses best, by their covariance; None where nothing was turned.
 
-    towards : (3,), a direction that the axis is to have an acute angle with, as that of the start.
+    poses : (N, 4, 4), covariance : (6 (N - 1), 6 (N - 1)), middle_mm and radius_mm : of an object, as those of a
+    `Registration`. towards : (3,), a direction that the axis is to have an acute angle with, as that of the start.
     """
-    poses, middle, radius = registration.poses, registration.middle_mm, registration.radius_mm
+    middle, radius = middle_mm, radius_mm
     vectors = Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()
     if np.linalg.norm(vectors, axis=1).max() < _LEAST_TURN_RAD:
         return None
@@ -64,8 +80,8 @@ def found_axis(registration: Registration, towards: FloatArray) -> FoundAxis | N
     point = middle + np.linalg.lstsq(still, poses[:, :3, 3].ravel() - still @ middle, rcond=1e-6)[0]
     across = np.linalg.svd(direction[None])[2][1:]
     scale = np.tile(np.repeat([radius, 1.0], 3), len(poses) - 1)
-    covariance = registration.covariance * scale[:, None] * scale
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance + _EXACT_MM**2 * np.eye(len(scale))))
+    scaled = covariance * scale[:, None] * scale
+    whiten = np.linalg.inv(np.linalg.cholesky(scaled + _EXACT_MM**2 * np.eye(len(scale))))
 
     def axis(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         tilted = direction + parameters[2:4] @ across / radius
@@ -81,18 +97,24 @@ def found_axis(registration: Registration, towards: FloatArray) -> FoundAxis | N
 
     begin = np.concatenate([np.zeros(4), -(vectors @ direction)[1:]])
     fit = least_squares(whitened, begin)
-    # Where poses are no pure turns within their deviations, the axis is known the less.
-    beyond = max(1.0, np.sqrt(2 * fit.cost / (len(fit.fun) - len(fit.x))))
+    over = float(np.sqrt(2 * fit.cost / (len(fit.fun) - len(fit.x))))
     slopes = np.asarray(fit.jac)
-    sigma = beyond * np.sqrt(np.diag(np.linalg.pinv(slopes.T @ slopes)))
+    # Where poses are no pure turns within their deviations, the axis is known the less.
+    known = max(1.0, over) ** 2 * np.linalg.pinv(slopes.T @ slopes)[:4, :4]
     left = np.square(apart(fit.x)).reshape(-1, 6).sum(axis=1)
     place, way = axis(fit.x)
     turned = np.append(0.0, fit.x[4:])
+    along = way @ (middle - place)
+    tilts = across.T / radius
+    by_fit = np.block([[across.T, along * tilts], [np.zeros((3, 2)), tilts]])
+    of_axis = by_fit @ known @ by_fit.T
     return FoundAxis(
-        point_mm=place + way * (way @ (middle - place)),
+        point_mm=place + way * along,
         direction=way,
         angles_rad=(turned + np.pi) % (2 * np.pi) - np.pi,
-        point_sigma_mm=float(np.sqrt(np.mean(sigma[:2] ** 2))),
-        direction_sigma_rad=float(np.sqrt(np.mean(sigma[2:4] ** 2)) / radius),
+        point_sigma_mm=float(np.sqrt(np.trace(of_axis[:3, :3]) / 2)),
+        direction_sigma_rad=float(np.sqrt(np.trace(of_axis[3:, 3:]) / 2)),
         rms_mm=float(np.sqrt(left.mean())),
+        rms_over_sigma=over,
+        covariance=of_axis,
     )
