@@ -26,6 +26,7 @@ from slrig.api import (
     scans,
     schedules,
     sessions,
+    stage,
     system,
 )
 from slrig.api.access import Access
@@ -66,6 +67,7 @@ def bare_app() -> FastAPI:
         rig,
         calibration,
         health,
+        stage,
         acceptance,
         schedules,
         sessions,

@@ -19,6 +19,7 @@ from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.combine.desk import CombineInto, ModelDesk
+from slrig.combine.stage import StageStore
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
 from slrig.jobs.data_folder import DataFolder
@@ -127,6 +128,9 @@ class Service:
             spare_bytes=spare_bytes,
         )
         runner.spare_what_is_used(self.models.unused)
+        self.stage = StageStore(folder.root / "stage")
+        self.find_axis = worker.task("slrig.calibrate.stage_axis:axis_of_poses", "axis of the stage")
+        self.find_planes = worker.task("slrig.combine.empty_stage:planes_in", "planes of the stage")
         self.durations = Durations()
         self.traces = traces_by_environment()
         self._desks = (self.verifications, self.calibrations, self.acceptance, self.models)

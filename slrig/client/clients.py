@@ -20,6 +20,7 @@ from slrig.client.endpoints import (
     Models,
     Presets,
     RigHealth,
+    RigStage,
     RigState,
     ScanOptions,
     Scans,
@@ -49,6 +50,7 @@ class _Service(Remote[W]):
         self.rig = RigState(self.core)
         self.calibration = Calibrations(self.core)
         self.health = RigHealth(self.core)
+        self.stage = RigStage(self.core)
         self.accept = Acceptance(self.core)
         self.schedules = Schedules(self.core)
         self.system = System(self.core)

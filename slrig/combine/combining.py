@@ -77,7 +77,7 @@ def combine_into(
         names, views = list(meshes), []
         for number, (name, file) in enumerate(meshes.items()):
             entered("reading", 0.2 * number / len(meshes), name)
-            views.append(_mesh(file))
+            views.append(read_mesh(file))
         entered("registering", 0.2, f"{len(views)} views")
         starts = _starts(poses)
         found = registered(views, starts, names=names, start_error_mm=start_error_mm)
@@ -104,8 +104,8 @@ def combine_into(
     progress("done", 1.0, f"{len(whole.mesh.faces)} triangles")
 
 
-def _mesh(file: Path) -> Mesh:
-    """Raises InvalidInputError: the file is not as slrig wrote it; StorageError: it cannot be read."""
+def read_mesh(file: Path) -> Mesh:
+    """A view. Raises InvalidInputError: the file is not as slrig wrote it; StorageError: it cannot be read."""
     with refusals_of(file):
         data = file.read_bytes()
     try:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
+
 from slrig.model.arrays import FloatArray
 
 
@@ -28,6 +30,16 @@ class MeasuredAxis(StageAxis):
     """
 
     covariance: FloatArray
+
+    @property
+    def point_sigma_mm(self) -> float:
+        """Standard deviation of the point across the axis, rms of both directions."""
+        return float(np.sqrt(max(np.trace(self.covariance[:3, :3]), 0.0) / 2))
+
+    @property
+    def direction_sigma_rad(self) -> float:
+        """The same of the direction."""
+        return float(np.sqrt(max(np.trace(self.covariance[3:, 3:]), 0.0) / 2))
 
 
 class PlaneKind(StrEnum):

@@ -143,7 +143,8 @@ def cut(view: Mesh, planes: Sequence[StagePlane], *, name: str = "the view") -> 
         told = ", ".join(f"{plane.kind} {share:.0%}" for plane, share in zip(planes, removed, strict=True))
         raise StageRefusedError(
             f"{name}: expected an object before the planes of the stage, found that a cut would leave "
-            f"{used.mean():.1%} of the view ({told}). The stage or the cameras were moved: scan the empty stage again, or do not cut"
+            f"{used.mean():.1%} of the view ({told}). The stage or the cameras were moved: scan the empty stage again, "
+            "or do not cut"
         )
     numbers = np.cumsum(used, dtype=np.int32) - np.int32(1)
     mesh = Mesh(

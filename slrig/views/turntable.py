@@ -107,14 +107,14 @@ def axis_of(
     along = way @ (middle - place)
     tilts = across.T / radius
     by_fit = np.block([[across.T, along * tilts], [np.zeros((3, 2)), tilts]])
-    of_axis = by_fit @ known @ by_fit.T
+    axis_found = MeasuredAxis(place + way * along, way, by_fit @ known @ by_fit.T)
     return FoundAxis(
-        point_mm=place + way * along,
+        point_mm=axis_found.point_mm,
         direction=way,
         angles_rad=(turned + np.pi) % (2 * np.pi) - np.pi,
-        point_sigma_mm=float(np.sqrt(np.trace(of_axis[:3, :3]) / 2)),
-        direction_sigma_rad=float(np.sqrt(np.trace(of_axis[3:, 3:]) / 2)),
+        point_sigma_mm=axis_found.point_sigma_mm,
+        direction_sigma_rad=axis_found.direction_sigma_rad,
         rms_mm=float(np.sqrt(left.mean())),
         rms_over_sigma=over,
-        covariance=of_axis,
+        covariance=axis_found.covariance,
     )

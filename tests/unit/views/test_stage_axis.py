@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from slrig.calibration.board import USUAL_BOARD
 from slrig.errors import StageRefusedError
 from slrig.model import FloatArray, MeasuredAxis
-from slrig.views.stage_axis import BoardAxis, board_axis, noted
+from slrig.views.axis_change import noted
+from slrig.views.stage_axis import BoardAxis, board_axis
 
 POINT_MM = np.array([12.0, 60.0, 480.0])
 DIRECTION = np.array([0.05, -0.93, -0.36]) / np.linalg.norm([0.05, -0.93, -0.36])
@@ -39,7 +40,7 @@ def shot(
         pose[:3, 3] = turn @ (stood - POINT_MM) + POINT_MM + error[3:]
     each = np.diag(NOISE**2)
     shared = np.outer([0, 0, 0, 0.2, -0.3, 0.5], [0, 0, 0, 0.2, -0.3, 0.5])
-    covariance: FloatArray = np.kron(np.eye(len(angles_deg)), each) + np.kron(np.ones((len(angles_deg),) * 2), shared)
+    covariance = np.asarray(np.kron(np.eye(len(poses)), each) + np.kron(np.ones((len(poses),) * 2), shared), np.float64)
     return [f"pose {number}" for number in range(1, len(angles_deg) + 1)], poses, covariance
 
 

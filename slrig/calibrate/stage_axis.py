@@ -1,0 +1,30 @@
+"""The axis of a stage from a session's poses. Run by the worker and by `slrig stage axis`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from slrig.calibration.board import Board
+from slrig.calibration.health.standing import board_poses
+from slrig.calibration.observations import PoseObservation
+from slrig.model import Calibration
+from slrig.views.stage_axis import BoardAxis, board_axis
+
+
+def axis_of_poses(
+    poses: Sequence[PoseObservation],
+    board: Board,
+    calibration: Calibration,
+    angles_deg: Sequence[float] | None = None,
+) -> BoardAxis:
+    """The axis that a board was turned about. angles_deg : where the stage says that it stood, pose by pose.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration is of other cameras than saw the board.
+    StageRefusedError
+        As `board_axis` does.
+    """
+    known = board_poses(poses, board, calibration)
+    return board_axis(known.names, known.poses, known.covariance, board.points_mm, angles_deg)

@@ -1,0 +1,14 @@
+"""The planes of an empty stage from the files of a scan. Run by the worker and by `slrig stage planes`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from slrig.combine.combining import read_mesh
+from slrig.model import StageAxis, StagePlane
+from slrig.views.stage_planes import stage_planes
+
+
+def planes_in(mesh: Path, axis: StageAxis | None) -> tuple[StagePlane, ...]:
+    """The planes in a mesh.ply; see `stage_planes`. Raises as that does, InvalidInputError, and StorageError."""
+    return stage_planes(read_mesh(mesh), axis)

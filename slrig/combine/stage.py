@@ -1,0 +1,148 @@
+"""The stage of a rig on disk, DATA/stage/stage.json: its axis, which every model improves, and its planes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+import structlog
+
+from slrig.bundle.stage_file import AxisSource, ChangeEntry, StageRecord, encode_stage, read_stage
+from slrig.bundle.storage import sync_folder, write_file
+from slrig.disk import refusals_of
+from slrig.errors import ConfigError, StorageError
+from slrig.jobs.records import utc_now
+from slrig.model import MeasuredAxis, StagePlane
+from slrig.views.axis_change import MOST_SIGMAS, Noted, noted
+
+_FILE = "stage.json"
+_log = structlog.get_logger(__name__)
+
+
+class StageState(StrEnum):
+    """unknown : there is no axis. known : there is. moved : the last model turned about another one."""
+
+    UNKNOWN = "unknown"
+    KNOWN = "known"
+    MOVED = "moved"
+
+
+def state_of(record: StageRecord) -> tuple[StageState, str]:
+    """The state of a stage, and what to do about it; empty where nothing is to be done."""
+    if record.axis is None:
+        return StageState.UNKNOWN, (
+            "stand a board on the stage, shoot it at six angles as poses of a calibration (POST /calibration), and "
+            "POST /rig/stage/axis"
+        )
+    if record.history and not record.history[-1].taken:
+        last = record.history[-1]
+        return StageState.MOVED, (
+            f"model {last.of} turned about an axis that is {last.moved_mm:.3f} mm and {last.moved_deg:.3f}° from the "
+            f"one on record, {last.sigmas:.0f} deviations where {MOST_SIGMAS:g} are allowed: were the stage or the "
+            "cameras moved, or is the rig newly calibrated? Then calibrate the axis again (POST /rig/stage/axis) and "
+            "scan the empty stage (POST /rig/stage/planes); else scan the object again"
+        )
+    return StageState.KNOWN, ""
+
+
+class StageStore:
+    """The stage of a data folder. One process uses it, from any thread. root : its own folder in there, DATA/stage.
+
+    Whatever reads or writes raises StorageError: the disk refused, or the file is damaged. A damaged one is never
+    overwritten: it has to be deleted first.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._path = root / _FILE
+        self._lock = threading.RLock()
+
+    def record(self) -> StageRecord:
+        """What is known; nothing where there is no file."""
+        if not self._path.exists():
+            return StageRecord()
+        try:
+            return read_stage(self._path)
+        except ConfigError as error:
+            message = (
+                f"The record of the stage is damaged, and is left as it is. {error}\nBring {self._path} back from a "
+                "backup, or delete it (DELETE /rig/stage) and calibrate the stage again."
+            )
+            raise StorageError(message) from error
+
+    def axis(self) -> MeasuredAxis | None:
+        """The axis on record; None where none is."""
+        return self.record().axis
+
+    def planes(self) -> Sequence[StagePlane]:
+        """Those that views are cut by."""
+        return self.record().planes
+
+    def put_axis(self, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None) -> StageRecord:
+        """Put an axis on record in place of any other. of : what it was found by, by its id."""
+        with self._lock:
+            record = self.record()
+            apart = None if record.axis is None else noted(record.axis, axis)
+            return self._changed(record, axis, _change(axis, source, of, at or utc_now(), apart, taken=True))
+
+    def put_planes(self, planes: Sequence[StagePlane]) -> StageRecord:
+        """Put planes on record in place of all others."""
+        with self._lock:
+            return self.replace(replace(self.record(), planes=tuple(planes)))
+
+    def note(self, axis: MeasuredAxis, *, of: str, at: datetime | None = None) -> Noted | None:
+        """Improve the axis on record by one that a model was found to turn about; None where none is on record.
+
+        An axis that is too far from it (`MOST_SIGMAS`) is not taken, only told.
+        """
+        with self._lock:
+            record = self.record()
+            if record.axis is None:
+                return None
+            found = noted(record.axis, axis)
+            change = _change(axis, AxisSource.MODEL, of, at or utc_now(), found, taken=found.agrees)
+            self._changed(record, found.axis, change)
+        if not found.agrees:
+            _log.warning("the stage was moved?", model=of, moved_mm=found.moved_mm, sigmas=found.sigmas)
+        return found
+
+    def replace(self, record: StageRecord) -> StageRecord:
+        """Put a whole record in place of the one there is, unless that is damaged."""
+        with self._lock:
+            self.record()
+            with refusals_of(self._path):
+                self._path.parent.mkdir(exist_ok=True)
+            write_file(self._path, encode_stage(record))
+            return record
+
+    def delete(self) -> None:
+        """Forget the stage, whatever the file holds. Idempotent."""
+        with self._lock, refusals_of(self._path), suppress(FileNotFoundError):
+            self._path.unlink()
+            sync_folder(self._path.parent)
+
+    def _changed(self, record: StageRecord, axis: MeasuredAxis, change: ChangeEntry) -> StageRecord:
+        return self.replace(replace(record, axis=axis, history=(*record.history, change)))
+
+
+def _change(
+    axis: MeasuredAxis, source: AxisSource, of: str, at: datetime, apart: Noted | None, *, taken: bool
+) -> ChangeEntry:
+    return ChangeEntry(
+        at=at,
+        source=source,
+        of=of,
+        point_mm=axis.point_mm.tolist(),
+        direction=axis.direction.tolist(),
+        point_sigma_mm=axis.point_sigma_mm,
+        direction_sigma_deg=float(np.rad2deg(axis.direction_sigma_rad)),
+        moved_mm=None if apart is None else apart.moved_mm,
+        moved_deg=None if apart is None else apart.moved_deg,
+        sigmas=None if apart is None else apart.sigmas,
+        taken=taken,
+    )
