@@ -49,6 +49,9 @@ class ModelRequest(Strict):
     voxel_mm: Annotated[float, Field(ge=0.001, le=1000)] | None = Field(
         default=None, description="length of the model's edges. Default: 1.25 times that of the scans'"
     )
+    cut: bool = Field(
+        default=True, description="whether plate and backdrops, where the stage's planes are known, are cut away first"
+    )
     label: FreeText | None = Field(default=None, description="free text, to find the model again")
 
     @model_validator(mode="after")
@@ -67,7 +70,9 @@ class ModelRequest(Strict):
         else:
             axis = None if self.axis is None else StatedAxis.of(self.axis.point_mm, self.axis.direction)
             poses = TurntablePoses(axis, None if self.angles_deg is None else tuple(self.angles_deg))
-        return ModelPlan(tuple(self.scans), poses, start_error_mm=self.start_error_mm, voxel_mm=self.voxel_mm)
+        return ModelPlan(
+            tuple(self.scans), poses, start_error_mm=self.start_error_mm, voxel_mm=self.voxel_mm, cut=self.cut
+        )
 
 
 class ModelBody(JobBody):

@@ -118,17 +118,18 @@ class Service:
             report=worker.task("slrig.accept.report:write_reports", "report of the acceptance test"),
             wanted_mm=wanted_mm,
         )
+        self.stage = StageStore(folder.root / "stage")
         self.models = ModelDesk(
             folder,
             runner.queue,
             JobStore(database, JobKind.MODEL, outbox=outbox),
             scans=store,
             combine=combine or worker.task("slrig.combine.combining:combine_into", "model"),
+            stage=self.stage,
             keep=settings.keep_models,
             spare_bytes=spare_bytes,
         )
         runner.spare_what_is_used(self.models.unused)
-        self.stage = StageStore(folder.root / "stage")
         self.find_axis = worker.task("slrig.calibrate.stage_axis:axis_of_poses", "axis of the stage")
         self.find_planes = worker.task("slrig.combine.empty_stage:planes_in", "planes of the stage")
         self.durations = Durations()

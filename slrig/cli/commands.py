@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import typer
 import typer.core
 
-from slrig.cli import calibrate, key, preset, schedule
+from slrig.cli import calibrate, key, preset, schedule, stage
 from slrig.cli.backup import backup, restore
 from slrig.cli.foreign import import_images
 from slrig.cli.model import model
@@ -386,6 +386,7 @@ app.command()(restore)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(schedule.app, name="schedule")
 app.add_typer(preset.app, name="preset")
+app.add_typer(stage.app, name="stage")
 app.add_typer(key.app, name="key")
 
 

@@ -36,6 +36,13 @@ def model(
     axis_direction: Annotated[
         Vector | None, typer.Option(metavar="X Y Z", help="With --axis-point: the direction of the axis.")
     ] = None,
+    stage: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="What slrig stage wrote: the axis for --angle, and planes to cut views by."),
+    ] = None,
+    no_cut: Annotated[bool, typer.Option("--no-cut", help="With --stage: leave plate and backdrops in the views.")] = (
+        False
+    ),
     poses: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Poses to start from, by the scans' names, as in poses.json.")
     ] = None,
@@ -52,21 +59,31 @@ def model(
     Says how well they agree, and which motions their shape leaves open. The start is a stage's angle or poses. Where
     no scan has seen the object, the mesh is open.
     """
+    from slrig.bundle.stage_file import StageRecord, read_stage
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.combine.offered import MEDIA_TYPES, POSES, REPORT, REPORT_FORMAT
+    from slrig.combine.plan import StatedAxis
     from slrig.logs import set_up_logs_for_a_person
     from slrig.scan.artefacts import staged_folder
 
     set_up_logs_for_a_person()
     keep_kernels()
     files = _named_meshes(scans)
-    start = _starts(list(files), angle, _axis(axis, axis_point, axis_direction), poses)
-    _require_apart(output, [*files.values(), *(each for each in (axis, poses) if each and each.name != POSES)])
+    known = StageRecord() if stage is None else read_stage(stage)
+    told = _axis(axis, axis_point, axis_direction)
+    if told is None and known.axis is not None and poses is None:
+        told = StatedAxis.of(known.axis.point_mm, known.axis.direction)
+    start = _starts(list(files), angle, told, poses)
+    read = [each for each in (axis, poses, stage) if each and each.name != POSES]
+    _require_apart(output, [*files.values(), *read])
     with staged_folder(output, REPORT_FORMAT) as folder, progress_shown() as display:
         from slrig.combine.combining import combine_into
 
-        combine_into(files, folder, start, start_error_mm=start_error_mm, voxel_mm=voxel_mm, progress=display)
+        planes = () if no_cut else known.planes
+        combine_into(
+            files, folder, start, start_error_mm=start_error_mm, voxel_mm=voxel_mm, planes=planes, progress=display
+        )
         report = json.loads((folder / REPORT).read_bytes())
     _tell(report)
     _tell_fused(report["model"])
@@ -103,6 +120,9 @@ def _tell(report: Mapping[str, Any]) -> None:
         )  # fmt: skip
     figures = ("vertices", "overlaps", "most", "residual", "over σ", "closure", "σ of pose")
     print_table((Column("view", overflow="fold"), *(Column(each, justify="right") for each in figures)), rows)
+    removed = [sum(each["share"] for each in view["removed"]) for view in report["views"] if view["removed"]]
+    if removed:
+        typer.echo(f"{'cut':<10}{min(removed):.0%} to {max(removed):.0%} of the views lay behind the stage's planes")
     for kind in dict.fromkeys(each["motion"] for each in report["free"]):
         mine = [each for each in report["free"] if each["motion"] == kind]
         who = counted(len({each["view"] for each in mine}), "view")
@@ -126,12 +146,13 @@ def _starts(names: Sequence[str], angle: float | None, axis: StatedAxis | None, 
     from slrig.combine.plan import GivenPoses, TurntablePoses
 
     if (angle is None) == (file is None) or (angle is None) != (axis is None):
-        told = {"--angle": angle, "--axis or --axis-point": axis, "--poses": file}
+        told = {"--angle": angle, "--axis, --axis-point or --stage": axis, "--poses": file}
         found = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
         message = (
-            "expected a stage's --angle with its axis (--axis FILE, or --axis-point and --axis-direction), or --poses "
-            f"FILE, found {found}. Poses that nobody knows cannot be found yet: place the scans by hand in another "
-            "program, and write what it says into a file as slrig/views/README.md describes"
+            "expected a stage's --angle with its axis (--stage FILE, --axis FILE, or --axis-point and "
+            f"--axis-direction), or --poses FILE, found {found}. Poses that nobody knows cannot be found yet: place "
+            "the scans by hand in another program, and write what it says into a file as slrig/views/README.md "
+            "describes"
         )
         raise ConfigError(message)
     if file is None:

@@ -100,6 +100,7 @@ class Models(Remote[W]):
         axis: Mapping[str, Any] | None = None,
         start_error_mm: float | None = None,
         voxel_mm: float | None = None,
+        cut: bool | None = None,
         label: str | None = None,
     ) -> Json:
         """Have scans made one mesh, and return the model as it is on record; `wait` returns it when it is over."""

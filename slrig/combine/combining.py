@@ -18,13 +18,14 @@ from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, Turnta
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
-from slrig.model import FloatArray, Mesh
+from slrig.model import FloatArray, Mesh, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
 from slrig.views.fusion import FusedModel, fused
 from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
+from slrig.views.stage_planes import cut
 from slrig.views.turntable import FoundAxis, found_axis, turntable
 
 
@@ -35,6 +36,7 @@ def combine_into(
     *,
     start_error_mm: float = START_ERROR_MM,
     voxel_mm: float | None = None,
+    planes: Sequence[StagePlane] = (),
     progress: Progress,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> None:
@@ -43,7 +45,8 @@ def combine_into(
 
     meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near where they belong; of
     a turntable, with its axis and angles. start_error_mm : how far a surface may be from there. voxel_mm : length of
-    the model's edges; None is 1.25 times that of the views'.
+    the model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind them is cut
+    away first.
 
     Raises
     ------
@@ -51,6 +54,8 @@ def combine_into(
         The turntable's axis or angles are not told.
     RegistrationRefusedError
         A view overlaps no other, or does not agree with them.
+    StageRefusedError
+        All but nothing of a view would be left before the planes.
     InvalidInputError
         A mesh is not as slrig wrote it, is no manifold, or the voxels are too fine for it.
     NothingToReconstructError
@@ -74,10 +79,12 @@ def combine_into(
         progress(*at, f"preparing kernels, first time only: {kernel}")
 
     with compilations_told(compiling):
-        names, views = list(meshes), []
+        names, views, removed = list(meshes), [], []
         for number, (name, file) in enumerate(meshes.items()):
             entered("reading", 0.2 * number / len(meshes), name)
-            views.append(read_mesh(file))
+            view, taken = cut(read_mesh(file), planes, name=name)
+            views.append(view)
+            removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
         starts = _starts(poses)
         found = registered(views, starts, names=names, start_error_mm=start_error_mm)
@@ -91,6 +98,10 @@ def combine_into(
             dict(zip(names, found.poses, strict=True)), None if axis is None else (axis.point_mm, axis.direction)
         )
         report = _report(names, views, found, None if axis is None else _axis(axis, poses), whole)
+        for view_told, taken in zip(report["views"], removed, strict=True):
+            view_told["removed"] = [
+                {"kind": plane.kind, "share": share} for plane, share in zip(planes, taken, strict=True)
+            ]
         # One at a time: each is as large as all meshes.
         files: dict[str, Callable[[], bytes]] = {
             MODEL: lambda: encode_mesh_ply(whole.mesh),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,8 @@ import structlog
 
 from slrig.combine.offered import missing_files
 from slrig.combine.plan import ModelPlan, StartingPoses, StatedAxis, TurntablePoses, plan_from_json, plan_json
-from slrig.combine.store import ModelStore, summary
+from slrig.combine.stage import StageStore
+from slrig.combine.store import ModelStore, found_axis, summary
 from slrig.errors import ConfigError, JobNotFoundError, QueueFullError, ScanStateError, StorageError
 from slrig.failure import failure_of
 from slrig.jobs.data_folder import DataFolder
@@ -25,7 +26,7 @@ from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobRecord, JobState
 from slrig.jobs.rig_jobs import Outcome, Parts, RigJobs
 from slrig.jobs.store import JobStore
-from slrig.model import StageAxis
+from slrig.model import StagePlane
 from slrig.scan.artefacts import MESH
 from slrig.scan.plan import Progress
 
@@ -47,6 +48,7 @@ class CombineInto(Protocol):
         *,
         start_error_mm: float,
         voxel_mm: float | None,
+        planes: Sequence[StagePlane],
         progress: Progress,
         cancelled: Callable[[], bool],
     ) -> None:
@@ -57,8 +59,8 @@ class CombineInto(Protocol):
 class ModelDesk:
     """Has models made, and keeps the newest. Any thread may call.
 
-    scans : those on record. combine : see `CombineInto`. axis : gives the stage's own, None where it is not known.
-    keep : so many models are kept. spare_bytes : left free on the disk.
+    scans : those on record. combine : see `CombineInto`. stage : knows its axis and planes, and learns
+    of each model's axis. keep : so many models are kept. spare_bytes : left free on the disk.
     """
 
     def __init__(
@@ -69,7 +71,7 @@ class ModelDesk:
         *,
         scans: JobStore,
         combine: CombineInto,
-        axis: Callable[[], StageAxis | None] = lambda: None,
+        stage: StageStore,
         keep: int,
         spare_bytes: int = 0,
     ) -> None:
@@ -79,7 +81,7 @@ class ModelDesk:
         self._queue = queue
         self._scans = scans
         self._combine = combine
-        self._axis = axis
+        self._stage = stage
         self._keep = keep
         self._spare_bytes = spare_bytes
         self._work = RigJobs(jobs, queue, folder)
@@ -160,7 +162,7 @@ class ModelDesk:
         if not isinstance(poses, TurntablePoses):
             return plan
         if poses.axis is None:
-            axis = self._axis()
+            axis = self._stage.axis()
             if axis is None:
                 message = (
                     "axis: expected that of the stage, and none is known here; say axis, with point_mm and direction "
@@ -242,6 +244,7 @@ class ModelDesk:
             plan.poses,
             start_error_mm=plan.start_error_mm,
             voxel_mm=plan.voxel_mm,
+            planes=self._stage.planes() if plan.cut else (),
             progress=progress,
             cancelled=job.stop.is_set,
         )
@@ -252,7 +255,14 @@ class ModelDesk:
             )
             raise StorageError(message)
         found = summary(staged)
+        axis = found_axis(staged)
         self.store.commit(record.id)
+        if axis is not None:
+            try:
+                self._stage.note(axis, of=str(record.id))
+            except StorageError as error:
+                # The model is there, and is no worse for that.
+                _log.warning("the axis of a model could not be noted", model=str(record.id), cause=str(error))
         return Outcome(found)
 
     def _mesh(self, scan_id: UUID) -> Path:

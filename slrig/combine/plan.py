@@ -76,7 +76,8 @@ class ModelPlan:
     """One model. scans : in the frame of the first one it is. poses : where their registration starts from.
 
     start_error_mm : how far a surface may be from where `poses` put it. voxel_mm : length of the model's edges; None is
-    1.25 times that of the scans'.
+    1.25 times that of the scans'. cut : whether what lies behind the planes of the stage, where there are any, is cut
+    away first.
 
     Raises
     ------
@@ -89,6 +90,7 @@ class ModelPlan:
     poses: Annotated[StartingPoses, Field(discriminator="kind")] = field(default_factory=TurntablePoses)
     start_error_mm: float = START_ERROR_MM
     voxel_mm: float | None = None
+    cut: bool = True
 
     def __post_init__(self) -> None:
         if len(self.scans) < 2:

@@ -51,6 +51,14 @@ def state_of(record: StageRecord) -> tuple[StageState, str]:
     return StageState.KNOWN, ""
 
 
+def with_axis(
+    record: StageRecord, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None
+) -> StageRecord:
+    """The record with an axis in place of any other, and with how far it has moved."""
+    apart = None if record.axis is None else noted(record.axis, axis)
+    return replace(record, axis=axis, history=(*record.history, _change(axis, source, of, at, apart, taken=True)))
+
+
 class StageStore:
     """The stage of a data folder. One process uses it, from any thread. root : its own folder in there, DATA/stage.
 
@@ -86,9 +94,7 @@ class StageStore:
     def put_axis(self, axis: MeasuredAxis, *, source: AxisSource, of: str, at: datetime | None = None) -> StageRecord:
         """Put an axis on record in place of any other. of : what it was found by, by its id."""
         with self._lock:
-            record = self.record()
-            apart = None if record.axis is None else noted(record.axis, axis)
-            return self._changed(record, axis, _change(axis, source, of, at or utc_now(), apart, taken=True))
+            return self.replace(with_axis(self.record(), axis, source=source, of=of, at=at))
 
     def put_planes(self, planes: Sequence[StagePlane]) -> StageRecord:
         """Put planes on record in place of all others."""
@@ -105,8 +111,8 @@ class StageStore:
             if record.axis is None:
                 return None
             found = noted(record.axis, axis)
-            change = _change(axis, AxisSource.MODEL, of, at or utc_now(), found, taken=found.agrees)
-            self._changed(record, found.axis, change)
+            change = _change(axis, AxisSource.MODEL, of, at, found, taken=found.agrees)
+            self.replace(replace(record, axis=found.axis, history=(*record.history, change)))
         if not found.agrees:
             _log.warning("the stage was moved?", model=of, moved_mm=found.moved_mm, sigmas=found.sigmas)
         return found
@@ -126,15 +132,12 @@ class StageStore:
             self._path.unlink()
             sync_folder(self._path.parent)
 
-    def _changed(self, record: StageRecord, axis: MeasuredAxis, change: ChangeEntry) -> StageRecord:
-        return self.replace(replace(record, axis=axis, history=(*record.history, change)))
-
 
 def _change(
-    axis: MeasuredAxis, source: AxisSource, of: str, at: datetime, apart: Noted | None, *, taken: bool
+    axis: MeasuredAxis, source: AxisSource, of: str, at: datetime | None, apart: Noted | None, *, taken: bool
 ) -> ChangeEntry:
     return ChangeEntry(
-        at=at,
+        at=at or utc_now(),
         source=source,
         of=of,
         point_mm=axis.point_mm.tolist(),

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from uuid import UUID
+
+import numpy as np
 
 from slrig.combine.offered import REPORT
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
 from slrig.jobs.data_folder import DataFolder
+from slrig.model import MeasuredAxis
 
 
 class ModelStore:
@@ -71,8 +75,7 @@ def summary(model: Path) -> dict[str, Any]:
 
     pose_sigma_mm : of the view that is known least. free : views that may move without a residual. Raises StorageError.
     """
-    try:
-        report = json.loads((model / REPORT).read_bytes())
+    with _report(model) as report:
         return {
             "views": len(report["views"]),
             "pairs": len(report["pairs"]),
@@ -80,6 +83,24 @@ def summary(model: Path) -> dict[str, Any]:
             "pose_sigma_mm": max(view["sigma_mm"] for view in report["views"]),
             **{name: report["model"][name] for name in ("vertices", "triangles", "voxel_mm", "sigma_mm")},
         }
+
+
+def found_axis(model: Path) -> MeasuredAxis | None:
+    """The axis that a stage was found to turn about; None without a stage, or where motions were left as the start had
+    them, and the axis with them. Raises StorageError.
+    """
+    with _report(model) as report:
+        axis = report.get("axis")
+        if axis is None or report["free"]:
+            return None
+        return MeasuredAxis(*(np.array(axis[name]) for name in ("point_mm", "direction", "covariance")))
+
+
+@contextmanager
+def _report(model: Path) -> Iterator[dict[str, Any]]:
+    """A model's report. Raises StorageError: it cannot be read, or lacks what is looked for within the block."""
+    try:
+        yield json.loads((model / REPORT).read_bytes())
     except (OSError, ValueError, KeyError, TypeError) as error:
         message = f"{model / REPORT} cannot be read ({error}). Make the model again."
         raise StorageError(message) from error

@@ -130,6 +130,8 @@ def cut(view: Mesh, planes: Sequence[StagePlane], *, name: str = "the view") -> 
     StageRefusedError
         Less than a hundredth would be left.
     """
+    if not planes:
+        return Cut(view, ())
     points = view.vertices_mm.astype(np.float64)
     kept = np.ones(len(points), dtype=np.bool_)
     removed = []

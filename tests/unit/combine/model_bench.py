@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 from uuid import UUID, uuid4
 
+from slrig.bundle.stage_file import AxisSource
 from slrig.combine.desk import ModelDesk
 from slrig.combine.offered import MEDIA_TYPES, REPORT
 from slrig.combine.plan import StartingPoses
+from slrig.combine.stage import StageStore
 from slrig.errors import ScanCancelledError
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.records import JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
-from slrig.model import StageAxis
+from slrig.model import MeasuredAxis, StagePlane
 from slrig.scan.plan import Progress, ScanPlan
 from slrig.scan.records import plan_json
 from slrig.scan.sweep import sweep
@@ -38,12 +41,15 @@ def kept_scan(store: JobStore, folder: DataFolder, *, angle_deg: float | None = 
 
 
 class TameCombining:
-    """Combines nothing. asked : what it was told of each model, meshes, poses. error : raised in place of the next one.
-    While `gate` is clear it goes on; `began` is set when one does.
+    """Combines nothing. asked : what it was told of each model, meshes, poses; planes : of the last one. error : raised
+    in place of the next one. axis : what it says it found. While `gate` is clear it goes on; `began` is set when one
+    does.
     """
 
     def __init__(self) -> None:
         self.asked: list[tuple[Mapping[str, Path], StartingPoses, float, float | None]] = []
+        self.planes: Sequence[StagePlane] = ()
+        self.axis: Mapping[str, Any] | None = None
         self.error: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
@@ -58,9 +64,11 @@ class TameCombining:
         *,
         start_error_mm: float,
         voxel_mm: float | None,
+        planes: Sequence[StagePlane],
         progress: Progress,
         cancelled: Callable[[], bool],
     ) -> None:
+        self.planes = planes
         self.asked.append((meshes, poses, start_error_mm, voxel_mm))
         assert list(folder.iterdir()) == []
         progress("registering", 0.2, f"{len(meshes)} views")
@@ -72,10 +80,10 @@ class TameCombining:
         if self.error is not None:
             error, self.error = self.error, None
             raise error
-        model_files(folder, list(meshes))
+        model_files(folder, list(meshes), self.axis)
 
 
-def model_files(folder: Path, names: list[str]) -> None:
+def model_files(folder: Path, names: list[str], axis: Mapping[str, Any] | None = None) -> None:
     """The files of a model, as far as they are looked at."""
     for name in MEDIA_TYPES:
         (folder / name).write_bytes(name.encode())
@@ -84,6 +92,7 @@ def model_files(folder: Path, names: list[str]) -> None:
         "views": [{"name": name, "sigma_mm": 0.002 * number} for number, name in enumerate(names)],
         "pairs": [{"first": names[0], "second": name} for name in names[1:]],
         "free": [],
+        "axis": axis,
         "model": {"vertices": 9, "triangles": 12, "voxel_mm": 0.5, "sigma_mm": 0.01},
     }
     (folder / REPORT).write_text(json.dumps(told))
@@ -92,18 +101,21 @@ def model_files(folder: Path, names: list[str]) -> None:
 class ModelBench(Bench):
     """A desk for models beside a runner of scans. start : begin at once; else what is taken up waits for that."""
 
-    def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: StageAxis | None = None) -> None:
+    def __init__(self, root: Path, *, keep: int = 100, start: bool = True, axis: MeasuredAxis | None = None) -> None:
         super().__init__(root)
         self.tame = TameCombining()
         self.models = JobStore(self.store.database, JobKind.MODEL)
         sweep(self.store, self.folder)
+        self.stage = StageStore(root / "stage")
+        if axis is not None:
+            self.stage.put_axis(axis, source=AxisSource.BOARD, of="a board")
         self.desk = ModelDesk(
             self.folder,
             self.runner.queue,
             self.models,
             scans=self.store,
             combine=self.tame,
-            axis=lambda: axis,
+            stage=self.stage,
             keep=keep,
         )
         self.runner.spare_what_is_used(self.desk.unused)

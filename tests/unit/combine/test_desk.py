@@ -23,7 +23,7 @@ from slrig.errors import (
 )
 from slrig.failure import failure_of, interruption
 from slrig.jobs.records import JobState
-from slrig.model import StageAxis
+from slrig.model import MeasuredAxis, PlaneKind, StagePlane
 from slrig.scan.plan import ScanPlan
 from slrig.scan.records import plan_json as scan_plan_json
 from slrig.scan.retention import ScanLimits, ScanRetention
@@ -64,11 +64,30 @@ def test_a_model_is_made_of_scans_on_a_stage_and_lies_in_its_place(bench: ModelB
 
 
 def test_the_axis_is_the_stages_own_unless_it_is_said(tmp_path: Path) -> None:
-    bench = ModelBench(tmp_path, axis=StageAxis(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0])))
+    bench = ModelBench(tmp_path, axis=MeasuredAxis(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.0, 1.0]), np.eye(6)))
     scans = bench.kept_scans(None, None)
     for axis, expected in ((None, StatedAxis((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))), (AXIS, AXIS)):
         plan = ModelPlan(scans, TurntablePoses(axis, (10.0, 55.0)))
         assert bench.desk.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0))
+    bench.close()
+
+
+def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path: Path) -> None:
+    covariance = np.diag([1e-4, 1e-4, 0.0, 1e-8, 1e-8, 0.0])
+    bench = ModelBench(tmp_path, axis=MeasuredAxis(np.zeros(3), np.array([0.0, 0.0, 1.0]), covariance))
+    plate = StagePlane(PlaneKind.PLATE, np.zeros(3), np.array([0.0, 0.0, -1.0]), 0.03, 80.0, 1.2)
+    bench.stage.put_planes([plate])
+    scans = bench.kept_scans(0.0, 40.0)
+    bench.tame.axis = {
+        "point_mm": [0.02, 0.0, 5.0], "direction": [0.0, 0.0, 1.0], "covariance": covariance.tolist(),
+    }  # fmt: skip
+    for cut in (True, False):
+        made = bench.over(bench.desk.combine(ModelPlan(scans, TurntablePoses(), cut=cut)).id)
+        assert [each.kind for each in bench.tame.planes] == [PlaneKind.PLATE] * cut
+        assert bench.stage.record().history[-1].of == str(made.id)
+    axis = bench.stage.axis()
+    assert axis is not None
+    assert 0.01 < axis.point_mm[0] < 0.02
     bench.close()
 
 
