@@ -20,7 +20,6 @@ from slrig.client.endpoints import (
     Models,
     Presets,
     RigHealth,
-    RigStage,
     RigState,
     ScanOptions,
     Scans,
@@ -30,6 +29,7 @@ from slrig.client.endpoints import (
 from slrig.client.events import Event
 from slrig.client.operations import Operation, Remote
 from slrig.client.scans import ScanJob, ScanResult, Told
+from slrig.client.stage import RigStage
 from slrig.client.wire import Awaited, Blocking
 from slrig.errors import ConfigError, ServiceError
 

@@ -297,32 +297,6 @@ class RigHealth(Remote[W]):
         """What happens to a verification until it is over, from its beginning."""
 
 
-class RigStage(Remote[W]):
-    """The stage that turns objects: its axis, and the planes that models are cut by."""
-
-    look = entry("GET /rig/stage", _told, "The axis, how well it is known, the planes, and whether both still hold.")
-    plot = entry("GET /rig/stage.svg", _text, "How the axis has moved, as SVG.")
-    forget = entry("DELETE /rig/stage", _done, "Forget axis, planes and history.")
-
-    @endpoint("POST /rig/stage/axis")
-    def calibrate(
-        self,
-        calibration: str,
-        *,
-        poses: Sequence[int] | None = None,
-        angles_deg: Sequence[float] | None = None,
-    ) -> Json:
-        """The axis, from poses of a board that stood on the stage. angles_deg : as the stage says, pose by pose."""
-
-    @endpoint("POST /rig/stage/planes")
-    def find_planes(self, scan: str) -> Json:
-        """Plate and backdrops, from a scan of the empty stage."""
-
-    @endpoint("PUT /rig/stage", content="document")
-    def put(self, document: Mapping[str, Any] | str | bytes) -> Json:
-        """Put back a document that was kept, in place of all that is known."""
-
-
 class Acceptance(Remote[W]):
     """Acceptance tests, position by position."""
 

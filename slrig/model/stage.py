@@ -53,7 +53,7 @@ class PlaneKind(StrEnum):
 class StagePlane:
     """A plane of the empty stage, in the calibration's world frame; nothing of the object lies behind it.
 
-    point_mm : (3,), the middle of what was seen of it. normal : (3,), unit, to the first camera's side. sigma_mm :
+    point_mm : (3,), the middle of what was seen of it. normal : (3,), unit, to the side it was seen from. sigma_mm :
     deviation of its surface from it; radius_mm : how far from the middle it was seen. margin_mm : what lies so near
     before it is cut away, too.
     """

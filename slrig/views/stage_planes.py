@@ -56,7 +56,7 @@ def stage_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[StagePlane
         flat = float(np.mean(np.abs(normals[mine] @ normal) > _COSINE)) if mine.any() else 0.0
         if mine.mean() < _LEAST_SHARE or flat < _LEAST_FLAT or _NEAR_SIGMAS * sigma > _FAR_MM:
             break
-        found.append(_plane(points[mine], middle, normal, sigma, axis))
+        found.append(_plane(points[mine], normals[mine], middle, normal, sigma, axis))
         # What is near it, and behind it, is part of it or hidden by it.
         left &= (points - middle) @ found[-1].normal > found[-1].margin_mm
     if not found:
@@ -99,10 +99,10 @@ def _fitted(
 
 
 def _plane(
-    points: FloatArray, middle: FloatArray, normal: FloatArray, sigma: float, axis: StageAxis | None
+    points: FloatArray, seen: FloatArray, middle: FloatArray, normal: FloatArray, sigma: float, axis: StageAxis | None
 ) -> StagePlane:
-    # The first camera stands in the world's origin, and sees the plane.
-    normal = normal * (1.0 if normal @ middle < 0 else -1.0)
+    # Normals of a scan's vertices point to the side from which they were seen.
+    normal = normal * (1.0 if np.median(seen @ normal) > 0 else -1.0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 99))
     square = 0.0 if axis is None else abs(float(normal @ axis.direction))
     kind = PlaneKind.PLATE if square > _PLATE_COSINE else PlaneKind.BACKDROP

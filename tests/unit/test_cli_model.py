@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from slrig.bundle.poses_file import Poses, encode_poses, read_poses
+from slrig.bundle.stage_file import StageRecord, encode_stage
 from slrig.cli.commands import app
 from slrig.combine import plan
 from slrig.errors import ConfigError
 from slrig.meshing.topology import topology_counts
+from slrig.model import MeasuredAxis, PlaneKind, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply
 from slrig.views import registration
 from tests.turned_views import AXIS, AXIS_POINT_MM, bumpy, displacement_mm, off_surface_mm, seen, vase
@@ -91,8 +93,19 @@ def test_how_far_starts_may_be_off_is_said_once() -> None:
 
 
 def test_a_vase_is_told_to_be_free(scans: Path, tmp_path: Path) -> None:
-    done = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "model", *STAGE)
+    # What is known of the stage is in a file: its axis, and a plate that hides a part of the vase.
+    views = [decode_mesh_ply((scans / f"vase-{number}.ply").read_bytes()) for number in (0, 1)]
+    height = (views[0].vertices_mm - AXIS_POINT_MM) @ AXIS
+    foot = StagePlane(PlaneKind.PLATE, AXIS_POINT_MM + np.quantile(height, 0.1) * AXIS, AXIS, 0.02, 50.0, 1.0)
+    known = MeasuredAxis(np.add(AXIS_POINT_MM, [0.3, 0.0, -0.2]), AXIS, 1e-4 * np.eye(6))
+    (tmp_path / "stage.json").write_bytes(encode_stage(StageRecord(known, (foot,))))
+    words = ("--angle", ANGLE, "--stage", tmp_path / "stage.json")
+    done = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "model", *words)
     assert done.exit_code == 0, done.output
+    assert "of the views lay behind the stage's planes" in done.stdout
+    whole = decode_mesh_ply((tmp_path / "model" / "model.ply").read_bytes())
+    # Within an edge of the model of where it was cut, 1 mm before the plane.
+    assert ((whole.vertices_mm - foot.point_mm) @ AXIS).min() > 0.0
     assert "free      1 view may turn about an axis along (-0.0" in done.stdout
     assert "held as the start has it" in done.stdout
     (free,) = json.loads((tmp_path / "model" / "report.json").read_text())["free"]

@@ -1,0 +1,169 @@
+"""A rendered turntable: its axis from a board, plate and wall from an empty scan, and views that are cut by them."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from simulated_rig.device import simulated_head
+from slrig.bundle import write_calibration
+from slrig.bundle.stage_file import read_stage
+from slrig.cli.commands import app
+from slrig.combine.combining import read_mesh
+from slrig.devices import CameraSettings, Rig, Turntable
+from slrig.model import Mesh, PlaneKind, StageAxis
+from slrig.scan.acquisition import capture_frames
+from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
+from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.views.registration import registered
+from slrig.views.stage_planes import cut, stage_planes
+from slrig.views.turntable import turntable
+from tests.rendered_boards import board_head, board_options, board_rig, board_scene
+from tests.turned_views import displacement_mm
+
+pytestmark = pytest.mark.slow
+
+CONFIG = Path(__file__).parents[2] / "config"
+BOARD_ANGLES = (-50.0, -30.0, -10.0, 10.0, 30.0, 50.0)
+BOARD = (
+    "--board",
+    "charuco",
+    "--corners",
+    "6x4",
+    "--square-mm",
+    "26",
+    "--marker-mm",
+    "20",
+    "--dictionary",
+    "DICT_4X4_50",
+)
+VIEW_ANGLES = (0.0, 12.0, 24.0)
+
+
+def axis_of(point_mm: Sequence[float], direction: Sequence[float]) -> StageAxis:
+    return StageAxis(np.array(point_mm), np.array(direction) / np.linalg.norm(direction))
+
+
+def recorded(rig: Rig, angle_deg: float, bundle: Path, *, rows: bool) -> Path:
+    """A bundle of what stands on the table, turned."""
+    assert isinstance(rig.positioner, Turntable)
+    rig.positioner.turn(angle_deg)
+    plan = ScanPlan(patterns=PatternPlan(rows=rows))
+    capture_frames(rig, plan, bundle, progress=lambda *_: None, cancelled=lambda: False).finish()
+    return bundle
+
+
+def test_the_axis_is_found_from_a_board_at_six_angles(tmp_path: Path) -> None:
+    axis = axis_of([3.0, 0.0, 12.0], [0.03, -1.0, -0.05])
+    table = {"point_mm": axis.point_mm.tolist(), "direction": axis.direction.tolist(), "objects": ["board"]}
+    options = board_options(cameras=2, carries_calibration=True, turntable=table)
+    del options["poses"]
+    head = board_head(tmp_path / "rig", options, board_scene(more="rotation_deg = [20.0, 0.0, 0.0]"))
+    assert head.calibration is not None
+    write_calibration(tmp_path / "calibration.json", head.calibration)
+    with board_rig(head, options) as rig:
+        for number, angle in enumerate(BOARD_ANGLES):
+            recorded(rig, angle, tmp_path / "poses" / f"pose_{number}", rows=True)
+    done = CliRunner().invoke(
+        app,
+        [
+            "stage", "axis", str(tmp_path / "poses"), *BOARD, "--calibration", str(tmp_path / "calibration.json"),
+            "--angle", "20", "--output", str(tmp_path / "stage.json"),
+        ],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    print(done.stdout)  # noqa: T201
+    found = read_stage(tmp_path / "stage.json").axis
+    assert found is not None
+    across = np.linalg.svd(found.direction[None])[2][1:]
+    along = found.direction @ (found.point_mm - axis.point_mm) / (found.direction @ axis.direction)
+    off_mm = np.linalg.norm(across @ (found.point_mm - axis.point_mm - along * axis.direction))
+    off_rad = np.arccos(min(1.0, float(found.direction @ axis.direction)))
+    assert off_mm < 0.03
+    assert off_mm < 3 * found.point_sigma_mm < 0.1
+    assert off_rad < 3 * found.direction_sigma_rad < np.deg2rad(0.05)
+
+
+VASE = """
+[[object]]
+name = "vase"
+shape = "turned"
+position_mm = [2.0, 6.0, 1.5]
+profile_mm = [[15.0, -24.0], [17.5, -16.0], [16.0, -6.0], [11.5, 6.0], [8.5, 15.0], [10.0, 20.0]]
+albedo = 0.85
+"""
+STAGE = """
+[[object]]
+name = "plate"
+shape = "plane"
+position_mm = [2.0, 26.0, 1.5]
+rotation_deg = [-90.0, 0.0, 0.0]
+size_mm = [90.0, 90.0]
+albedo = 0.5
+
+[[object]]
+name = "wall"
+shape = "plane"
+position_mm = [0.0, 0.0, 52.0]
+size_mm = [400.0, 400.0]
+albedo = 0.4
+"""
+AXIS = axis_of([2.0, 0.0, 1.5], [0.0, -1.0, 0.0])
+
+
+def scanned(folder: Path, scene: str, angles_deg: Sequence[float]) -> list[Mesh]:
+    """Scans of a scene whose wall stands still, by the rig of the figure on a turntable, from higher up."""
+    folder.mkdir()
+    (folder / "scene.toml").write_text(scene)
+    options: dict[str, Any] = tomllib.loads((CONFIG / "rigs" / "turntable.toml").read_text())["head"]
+    del options["driver"]
+    options["scene"] = "scene.toml"
+    turned = [each["name"] for each in tomllib.loads(scene)["object"] if each["name"] != "wall"]
+    options["turntable"] |= {
+        "point_mm": AXIS.point_mm.tolist(), "direction": AXIS.direction.tolist(), "objects": turned
+    }  # fmt: skip
+    options["projector"]["position_mm"] = [105.0, -260.0, -540.0]
+    options["camera"][0]["position_mm"] = [-150.0, -262.0, -500.0]
+    head, meshes = simulated_head(options, folder), []
+    settings = {"left": CameraSettings(0.0167)}
+    with Rig(
+        "from above", head.cameras, head.projector, settings, head.calibration, head, clock=head.clock,
+        positioner=head.positioner,
+    ) as rig:  # fmt: skip
+        for angle in angles_deg:
+            bundle, output = recorded(rig, angle, folder / f"{angle}", rows=False), folder / f"{angle}-scan"
+            reconstruct_bundle(
+                bundle, output, plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False
+            )
+            meshes.append(read_mesh(output / "mesh.ply"))
+    return meshes
+
+
+def test_plate_and_wall_are_found_and_a_vase_alone_is_left_where_the_stage_put_it(tmp_path: Path) -> None:
+    (empty,) = scanned(tmp_path / "empty", STAGE, [0.0])
+    planes = stage_planes(empty, AXIS)
+    for plane, kind, normal, at in zip(
+        planes, (PlaneKind.PLATE, PlaneKind.BACKDROP), ([0, -1, 0], [0, 0, -1]), ([0, 26, 0], [0, 0, 52]), strict=True
+    ):
+        assert plane.kind is kind
+        assert np.arccos(min(1.0, float(plane.normal @ normal))) < 1e-4
+        assert abs((plane.point_mm - at) @ normal) < 0.002
+        assert plane.sigma_mm < 0.015
+    views = scanned(tmp_path / "views", VASE + STAGE, VIEW_ANGLES)
+    true = turntable(AXIS.point_mm, AXIS.direction, np.deg2rad(VIEW_ANGLES))
+    cuts = [cut(view, planes).mesh for view in views]
+    # The vase alone is left, but for the margin above the plate.
+    for mesh in cuts:
+        assert mesh.vertices_mm[:, 1].max() < 26 - 1.0
+        assert np.linalg.norm((mesh.vertices_mm - AXIS.point_mm)[:, [0, 2]], axis=1).max() < 18
+
+    found = registered(cuts, true).poses
+    off_mm = [displacement_mm(*each) for each in zip(cuts, found, true, strict=True)]
+    print(f"off by {np.round(off_mm, 4)} mm")  # noqa: T201
+    assert max(off_mm) < 0.01
