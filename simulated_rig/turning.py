@@ -93,6 +93,11 @@ class RenderedTurntable(AnyAngle):
         """See `Turntable`. Without the errors."""
         return self._options.axis if self._options.knows_axis else None
 
+    @property
+    def opened_at_deg(self) -> float | None:
+        """See `Turntable`. Its objects stand as the scene file has them, each time."""
+        return None
+
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`. It is there at once, and stays where it is when it is there already."""
         if self._closed:

@@ -74,6 +74,11 @@ class SerialTurntable(AnyAngle):
         """See `Turntable`. Nobody has told it."""
         return None
 
+    @property
+    def opened_at_deg(self) -> float | None:
+        """See `Turntable`."""
+        return self._origin / self._units_per_deg
+
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`. Raises DeviceError, also ever after, once it is not known where the table stands."""
         if self._lines.closing.is_set():

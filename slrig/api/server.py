@@ -87,7 +87,7 @@ def open_service(
     runner = Runner(
         store,
         folder,
-        RigSession(rig.name, lambda: open_rig(rig)),
+        RigSession(rig.name, lambda: open_rig(rig), table_at=folder.root / "stage" / "table.json"),
         worker,
         capture=capture_frames,
         queue_length=settings.queue_length,

@@ -47,6 +47,13 @@ class Turntable(Positioner, Protocol):
         """The angle of each of its poses."""
         ...
 
+    @property
+    def opened_at_deg(self) -> float | None:
+        """Where its own count stood when it was opened, in degrees of the table: as it was left, unless it restarted or
+        was moved. None where each opening brings it to the same place.
+        """
+        ...
+
     def turn(self, angle_deg: float) -> None:
         """Stand at an angle, counted right-handed about the axis from where it stood when it was opened, and return
         when the object stands still. Raises DeviceError: it did not get there.

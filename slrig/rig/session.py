@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import structlog
 
@@ -15,6 +16,7 @@ from slrig.errors import CalibrationError, DeviceError, UnsupportedByDeviceError
 from slrig.failure import UNEXPECTED, JobFailure, failure_of
 from slrig.model import Calibration, Size
 from slrig.rig.settings import SettingsInUse
+from slrig.rig.turn_count import CountedTurntable
 from slrig.rig.watchdog import OPEN, OPEN_LIMIT_S, Call, Calls, guarded
 
 _LAST_RESORT_S = 1.0
@@ -69,10 +71,15 @@ class RigSession:
 
     Whoever sets `active` gives whatever is begun from then on that calibration in place of the rig's own. One that is
     for other devices leaves the rig without any: the rig can still be calibrated, and a scan is refused.
+
+    table_at : the file that keeps where a turntable stands, so that its angles go on from one opening to the next.
     """
 
-    def __init__(self, name: str, open_rig: Callable[[], Rig], *, calls: Calls | None = None) -> None:
+    def __init__(
+        self, name: str, open_rig: Callable[[], Rig], *, calls: Calls | None = None, table_at: Path | None = None
+    ) -> None:
         self.name = name
+        self._table_at = table_at
         self.calls = Calls() if calls is None else calls
         self._open_rig = open_rig
         self._rig: Rig | None = None
@@ -100,6 +107,9 @@ class RigSession:
                 raise
             self.settings = {}
             self._rig, self._bare = guarded(rig, self.calls, self.settings), rig
+            if self._table_at is not None and isinstance(self._rig.positioner, Turntable):
+                table = CountedTurntable(self._rig.positioner, self._table_at)
+                self._rig = replace(self._rig, positioner=table)
             self.calls.failure = None
             self.fault = None
         active = self.active

@@ -350,6 +350,11 @@ class GuardedTurntable(GuardedPositioner):
         """See `Turntable`."""
         return self._turntable.angles_deg
 
+    @property
+    def opened_at_deg(self) -> float | None:
+        """See `Turntable`."""
+        return self._turntable.opened_at_deg
+
     def turn(self, angle_deg: float) -> None:
         """See `Turntable`."""
         self._made("turn", MOVE_LIMIT_S, lambda: self._turntable.turn(angle_deg))

@@ -153,5 +153,12 @@ def test_it_opens_again_after_it_was_closed_and_counts_from_there(bench: Bench) 
     again = bench.opened()
     start = bench.stands_deg()
     assert start in (before, 0.0)
+    # Its own count tells which of the two it is.
+    opened_at_deg = [each.opened_at_deg for each in (table, again)]
+    if start:
+        first_deg, second_deg = (each_deg for each_deg in opened_at_deg if each_deg is not None)
+        assert second_deg - first_deg == pytest.approx(start, abs=0.01)
+    else:
+        assert opened_at_deg == [None, None]
     again.turn(30.0)
     assert bench.stands_deg() - start == pytest.approx(30.0, abs=0.01)

@@ -345,7 +345,7 @@ def test_a_turn_that_hangs_is_told_as_a_move_that_hangs() -> None:
     found: list[Call | None] = []
 
     class Table:
-        poses, angles_deg, axis = ("0°", "180°"), (0.0, 180.0), None
+        poses, angles_deg, axis, opened_at_deg = ("0°", "180°"), (0.0, 180.0), None, 7.0
 
         def move(self, index: int) -> None:
             self.turn(self.angles_deg[index])
@@ -362,6 +362,7 @@ def test_a_turn_that_hangs_is_told_as_a_move_that_hangs() -> None:
     table = guarded(Rig("bench", {}, TameProjector(), {}, positioner=Table()), calls, {}).positioner
     assert isinstance(table, GuardedTurntable)
     assert (table.axis, table.angles_deg, table.poses) == (None, (0.0, 180.0), ("0°", "180°"))
+    assert table.opened_at_deg == 7.0
     table.turn(45.0)
     with pytest.raises(DeviceError, match=r"^the positioner: its driver has not come back from turn for 120 s and"):
         table.turn(100.0)
