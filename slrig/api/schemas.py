@@ -31,10 +31,11 @@ from slrig.bundle.scan_options import (
     ScanDefaults,
     alone,
 )
+from slrig.bundle.stage import TurnedBy
 from slrig.failure import JobFailure
 from slrig.jobs.records import JobRecord, JobState
 from slrig.model import Axis, FlipRule, Size
-from slrig.scan.plan import PatternPlan, PresetUse, ReconstructionPlan, ScanPlan
+from slrig.scan.plan import MOST_TURN_DEG, PatternPlan, PresetUse, ReconstructionPlan, ScanPlan
 
 MOST_EXPOSURE_S = 60.0
 MOST_REPEATS = 500
@@ -130,6 +131,14 @@ class ScanRequest(Strict):
         "refuse where the projector has no such lights or every camera has colour. Default: as the rig file says, else "
         "false",
     )
+    turn_deg: Annotated[float, Field(ge=-MOST_TURN_DEG, le=MOST_TURN_DEG)] | None = Field(
+        default=None,
+        description="angle of the stage that the object is shot at, right-handed about its axis; the report says so. "
+        "The rig's turntable turns there first, from where it stood when it was opened. Default: nothing is turned",
+    )
+    turned_by: TurnedBy = Field(
+        default="table", description="hand: somebody has turned the object to turn_deg already, and nothing moves"
+    )
     if_busy: Literal["reject", "queue"] = Field(
         default="reject", description="what to do while the rig is held: answer 409, or wait in line"
     )
@@ -182,6 +191,8 @@ def scan_plan(request: ScanRequest, defaults: ScanDefaults, preset: PresetDocume
         colour=request.colour if request.colour is not None else usual.colour,
         coloured_light=bool(usual.coloured_light if request.coloured_light is None else request.coloured_light),
         preset=use,
+        turn_deg=request.turn_deg,
+        turned_by=request.turned_by,
     )
 
 

@@ -154,9 +154,7 @@ def scan(
         exposure_s=exposure_s[0] if exposure_s and len(exposure_s) == 1 else None,
         exposures_s=exposure_s if exposure_s and len(exposure_s) > 1 else None,
         if_busy="queue" if queue else "reject",
-        preset=asked.preset,
-        colour=asked.colour,
-        coloured_light=asked.coloured_light,
+        **asked.asked(),
         repeat=repeat if repeat > 1 else None,
         every_s=every_s,
         patterns=given(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from slrig.cli.options import given
 
 
 @dataclass(frozen=True, slots=True)
 class ScanOptions:
-    """What the command line says of the object and of colour; None where it says nothing."""
+    """What the command line says of the object, of its stage and of colour; None where it says nothing."""
 
     preset: Annotated[str | None, typer.Option(help="Options by name: see slrig preset list.")] = None
     assist: Annotated[
@@ -28,3 +30,20 @@ class ScanOptions:
             help="Play white in red, green and blue too, for cameras without colour. Default: the rig file's."
         ),
     ] = None
+    turn_deg: Annotated[
+        float | None,
+        typer.Option(help="Angle of the stage that the object is shot at; the rig's turntable turns there first."),
+    ] = None
+    by_hand: Annotated[
+        bool, typer.Option("--by-hand", help="With --turn-deg: the object was turned by hand; nothing moves.")
+    ] = False
+
+    def asked(self) -> dict[str, Any]:
+        """What was given of it, as a request says it."""
+        return given(
+            preset=self.preset,
+            colour=self.colour,
+            coloured_light=self.coloured_light,
+            turn_deg=self.turn_deg,
+            turned_by="hand" if self.by_hand else None,
+        )

@@ -23,7 +23,7 @@ Position = int | str
 
 
 class ScanOptions(TypedDict, total=False):
-    """What a scan may be asked for. exposure_s, exposures_s, every_s in seconds."""
+    """What a scan may be asked for. exposure_s, exposures_s, every_s in seconds; turned_by "table" or "hand"."""
 
     label: str | None
     preset: str | None
@@ -34,6 +34,8 @@ class ScanOptions(TypedDict, total=False):
     reconstruction: Mapping[str, Any] | None
     colour: bool | None
     coloured_light: bool | None
+    turn_deg: float | None
+    turned_by: str | None
     if_busy: IfBusy | None
     repeat: int | None
     every_s: float | None

@@ -23,17 +23,18 @@ import structlog
 from slrig.bundle import BundleWriter, write_truth
 from slrig.bundle.notes import write_notes
 from slrig.bundle.refused import FOLDER, Refused
+from slrig.bundle.stage import StageAngle, write_stage
 from slrig.capture.exposure import whole_refreshes_s
 from slrig.capture.sequencer import choose_triggers
 from slrig.capture.session import SETTINGS_TOLERANCE
-from slrig.devices import Camera, Rig, Trigger
+from slrig.devices import Camera, Rig, Trigger, Turntable
 from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceError
 from slrig.jobs.frame_feed import FrameSink
 from slrig.model import Shot, Truth
 from slrig.model.header import CaptureHeader
 from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import Progress, ScanPlan
-from slrig.scan.plan_check import in_colour, pattern_sequence
+from slrig.scan.plan_check import in_colour, no_turntable, pattern_sequence
 
 MOST_WAITING_BYTES = 256 * 2**20
 """How much of frames may wait for the disk."""
@@ -48,11 +49,14 @@ class Recording:
     on any thread: the rig is not needed for either.
     """
 
-    def __init__(self, folder: Path, writing: ExitStack, notes: Sequence[str], truth: Truth | None) -> None:
+    def __init__(
+        self, folder: Path, writing: ExitStack, notes: Sequence[str], truth: Truth | None, stage: StageAngle | None
+    ) -> None:
         self._folder = folder
         self._writing = writing
         self._notes = notes
         self._truth = truth
+        self._stage = stage
 
     def finish(self) -> None:
         """Wait until the bundle is in its place, and write what belongs to it. Raises StorageError: the disk refused,
@@ -62,6 +66,8 @@ class Recording:
         write_notes(self._folder, self._notes)
         if self._truth is not None:
             write_truth(self._folder, self._truth)
+        if self._stage is not None:
+            write_stage(self._folder, self._stage)
 
     def discard(self) -> None:
         """Let it go. Nothing is left of it."""
@@ -151,6 +157,8 @@ def capture_frames(
     """Play the plan's patterns on the rig, and return when the last frame is proven. What comes back brings the bundle
     to `folder`, which must not exist.
 
+    Where the plan says at which angle of the rig's turntable, that turns there first.
+
     `frames` is shown each frame that has passed its test, and once more the frames that took another one's place.
 
     Raises
@@ -161,7 +169,7 @@ def capture_frames(
     PatternError
         The plan does not fit the projector, or its patterns tell no depth by the rig's calibration.
     DeviceError
-        The rig failed, or has no colour, or coloured light, where the plan asks for it.
+        The rig failed, or has no turntable, colour or coloured light where the plan asks for it.
     ScanCancelledError
         `cancelled()` became true.
     StorageError
@@ -183,6 +191,7 @@ def capture_frames(
         progress("capture", 0.0, words)
     formats = {name: camera.info.format for name, camera in rig.cameras.items()}
     colour = in_colour(plan, {name: camera.info for name, camera in rig.cameras.items()}, rig.projector.info)
+    stage = _turned(rig, plan, progress)
     writer = BundleWriter(
         folder, rig.projector.info.size, sequence.patterns, formats, rig.calibration, captured_at=datetime.now(UTC)
     )
@@ -207,7 +216,19 @@ def capture_frames(
             raise type(error)(message) from error
         if frames is not None:
             frames.end(exposing.summary())
-        return Recording(folder, writing.pop_all(), told, rig.truth())
+        return Recording(folder, writing.pop_all(), told, rig.truth(), stage)
+
+
+def _turned(rig: Rig, plan: ScanPlan, progress: Progress) -> StageAngle | None:
+    """Where the stage stands when the object was turned as the plan says; None where it says nothing of a stage."""
+    if plan.turn_deg is None:
+        return None
+    if plan.turned_by == "table":
+        if not isinstance(rig.positioner, Turntable):
+            raise no_turntable(plan.turn_deg)
+        progress("turn", 0.0, f"to {plan.turn_deg:g}°")
+        rig.positioner.turn(plan.turn_deg)
+    return StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by)
 
 
 def _of_the_rig(rig: Rig) -> list[str]:

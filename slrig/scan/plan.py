@@ -8,8 +8,12 @@ from datetime import datetime, timedelta
 from typing import Protocol
 from uuid import UUID
 
-from slrig.errors import ConfigError
+from slrig.bundle.stage import TurnedBy
+from slrig.errors import ConfigError, setting
 from slrig.model import Axis, FlipRule, Region, bracket_fault
+
+MOST_TURN_DEG = 3600.0
+"""Ten turns either way: more is a slip, and winds up the cables of what stands on a stage."""
 
 
 class Progress(Protocol):
@@ -127,12 +131,15 @@ class ScanPlan:
     exposure_factors : one or a bracket, in place of both, times the exposures that the cameras have by themselves;
     see `slrig.scan.acquisition.exposed`. preset : where some of this came from, None where no preset was named.
     colour : keep white and black frames in colour, None where a camera has it. coloured_light : play white in red,
-    green and blue as well, for the cameras that have no colour. series : None for a scan alone.
+    green and blue as well, for the cameras that have no colour. series : None for a scan alone. turn_deg : the angle
+    of the stage that the object is shot at, right-handed about its axis; None where there is no stage. turned_by : the
+    table turns to it before the first frame; a hand has turned already, and nothing moves.
 
     Raises
     ------
     ConfigError
-        exposure_s is not above 0 and finite, exposures_s is no bracket, or more than one of the three is given.
+        exposure_s is not above 0 and finite, exposures_s is no bracket, or more than one of the three is given. Or
+        turn_deg is no angle of at most MOST_TURN_DEG.
     """
 
     patterns: PatternPlan = field(default_factory=PatternPlan)
@@ -144,8 +151,20 @@ class ScanPlan:
     coloured_light: bool = False
     series: SeriesPlace | None = None
     preset: PresetUse | None = None
+    turn_deg: float | None = None
+    turned_by: TurnedBy = "table"
 
     def __post_init__(self) -> None:
+        # NaN is within no limits.
+        if self.turn_deg is not None and not abs(self.turn_deg) <= MOST_TURN_DEG:
+            message = (
+                f"{setting('turn_deg')}: expected an angle from {-MOST_TURN_DEG:g}° to {MOST_TURN_DEG:g}°, found "
+                f"{self.turn_deg:g}°; the next view of eight is at 45"
+            )
+            raise ConfigError(message)
+        if self.turn_deg is None and self.turned_by == "hand":
+            message = f"{setting('turn_deg')}: expected the angle that a hand has turned to, found none; say it"
+            raise ConfigError(message)
         if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
             message = f"exposure_s: expected a finite time above 0 s, found {self.exposure_s:g} s; 0.0167 is usual"
             raise ConfigError(message)

@@ -71,6 +71,15 @@ def in_colour(plan: ScanPlan, cameras: Mapping[str, CameraInfo], projector: Proj
     return kept
 
 
+def no_turntable(turn_deg: float) -> UnsupportedByDeviceError:
+    """The error that a rig cannot turn what stands before it."""
+    message = (
+        f"{setting('turn_deg')}: the object is to stand at {turn_deg:g}°, and this rig has no turntable. Turn it by "
+        'hand, and say so ("turned_by": "hand", or --by-hand); or name a turntable in the rig file'
+    )
+    return UnsupportedByDeviceError(message)
+
+
 def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None = None) -> int:
     """Return the bytes that the frames of a scan take on this rig, uncompressed. calibration : that it is to use.
 
@@ -82,7 +91,10 @@ def check_plan(plan: ScanPlan, facts: RigFacts, calibration: Calibration | None 
         The region names a camera that is not there, or a mask of another extent.
     UnsupportedByDeviceError
         A camera cannot expose that long, or that briefly, or has no colour, or the frames are more than a bundle holds.
+        Or there is no turntable to turn.
     """
+    if plan.turn_deg is not None and plan.turned_by == "table" and not facts.turntable:
+        raise no_turntable(plan.turn_deg)
     exposures_s = plan.rising_exposures_s
     if plan.reconstruction.region is not None:
         plan.reconstruction.region.require_fits({name: each.format.size for name, each in facts.cameras.items()})

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from slrig.bundle import read_truth
 from slrig.bundle.health import read_health
 from slrig.bundle.notes import read_notes
+from slrig.bundle.stage import read_stage
 from slrig.bundle.storage import write_file
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
@@ -170,6 +171,8 @@ def reconstruct_into(
         for name, picture in pictures.result().items():
             place(name, picture)
         known = _compared_with_truth(bundle, mesh, cameras[0], plan.region, entered)
+        if (stage := read_stage(bundle)) is not None:
+            known["stage"] = stage.model_dump()
         entered("write report", 0.98, "")
         seconds = watch.finished()
         report = {

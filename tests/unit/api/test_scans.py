@@ -131,6 +131,19 @@ def test_plan_is_request_over_rig_file_over_default(client: TestClient) -> None:
     }
     # The rig file's exposure belongs to its cameras, not to the plan.
     assert plan["exposure_s"] is None
+    assert (plan["turn_deg"], plan["turned_by"]) == (None, "table")
+
+
+def test_the_angle_of_the_stage_is_told_by_hand_and_refused_where_nothing_turns(client: TestClient) -> None:
+    by_hand = client.post("/scan", json={"turn_deg": -45, "turned_by": "hand"}).json()
+    assert (by_hand["plan"]["turn_deg"], by_hand["plan"]["turned_by"]) == (-45.0, "hand")
+    assert ended(client, by_hand["id"])["state"] == "succeeded"
+    refused = client.post("/scan", json={"turn_deg": 45})
+    assert (refused.status_code, refused.json()["type"]) == (422, "/problems/unsupported-by-device")
+    assert "this rig has no turntable. Turn it by hand, and say so" in refused.json()["detail"]
+    for body in ('{"turn_deg": NaN}', '{"turn_deg": 1e9}', '{"turned_by": "hand"}', '{"turn_deg": 1, "turned_by": 2}'):
+        headers = {"Content-Type": "application/json"}
+        assert client.post("/scan", content=body, headers=headers).status_code in {400, 422}, body
 
 
 def test_stream_resumes_after_the_event_that_was_seen(client: TestClient) -> None:

@@ -22,7 +22,7 @@ from slrig.errors import (
     ScanEvidenceError,
     UnsupportedByDeviceError,
 )
-from slrig.model import CameraFormat, Frame, Pattern, PatternSequence, Pixels, Shot, Size
+from slrig.model import CameraFormat, Frame, Pattern, PatternSequence, Pixels, Shot, Size, StageAxis
 from slrig.patterns.sequence import encode, scan_patterns
 
 EXPOSURE_NS = 10_000_000
@@ -237,6 +237,34 @@ class FakeProjector:
 
     def close(self) -> None:
         self.world.light = None
+
+
+@dataclass
+class FakeTurntable:
+    """Implements `Turntable`. turned_deg : every angle that it was told, in order."""
+
+    turned_deg: list[float] = field(default_factory=list)
+    error: Exception | None = None
+    axis: StageAxis | None = None
+
+    @property
+    def angles_deg(self) -> Sequence[float]:
+        return (0.0, 90.0)
+
+    @property
+    def poses(self) -> Sequence[str]:
+        return ("0°", "90°")
+
+    def move(self, index: int) -> None:
+        self.turn(self.angles_deg[index])
+
+    def turn(self, angle_deg: float) -> None:
+        if self.error is not None:
+            raise self.error
+        self.turned_deg.append(angle_deg)
+
+    def close(self) -> None:
+        pass
 
 
 @dataclass

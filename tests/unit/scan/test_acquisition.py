@@ -15,6 +15,7 @@ import pytest
 from slrig.bundle import read_bundle
 from slrig.bundle.notes import read_notes
 from slrig.bundle.refused import read_refused
+from slrig.bundle.stage import StageAngle, read_stage
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.devices import CameraSettings, Projector, Synchronisation, Trigger
 from slrig.errors import (
@@ -24,6 +25,7 @@ from slrig.errors import (
     ScanCancelledError,
     ScanEvidenceError,
     SlrigError,
+    UnsupportedByDeviceError,
 )
 from slrig.jobs.frame_feed import Abandon, FrameFeed
 from slrig.model import Calibration, Shot
@@ -35,7 +37,7 @@ from slrig.scan.stream import ScanStream
 from tests.contract.benches import PROJECTOR, simulated
 from tests.contract.suite import rig_of
 from tests.samples import sample_calibration
-from tests.unit.capture.fake_rig import CameraFaults, FakeRig, fake_rig
+from tests.unit.capture.fake_rig import CameraFaults, FakeRig, FakeTurntable, fake_rig
 from tests.unit.doctor.test_doctor import OtherCamera, small_rig
 from tests.unit.scan.fakes import WAIT_S
 
@@ -62,11 +64,13 @@ class Sink:
         self.evidence = evidence
 
 
-def captured(fake: FakeRig, folder: Path, sink: Sink | FrameFeed | None = None) -> list[tuple[float, str]]:
+def captured(
+    fake: FakeRig, folder: Path, sink: Sink | FrameFeed | None = None, *, plan: ScanPlan | None = None
+) -> list[tuple[float, str]]:
     told: list[tuple[float, str]] = []
     capture_frames(
         fake.rig,
-        ScanPlan(),
+        plan or ScanPlan(),
         folder,
         progress=lambda _stage, fraction, detail: told.append((fraction, detail)),
         cancelled=lambda: False,
@@ -98,6 +102,39 @@ def test_a_rig_whose_latency_was_never_measured_says_so(tmp_path: Path) -> None:
     assert "Run slrig latency" in note
     assert read_notes(tmp_path / "measured") == ()
     assert not (tmp_path / "triggered" / "notes.json").exists()
+
+
+def test_the_turntable_turns_before_the_first_frame_and_the_bundle_says_where_to(tmp_path: Path) -> None:
+    fake, table = fake_rig(), FakeTurntable()
+    on_stage = replace(fake, rig=replace(fake.rig, positioner=table))
+    told = captured(on_stage, tmp_path / "table", plan=ScanPlan(turn_deg=135.0))
+    assert (told[0], table.turned_deg) == ((0.0, "to 135°"), [135.0])
+    assert read_stage(tmp_path / "table") == StageAngle(angle_deg=135.0, turned_by="table")
+    # A hand has turned: the table stays where it is.
+    captured(on_stage, tmp_path / "hand", plan=ScanPlan(turn_deg=90.0, turned_by="hand"))
+    assert table.turned_deg == [135.0]
+    assert read_stage(tmp_path / "hand") == StageAngle(angle_deg=90.0, turned_by="hand")
+    captured(on_stage, tmp_path / "none")
+    assert read_stage(tmp_path / "none") is None
+
+
+def test_no_frame_is_shot_where_nothing_turns(tmp_path: Path) -> None:
+    fake, table = fake_rig(), FakeTurntable(error=DeviceGoneError("the turntable is gone"))
+    for rig, error, words in (
+        (fake.rig, UnsupportedByDeviceError, "stand at 45°, and this rig has no turntable. Turn it by hand"),
+        (replace(fake.rig, positioner=table), DeviceGoneError, "the turntable is gone"),
+    ):
+        with pytest.raises(error, match=words):
+            captured(replace(fake, rig=rig), tmp_path / "bundle", plan=ScanPlan(turn_deg=45.0))
+    assert not (tmp_path / "bundle").exists()
+    assert not any(call.startswith("show") for call in fake.rig.projector.world.calls)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("text", ['{"angle_deg": NaN, "turned_by": "hand"}', '{"angle_deg": 1}', "[]"])
+def test_an_angle_that_is_none_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "stage.json").write_text(text)
+    with pytest.raises(BundleError, match=r"stage\.json"):
+        read_stage(tmp_path)
 
 
 def test_notes_that_are_none_are_refused(tmp_path: Path) -> None:

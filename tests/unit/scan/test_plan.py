@@ -54,3 +54,16 @@ def test_an_axis_is_a_column_or_a_row() -> None:
 def test_least_plan_is_accepted() -> None:
     assert ReconstructionPlan(depth_edge_ratio=1.001, max_code_gap=1).max_code_gap == 1
     assert ScanPlan(exposure_s=1e-6).exposure_s == 1e-6
+
+
+@pytest.mark.parametrize("turn_deg", [math.nan, math.inf, -math.inf, 3600.1, -1e300])
+def test_an_angle_of_the_stage_is_finite_and_not_huge(turn_deg: float) -> None:
+    with pytest.raises(ConfigError, match=r"turn_deg .*: expected an angle from -3600° to 3600°, found "):
+        ScanPlan(turn_deg=turn_deg)
+
+
+def test_the_angle_of_the_stage_and_who_turned_are_kept_and_a_hand_says_where() -> None:
+    plan = ScanPlan(turn_deg=-45.0, turned_by="hand")
+    assert plan_from_json(json.loads(json.dumps(plan_json(plan)))) == plan
+    with pytest.raises(ConfigError, match=r"turn_deg .*found none; say it"):
+        ScanPlan(turned_by="hand")

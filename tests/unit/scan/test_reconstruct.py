@@ -14,6 +14,7 @@ import pytest
 
 from slrig.bundle import read_bundle, write_bundle
 from slrig.bundle.notes import write_notes
+from slrig.bundle.stage import StageAngle, write_stage
 from slrig.capture.evidence import EvidenceSummary, check_capture
 from slrig.config import read_rig
 from slrig.discovery import open_rig
@@ -107,8 +108,13 @@ def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(recorded: Path, tmp
 
 @pytest.mark.slow
 def test_results_of_an_earlier_run_are_replaced_and_other_folders_are_not(recorded: Path, tmp_path: Path) -> None:
-    run(recorded, tmp_path / "out")
-    run(recorded, tmp_path / "out")
+    bundle = shutil.copytree(recorded, tmp_path / "bundle")
+    assert "stage" not in run(bundle, tmp_path / "out")
+    # What the bundle says of the stage is said by every reconstruction of it.
+    write_stage(bundle, StageAngle(angle_deg=45.0, turned_by="hand"))
+    run(bundle, tmp_path / "out")
+    written = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert written["stage"] == {"angle_deg": 45.0, "turned_by": "hand"}
     other = tmp_path / "holiday"
     other.mkdir()
     (other / "picture.jpg").write_bytes(b"not ours")
