@@ -174,6 +174,10 @@ class StageRefusedError(SlrigError, code="stage-refused"):
     """
 
 
+class ViewsFailedError(SlrigError, code="views-failed"):
+    """Too few of a model's views could be shot. Name those that failed, each with its cause."""
+
+
 class CalibrationNotFoundError(SlrigError, code="calibration-not-found"):
     """No calibration, or no pose of one, of this id is on record here."""
 

@@ -25,7 +25,8 @@ _CODES = {
     404: "schedule-not-found camera-not-found calibration-not-found job-not-found preset-not-found",
     409: "rig-busy scan-cancelled calibration-state artefact-not-ready scan-state key-in-flight",
     422: "invalid-input config bundle calibration pattern schedule nothing-to-reconstruct "
-    "unsupported-by-device wrong-system pose-refused solve-refused registration-refused stage-refused idempotency",
+    "unsupported-by-device wrong-system pose-refused solve-refused registration-refused stage-refused views-failed "
+    "idempotency",
     429: "queue-full",
     500: "slrig device-state worker-lost out-of-memory",
     501: "extra-missing",

@@ -37,6 +37,7 @@ def combine_into(
     start_error_mm: float = START_ERROR_MM,
     voxel_mm: float | None = None,
     planes: Sequence[StagePlane] = (),
+    notes: Sequence[str] = (),
     progress: Progress,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> None:
@@ -46,7 +47,7 @@ def combine_into(
     meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near where they belong; of
     a turntable, with its axis and angles. start_error_mm : how far a surface may be from there. voxel_mm : length of
     the model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind them is cut
-    away first.
+    away first. notes : for the report.
 
     Raises
     ------
@@ -102,6 +103,7 @@ def combine_into(
             view_told["removed"] = [
                 {"kind": plane.kind, "share": share} for plane, share in zip(planes, taken, strict=True)
             ]
+        report["notes"] = list(notes)
         # One at a time: each is as large as all meshes.
         files: dict[str, Callable[[], bytes]] = {
             MODEL: lambda: encode_mesh_ply(whole.mesh),

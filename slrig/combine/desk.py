@@ -33,6 +33,10 @@ from slrig.scan.plan import Progress
 _FILES_OF_MESHES = 3
 """A model's files over the meshes of its scans: placed.ply is as large as all of them, model.ply and model.glb less."""
 
+SHOOTING_SHARE = 0.8
+"""The part of its progress that is shooting, of a model that is shot: a view takes seconds to a minute, the model half
+a minute."""
+
 _log = structlog.get_logger(__name__)
 
 
@@ -49,6 +53,7 @@ class CombineInto(Protocol):
         start_error_mm: float,
         voxel_mm: float | None,
         planes: Sequence[StagePlane],
+        notes: Sequence[str],
         progress: Progress,
         cancelled: Callable[[], bool],
     ) -> None:
@@ -92,13 +97,18 @@ class ModelDesk:
         """Bring records and files together again after whatever ended the last run of the service.
 
         - A model that waited is made; so is one that was being made, once more, unless its files are in place.
+        - One whose views are still shot is left to `slrig.combine.shooting.ViewShooting`.
         - A deletion that was cut off is completed.
         - A model that succeeded and lacks a file is recorded as failed.
         - Files without a record are put aside in `.orphans`.
         """
         for record in self.jobs.unfinished():
             place = self.store.place(record.id)
-            if missing_files(place):
+            if plan_from_json(record.plan).being_shot:
+                continue
+            if record.state is JobState.CAPTURING:
+                self._start(record)
+            elif missing_files(place):
                 self._work.take_up(record, self._parts(record), holder=_holder(record.id), resumes=True)
             else:
                 self.jobs.finish(record.id, JobState.SUCCEEDED, summary=summary(place))
@@ -142,12 +152,33 @@ class ModelDesk:
                     f"{self._queue.backlog_length} models are made or wait for that, as many as may. Try again later."
                 )
                 raise QueueFullError(message)
-            mesh_bytes = sum(self._mesh(scan).stat().st_size for scan in used.scans)
-            self._folder.require_space(_FILES_OF_MESHES * mesh_bytes + self._spare_bytes)
+            self._require_space(used)
             record = self.jobs.create(plan_json(used), rig=self._queue.rig.name, label=label, key=key)
         self._work.take_up(record, self._parts(record), holder=_holder(record.id))
         self._remove_old()
         return self.jobs.get(record.id)
+
+    def begin(self, record: JobRecord, plan: ModelPlan) -> None:
+        """Have a model on record made, now that its views were shot: `plan` names them. Raises as `combine`."""
+        with self._naming:
+            used = self.settled(plan)
+            self._require_space(used)
+            record = self.jobs.replan(record.id, plan_json(used))
+        self._start(record)
+
+    def with_axis(self, plan: ModelPlan) -> ModelPlan:
+        """The plan with the stage's axis in it, where it leaves that to the stage. Raises ConfigError."""
+        poses = plan.poses
+        if not isinstance(poses, TurntablePoses) or poses.axis is not None:
+            return plan
+        axis = self._stage.axis()
+        if axis is None:
+            message = (
+                "axis: expected that of the stage, and none is known here; say axis, with point_mm and direction "
+                "in the scans' frame, or give the poses"
+            )
+            raise ConfigError(message)
+        return replace(plan, poses=replace(poses, axis=StatedAxis.of(axis.point_mm, axis.direction)))
 
     def settled(self, plan: ModelPlan) -> ModelPlan:
         """The plan with the stage's axis and angles in it, where it leaves them to the stage. Raises as `combine`."""
@@ -158,18 +189,9 @@ class ModelDesk:
                     f"Scan {scan} is {found.state}. A model takes scans that succeeded: wait for it, or leave it out."
                 )
                 raise ScanStateError(message)
-        poses = plan.poses
+        poses = self.with_axis(plan).poses
         if not isinstance(poses, TurntablePoses):
             return plan
-        if poses.axis is None:
-            axis = self._stage.axis()
-            if axis is None:
-                message = (
-                    "axis: expected that of the stage, and none is known here; say axis, with point_mm and direction "
-                    "in the scans' frame, or give the poses"
-                )
-                raise ConfigError(message)
-            poses = replace(poses, axis=StatedAxis.of(axis.point_mm, axis.direction))
         if poses.angles_deg is None:
             told = {scan: self._stage_angle_deg(scan) for scan in plan.scans}
             untold = [str(scan) for scan, angle in told.items() if angle is None]
@@ -216,11 +238,11 @@ class ModelDesk:
         Raises
         ------
         ScanStateError
-            A model that waits or is being made needs it.
+            A model that waits or is being made needs it, or it is a view of one that is being shot.
         """
         with self._naming:
             for record in self.jobs.unfinished():
-                if str(scan_id) in record.plan["scans"]:
+                if str(scan_id) in record.plan["scans"] or self._scans.get(scan_id).parent == record.id:
                     message = (
                         f"Scan {scan_id} is needed by model {record.id}, which is {record.state}. Wait for it, or "
                         f"cancel it first (POST /model/{record.id}/cancel), then delete the scan."
@@ -233,7 +255,15 @@ class ModelDesk:
         self._work.close()
 
     def _parts(self, record: JobRecord) -> Parts:
-        return Parts(lambda job, progress: self._make(record, job, progress), capture_share=0.0)
+        share = 0.0 if record.plan.get("shoot") is None else SHOOTING_SHARE
+        return Parts(lambda job, progress: self._make(record, job, progress), capture_share=share)
+
+    def _start(self, record: JobRecord) -> None:
+        self._queue.add([self._work.job(record.id, self._parts(record), _holder(record.id))])
+
+    def _require_space(self, plan: ModelPlan) -> None:
+        mesh_bytes = sum(self._mesh(scan).stat().st_size for scan in plan.scans)
+        self._folder.require_space(_FILES_OF_MESHES * mesh_bytes + self._spare_bytes)
 
     def _make(self, record: JobRecord, job: Job, progress: ProgressRecorder) -> Outcome:
         plan = plan_from_json(record.plan)
@@ -245,6 +275,7 @@ class ModelDesk:
             start_error_mm=plan.start_error_mm,
             voxel_mm=plan.voxel_mm,
             planes=self._stage.planes() if plan.cut else (),
+            notes=plan.notes,
             progress=progress,
             cancelled=job.stop.is_set,
         )

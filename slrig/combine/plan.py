@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 from typing import Annotated, Any, Literal, Self, cast
 from uuid import UUID
 
 from pydantic import Field, TypeAdapter
 
+from slrig.bundle.stage import TurnedBy
 from slrig.errors import ConfigError
 from slrig.model import FloatArray
+from slrig.scan.plan import ScanPlan, SeriesPlace
 
 START_ERROR_MM = 3.0
 """See `slrig.views.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
+
+MOST_VIEWS = 72
+"""Of a model that is shot: one every 5°, closer than which neighbours tell the same."""
 
 Vector = tuple[float, float, float]
 Row = tuple[float, float, float, float]
@@ -72,12 +78,46 @@ StartingPoses = TurntablePoses | GivenPoses
 
 
 @dataclass(frozen=True, slots=True)
+class ShootPlan:
+    """What is shot for a model: so many views, evenly around a stage. scan : each of them, but for its angle. by_hand :
+    a person turns the object, and says when.
+
+    Raises ConfigError: there are fewer than two views, or more than MOST_VIEWS.
+    """
+
+    views: int
+    scan: ScanPlan = field(default_factory=ScanPlan)
+    by_hand: bool = False
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.views <= MOST_VIEWS:
+            message = f"views: expected 2 to {MOST_VIEWS}, found {self.views}; 8 is usual"
+            raise ConfigError(message)
+
+    @property
+    def step_deg(self) -> float:
+        """From one view to the next."""
+        return 360 / self.views
+
+    def angle_deg(self, number: int) -> float:
+        """Where the stage stands for a view, counted from 1."""
+        return (number - 1) * self.step_deg
+
+    def view(self, number: int, model_id: UUID, begins_at: datetime) -> ScanPlan:
+        """The scan of a view, counted from 1."""
+        place = SeriesPlace(model_id, number, self.views, begins_at)
+        turned_by: TurnedBy = "hand" if self.by_hand else "table"
+        return replace(self.scan, turn_deg=self.angle_deg(number), turned_by=turned_by, series=place)
+
+
+@dataclass(frozen=True, slots=True)
 class ModelPlan:
     """One model. scans : in the frame of the first one it is. poses : where their registration starts from.
 
     start_error_mm : how far a surface may be from where `poses` put it. voxel_mm : length of the model's edges; None is
     1.25 times that of the scans'. cut : whether what lies behind the planes of the stage, where there are any, is cut
-    away first.
+    away first. shoot : what is shot for it, None of scans that there were; until that has ended
+    there are no `scans`, and poses that are given are of all views. notes : for the report, in sentences.
 
     Raises
     ------
@@ -91,9 +131,11 @@ class ModelPlan:
     start_error_mm: float = START_ERROR_MM
     voxel_mm: float | None = None
     cut: bool = True
+    shoot: ShootPlan | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.scans) < 2:
+        if len(self.scans) < 2 and not self.being_shot:
             message = f"scans: expected two or more, found {len(self.scans)}; scan the object turned"
             raise ConfigError(message)
         twice = next((scan for scan in self.scans if self.scans.count(scan) > 1), None)
@@ -101,14 +143,20 @@ class ModelPlan:
             message = f"scans: expected each once, found {twice} twice; leave one out"
             raise ConfigError(message)
         told = self.poses.matrices if isinstance(self.poses, GivenPoses) else self.poses.angles_deg
-        if told is not None and len(told) != len(self.scans):
+        count = self.shoot.views if self.shoot is not None and self.being_shot else len(self.scans)
+        if told is not None and len(told) != count:
             name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"
-            message = f"{name}: expected one for each of {len(self.scans)} scans, in their order, found {len(told)}"
+            message = f"{name}: expected one for each of {count} scans, in their order, found {len(told)}"
             raise ConfigError(message)
         for name, length_mm in (("start_error_mm", self.start_error_mm), ("voxel_mm", self.voxel_mm)):
             if length_mm is not None and not 0 < length_mm < math.inf:
                 message = f"{name}: expected a finite length above 0 mm, found {length_mm:g}; left out, it is as usual"
                 raise ConfigError(message)
+
+    @property
+    def being_shot(self) -> bool:
+        """Whether its scans are still to come."""
+        return self.shoot is not None and not self.scans
 
 
 _adapter = TypeAdapter(ModelPlan)

@@ -73,7 +73,8 @@ class ModelStore:
 def summary(model: Path) -> dict[str, Any]:
     """What a list says of a model, of the report in its folder. sigma_mm : of its vertices, the middle one.
 
-    pose_sigma_mm : of the view that is known least. free : views that may move without a residual. Raises StorageError.
+    pose_sigma_mm : of the view that is known least. free : views that may move without a residual. notes : if there are
+    any. Raises StorageError.
     """
     with _report(model) as report:
         return {
@@ -81,6 +82,7 @@ def summary(model: Path) -> dict[str, Any]:
             "pairs": len(report["pairs"]),
             "free": len({each["view"] for each in report["free"]}),
             "pose_sigma_mm": max(view["sigma_mm"] for view in report["views"]),
+            **({"notes": report["notes"]} if report.get("notes") else {}),
             **{name: report["model"][name] for name in ("vertices", "triangles", "voxel_mm", "sigma_mm")},
         }
 

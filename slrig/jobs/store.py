@@ -154,6 +154,13 @@ class JobStore:
                 found[UUID(row.parent)].append(record_of(row))
         return found
 
+    def replan(self, job_id: UUID, plan: Mapping[str, Any]) -> JobRecord:
+        """Record that a job is asked for something else, now that more is known. Raises JobNotFoundError."""
+        with self.database.changing() as session:
+            row = self._find(session, job_id)
+            row.plan = dict(plan)
+            return record_of(row)
+
     def attempts(self, job_id: UUID) -> int:
         """How often the computing part of a job was begun."""
         states = [event.data["state"] for event in self.events(job_id, after=0) if event.kind == "state"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
@@ -122,26 +122,69 @@ class Runner:
         DeviceError
             A driver hangs.
         """
+        self._require_possible(plan)
+
+        def records() -> list[JobRecord]:
+            if repeat == 1:
+                return [self._store.create(plan_json(plan), rig=self.queue.rig.name, label=label, key=key)]
+            series = uuid4()
+            plans = series_of(plan, series, count=repeat, every_s=every_s, begins_at=utc_now())
+            return self._recorded(plans, label=label, parent=series, key=key)
+
+        return self._submit(records, wait=wait)[0]
+
+    def submit_views(
+        self,
+        plans: Sequence[ScanPlan],
+        parent: UUID,
+        *,
+        label: str | None,
+        wait: bool,
+        begun: Callable[[], object] = lambda: None,
+    ) -> list[JobRecord]:
+        """Record scans of one parent and have them done in their order; `wait` lets the first queue behind others.
+
+        begun : puts the parent on record, once a place in the line is certain. Raises as `submit`.
+        """
+        for plan in plans:
+            self._require_possible(plan, count=len(plans))
+
+        def records() -> list[JobRecord]:
+            begun()
+            return self._recorded(plans, label=label, parent=parent)
+
+        return self._submit(records, wait=wait)
+
+    def add_views(self, plans: Sequence[ScanPlan], parent: UUID, *, label: str | None) -> None:
+        """Have further scans of a parent done, however many wait: nobody is there to hear a refusal."""
+        records = self._recorded(plans, label=label, parent=parent)
+        self.queue.add([scan_job(record, self._tools, self._work) for record in records])
+
+    def _require_possible(self, plan: ScanPlan, *, count: int = 1) -> None:
+        """Raise what `submit` raises of a rig that cannot, or a disk without room for so many."""
         rig = self.queue.rig
         # Before the rig was first open nothing is known about it; the scan then fails with the same errors.
         frame_bytes = 0 if rig.facts is None else check_plan(plan, rig.facts, rig.calibration)
         rig.refuse_misfit()
         # Frames once as captured, and as much again for meshes and the zipped bundle of a careful client.
-        self._folder.require_space(2 * frame_bytes + self._tools.spare_bytes)
+        self._folder.require_space(2 * count * frame_bytes + self._tools.spare_bytes)
+
+    def _submit(self, make: Callable[[], list[JobRecord]], *, wait: bool) -> list[JobRecord]:
+        """Have the scans done that `make` puts on record."""
         records: list[JobRecord] = []
 
-        def make() -> list[Job]:
-            if repeat == 1:
-                records.append(self._store.create(plan_json(plan), rig=rig.name, label=label, key=key))
-            else:
-                series = uuid4()
-                plans = series_of(plan, series, count=repeat, every_s=every_s, begins_at=utc_now())
-                documents = [plan_json(each) for each in plans]
-                records.extend(self._store.create_series(documents, rig=rig.name, label=label, parent=series, key=key))
+        def jobs() -> list[Job]:
+            records.extend(make())
             return [scan_job(record, self._tools, self._work) for record in records]
 
-        self.queue.submit(make, wait=wait)
-        return records[0]
+        self.queue.submit(jobs, wait=wait)
+        return records
+
+    def _recorded(
+        self, plans: Sequence[ScanPlan], *, label: str | None, parent: UUID, key: str | None = None
+    ) -> list[JobRecord]:
+        rig, documents = self.queue.rig.name, [plan_json(each) for each in plans]
+        return self._store.create_series(documents, rig=rig, label=label, parent=parent, key=key)
 
     def cancel_series(self, series: UUID) -> list[JobRecord]:
         """Ask all scans of a series to stop, as `cancel` does. Raises JobNotFoundError: there is none of that id."""

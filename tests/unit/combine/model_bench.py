@@ -65,6 +65,7 @@ class TameCombining:
         start_error_mm: float,
         voxel_mm: float | None,
         planes: Sequence[StagePlane],
+        notes: Sequence[str],
         progress: Progress,
         cancelled: Callable[[], bool],
     ) -> None:
@@ -80,10 +81,12 @@ class TameCombining:
         if self.error is not None:
             error, self.error = self.error, None
             raise error
-        model_files(folder, list(meshes), self.axis)
+        model_files(folder, list(meshes), self.axis, notes)
 
 
-def model_files(folder: Path, names: list[str], axis: Mapping[str, Any] | None = None) -> None:
+def model_files(
+    folder: Path, names: list[str], axis: Mapping[str, Any] | None = None, notes: Sequence[str] = ()
+) -> None:
     """The files of a model, as far as they are looked at."""
     for name in MEDIA_TYPES:
         (folder / name).write_bytes(name.encode())
@@ -93,6 +96,7 @@ def model_files(folder: Path, names: list[str], axis: Mapping[str, Any] | None =
         "pairs": [{"first": names[0], "second": name} for name in names[1:]],
         "free": [],
         "axis": axis,
+        "notes": list(notes),
         "model": {"vertices": 9, "triangles": 12, "voxel_mm": 0.5, "sigma_mm": 0.01},
     }
     (folder / REPORT).write_text(json.dumps(told))

@@ -1,0 +1,333 @@
+"""The views of a model, shot as scans of their own: all at once by the rig's turntable, or one by one by hand.
+
+A model on record says what is shot, its scans name it as their parent, and nothing else is kept: whatever ends the
+service, the next start goes on from the records.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from uuid import UUID, uuid4
+
+import structlog
+
+from slrig.combine.desk import SHOOTING_SHARE, ModelDesk
+from slrig.combine.plan import GivenPoses, ModelPlan, ShootPlan, TurntablePoses, plan_from_json, plan_json
+from slrig.errors import (
+    DeviceError,
+    DriverBrokenError,
+    JobNotFoundError,
+    ScanCancelledError,
+    ScanStateError,
+    SlrigError,
+    StorageError,
+    UnsupportedByDeviceError,
+    ViewsFailedError,
+)
+from slrig.failure import errors_by_code, failure_of
+from slrig.jobs.records import JobProgress, JobRecord, JobState, acting_as, utc_now
+from slrig.jobs.store import JobStore
+from slrig.scan.records import plan_from_json as scan_plan_from_json
+from slrig.scan.runner import Runner
+
+MOST_AGAIN = 2
+"""How often a view is shot again by itself: what a device does three times it will do once more."""
+
+VIEW, TURN = "view", "turn"
+"""Stages of a model's progress: a view is shot, or the object is to be turned by hand."""
+
+_log = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One view of a model. number : from 1; scans : all that were shot of it, from the first to the last."""
+
+    number: int
+    scans: tuple[JobRecord, ...]
+
+    @property
+    def good(self) -> JobRecord | None:
+        """The newest of its scans that succeeded."""
+        return next((scan for scan in reversed(self.scans) if scan.state is JobState.SUCCEEDED), None)
+
+    @property
+    def ended(self) -> bool:
+        """Whether it was shot, and nothing of it is under way."""
+        return bool(self.scans) and all(scan.state.final for scan in self.scans)
+
+    @property
+    def why(self) -> str:
+        """Why its last scan did not succeed."""
+        if not self.scans:
+            return "it was not shot"
+        last = self.scans[-1]
+        return str(last.state) if last.fault is None else last.fault.message
+
+    @property
+    def again(self) -> bool:
+        """Whether it is to be shot again by itself: a device failed, or the service was ended."""
+        failed = 0
+        for scan in reversed(self.scans):
+            if not _may_pass(scan):
+                break
+            failed += 1
+        return self.ended and 0 < failed <= MOST_AGAIN
+
+
+def views_of(shoot: ShootPlan, scans: Sequence[JobRecord]) -> tuple[View, ...]:
+    """The views of a model by the scans that name it as their parent, from old to new."""
+    by_number: dict[int, list[JobRecord]] = {number: [] for number in range(1, shoot.views + 1)}
+    for scan in scans:
+        if (place := scan_plan_from_json(scan.plan).series) is not None:
+            by_number[place.number].append(scan)
+    return tuple(View(number, tuple(shot)) for number, shot in by_number.items())
+
+
+class ViewShooting:
+    """Shoots models. Any thread may call. scans : those on record; `view_ended` has to be told of the end of each."""
+
+    def __init__(self, desk: ModelDesk, runner: Runner, scans: JobStore) -> None:
+        self._desk = desk
+        self._runner = runner
+        self._scans = scans
+        # Held while it is decided what comes next; the end of a scan may be told within.
+        self._deciding = threading.RLock()
+
+    def take_up(self) -> None:
+        """Go on with the models that an earlier run of the service was shooting; once its scans are taken up."""
+        for record in self._desk.jobs.unfinished():
+            if plan_from_json(record.plan).being_shot:
+                self._watch(record.id)
+                self._go_on(record.id)
+
+    def shoot(self, plan: ModelPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
+        """Have the views of a model shot, and the model made of them. Returns at once.
+
+        By hand only the first view is shot, as the object stands; `shoot_view` shoots each of the others. wait : stand
+        in line while the rig is held. key : the idempotency key of the request, reserved.
+
+        Raises
+        ------
+        UnsupportedByDeviceError
+            The rig has no turntable, and nobody turns the object by hand; or it cannot do what the scans ask for.
+        ConfigError
+            The poses are to be a turntable's, and its axis is not known.
+        PatternError, CalibrationError, StorageError, RigBusyError, QueueFullError, DeviceError
+            As a scan.
+        """
+        shoot = _shoot_plan(plan)
+        plan = self._desk.with_axis(plan)
+        model_id, numbers = uuid4(), range(1, 2 if shoot.by_hand else shoot.views + 1)
+
+        def begun() -> None:
+            jobs, rig = self._desk.jobs, self._runner.queue.rig.name
+            jobs.create(plan_json(plan), rig=rig, label=label, key=key, job_id=model_id)
+
+        views = [shoot.view(number, model_id, utc_now()) for number in numbers]
+        with self._deciding:
+            self._runner.submit_views(views, model_id, label=label, wait=wait, begun=begun)
+            self._tell(model_id, shoot)
+        self._watch(model_id)
+        return self._desk.jobs.get(model_id)
+
+    def shoot_view(self, model_id: UUID, *, again: bool, wait: bool) -> JobRecord:
+        """Have the next view of a model shot, whose object was turned by hand; or the last one once more, in place of
+        what there is of it. Returns the model at once.
+
+        Raises
+        ------
+        JobNotFoundError
+            There is no such model.
+        ScanStateError
+            It waits for no hand, or has no further view.
+        PatternError, CalibrationError, StorageError, RigBusyError, QueueFullError, DeviceError
+            As a scan.
+        """
+        with self._deciding:
+            record, shoot, views = self._waiting(model_id)
+            begun = [view.number for view in views if view.scans]
+            number = begun[-1] if again else len(begun) + 1
+            if number > shoot.views:
+                message = (
+                    f"All {shoot.views} views of model {model_id} were shot. Make the model of them "
+                    f'(POST /model/{model_id}/combine), or shoot the last one once more ("again": true).'
+                )
+                raise ScanStateError(message)
+            plan = shoot.view(number, model_id, utc_now())
+            self._runner.submit_views([plan], model_id, label=record.label, wait=wait)
+            self._tell(model_id, shoot)
+            return self._desk.jobs.get(model_id)
+
+    def combine(self, model_id: UUID) -> JobRecord:
+        """Have a model made of the views that there are. Returns it at once.
+
+        Raises
+        ------
+        JobNotFoundError
+            There is no such model.
+        ScanStateError
+            It waits for no hand, or fewer than two of its views are good.
+        """
+        with self._deciding:
+            record, shoot, views = self._waiting(model_id)
+            good = sum(view.good is not None for view in views)
+            if good < 2:
+                message = f"Model {model_id} has {good} good views of {shoot.views}; it takes two. Shoot another first."
+                raise ScanStateError(message)
+            self._combine(record, shoot, views)
+            return self._desk.jobs.get(model_id)
+
+    def cancel(self, model_id: UUID) -> JobRecord:
+        """Ask a model to end early, and with it those of its scans that are not over. Returns at once; one that is over
+        stays so. Raises JobNotFoundError.
+        """
+        with self._deciding:
+            record = self._desk.jobs.get(model_id)
+            if record.state.final or not plan_from_json(record.plan).being_shot:
+                return self._desk.cancel(model_id)
+            fault = failure_of(ScanCancelledError("The model was cancelled while its views were shot. They stay."))
+            self._desk.jobs.finish(model_id, JobState.CANCELLED, fault=fault)
+            # The last first: no other one begins meanwhile.
+            for scan in reversed(self._scans.of(model_id).get(model_id, [])):
+                self._runner.cancel(scan.id)
+            return self._desk.jobs.get(model_id)
+
+    def view_ended(self, scan: JobRecord) -> None:
+        """Go on with the model that a scan is a view of, if it is one. Raises nothing; see `JobStore.after_end`."""
+        if scan.parent is None or scan_plan_from_json(scan.plan).turn_deg is None:
+            return
+        try:
+            self._go_on(scan.parent)
+        except Exception:  # noqa: BLE001 - the scan is over, and the next start goes on from the records
+            _log.exception("a model could not be gone on with", model=str(scan.parent))
+
+    def _go_on(self, model_id: UUID) -> None:
+        """Do what comes next, whatever was done before: shoot what is missing, tell a person, or make the model."""
+        with self._deciding:
+            try:
+                record = self._desk.jobs.get(model_id)
+            except JobNotFoundError:
+                # Of a series of scans, or of a model that was deleted.
+                return
+            plan = plan_from_json(record.plan)
+            if record.state.final or not plan.being_shot or self._runner.queue.ending:
+                return
+            shoot = _shoot_plan(plan)
+            views = self._views(model_id, shoot)
+            missing = [view for view in views if view.again or not (view.scans or shoot.by_hand)]
+            if missing:
+                _log.info("views are put in line", model=str(model_id), views=[view.number for view in missing])
+                plans = [shoot.view(view.number, model_id, utc_now()) for view in missing]
+                with acting_as(record.requested_by):
+                    self._runner.add_views(plans, model_id, label=record.label)
+            elif shoot.by_hand and not (views[-1].ended and views[-1].good is views[-1].scans[-1]):
+                pass  # A person turns, or decides what becomes of a last view that failed.
+            elif all(view.ended or shoot.by_hand for view in views):
+                self._combine(record, shoot, views)
+                return
+            self._tell(model_id, shoot)
+
+    def _combine(self, record: JobRecord, shoot: ShootPlan, views: Sequence[View]) -> None:
+        """Have the model made of its good views, or end it in words."""
+        good = {view.number: view.good.id for view in views if view.good is not None}
+        left_out = tuple(
+            f"view {view.number} of {shoot.views}, at {shoot.angle_deg(view.number):g}°, is not in it: {view.why}"
+            for view in views
+            if view.number not in good
+        )
+        plan = plan_from_json(record.plan)
+        poses = plan.poses
+        if isinstance(poses, GivenPoses):
+            poses = replace(poses, matrices=tuple(poses.matrices[number - 1] for number in good))
+        elif isinstance(poses, TurntablePoses):
+            poses = replace(poses, angles_deg=tuple(shoot.angle_deg(number) for number in good))
+        try:
+            if len(good) < 2:
+                message = (
+                    f"{len(good)} of {shoot.views} views succeeded, and a model takes two: {'; '.join(left_out)}. "
+                    f"The scans stay: GET /scan/series/{record.id}. Put right what failed, and shoot again."
+                )
+                raise ViewsFailedError(message)
+            self._desk.begin(record, replace(plan, scans=tuple(good.values()), poses=poses, notes=left_out))
+        except SlrigError as error:
+            _log.warning("a model failed", model=str(record.id), cause=str(error))
+            self._desk.jobs.finish(record.id, JobState.FAILED, fault=failure_of(error))
+
+    def _waiting(self, model_id: UUID) -> tuple[JobRecord, ShootPlan, tuple[View, ...]]:
+        """A model that waits for a hand. Raises JobNotFoundError, ScanStateError."""
+        record = self._desk.jobs.get(model_id)
+        plan = plan_from_json(record.plan)
+        if record.state.final or not plan.being_shot or plan.shoot is None or not plan.shoot.by_hand:
+            how = "is not shot by hand" if plan.shoot is None or not plan.shoot.by_hand else f"is {record.state}"
+            message = f'Model {model_id} {how}. Begin one: POST /model/shoot with "by_hand": true.'
+            raise ScanStateError(message)
+        views = self._views(model_id, plan.shoot)
+        for view in views:
+            if view.scans and not view.ended:
+                message = (
+                    f"View {view.number} of model {model_id} is being shot. Wait for its end, then turn the object."
+                )
+                raise ScanStateError(message)
+        return record, plan.shoot, views
+
+    def _views(self, model_id: UUID, shoot: ShootPlan) -> tuple[View, ...]:
+        return views_of(shoot, self._scans.of(model_id).get(model_id, []))
+
+    def _tell(self, model_id: UUID, shoot: ShootPlan) -> None:
+        """Put on record how far it is, and for a person what to do."""
+        views = self._views(model_id, shoot)
+        done = sum(view.good is not None for view in views)
+        under_way = next((view for view in views if view.scans and not view.ended), None)
+        stage, detail = VIEW, f"view {1 if under_way is None else under_way.number} of {shoot.views}"
+        if under_way is None and shoot.by_hand:
+            stage, last = TURN, [view for view in views if view.scans][-1]
+            detail = (
+                f"turn the object by {shoot.step_deg:g}° for view {last.number + 1} of {shoot.views}"
+                if last.number < shoot.views
+                else "all views were shot: shoot the last one again, or have the model made"
+            )
+            if last.good is None:
+                detail = f"view {last.number} failed, and may be shot again: {last.why} Or {detail}"
+        try:
+            self._desk.jobs.progress(model_id, JobProgress(stage, SHOOTING_SHARE * done / shoot.views, detail))
+        except StorageError as error:
+            _log.warning("how far a model is could not be recorded", model=str(model_id), cause=str(error))
+
+    def _watch(self, model_id: UUID) -> None:
+        """Have a model that is queued be on record as capturing once the first of its views is begun."""
+
+        def look() -> None:
+            # The next event will do where this one comes in the middle of a decision: whoever tells it may hold a lock.
+            if not self._deciding.acquire(blocking=False):
+                return
+            try:
+                begun = any(scan.state is not JobState.QUEUED for scan in self._scans.of(model_id).get(model_id, []))
+                if begun and watching:
+                    watching.pop()()
+                    if self._desk.jobs.states().get(model_id) is JobState.QUEUED:
+                        self._desk.jobs.advance(model_id, JobState.CAPTURING)
+            finally:
+                self._deciding.release()
+
+        watching: list[Callable[[], None]] = []
+        watching.append(self._scans.watch(model_id, look))
+        look()
+
+
+def _shoot_plan(plan: ModelPlan) -> ShootPlan:
+    if plan.shoot is None:
+        message = "shoot: expected what is shot, found none; POST /model makes a model of scans that there are"
+        raise ScanStateError(message)
+    return plan.shoot
+
+
+def _may_pass(scan: JobRecord) -> bool:
+    """Whether a scan failed by what may be over the next time: a device's fault, or the end of the service."""
+    if scan.state is JobState.INTERRUPTED:
+        return True
+    error = SlrigError if scan.fault is None else errors_by_code().get(scan.fault.code, SlrigError)
+    cannot = issubclass(error, UnsupportedByDeviceError | DriverBrokenError)
+    return scan.state is JobState.FAILED and issubclass(error, DeviceError) and not cannot

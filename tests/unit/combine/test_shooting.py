@@ -1,0 +1,374 @@
+"""Views of a model: shot by a table and by hand, failed and shot again, and gone on with after whatever ended the
+service.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from uuid import UUID, uuid4
+
+import pytest
+
+from slrig.combine.plan import GivenPoses, ModelPlan, ShootPlan, StatedAxis, TurntablePoses, plan_from_json, plan_json
+from slrig.combine.shooting import ViewShooting
+from slrig.devices import Rig
+from slrig.errors import (
+    ConfigError,
+    DeviceGoneError,
+    RigBusyError,
+    ScanCancelledError,
+    ScanEvidenceError,
+    ScanStateError,
+    UnsupportedByDeviceError,
+    ViewsFailedError,
+)
+from slrig.failure import failure_of
+from slrig.jobs.job import Holder, Job
+from slrig.jobs.records import JobRecord, JobState, utc_now
+from slrig.jobs.rig_jobs import Recorded
+from slrig.rig.session import RigSession
+from slrig.scan.plan import ScanPlan
+from slrig.scan.records import plan_from_json as scan_plan_from_json
+from slrig.scan.records import plan_json as scan_plan_json
+from tests.unit.capture.fake_rig import FakeTurntable
+from tests.unit.combine.model_bench import ModelBench, kept_scan
+from tests.unit.scan.fakes import WAIT_S
+
+AXIS = StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))
+STILL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+
+
+def asked(views: int = 4, *, by_hand: bool = False, exposure_s: float | None = None) -> ModelPlan:
+    return ModelPlan((), TurntablePoses(AXIS), shoot=ShootPlan(views, ScanPlan(exposure_s=exposure_s), by_hand))
+
+
+class ShootingBench(ModelBench):
+    """A bench whose rig has a turntable. shot : angle and cause of each capture, in order; faults : what the next
+    captures at an angle raise.
+    """
+
+    def __init__(self, root: Path, *, table: bool = True, start: bool = True, **options: Any) -> None:
+        self.table = FakeTurntable() if table else None
+        self.shot: list[float | None] = []
+        self.faults: dict[float, list[Exception]] = {}
+        super().__init__(root, start=False, **options)
+        self.shooting = ViewShooting(self.desk, self.runner, self.store)
+        self.store.after_end = self.shooting.view_ended
+        if start:
+            known = threading.Event()
+            self.runner.queue.add([_look(known)])
+            # As a service does it.
+            self.runner.take_up([scan.id for scan in self.store.unfinished()])
+            self.desk.take_up()
+            self.shooting.take_up()
+            self.runner.start()
+            assert known.wait(WAIT_S)
+
+    def open_rig(self) -> Rig:
+        return replace(super().open_rig(), positioner=self.table)
+
+    def capture(self, rig: Rig, plan: ScanPlan, folder: Path, /, **how: Any) -> Recorded:
+        self.shot.append(plan.turn_deg)
+        if faults := self.faults.get(plan.turn_deg or 0.0):
+            raise faults.pop(0)
+        return super().capture(rig, plan, folder, **how)
+
+    def views(self, model_id: UUID) -> list[tuple[float | None, JobState]]:
+        """Angle and state of each scan of a model, from the first to the last."""
+        scans = self.store.of(model_id).get(model_id, [])
+        return [(scan_plan_from_json(scan.plan).turn_deg, scan.state) for scan in scans]
+
+    def until_told(self, model_id: UUID, words: str) -> JobRecord:
+        """The model once its progress says this."""
+        told = threading.Event()
+
+        def look() -> None:
+            if words in self.models.get(model_id).progress.detail:
+                told.set()
+
+        unwatch = self.models.watch(model_id, look)
+        look()
+        assert told.wait(WAIT_S), self.models.get(model_id).progress
+        unwatch()
+        return self.models.get(model_id)
+
+
+def _look(known: threading.Event) -> Job:
+    """Opens the rig, so that it is known what it can do."""
+
+    def work(held: RigSession, _: Job) -> None:
+        held.open()
+
+    return Job(uuid4(), Holder("look", "look", None), utc_now(), work, lambda _: known.set())
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[ShootingBench]:
+    found = ShootingBench(tmp_path)
+    yield found
+    found.close()
+
+
+def started(bench: ShootingBench, plan: ModelPlan | None = None, *, wait: bool = False) -> UUID:
+    return bench.shooting.shoot(plan or asked(), label="cup", wait=wait).id
+
+
+def test_all_views_are_shot_around_the_table_and_the_model_is_made_of_them(bench: ShootingBench) -> None:
+    model_id = started(bench, asked(exposure_s=0.02))
+    made = bench.over(model_id)
+    assert (made.state, made.label, bench.shot) == (JobState.SUCCEEDED, "cup", [0.0, 90.0, 180.0, 270.0])
+    scans = bench.runner.series(model_id)
+    assert {each.label for each in scans} == {"cup"}
+    assert {scan_plan_from_json(each.plan).exposure_s for each in scans} == {0.02}
+    used = plan_from_json(made.plan)
+    assert used.scans == tuple(each.id for each in scans)
+    assert used.poses == TurntablePoses(AXIS, (0.0, 90.0, 180.0, 270.0))
+    told = [event.data for event in bench.models.events(model_id, after=0)]
+    assert [each["state"] for each in told if "time" in each] == ["queued", "capturing", "computing", "succeeded"]
+    details = [each["detail"] for each in told if each.get("stage") == "view"]
+    assert details == [f"view {number} of 4" for number in (1, 2, 3, 4)]
+    fractions = [each["fraction"] for each in told if "fraction" in each]
+    assert fractions == sorted(fractions)
+    assert made.summary is not None
+    assert "notes" not in made.summary
+
+
+def test_a_view_that_fails_is_told_and_a_devices_fault_is_tried_twice_more(bench: ShootingBench) -> None:
+    gone = DeviceGoneError("left was unplugged")
+    bench.faults = {90.0: [ScanEvidenceError("white is not brighter than black")], 180.0: [gone], 270.0: [gone] * 9}
+    poses = GivenPoses(tuple(((1.0, 0.0, 0.0, float(view)), *STILL[1:]) for view in range(4)))
+    made = bench.over(started(bench, replace(asked(), poses=poses)))
+    assert made.state is JobState.SUCCEEDED
+    assert [bench.shot.count(angle) for angle in (0.0, 90.0, 180.0, 270.0)] == [1, 1, 2, 3]
+    assert made.summary is not None
+    assert made.summary["notes"] == [
+        "view 2 of 4, at 90°, is not in it: white is not brighter than black",
+        "view 4 of 4, at 270°, is not in it: left was unplugged",
+    ]
+    used = plan_from_json(made.plan)
+    assert isinstance(used.poses, GivenPoses)
+    assert [matrix[0][3] for matrix in used.poses.matrices] == [0.0, 2.0]
+
+
+def test_of_fewer_than_two_views_there_is_no_model_and_the_scans_stay(bench: ShootingBench) -> None:
+    bench.faults = {angle: [ScanEvidenceError("too dark")] for angle in (90.0, 180.0, 270.0)}
+    model_id = started(bench)
+    failed = bench.over(model_id)
+    assert (failed.state, failed.fault and failed.fault.code) == (JobState.FAILED, ViewsFailedError.code)
+    assert failed.fault is not None
+    assert (
+        "1 of 4 views succeeded, and a model takes two: view 2 of 4, at 90°, is not in it: too" in failed.fault.message
+    )
+    states = [state for _, state in bench.views(model_id)]
+    assert states == [JobState.SUCCEEDED, *[JobState.FAILED] * 3]
+
+
+def test_a_cancelled_model_takes_its_waiting_views_with_it(bench: ShootingBench) -> None:
+    bench.gate.clear()
+    model_id = started(bench)
+    assert bench.began.wait(WAIT_S)
+    with (
+        pytest.raises(ScanStateError, match=f"needed by model {model_id}"),
+        bench.desk.unused(bench.runner.series(model_id)[3].id),
+    ):
+        pass
+    assert bench.shooting.cancel(model_id).state is JobState.CANCELLED
+    ended = [bench.until(scan.id).state for scan in bench.runner.series(model_id)]
+    assert (ended, bench.shot) == ([JobState.CANCELLED] * 4, [0.0])
+    assert bench.shooting.cancel(model_id).state is JobState.CANCELLED
+    assert bench.models.unfinished() == []
+
+
+def test_what_cannot_be_shot_is_refused_and_nothing_is_on_record(tmp_path: Path) -> None:
+    bench = ShootingBench(tmp_path, table=False)
+    with pytest.raises(UnsupportedByDeviceError, match=r"this rig has no turntable\. Turn it by hand"):
+        started(bench)
+    with pytest.raises(ConfigError, match="axis: expected that of the stage"):
+        started(bench, replace(asked(), poses=TurntablePoses()))
+    bench.held()
+    with pytest.raises(RigBusyError):
+        started(bench, asked(by_hand=True))
+    assert bench.models.states() == {}
+    for wrong in (1, 73):
+        with pytest.raises(ConfigError, match=f"views: expected 2 to 72, found {wrong}"):
+            ShootPlan(wrong)
+    bench.close()
+
+
+def test_by_hand_each_view_waits_for_a_word_and_the_last_may_be_shot_again(tmp_path: Path) -> None:
+    bench = ShootingBench(tmp_path, table=False)
+    model_id = started(bench, asked(3, by_hand=True))
+    waiting = bench.until_told(model_id, "turn the object by 120° for view 2 of 3")
+    assert (waiting.state, waiting.progress.stage, bench.shot) == (JobState.CAPTURING, "turn", [0.0])
+    with pytest.raises(ScanStateError, match="has 1 good views of 3; it takes two"):
+        bench.shooting.combine(model_id)
+    bench.faults = {120.0: [ScanEvidenceError("It moved.")]}
+    bench.shooting.shoot_view(model_id, again=False, wait=False)
+    bench.until_told(model_id, "view 2 failed, and may be shot again: It moved. Or turn the object by 120° for view 3")
+    bench.gate.clear()
+    bench.shooting.shoot_view(model_id, again=True, wait=False)
+    with pytest.raises(ScanStateError, match=r"View 2 of model .* is being shot"):
+        bench.shooting.shoot_view(model_id, again=False, wait=False)
+    bench.gate.set()
+    bench.until_told(model_id, "turn the object by 120° for view 3 of 3")
+    bench.shooting.shoot_view(model_id, again=True, wait=False)
+    bench.until_told(model_id, "turn the object by 120° for view 3 of 3")
+    bench.shooting.shoot_view(model_id, again=False, wait=False)
+    made = bench.over(model_id)
+    assert (made.state, bench.shot) == (JobState.SUCCEEDED, [0.0, 120.0, 120.0, 120.0, 240.0])
+    # The newest that succeeded counts.
+    scans = bench.runner.series(model_id)
+    assert plan_from_json(made.plan).scans == (scans[0].id, scans[3].id, scans[4].id)
+    with pytest.raises(ScanStateError, match=f"Model {model_id} is succeeded"):
+        bench.shooting.shoot_view(model_id, again=True, wait=False)
+    bench.close()
+
+
+def test_by_hand_it_may_end_early_with_what_there_is(tmp_path: Path) -> None:
+    bench = ShootingBench(tmp_path, table=False)
+    model_id = started(bench, asked(8, by_hand=True))
+    bench.until_told(model_id, "view 2 of 8")
+    bench.shooting.shoot_view(model_id, again=False, wait=False)
+    bench.until_told(model_id, "turn the object by 45° for view 3 of 8")
+    bench.shooting.combine(model_id)
+    made = bench.over(model_id)
+    assert made.state is JobState.SUCCEEDED
+    assert made.summary is not None
+    assert made.summary["notes"][0] == "view 3 of 8, at 90°, is not in it: it was not shot"
+    assert len(made.summary["notes"]) == 6
+    bench.close()
+
+
+def test_a_model_that_the_table_turns_waits_for_no_hand(bench: ShootingBench) -> None:
+    bench.gate.clear()
+    model_id = started(bench)
+    with pytest.raises(ScanStateError, match="is not shot by hand"):
+        bench.shooting.combine(model_id)
+    with pytest.raises(ScanStateError, match="is not shot by hand"):
+        bench.shooting.shoot_view(model_id, again=True, wait=True)
+    bench.shooting.cancel(model_id)
+
+
+def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, by_hand: bool = False) -> UUID:
+    """A model on record as a kill of the service leaves it."""
+    bench = ShootingBench(root, start=False)
+    bench.store.after_end = lambda _: None
+    plan = asked(by_hand=by_hand)
+    model_id = bench.models.create(plan_json(plan), rig="bench", label="cup").id
+    leave(bench, model_id)
+    bench.close()
+    return model_id
+
+
+def view(bench: ShootingBench, model_id: UUID, number: int, state: JobState) -> UUID:
+    """A view on record that came as far as that."""
+    plan = ShootPlan(4).view(number, model_id, utc_now())
+    document = scan_plan_json(plan)
+    if state is JobState.SUCCEEDED:
+        scan_id = kept_scan(bench.store, bench.folder)
+        bench.store.delete(scan_id)
+        bench.store.restore(
+            scan_id, document, {}, rig="bench", label="cup", created_at=utc_now(), started_at=utc_now(), parent=model_id
+        )
+        return scan_id
+    [record] = bench.store.create_series([document], rig="bench", label="cup", parent=model_id)
+    if state is not JobState.QUEUED:
+        bench.store.advance(record.id, state)
+    return record.id
+
+
+def nothing_shot(bench: ShootingBench, model_id: UUID) -> None:
+    del bench, model_id
+
+
+def between_views(bench: ShootingBench, model_id: UUID) -> None:
+    view(bench, model_id, 1, JobState.SUCCEEDED)
+    for number in (2, 3, 4):
+        view(bench, model_id, number, JobState.QUEUED)
+    bench.models.advance(model_id, JobState.CAPTURING)
+
+
+def within_a_view(bench: ShootingBench, model_id: UUID) -> None:
+    view(bench, model_id, 1, JobState.SUCCEEDED)
+    view(bench, model_id, 2, JobState.CAPTURING)
+    for number in (3, 4):
+        view(bench, model_id, number, JobState.QUEUED)
+    bench.models.advance(model_id, JobState.CAPTURING)
+
+
+def all_shot(bench: ShootingBench, model_id: UUID) -> None:
+    for number in (1, 2, 3, 4):
+        view(bench, model_id, number, JobState.SUCCEEDED)
+    bench.models.advance(model_id, JobState.CAPTURING)
+
+
+def named(bench: ShootingBench, model_id: UUID) -> None:
+    all_shot(bench, model_id)
+    plan = plan_from_json(bench.models.get(model_id).plan)
+    scans = tuple(scan.id for scan in bench.store.of(model_id)[model_id])
+    bench.models.replan(
+        model_id, plan_json(bench.desk.settled(replace(plan, scans=scans, poses=GivenPoses((STILL,) * 4))))
+    )
+
+
+def combining(bench: ShootingBench, model_id: UUID) -> None:
+    named(bench, model_id)
+    bench.models.advance(model_id, JobState.COMPUTING)
+
+
+@pytest.mark.parametrize(
+    ("leave", "shot"),
+    [
+        (nothing_shot, [0.0, 90.0, 180.0, 270.0]),
+        (between_views, [90.0, 180.0, 270.0]),
+        (within_a_view, [180.0, 270.0, 90.0]),
+        (all_shot, []),
+        (named, []),
+        (combining, []),
+    ],
+)
+def test_after_a_kill_exactly_the_missing_views_are_shot(
+    tmp_path: Path, leave: Callable[[ShootingBench, UUID], None], shot: list[float]
+) -> None:
+    model_id = killed(tmp_path, leave)
+    bench = ShootingBench(tmp_path)
+    made = bench.over(model_id)
+    assert (made.state, bench.shot) == (JobState.SUCCEEDED, shot)
+    assert len(plan_from_json(made.plan).scans) == 4
+    assert len(bench.tame.asked) == 1
+    assert made.summary is not None
+    assert "notes" not in made.summary
+    bench.close()
+
+
+def test_after_a_kill_a_model_by_hand_waits_where_it_was(tmp_path: Path) -> None:
+    def leave(bench: ShootingBench, model_id: UUID) -> None:
+        view(bench, model_id, 1, JobState.SUCCEEDED)
+        bench.models.advance(model_id, JobState.CAPTURING)
+
+    model_id = killed(tmp_path, leave, by_hand=True)
+    bench = ShootingBench(tmp_path, table=False)
+    waiting = bench.until_told(model_id, "turn the object by 90° for view 2 of 4")
+    assert (waiting.state, bench.shot) == (JobState.CAPTURING, [])
+    bench.shooting.cancel(model_id)
+    cancelled = ScanCancelledError("The model was cancelled while its views were shot. They stay.")
+    assert bench.over(model_id).fault == failure_of(cancelled)
+    bench.close()
+
+
+def test_the_end_of_the_service_leaves_the_rest_to_the_next_start(tmp_path: Path) -> None:
+    ended = ShootingBench(tmp_path)
+    ended.gate.clear()
+    model_id = started(ended)
+    assert ended.began.wait(WAIT_S)
+    ended.close()
+    assert ended.shot == [0.0]
+    bench = ShootingBench(tmp_path)
+    assert bench.over(model_id).state is JobState.SUCCEEDED
+    # The one that had the rig is shot again, after those that waited.
+    assert bench.shot == [90.0, 180.0, 270.0, 0.0]
+    bench.close()
