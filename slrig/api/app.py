@@ -19,6 +19,7 @@ from slrig.api import (
     events,
     exposure,
     health,
+    model_shooting,
     models,
     page,
     presets,
@@ -62,6 +63,7 @@ def bare_app() -> FastAPI:
         events,
         artefacts,
         models,
+        model_shooting,
         presets,
         exposure,
         rig,
@@ -98,6 +100,7 @@ def create_app(service: Service, *, ring: KeyRing | None, cookie: str = "slrig_s
     # the body's size. FastAPI's own size limit would lie outside of all of them and answer in plain text.
     longer = {
         IMPORT_PATH: max(MOST_IMPORT_BYTES, settings.max_body_bytes),
+        "/model/shoot": max(scans.MOST_SCAN_BYTES, settings.max_body_bytes),
         "/scan": max(scans.MOST_SCAN_BYTES, settings.max_body_bytes),
     }
     app.add_middleware(BodyLimits, most_bytes=settings.max_body_bytes, longer=longer)

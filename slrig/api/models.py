@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Literal, Self
 from uuid import UUID
 
@@ -18,27 +18,27 @@ from slrig.bundle.faults import Strict
 from slrig.bundle.free_text import FreeText
 from slrig.bundle.poses_file import MOST_VIEWS, AxisEntry, PoseEntry, rotating
 from slrig.combine.offered import MEDIA_TYPES
-from slrig.combine.plan import START_ERROR_MM, GivenPoses, ModelPlan, StartingPoses, StatedAxis, TurntablePoses
+from slrig.combine.plan import (
+    START_ERROR_MM,
+    GivenPoses,
+    ModelPlan,
+    ShootPlan,
+    StartingPoses,
+    StatedAxis,
+    TurntablePoses,
+)
 from slrig.jobs.records import JobRecord, JobState
 
 router = APIRouter(prefix="/model", tags=["model"])
 
 
-class ModelRequest(Strict):
-    """A model of scans on record."""
+class MadeRequest(Strict):
+    """How a model is made of its scans, whether those are on record or still to be shot."""
 
-    scans: Annotated[list[Annotated[UUID, Field(strict=False)]], Field(min_length=2, max_length=MOST_VIEWS)] = Field(
-        description="ids of scans that succeeded; the model is in the frame of the first"
-    )
     poses: Literal["turntable"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = Field(
         default="turntable",
         description='about where the scans belong. "turntable": a stage turned the object. Or of each scan a motion, '
         "4 × 4, that takes its mm to a common frame",
-    )
-    angles_deg: Annotated[list[float], Field(max_length=MOST_VIEWS)] | None = Field(
-        default=None,
-        description="of a turntable: where the stage stood at each scan, right-handed about its axis. Default: as the "
-        "scans' reports say",
     )
     axis: AxisEntry | None = Field(
         default=None, description="of a turntable, in the scans' frame. Default: the stage's own, where it is known"
@@ -56,23 +56,38 @@ class ModelRequest(Strict):
 
     @model_validator(mode="after")
     def _of_a_turntable(self) -> Self:
-        told = [name for name in ("angles_deg", "axis") if getattr(self, name) is not None]
+        told = [name for name in ("angles_deg", "axis") if getattr(self, name, None) is not None]
         if self.poses != "turntable" and told:
             message = f'{told[0]}: expected "poses": "turntable" beside it, found poses; leave one of them out'
             raise ValueError(message)
         return self
 
-    def plan(self) -> ModelPlan:
+    def plan(
+        self, scans: Sequence[UUID], *, angles_deg: Sequence[float] | None = None, shoot: ShootPlan | None = None
+    ) -> ModelPlan:
         """What is asked for. Raises ConfigError: see `ModelPlan`."""
         poses: StartingPoses
         if self.poses != "turntable":
             poses = GivenPoses.of(map(rotating, self.poses))
         else:
             axis = None if self.axis is None else StatedAxis.of(self.axis.point_mm, self.axis.direction)
-            poses = TurntablePoses(axis, None if self.angles_deg is None else tuple(self.angles_deg))
+            poses = TurntablePoses(axis, None if angles_deg is None else tuple(angles_deg))
         return ModelPlan(
-            tuple(self.scans), poses, start_error_mm=self.start_error_mm, voxel_mm=self.voxel_mm, cut=self.cut
+            tuple(scans), poses, start_error_mm=self.start_error_mm, voxel_mm=self.voxel_mm, cut=self.cut, shoot=shoot
         )
+
+
+class ModelRequest(MadeRequest):
+    """A model of scans on record."""
+
+    scans: Annotated[list[Annotated[UUID, Field(strict=False)]], Field(min_length=2, max_length=MOST_VIEWS)] = Field(
+        description="ids of scans that succeeded; the model is in the frame of the first"
+    )
+    angles_deg: Annotated[list[float], Field(max_length=MOST_VIEWS)] | None = Field(
+        default=None,
+        description="of a turntable: where the stage stood at each scan, right-handed about its axis. Default: as the "
+        "scans' reports say",
+    )
 
 
 class ModelBody(JobBody):
@@ -97,11 +112,12 @@ def start_model(
     desk = service.models
 
     def start(key: str | None) -> UUID:
-        return desk.combine(request.plan(), label=request.label, key=key).id
+        plan = request.plan(request.scans, angles_deg=request.angles_deg)
+        return desk.combine(plan, label=request.label, key=key).id
 
     record = started_once(service.keys, desk.jobs, idempotency_key, "/model", request, start)
     response.headers["Location"] = f"/model/{record.id}"
-    return _body(service, record)
+    return model_body(service, record)
 
 
 @router.get("")
@@ -109,19 +125,19 @@ def list_models(service: Serving, response: Response, cursor: Cursor = None, lim
     """List models from new to old."""
     jobs = service.models.jobs
     shown, following = paged(lambda most: jobs.page(before=cursor, limit=most), limit, "/model", service, response)
-    return ModelPage(models=[_body(service, record) for record in shown], next=following)
+    return ModelPage(models=[model_body(service, record) for record in shown], next=following)
 
 
 @router.get("/{model_id}")
 def look_at_model(service: Serving, model_id: UUID) -> ModelBody:
     """Return a model: its state, how far it is, and where its files are."""
-    return _body(service, service.models.jobs.get(model_id))
+    return model_body(service, service.models.jobs.get(model_id))
 
 
 @router.post("/{model_id}/cancel", status_code=202)
 def cancel_model(service: Serving, model_id: UUID) -> ModelBody:
-    """Ask a model to stop. May be repeated; one that is over stays as it is."""
-    return _body(service, service.models.cancel(model_id))
+    """Ask a model to stop, with the views that are shot for it. May be repeated; one that is over stays as it is."""
+    return model_body(service, service.shooting.cancel(model_id))
 
 
 @router.delete("/{model_id}", status_code=204, responses=problems(409, 507))
@@ -153,7 +169,8 @@ for _name, _media_type in MEDIA_TYPES.items():
     )
 
 
-def _body(service: Service, record: JobRecord) -> ModelBody:
+def model_body(service: Service, record: JobRecord) -> ModelBody:
+    """A record as an answer."""
     here, place = f"/model/{record.id}", service.models.store.place(record.id)
     ready = [name for name in MEDIA_TYPES if record.state is JobState.SUCCEEDED and service.folder.owns(place / name)]
     files = {name: f"{here}/{name}" for name in ready}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 from uuid import UUID
 
@@ -32,6 +33,7 @@ def start_scan(
     """Start a scan. The answer comes at once; follow `links.events` for the rest."""
     preset = None if request.preset is None else service.presets.get(request.preset)
     plan = scan_plan(request, service.scan_defaults, preset)
+    plan = replace(plan, turn_deg=request.turn_deg, turned_by=request.turned_by)
 
     def start(key: str | None) -> UUID:
         health, _, _ = service.verifications.health()

@@ -95,10 +95,9 @@ class ReconstructionRequest(Strict):
     region: RegionTable | None = Field(default=None, description="what of the scene is measured. Default: all of it")
 
 
-class ScanRequest(Strict):
-    """A scan. An empty request is a scan as the rig file describes it."""
+class ShotRequest(Strict):
+    """How an object is shot. An empty request is as the rig file describes it."""
 
-    label: FreeText | None = Field(default=None, description="free text, to find the scan again")
     preset: PresetName | None = Field(
         default=None,
         description="options by name, as GET /preset lists them. What is said beside it stands above it, and it stands "
@@ -131,6 +130,14 @@ class ScanRequest(Strict):
         "refuse where the projector has no such lights or every camera has colour. Default: as the rig file says, else "
         "false",
     )
+
+    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
+
+
+class ScanRequest(ShotRequest):
+    """A scan. An empty request is a scan as the rig file describes it."""
+
+    label: FreeText | None = Field(default=None, description="free text, to find the scan again")
     turn_deg: Annotated[float, Field(ge=-MOST_TURN_DEG, le=MOST_TURN_DEG)] | None = Field(
         default=None,
         description="angle of the stage that the object is shot at, right-handed about its axis; the report says so. "
@@ -160,8 +167,6 @@ class ScanRequest(Strict):
             raise ValueError(message)
         return every_s
 
-    _one_exposure = field_validator("exposures_s", "exposure_factors")(alone)
-
 
 def filled(body: type[Body], source: object, /, **others: Any) -> Body:
     """An answer with the attributes of `source` by their names, at every depth, save what `others` says."""
@@ -169,7 +174,7 @@ def filled(body: type[Body], source: object, /, **others: Any) -> Body:
     return body.model_validate({**own, **others}, from_attributes=True)
 
 
-def scan_plan(request: ScanRequest, defaults: ScanDefaults, preset: PresetDocument | None = None) -> ScanPlan:
+def scan_plan(request: ShotRequest, defaults: ScanDefaults, preset: PresetDocument | None = None) -> ScanPlan:
     """The plan that a request means on a rig with these defaults. preset : the one that the request names.
 
     The rig file's exposure is no part of it: it is among the settings that each camera was opened with. Its bracket is,
@@ -191,8 +196,6 @@ def scan_plan(request: ScanRequest, defaults: ScanDefaults, preset: PresetDocume
         colour=request.colour if request.colour is not None else usual.colour,
         coloured_light=bool(usual.coloured_light if request.coloured_light is None else request.coloured_light),
         preset=use,
-        turn_deg=request.turn_deg,
-        turned_by=request.turned_by,
     )
 
 

@@ -19,6 +19,7 @@ from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
 from slrig.combine.desk import CombineInto, ModelDesk
+from slrig.combine.shooting import ViewShooting
 from slrig.combine.stage import StageStore
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
@@ -130,6 +131,7 @@ class Service:
             spare_bytes=spare_bytes,
         )
         runner.spare_what_is_used(self.models.unused)
+        self.shooting = ViewShooting(self.models, runner, store)
         self.find_axis = worker.task("slrig.calibrate.stage_axis:axis_of_poses", "axis of the stage")
         self.find_planes = worker.task("slrig.combine.empty_stage:planes_in", "planes of the stage")
         self.durations = Durations()
@@ -143,7 +145,7 @@ class Service:
         self.feed = JobFeed(*stores)
         for jobs in stores:
             jobs.after_end = partial(self._ended, jobs)
-        for desk in self._desks:
+        for desk in (*self._desks, self.shooting):
             desk.take_up()
         self.retention = Retention(
             self.calibrations,
@@ -159,8 +161,9 @@ class Service:
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
 
     def _ended(self, jobs: JobStore, record: JobRecord) -> None:
-        """Measure a job that is over, and make room after a scan."""
+        """Measure a job that is over, and go on with the model of a view, and make room, after a scan."""
         if jobs is self.store:
+            self.shooting.view_ended(record)
             self.scan_retention.look()
         try:
             events = jobs.events(record.id, after=0)

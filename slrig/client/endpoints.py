@@ -107,6 +107,28 @@ class Models(Remote[W]):
     ) -> Json:
         """Have scans made one mesh, and return the model as it is on record; `wait` returns it when it is over."""
 
+    @endpoint("POST /model/shoot", once=True)
+    def shoot(
+        self,
+        *,
+        views: int | None = None,
+        scan: Mapping[str, Any] | None = None,
+        by_hand: bool | None = None,
+        poses: Literal["turntable"] | Sequence[Sequence[Sequence[float]]] | None = None,
+        axis: Mapping[str, Any] | None = None,
+        start_error_mm: float | None = None,
+        voxel_mm: float | None = None,
+        label: str | None = None,
+        if_busy: IfBusy | None = None,
+    ) -> Json:
+        """Have an object shot from all sides and the views made one mesh. scan : how, as `scans.start` takes it."""
+
+    @endpoint("POST /model/{model_id}/view", once=True)
+    def view(self, model_id: str, /, *, again: bool | None = None, if_busy: IfBusy | None = None) -> Json:
+        """Shoot the next view, of an object that was turned by hand; or the last one again, in its place."""
+
+    combine = entry("POST /model/{model_id}/combine", _told_of, "Make a model of the views that were shot by hand.")
+
     list = entry("GET /model", _paged, "A page of models from new to old: `models`, and `next`.")
     look = entry("GET /model/{model_id}", _told_of, "A model: its state, how far it is, and where its files are.")
     delete = entry("DELETE /model/{model_id}", _done_to, "Delete a model that is over with all its files.")

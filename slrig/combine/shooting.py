@@ -133,7 +133,7 @@ class ViewShooting:
         self._watch(model_id)
         return self._desk.jobs.get(model_id)
 
-    def shoot_view(self, model_id: UUID, *, again: bool, wait: bool) -> JobRecord:
+    def shoot_view(self, model_id: UUID, *, again: bool, wait: bool, key: str | None = None) -> JobRecord:
         """Have the next view of a model shot, whose object was turned by hand; or the last one once more, in place of
         what there is of it. Returns the model at once.
 
@@ -157,7 +157,7 @@ class ViewShooting:
                 )
                 raise ScanStateError(message)
             plan = shoot.view(number, model_id, utc_now())
-            self._runner.submit_views([plan], model_id, label=record.label, wait=wait)
+            self._runner.submit_views([plan], model_id, label=record.label, wait=wait, key=key)
             self._tell(model_id, shoot)
             return self._desk.jobs.get(model_id)
 

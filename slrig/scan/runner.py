@@ -140,8 +140,9 @@ class Runner:
         *,
         label: str | None,
         wait: bool,
+        key: str | None = None,
         begun: Callable[[], object] = lambda: None,
-    ) -> list[JobRecord]:
+    ) -> None:
         """Record scans of one parent and have them done in their order; `wait` lets the first queue behind others.
 
         begun : puts the parent on record, once a place in the line is certain. Raises as `submit`.
@@ -151,9 +152,9 @@ class Runner:
 
         def records() -> list[JobRecord]:
             begun()
-            return self._recorded(plans, label=label, parent=parent)
+            return self._recorded(plans, label=label, parent=parent, key=key)
 
-        return self._submit(records, wait=wait)
+        self._submit(records, wait=wait)
 
     def add_views(self, plans: Sequence[ScanPlan], parent: UUID, *, label: str | None) -> None:
         """Have further scans of a parent done, however many wait: nobody is there to hear a refusal."""

@@ -147,3 +147,18 @@ class ModelBench(Bench):
     def close(self) -> None:
         self.tame.gate.set()
         super().close()
+
+
+def until_told(models: JobStore, model_id: UUID, words: str) -> JobRecord:
+    """A model once its progress says this."""
+    told = threading.Event()
+
+    def look() -> None:
+        if words in models.get(model_id).progress.detail:
+            told.set()
+
+    unwatch = models.watch(model_id, look)
+    look()
+    assert told.wait(WAIT_S), models.get(model_id).progress
+    unwatch()
+    return models.get(model_id)

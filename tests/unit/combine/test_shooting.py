@@ -35,7 +35,7 @@ from slrig.scan.plan import ScanPlan
 from slrig.scan.records import plan_from_json as scan_plan_from_json
 from slrig.scan.records import plan_json as scan_plan_json
 from tests.unit.capture.fake_rig import FakeTurntable
-from tests.unit.combine.model_bench import ModelBench, kept_scan
+from tests.unit.combine.model_bench import ModelBench, kept_scan, until_told
 from tests.unit.scan.fakes import WAIT_S
 
 AXIS = StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0))
@@ -84,17 +84,7 @@ class ShootingBench(ModelBench):
 
     def until_told(self, model_id: UUID, words: str) -> JobRecord:
         """The model once its progress says this."""
-        told = threading.Event()
-
-        def look() -> None:
-            if words in self.models.get(model_id).progress.detail:
-                told.set()
-
-        unwatch = self.models.watch(model_id, look)
-        look()
-        assert told.wait(WAIT_S), self.models.get(model_id).progress
-        unwatch()
-        return self.models.get(model_id)
+        return until_told(self.models, model_id, words)
 
 
 def _look(known: threading.Event) -> Job:
