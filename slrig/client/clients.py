@@ -17,7 +17,6 @@ from slrig.client.core import Core, Json, W
 from slrig.client.endpoints import (
     Acceptance,
     Calibrations,
-    Models,
     Presets,
     RigHealth,
     RigState,
@@ -27,6 +26,7 @@ from slrig.client.endpoints import (
     System,
 )
 from slrig.client.events import Event
+from slrig.client.models import Models
 from slrig.client.operations import Operation, Remote
 from slrig.client.scans import ScanJob, ScanResult, Told
 from slrig.client.stage import RigStage

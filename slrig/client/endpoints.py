@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 from slrig.client.core import Core, Json, W
-from slrig.client.errors import ModelFailedError, RefusedError
+from slrig.client.errors import RefusedError
 from slrig.client.events import Event
 from slrig.client.operations import Operation, Remote, endpoint, entry, stream
 
@@ -46,12 +46,24 @@ def _done(self: object) -> None: ...
 def _text(self: object) -> str: ...
 def _listed(self: object, *, limit: int | None = None) -> Json: ...
 def _plotted(self: object, *, limit: int | None = None) -> str: ...
-def _paged(self: object, *, cursor: int | None = None, limit: int | None = None) -> Json: ...
-def _told_of(self: object, which: str, /) -> Json: ...
-def _done_to(self: object, which: str, /) -> None: ...
-def _file_of(self: object, which: str, name: str, /) -> bytes: ...
 def _told_of_pose(self: object, which: str, number: int, /) -> Json: ...
 def _done_to_pose(self: object, which: str, number: int, /) -> None: ...
+
+
+def paged(self: object, *, cursor: int | None = None, limit: int | None = None) -> Json:
+    """The shape of an operation that returns a page of a list."""
+
+
+def told_of(self: object, which: str, /) -> Json:
+    """The shape of one that returns what it is told of."""
+
+
+def done_to(self: object, which: str, /) -> None:
+    """The shape of one that returns nothing."""
+
+
+def file_of(self: object, which: str, name: str, /) -> bytes:
+    """The shape of one that returns a file, by its name."""
 
 
 class Scans(Remote[W]):
@@ -73,96 +85,28 @@ class Scans(Remote[W]):
         """Look at the object, and propose exposures: `scan` of the answer is what `start` takes. budget_s : seconds."""
 
     list = entry(
-        "GET /scan", _paged, "A page of scans from new to old: `scans`, and `next`, the path of the page after it."
+        "GET /scan", paged, "A page of scans from new to old: `scans`, and `next`, the path of the page after it."
     )
-    look = entry("GET /scan/{scan_id}", _told_of, "A scan: its state, how far it is, and where its files are.")
-    delete = entry("DELETE /scan/{scan_id}", _done_to, "Delete a finished scan with all its files.")
-    cancel = entry("POST /scan/{scan_id}/cancel", _told_of, "Ask a scan to stop between two frames.")
-    pin = entry("PUT /scan/{scan_id}/pin", _told_of, "Keep a scan, whatever the settings say of old ones.")
-    unpin = entry("DELETE /scan/{scan_id}/pin", _told_of, "Let a scan be removed when it is old.")
-    series = entry("GET /scan/series/{series_id}", _told_of, "The scans of a series.")
-    cancel_series = entry("POST /scan/series/{series_id}/cancel", _told_of, "Ask all scans of a series to stop.")
-    file = entry("GET /scan/{scan_id}/{name}", _file_of, "A file of a scan, by its name.")
+    look = entry("GET /scan/{scan_id}", told_of, "A scan: its state, how far it is, and where its files are.")
+    delete = entry("DELETE /scan/{scan_id}", done_to, "Delete a finished scan with all its files.")
+    cancel = entry("POST /scan/{scan_id}/cancel", told_of, "Ask a scan to stop between two frames.")
+    pin = entry("PUT /scan/{scan_id}/pin", told_of, "Keep a scan, whatever the settings say of old ones.")
+    unpin = entry("DELETE /scan/{scan_id}/pin", told_of, "Let a scan be removed when it is old.")
+    series = entry("GET /scan/series/{series_id}", told_of, "The scans of a series.")
+    cancel_series = entry("POST /scan/series/{series_id}/cancel", told_of, "Ask all scans of a series to stop.")
+    file = entry("GET /scan/{scan_id}/{name}", file_of, "A file of a scan, by its name.")
 
     @stream("GET /scan/{scan_id}/events", Core.follow)
     def follow(self, scan_id: str) -> Event:
         """What happens to a scan until it is over, from its beginning."""
 
 
-class Models(Remote[W]):
-    """Models: several scans of one object, made one mesh."""
-
-    @endpoint("POST /model", once=True)
-    def start(
-        self,
-        scans: Sequence[str],
-        *,
-        poses: Literal["turntable"] | Sequence[Sequence[Sequence[float]]] | None = None,
-        angles_deg: Sequence[float] | None = None,
-        axis: Mapping[str, Any] | None = None,
-        start_error_mm: float | None = None,
-        voxel_mm: float | None = None,
-        cut: bool | None = None,
-        label: str | None = None,
-    ) -> Json:
-        """Have scans made one mesh, and return the model as it is on record; `wait` returns it when it is over."""
-
-    @endpoint("POST /model/shoot", once=True)
-    def shoot(
-        self,
-        *,
-        views: int | None = None,
-        scan: Mapping[str, Any] | None = None,
-        by_hand: bool | None = None,
-        poses: Literal["turntable"] | Sequence[Sequence[Sequence[float]]] | None = None,
-        axis: Mapping[str, Any] | None = None,
-        start_error_mm: float | None = None,
-        voxel_mm: float | None = None,
-        label: str | None = None,
-        if_busy: IfBusy | None = None,
-    ) -> Json:
-        """Have an object shot from all sides and the views made one mesh. scan : how, as `scans.start` takes it."""
-
-    @endpoint("POST /model/{model_id}/view", once=True)
-    def view(self, model_id: str, /, *, again: bool | None = None, if_busy: IfBusy | None = None) -> Json:
-        """Shoot the next view, of an object that was turned by hand; or the last one again, in its place."""
-
-    combine = entry("POST /model/{model_id}/combine", _told_of, "Make a model of the views that were shot by hand.")
-
-    list = entry("GET /model", _paged, "A page of models from new to old: `models`, and `next`.")
-    look = entry("GET /model/{model_id}", _told_of, "A model: its state, how far it is, and where its files are.")
-    delete = entry("DELETE /model/{model_id}", _done_to, "Delete a model that is over with all its files.")
-    cancel = entry("POST /model/{model_id}/cancel", _told_of, "Ask a model to stop.")
-    file = entry("GET /model/{model_id}/{name}", _file_of, "A file of a model, by its name.")
-
-    @stream("GET /model/{model_id}/events", Core.follow)
-    def follow(self, model_id: str) -> Event:
-        """What happens to a model until it is over, from its beginning."""
-
-    @Operation
-    async def wait(self, model_id: str) -> Json:
-        """The model once it is over. `Client.fetch` writes a file of its `links`.
-
-        Raises
-        ------
-        ModelFailedError
-            It did not succeed.
-        """
-        path = f"/model/{model_id}"
-        async for _ in self.core.follow(f"{path}/events"):
-            pass
-        model: Json = await self.core.content("Json", "GET", path)
-        if model["state"] != "succeeded":
-            raise ModelFailedError(model)
-        return model
-
-
 class Presets(Remote[W]):
     """Options of scans by name."""
 
     list = entry("GET /preset", _told, "The presets: shipped, of the rig file, and kept by the service.")
-    look = entry("GET /preset/{name}", _told_of, "A preset as a document, which another service takes as it is.")
-    delete = entry("DELETE /preset/{name}", _done_to, "Delete a preset that was put.")
+    look = entry("GET /preset/{name}", told_of, "A preset as a document, which another service takes as it is.")
+    delete = entry("DELETE /preset/{name}", done_to, "Delete a preset that was put.")
 
     @endpoint("PUT /preset/{name}", content="document")
     def put(self, name: str, document: Mapping[str, Any] | str | bytes) -> Json:
@@ -229,10 +173,10 @@ class Calibrations(Remote[W]):
 
     look = entry(
         "GET /calibration/{calibration_id}",
-        _told_of,
+        told_of,
         "A calibration: its poses, what they cover, what to do next, and its solve.",
     )
-    delete = entry("DELETE /calibration/{calibration_id}", _done_to, "Delete a calibration.")
+    delete = entry("DELETE /calibration/{calibration_id}", done_to, "Delete a calibration.")
 
     @endpoint("POST /calibration/{calibration_id}/pose", once=True)
     def shoot(
@@ -266,11 +210,11 @@ class Calibrations(Remote[W]):
     def solve(self, calibration_id: str, *, board_shape: Literal["auto", "flat", "bowed"] | None = None) -> Json:
         """Solve from all accepted poses."""
 
-    activate = entry("POST /calibration/{calibration_id}/activate", _told_of, "Have scans use it from now on.")
-    deactivate = entry("POST /calibration/{calibration_id}/deactivate", _told_of, "Have scans use the rig's own again.")
+    activate = entry("POST /calibration/{calibration_id}/activate", told_of, "Have scans use it from now on.")
+    deactivate = entry("POST /calibration/{calibration_id}/deactivate", told_of, "Have scans use the rig's own again.")
     file = entry(
         "GET /calibration/{calibration_id}/{name}",
-        _file_of,
+        file_of,
         "calibration.json, calibration.yml or calibration.xml (OpenCV's), or report.html.",
     )
 
@@ -311,10 +255,10 @@ class RigHealth(Remote[W]):
 
     verification = entry(
         "GET /rig/verification/{verification_id}",
-        _told_of,
+        told_of,
         "A verification: its state, and what was found, or why nothing was.",
     )
-    cancel = entry("POST /rig/verification/{verification_id}/cancel", _told_of, "Ask a verification to end early.")
+    cancel = entry("POST /rig/verification/{verification_id}/cancel", told_of, "Ask a verification to end early.")
 
     @stream("GET /rig/verification/{verification_id}/events", Core.follow)
     def follow(self, verification_id: str) -> Event:
@@ -340,16 +284,16 @@ class Acceptance(Remote[W]):
 
     list = entry("GET /acceptance", _listed, "Tests, newest first.")
     look = entry(
-        "GET /acceptance/{test_id}", _told_of, "A test: what to do next, what was measured, and what was decided."
+        "GET /acceptance/{test_id}", told_of, "A test: what to do next, what was measured, and what was decided."
     )
-    delete = entry("DELETE /acceptance/{test_id}", _done_to, "Delete a test with all its files.")
+    delete = entry("DELETE /acceptance/{test_id}", done_to, "Delete a test with all its files.")
 
     @endpoint("POST /acceptance/{test_id}/position", once=True)
     def measure(self, test_id: str, *, scripted: bool | None = None, if_busy: IfBusy | None = None) -> Json:
         """Measure the next position; by script, all that are left."""
 
-    cancel = entry("POST /acceptance/{test_id}/cancel", _told_of, "End a test early.")
-    file = entry("GET /acceptance/{test_id}/{name}", _file_of, "report.html or report.json.")
+    cancel = entry("POST /acceptance/{test_id}/cancel", told_of, "End a test early.")
+    file = entry("GET /acceptance/{test_id}/{name}", file_of, "report.html or report.json.")
 
 
 class Schedules(Remote[W]):
@@ -373,17 +317,17 @@ class Schedules(Remote[W]):
     ) -> Json:
         """Have a task done by the clock: "30 6 * * mon-fri" is 06:30 on working days."""
 
-    look = entry("GET /schedule/{schedule_id}", _told_of, "A schedule, with its next due times.")
-    remove = entry("DELETE /schedule/{schedule_id}", _done_to, "Forget a schedule and its runs.")
+    look = entry("GET /schedule/{schedule_id}", told_of, "A schedule, with its next due times.")
+    remove = entry("DELETE /schedule/{schedule_id}", done_to, "Forget a schedule and its runs.")
 
     @endpoint("GET /schedule/{schedule_id}/runs")
     def runs(self, schedule_id: str, *, cursor: int | None = None, limit: int | None = None) -> Json:
         """A page of what became of its due times, from new to old."""
 
-    run = entry("POST /schedule/{schedule_id}/run", _told_of, "Do it now.")
-    pause = entry("POST /schedule/{schedule_id}/pause", _told_of, "Let nothing become due until it is resumed.")
-    resume = entry("POST /schedule/{schedule_id}/resume", _told_of, "Go on after a pause.")
-    cancel = entry("POST /schedule/{schedule_id}/cancel", _told_of, "Have the run under way end early.")
+    run = entry("POST /schedule/{schedule_id}/run", told_of, "Do it now.")
+    pause = entry("POST /schedule/{schedule_id}/pause", told_of, "Let nothing become due until it is resumed.")
+    resume = entry("POST /schedule/{schedule_id}/resume", told_of, "Go on after a pause.")
+    cancel = entry("POST /schedule/{schedule_id}/cancel", told_of, "Have the run under way end early.")
 
 
 class System(Remote[W]):
@@ -406,8 +350,8 @@ class System(Remote[W]):
         return {"checks": dict(found["checks"]), "pending": list(found.get("pending", ()))}
 
     metrics = entry("GET /metrics", _text, "Figures for Prometheus.")
-    audit = entry("GET /audit", _paged, "A page of who did what, from new to old.")
-    explain = entry("GET /problems/{name}", _told_of, "What a kind of problem means.")
+    audit = entry("GET /audit", paged, "A page of who did what, from new to old.")
+    explain = entry("GET /problems/{name}", told_of, "What a kind of problem means.")
     session = entry("GET /session", _told, "Whom the service takes this client for.")
     open_session = entry("POST /session", _told, "Log in by a cookie, as a browser does.")
     close_session = entry("DELETE /session", _done, "Log out.")
