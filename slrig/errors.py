@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-_FLAGS = {"exposures_s": "exposure-s", "kind": "board", "line_shift_period_px": "period-px"}
+_FLAGS = {
+    "exposures_s": "exposure-s",
+    "kind": "board",
+    "line_shift_period_px": "period-px",
+    "turned_by": "by-hand",
+}
 """Flags of the command line that are not called as the setting is."""
 
 

@@ -75,7 +75,7 @@ def no_turntable(turn_deg: float) -> UnsupportedByDeviceError:
     """The error that a rig cannot turn what stands before it."""
     message = (
         f"{setting('turn_deg')}: the object is to stand at {turn_deg:g}°, and this rig has no turntable. Turn it by "
-        'hand, and say so ("turned_by": "hand", or --by-hand); or name a turntable in the rig file'
+        f"hand, and say so with {setting('turned_by')}; or name a turntable in the rig file"
     )
     return UnsupportedByDeviceError(message)
 
