@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from slrig.cli.options import Service, given, grouped
 from slrig.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,17 +20,30 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 
 
+@grouped
 def model(
+    *,
     scans: Annotated[
-        list[Path], typer.Argument(metavar="SCAN", help="Folders with mesh.ply, or a folder of such; or PLY files.")
-    ],
+        list[Path] | None,
+        typer.Argument(metavar="SCAN", help="Folders with mesh.ply, or a folder of such; or PLY files."),
+    ] = None,
     output: Annotated[Path, typer.Option(help="Folder for the model, the poses and the report.")],
+    shoot: Annotated[
+        int | None,
+        typer.Option(min=2, metavar="N", help="Shoot so many views around the object, with a service or with --rig."),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="With --shoot: the rig file to shoot with; what the folder has of an earlier call stays."),
+    ] = None,
+    by_hand: Annotated[bool, typer.Option("--by-hand", help="With --shoot: turn it yourself, when told.")] = False,
+    service: Service,
     angle: Annotated[
         float | None,
         typer.Option(metavar="DEG", help="The stage turned the object by so much, right-handed, from scan to scan."),
     ] = None,
     axis: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --angle: the stage's axis, as in an earlier poses.json.")
+        Path | None, typer.Option(metavar="FILE", help="With --angle or --shoot: the stage's axis, as in poses.json.")
     ] = None,
     axis_point: Annotated[
         Vector | None, typer.Option(metavar="X Y Z", help="With --angle: a point of the axis, mm, in the scans' frame.")
@@ -62,19 +77,40 @@ def model(
     from slrig.bundle.stage_file import StageRecord, read_stage
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
-    from slrig.combine.offered import MEDIA_TYPES, POSES, REPORT, REPORT_FORMAT
+    from slrig.combine.offered import POSES, REPORT, REPORT_FORMAT
     from slrig.combine.plan import StatedAxis
     from slrig.logs import set_up_logs_for_a_person
     from slrig.scan.artefacts import staged_folder
 
     set_up_logs_for_a_person()
     keep_kernels()
-    files = _named_meshes(scans)
-    known = StageRecord() if stage is None else read_stage(stage)
+    known, notes = StageRecord() if stage is None else read_stage(stage), list[str]()
     told = _axis(axis, axis_point, axis_direction)
     if told is None and known.axis is not None and poses is None:
         told = StatedAxis.of(known.axis.point_mm, known.axis.direction)
-    start = _starts(list(files), angle, told, poses)
+    if (shoot is None) == (not scans) or (shoot is None and (rig or by_hand)):
+        raise ConfigError("expected scans, or --shoot N (with --rig or a service, and --by-hand), and not both")
+    if shoot is None:
+        files = _named_meshes(scans or ())
+        start = _starts(list(files), angle, told, poses)
+    elif angle is not None or poses is not None:
+        raise ConfigError("--shoot: it says itself where the views stand; leave --angle and --poses out")
+    elif rig is not None:
+        from slrig.cli.model_shoot import views_here
+
+        files, start, notes = views_here(rig, shoot, output, by_hand=by_hand, axis=told)
+        output /= "model"
+    else:
+        from slrig.cli.model_shoot import views_there
+
+        request = given(
+            views=shoot, by_hand=by_hand, axis=None if told is None else asdict(told), start_error_mm=start_error_mm,
+            voxel_mm=voxel_mm, cut=not no_cut,
+        )  # fmt: skip
+        with service.client() as client:
+            views_there(client, request, output)
+        _tell_all(json.loads((output / REPORT).read_bytes()), output)
+        return
     read = [each for each in (axis, poses, stage) if each and each.name != POSES]
     _require_apart(output, [*files.values(), *read])
     with staged_folder(output, REPORT_FORMAT) as folder, progress_shown() as display:
@@ -82,11 +118,20 @@ def model(
 
         planes = () if no_cut else known.planes
         combine_into(
-            files, folder, start, start_error_mm=start_error_mm, voxel_mm=voxel_mm, planes=planes, progress=display
-        )
+            files, folder, start, start_error_mm=start_error_mm, voxel_mm=voxel_mm, planes=planes, notes=notes,
+            progress=display,
+        )  # fmt: skip
         report = json.loads((folder / REPORT).read_bytes())
+    _tell_all(report, output)
+
+
+def _tell_all(report: Mapping[str, Any], output: Path) -> None:
+    from slrig.combine.offered import MEDIA_TYPES
+
     _tell(report)
     _tell_fused(report["model"])
+    for note in report["notes"]:
+        typer.echo(f"{'note':<10}{note}")
     for name in MEDIA_TYPES:
         typer.echo(f"{name:<12}{output / name}")
 

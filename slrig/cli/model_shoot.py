@@ -1,0 +1,135 @@
+"""`slrig model --shoot`: the views of an object shot around it, by a rig of this process or by a running service."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import typer
+
+from slrig.api.schemas import ScanRequest, scan_plan
+from slrig.bundle.description import DESCRIPTION
+from slrig.cli.display import answered, progress_shown
+from slrig.cli.reconstruct import prepare_kernels
+from slrig.client import Client
+from slrig.client.events import Progress
+from slrig.combine.plan import ShootPlan, StatedAxis, TurntablePoses
+from slrig.combine.shooting import TURN
+from slrig.config import read_rig
+from slrig.devices import Rig, Turntable
+from slrig.discovery import open_rig
+from slrig.errors import ConfigError, ServiceError, SlrigError, ViewsFailedError
+from slrig.jobs.records import utc_now
+from slrig.scan.acquisition import capture_frames
+from slrig.scan.artefacts import MESH
+from slrig.scan.plan import ScanPlan
+from slrig.scan.plan_check import no_turntable
+from slrig.scan.reconstruct import reconstruct_bundle
+
+
+def views_here(
+    rig_file: Path,
+    count: int,
+    output: Path,
+    *,
+    by_hand: bool,
+    axis: StatedAxis | None,
+    ask: Callable[[str], str] = input,
+) -> tuple[dict[str, Path], TurntablePoses, list[str]]:
+    """Shoot the views that `output` lacks, each into view-N with its frames in bundle-N. Return the meshes by name,
+    where they start from, and words for views that failed. Ctrl-C leaves what was shot.
+
+    axis : None for the turntable's own. ask : prints a prompt and returns what the person typed.
+
+    Raises
+    ------
+    ConfigError
+        The rig file is wrong, or the axis is not known.
+    UnsupportedByDeviceError
+        The rig has no turntable, and nobody turns by hand.
+    ViewsFailedError
+        Fewer than two views succeeded.
+    """
+    config = read_rig(rig_file)
+    shoot, model_id, notes = ShootPlan(count, scan_plan(ScanRequest(), config.scan), by_hand), uuid4(), []
+    meshes = {number: output / f"view-{number}" / MESH for number in range(1, count + 1)}
+    with open_rig(config) as rig:
+        table = rig.positioner if isinstance(rig.positioner, Turntable) else None
+        if table is None and not by_hand:
+            raise no_turntable(0.0)
+        if axis is None and table is not None and table.axis is not None:
+            axis = StatedAxis.of(table.axis.point_mm, table.axis.direction)
+        if axis is None:
+            raise ConfigError("expected the stage's axis, which the rig does not know: say --axis or --axis-point")
+        for number in [number for number, mesh in meshes.items() if not mesh.is_file()]:
+            prompt = f"turn the object by about {shoot.step_deg:g}°, to {shoot.angle_deg(number):g}° in all,"
+            while not by_hand or number == 1 or answered(ask, f"{prompt} then press Enter (q: no more) > ") != "q":
+                try:
+                    _shot(rig, shoot.view(number, model_id, utc_now()), output, number)
+                    break
+                except SlrigError as error:
+                    typer.secho(f"view-{number}: {error}", fg="red", err=True)
+                    prompt = "to shoot it again, turn nothing,"
+                    if not by_hand or number == 1:
+                        notes.append(f"view-{number}, at {shoot.angle_deg(number):g}°, is not in it: {error}")
+                        break
+            else:
+                break
+    good = {number: mesh for number, mesh in meshes.items() if mesh.is_file()}
+    if len(good) < 2:
+        message = f"{len(good)} of {count} views succeeded, and a model takes two. The same command shoots the others."
+        raise ViewsFailedError(message)
+    angles_deg = tuple(shoot.angle_deg(number) for number in good)
+    return {mesh.parent.name: mesh for mesh in good.values()}, TurntablePoses(axis, angles_deg), notes
+
+
+def _shot(rig: Rig, plan: ScanPlan, output: Path, number: int) -> None:
+    """One view; of frames that an earlier call has left, only the mesh is made."""
+    bundle = output / f"bundle-{number}"
+    with progress_shown() as display:
+        prepare_kernels(display)
+        if not (bundle / DESCRIPTION).is_file():
+            try:
+                capture_frames(rig, plan, bundle, progress=display, cancelled=lambda: False).finish()
+            except BaseException:
+                shutil.rmtree(bundle, ignore_errors=True)
+                raise
+        folder = output / f"view-{number}"
+        reconstruct_bundle(bundle, folder, plan=plan.reconstruction, progress=display, cancelled=lambda: False)
+
+
+def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask: Callable[[str], str] = input) -> None:
+    """Have a service shoot the views and make the model, and fetch its files into `output`. Ctrl-C cancels; scans that
+    were made stay with the service.
+
+    Raises ServiceError: it refused, is gone, or the model failed.
+    """
+    model: dict[str, Any] = client.models.shoot(**request)
+    here, events, turn = model["id"], client.models.follow(model["id"]), "begin"
+    try:
+        while turn:
+            turn = ""
+            with progress_shown() as display:
+                for event in events:
+                    if isinstance(event, Progress):
+                        display(event.stage, event.fraction, event.detail)
+                        if event.stage == TURN:
+                            turn = event.detail
+                            break
+            if turn:
+                answer = answered(ask, f"{turn}, then press Enter (a: shoot the last one again, q: no more) > ")
+                _ = client.models.combine(here) if answer == "q" else client.models.view(here, again=answer == "a")
+    except KeyboardInterrupt:
+        with suppress(ServiceError):
+            client.models.cancel(here)
+        raise
+    model = client.models.look(here)
+    if model["state"] != "succeeded":
+        raise ServiceError(f"Model {here} {model['state']}: {model['error']['detail']}")
+    output.mkdir(parents=True, exist_ok=True)
+    for name, link in model["links"]["files"].items():
+        client.fetch(link, output / name)
