@@ -246,6 +246,7 @@ class FakeTurntable:
     turned_deg: list[float] = field(default_factory=list)
     error: Exception | None = None
     axis: StageAxis | None = None
+    opened_at_deg: float | None = None
 
     @property
     def angles_deg(self) -> Sequence[float]:
