@@ -26,6 +26,7 @@ from slrig.combine.plan import (
     StartingPoses,
     StatedAxis,
     TurntablePoses,
+    UnknownPoses,
 )
 from slrig.jobs.records import JobRecord, JobState
 
@@ -35,10 +36,11 @@ router = APIRouter(prefix="/model", tags=["model"])
 class MadeRequest(Strict):
     """How a model is made of its scans, whether those are on record or still to be shot."""
 
-    poses: Literal["turntable"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = Field(
+    poses: Literal["turntable", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = Field(
         default="turntable",
-        description='about where the scans belong. "turntable": a stage turned the object. Or of each scan a motion, '
-        "4 × 4, that takes its mm to a common frame",
+        description='about where the scans belong. "turntable": a stage turned the object. "unknown": found from what '
+        "they see, or refused, as of an object that is symmetric. Or of each scan a motion, 4 × 4, that takes its mm "
+        "to a common frame",
     )
     axis: AxisEntry | None = Field(
         default=None, description="of a turntable, in the scans' frame. Default: the stage's own, where it is known"
@@ -58,7 +60,7 @@ class MadeRequest(Strict):
     def _of_a_turntable(self) -> Self:
         told = [name for name in ("angles_deg", "axis") if getattr(self, name, None) is not None]
         if self.poses != "turntable" and told:
-            message = f'{told[0]}: expected "poses": "turntable" beside it, found poses; leave one of them out'
+            message = f'{told[0]}: expected "poses": "turntable" beside it, found other poses; leave one of them out'
             raise ValueError(message)
         return self
 
@@ -67,7 +69,9 @@ class MadeRequest(Strict):
     ) -> ModelPlan:
         """What is asked for. Raises ConfigError: see `ModelPlan`."""
         poses: StartingPoses
-        if self.poses != "turntable":
+        if self.poses == "unknown":
+            poses = UnknownPoses()
+        elif self.poses != "turntable":
             poses = GivenPoses.of(map(rotating, self.poses))
         else:
             axis = None if self.axis is None else StatedAxis.of(self.axis.point_mm, self.axis.direction)

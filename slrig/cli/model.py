@@ -61,6 +61,9 @@ def model(
     poses: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Poses to start from, by the scans' names, as in poses.json.")
     ] = None,
+    unknown: Annotated[
+        bool, typer.Option("--unknown", help="Nobody knows where the scans belong: find it from what they see.")
+    ] = False,
     start_error_mm: Annotated[
         float, typer.Option(min=0.01, max=100.0, help="How far a surface may be from where angle or poses put it.")
     ] = 3.0,
@@ -71,8 +74,8 @@ def model(
 ) -> None:
     """Make one mesh of scans of an object from several sides.
 
-    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle or poses. Where
-    no scan has seen the object, the mesh is open.
+    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle, poses, or
+    unknown. Where no scan has seen the object, the mesh is open.
     """
     from slrig.bundle.stage_file import StageRecord, read_stage
     from slrig.cli.display import progress_shown
@@ -86,26 +89,26 @@ def model(
     keep_kernels()
     known, notes = StageRecord() if stage is None else read_stage(stage), list[str]()
     told = _axis(axis, axis_point, axis_direction)
-    if told is None and known.axis is not None and poses is None:
+    if told is None and known.axis is not None and poses is None and not unknown:
         told = StatedAxis.of(known.axis.point_mm, known.axis.direction)
     if (shoot is None) == (not scans) or (shoot is None and (rig or by_hand)):
         raise ConfigError("expected scans, or --shoot N (with --rig or a service, and --by-hand), and not both")
     if shoot is None:
         files = _named_meshes(scans or ())
-        start = _starts(list(files), angle, told, poses)
+        start = _starts(list(files), angle, told, poses, unknown=unknown)
     elif angle is not None or poses is not None:
         raise ConfigError("--shoot: it says itself where the views stand; leave --angle and --poses out")
     elif rig is not None:
         from slrig.cli.model_shoot import views_here
 
-        files, start, notes = views_here(rig, shoot, output, by_hand=by_hand, axis=told)
+        files, start, notes = views_here(rig, shoot, output, by_hand=by_hand, axis=told, unknown=unknown)
         output /= "model"
     else:
         from slrig.cli.model_shoot import views_there
 
         request = given(
-            views=shoot, by_hand=by_hand, axis=None if told is None else asdict(told), start_error_mm=start_error_mm,
-            voxel_mm=voxel_mm, cut=not no_cut,
+            views=shoot, by_hand=by_hand, poses="unknown" if unknown else None, axis=None if told is None else asdict(told),
+            start_error_mm=start_error_mm, voxel_mm=voxel_mm, cut=not no_cut,
         )  # fmt: skip
         with service.client() as client:
             views_there(client, request, output)
@@ -185,21 +188,27 @@ def _tell(report: Mapping[str, Any]) -> None:
         )
 
 
-def _starts(names: Sequence[str], angle: float | None, axis: StatedAxis | None, file: Path | None) -> StartingPoses:
+def _starts(
+    names: Sequence[str], angle: float | None, axis: StatedAxis | None, file: Path | None, *, unknown: bool
+) -> StartingPoses:
     """Where the scans start from. Raises ConfigError: that is not told in one way alone, or not of all scans."""
     from slrig.bundle.poses_file import read_poses
-    from slrig.combine.plan import GivenPoses, TurntablePoses
+    from slrig.combine.plan import GivenPoses, TurntablePoses, UnknownPoses
 
-    if (angle is None) == (file is None) or (angle is None) != (axis is None):
-        told = {"--angle": angle, "--axis, --axis-point or --stage": axis, "--poses": file}
+    ways = [angle is not None, file is not None, unknown]
+    if sum(ways) != 1 or (angle is None) != (axis is None):
+        told = {
+            "--angle": angle, "--axis, --axis-point or --stage": axis, "--poses": file, "--unknown": unknown or None,
+        }  # fmt: skip
         found = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
         message = (
             "expected a stage's --angle with its axis (--stage FILE, --axis FILE, or --axis-point and "
-            f"--axis-direction), or --poses FILE, found {found}. Poses that nobody knows cannot be found yet: place "
-            "the scans by hand in another program, and write what it says into a file as slrig/views/README.md "
-            "describes"
+            f"--axis-direction), --poses FILE, or --unknown, found {found}. Where --unknown is refused, place the scans "
+            "by hand in another program, and write what it says into a file as slrig/views/README.md describes"
         )
         raise ConfigError(message)
+    if unknown:
+        return UnknownPoses()
     if file is None:
         return TurntablePoses(axis, tuple((angle or 0.0) * number for number in range(len(names))))
     known = read_poses(file).poses

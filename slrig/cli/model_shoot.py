@@ -17,7 +17,7 @@ from slrig.cli.display import answered, progress_shown
 from slrig.cli.reconstruct import prepare_kernels
 from slrig.client import Client
 from slrig.client.events import Progress
-from slrig.combine.plan import ShootPlan, StatedAxis, TurntablePoses
+from slrig.combine.plan import ShootPlan, StartingPoses, StatedAxis, TurntablePoses, UnknownPoses
 from slrig.combine.shooting import TURN
 from slrig.config import read_rig
 from slrig.devices import Rig, Turntable
@@ -38,12 +38,13 @@ def views_here(
     *,
     by_hand: bool,
     axis: StatedAxis | None,
+    unknown: bool = False,
     ask: Callable[[str], str] = input,
-) -> tuple[dict[str, Path], TurntablePoses, list[str]]:
+) -> tuple[dict[str, Path], StartingPoses, list[str]]:
     """Shoot the views that `output` lacks, each into view-N with its frames in bundle-N. Return the meshes by name,
     where they start from, and words for views that failed. Ctrl-C leaves what was shot.
 
-    axis : None for the turntable's own. ask : prints a prompt and returns what the person typed.
+    axis : None for the turntable's own. unknown : the angles are not to be believed, and no axis is needed. ask : prints a prompt and returns what the person typed.
 
     Raises
     ------
@@ -63,8 +64,8 @@ def views_here(
             raise no_turntable(0.0)
         if axis is None and table is not None and table.axis is not None:
             axis = StatedAxis.of(table.axis.point_mm, table.axis.direction)
-        if axis is None:
-            raise ConfigError("expected the stage's axis, which the rig does not know: say --axis or --axis-point")
+        if axis is None and not unknown:
+            raise ConfigError("expected the stage's axis, which the rig does not know: say --axis, --axis-point or --unknown")
         for number in [number for number, mesh in meshes.items() if not mesh.is_file()]:
             prompt = f"turn the object by about {shoot.step_deg:g}°, to {shoot.angle_deg(number):g}° in all,"
             while not by_hand or number == 1 or answered(ask, f"{prompt} then press Enter (q: no more) > ") != "q":
@@ -84,7 +85,8 @@ def views_here(
         message = f"{len(good)} of {count} views succeeded, and a model takes two. The same command shoots the others."
         raise ViewsFailedError(message)
     angles_deg = tuple(shoot.angle_deg(number) for number in good)
-    return {mesh.parent.name: mesh for mesh in good.values()}, TurntablePoses(axis, angles_deg), notes
+    poses = UnknownPoses() if unknown else TurntablePoses(axis, angles_deg)
+    return {mesh.parent.name: mesh for mesh in good.values()}, poses, notes
 
 
 def _shot(rig: Rig, plan: ScanPlan, output: Path, number: int) -> None:

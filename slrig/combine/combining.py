@@ -14,7 +14,7 @@ import numpy as np
 from slrig.bundle.poses_file import Poses, encode_poses
 from slrig.bundle.storage import write_file
 from slrig.combine.offered import MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT
-from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses
+from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses, UnknownPoses
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
@@ -27,6 +27,7 @@ from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
 from slrig.views.stage_planes import cut
 from slrig.views.turntable import FoundAxis, found_axis, turntable
+from slrig.views.unknown import found_starts
 
 
 def combine_into(
@@ -45,16 +46,16 @@ def combine_into(
     only its maker knows yet; see `slrig.combine.offered`.
 
     meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near where they belong; of
-    a turntable, with its axis and angles. start_error_mm : how far a surface may be from there. voxel_mm : length of
-    the model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind them is cut
-    away first. notes : for the report.
+    a turntable, with its axis and angles; or unknown. start_error_mm : how far a surface may be from there. voxel_mm :
+    length of the model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind
+    them is cut away first. notes : for the report.
 
     Raises
     ------
     ConfigError
         The turntable's axis or angles are not told.
     RegistrationRefusedError
-        A view overlaps no other, or does not agree with them.
+        A view overlaps no other, or does not agree with them; or poses were to be found, and none or two were.
     StageRefusedError
         All but nothing of a view would be left before the planes.
     InvalidInputError
@@ -87,7 +88,7 @@ def combine_into(
             views.append(view)
             removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
-        starts = _starts(poses)
+        starts = found_starts(views, names=names) if isinstance(poses, UnknownPoses) else _starts(poses)
         found = registered(views, starts, names=names, start_error_mm=start_error_mm)
         axis = None
         if isinstance(poses, TurntablePoses) and poses.axis is not None:
@@ -127,7 +128,7 @@ def read_mesh(file: Path) -> Mesh:
         raise InvalidInputError(f"{file}: {error}") from error
 
 
-def _starts(poses: StartingPoses) -> FloatArray:
+def _starts(poses: TurntablePoses | GivenPoses) -> FloatArray:
     """(N, 4, 4). Raises ConfigError."""
     if isinstance(poses, GivenPoses):
         return np.array(poses.matrices)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Annotated, Any, Literal, Self, cast
@@ -74,7 +74,14 @@ class GivenPoses:
         return cls(tuple(cast("Matrix", tuple(map(tuple, pose.tolist()))) for pose in poses))
 
 
-StartingPoses = TurntablePoses | GivenPoses
+@dataclass(frozen=True, slots=True)
+class UnknownPoses:
+    """Nobody knows where the scans belong: it is found from what they see, or refused."""
+
+    kind: Literal["unknown"] = "unknown"
+
+
+StartingPoses = TurntablePoses | GivenPoses | UnknownPoses
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,10 +149,14 @@ class ModelPlan:
         if twice is not None:
             message = f"scans: expected each once, found {twice} twice; leave one out"
             raise ConfigError(message)
-        told = self.poses.matrices if isinstance(self.poses, GivenPoses) else self.poses.angles_deg
         count = self.shoot.views if self.shoot is not None and self.being_shot else len(self.scans)
+        name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"
+        told: Sequence[object] | None = None
+        if isinstance(self.poses, GivenPoses):
+            told = self.poses.matrices
+        elif isinstance(self.poses, TurntablePoses):
+            told = self.poses.angles_deg
         if told is not None and len(told) != count:
-            name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"
             message = f"{name}: expected one for each of {count} scans, in their order, found {len(told)}"
             raise ConfigError(message)
         for name, length_mm in (("start_error_mm", self.start_error_mm), ("voxel_mm", self.voxel_mm)):

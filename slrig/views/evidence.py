@@ -28,8 +28,10 @@ _MEDIAN = 0.6745
 _REACH_SIGMAS = 4.0
 _FACING = 0.95
 """Of a view's faces, that are seen from the origin if the camera stands there, as that of a scan's own frame does."""
-_PIXELS = 2.5
+_PIXELS = 2.0
 """A pixel of what a camera saw, in edges of the mesh."""
+_MARGIN = 3.0
+"""How far before what a camera saw a surface has to stand, in edges of the mesh."""
 _DAMPING = 1e-4
 
 
@@ -42,9 +44,9 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What the camera at a view's origin saw: the nearest depth in each pixel, infinite where it saw nothing.
+    """What the camera at a view's origin saw.
 
-    pixel : of x / z and y / z. corner : (2,) int64, of the first one.
+    nearest_mm : (h, w), the nearest depth in each pixel and those beside it, -inf where it saw nothing. pixel : of x / z and y / z. corner : (2,) int64, of the first one.
     """
 
     nearest_mm: FloatArray
@@ -58,7 +60,7 @@ class Sight:
         at = np.floor(ahead[:, :2] / ahead[:, 2:] / self.pixel).astype(np.int64) - self.corner
         inside = ((at >= 0) & (at < self.nearest_mm.shape)).all(axis=1)
         saw = self.nearest_mm[tuple(at[inside].T)]
-        return int((np.isfinite(saw) & (ahead[inside, 2] < saw - self.margin_mm)).sum())
+        return int((ahead[inside, 2] < saw - self.margin_mm).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +84,9 @@ def seen_by(view: Mesh) -> Seen:
     corner = at.min(axis=0)
     nearest = np.full(tuple(at.max(axis=0) - corner + 1), np.inf)
     np.minimum.at(nearest, tuple((at - corner).T), points[:, 2])
-    # Where the rim of something was too steep to be measured, pixels beside it tell of it.
-    return Seen(side, Sight(minimum_filter(nearest, size=3), corner, pixel, 2 * _PIXELS * side.spacing_mm))
+    # What was too steep to be measured may stand where nothing was, and reach into the pixels beside it.
+    nearest = minimum_filter(np.where(np.isinf(nearest), -np.inf, nearest), size=3, mode="constant", cval=-np.inf)
+    return Seen(side, Sight(nearest, corner, pixel, _MARGIN * side.spacing_mm))
 
 
 def evidence(first: Seen, second: Seen, pose: FloatArray, near_mm: float, most: int = SAMPLE) -> Evidence:

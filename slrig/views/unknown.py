@@ -43,8 +43,8 @@ contradicts, and the pairs that it is then fitted by."""
 _APART = 2.0
 """Answers nearer to one another are the same, in what is near."""
 _ADVICE = (
-    "Scan it with something beside it that has no symmetry, tell the stage's angle and axis or poses to start from, or "
-    "use markers"
+    "Scan it with something that is fixed to it and has no symmetry, or tell where to start from: the stage's angle and "
+    "axis, or poses"
 )
 
 

@@ -172,3 +172,16 @@ def test_a_file_of_poses_says_what_is_wrong_with_it(tmp_path: Path) -> None:
         read_poses(file)
     file.write_bytes(encode_poses(Poses({"front": np.eye(4)}, (np.ones(3), np.array([0.0, 0.0, 1.0])))))
     assert read_poses(file).poses["front"] == pytest.approx(np.eye(4))
+
+
+def test_scans_whose_places_nobody_knows_are_placed_and_a_vase_is_refused(scans: Path, tmp_path: Path) -> None:
+    done = model(scans / "all", "--output", tmp_path / "model", "--unknown")
+    assert done.exit_code == 0, done.output
+    poses = read_poses(tmp_path / "model" / "poses.json").poses
+    turns = [Rotation.from_matrix(poses[name][:3, :3]).magnitude() for name in ("scan-9", "scan-10", "scan-11")]
+    assert np.rad2deg(turns) == pytest.approx([0, ANGLE, 2 * ANGLE], abs=0.05)
+    refused = model(scans / "vase-0.ply", scans / "vase-1.ply", "--output", tmp_path / "vase", "--unknown")
+    assert refused.exit_code != 0
+    assert "or tell where to start from" in " ".join(refused.output.split())
+    assert not (tmp_path / "vase").exists()
+    assert "found --angle" in " ".join(model(scans / "all", "--output", tmp_path, *STAGE, "--unknown").output.split())

@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.combine.offered import MEDIA_TYPES
-from slrig.combine.plan import GivenPoses, StatedAxis, TurntablePoses
+from slrig.combine.plan import GivenPoses, StatedAxis, TurntablePoses, UnknownPoses
 from slrig.errors import RegistrationRefusedError
 from tests.unit.api.conftest import ServedBench
 from tests.unit.combine.model_bench import kept_scan
@@ -56,7 +56,12 @@ def test_a_model_is_asked_for_once_followed_and_fetched(
         assert found.headers["content-type"].startswith(MEDIA_TYPES[name])
         assert client.get(path, headers={"If-None-Match": found.headers["ETag"]}).status_code == 304
     second = over(client, client.post("/model", json={"scans": scans, "poses": [STILL, STILL]}).json())
-    assert isinstance(served.combining.asked[-1][1], GivenPoses)
+    asked = served.combining.asked
+    assert isinstance(asked[-1][1], GivenPoses)
+    found = client.post("/model", json={"scans": scans, "poses": "unknown"}).json()
+    assert over(client, found)["plan"]["poses"] == {"kind": "unknown"}
+    assert isinstance(asked[2][1], UnknownPoses)
+    assert client.delete(found["links"]["self"]).status_code == 204
     page = client.get("/model", params={"limit": 1}).json()
     assert [each["id"] for each in page["models"]] == [second["id"]]
     assert [each["id"] for each in client.get(page["next"]).json()["models"]] == [model["id"]]
@@ -99,6 +104,7 @@ def test_what_cannot_be_made_is_refused_and_not_on_record(client: TestClient, sc
         (422, "one for each of 2", {"scans": scans, "axis": AXIS, "angles_deg": [1.0]}),
         (422, "expected a rotation", {"scans": scans, "poses": [STILL, mirror]}),
         (422, "leave one of them out", {"scans": scans, "poses": [STILL, STILL], "axis": AXIS}),
+        (422, "leave one of them out", {"scans": scans, "poses": "unknown", "angles_deg": [0.0, 1.0]}),
         (422, "poses", {"scans": scans, "poses": "somewhere"}),
     ):
         refused = client.post("/model", json=request)

@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 
 from slrig.combine.offered import MEDIA_TYPES, MODEL
-from slrig.combine.plan import GivenPoses, ModelPlan, StatedAxis, TurntablePoses, plan_from_json, plan_json
+from slrig.combine.plan import (
+    GivenPoses,
+    ModelPlan,
+    StatedAxis,
+    TurntablePoses,
+    UnknownPoses,
+    plan_from_json,
+    plan_json,
+)
 from slrig.errors import (
     ConfigError,
     JobNotFoundError,
@@ -225,7 +233,7 @@ def test_one_that_the_end_of_the_service_cuts_off_goes_on_at_the_next_start(tmp_
 
 def test_a_plan_is_the_same_after_it_was_on_record() -> None:
     scans = (uuid4(), uuid4())
-    for poses in (TurntablePoses(), TurntablePoses(AXIS, (0.0, 30.0)), GivenPoses((STILL, STILL))):
+    for poses in (TurntablePoses(), TurntablePoses(AXIS, (0.0, 30.0)), GivenPoses((STILL, STILL)), UnknownPoses()):
         plan = ModelPlan(scans, poses, start_error_mm=1.0)
         assert plan_from_json(plan_json(plan)) == plan
         assert plan_from_json(plan_json(replace(plan, voxel_mm=0.3))).voxel_mm == 0.3

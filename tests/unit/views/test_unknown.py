@@ -15,7 +15,6 @@ from tests.ten_objects import OBJECTS, seen_from
 from tests.turned_views import displacement_mm
 from tests.unit.views.known_views import View
 
-
 ANGLES = np.deg2rad([0.0, 45.0, 90.0])
 FROM = np.stack([np.cos(ANGLES), np.sin(ANGLES), np.full(3, 0.4)], axis=1) / np.hypot(1, 0.4)
 
@@ -34,7 +33,9 @@ def test_views_come_to_where_they_belong_without_a_start(three: list[View]) -> N
 
 def test_a_vase_is_refused_with_what_to_do(three: list[View]) -> None:
     views = seen_from(OBJECTS["vase"](), FROM[:2])
-    with pytest.raises(RegistrationRefusedError, match=r"(a second one, turned by|no start that tells).* use markers"):
+    with pytest.raises(
+        RegistrationRefusedError, match=r"(a second one, turned by|no start that tells).* or tell where to start"
+    ):
         found_starts([view.mesh for view in views])
     with pytest.raises(RegistrationRefusedError, match=r"expected surface that is known again in other views"):
         found_starts([three[0].mesh, views[0].mesh])
@@ -49,7 +50,7 @@ def test_a_surface_before_what_a_camera_saw_is_told(three: list[View]) -> None:
     nearer = true.copy()
     nearer[2, 3] -= 60.0  # towards the second camera: nothing is near enough to be compared, and all stands before it
     wrong = evidence(one, two, nearer, 3.0)
-    assert wrong.against > 300 > 20 * wrong.agree
+    assert wrong.against > 200 > 20 * wrong.agree
 
 
 def test_a_pose_from_points_is_no_mirror() -> None:
