@@ -28,7 +28,7 @@ _MEDIAN = 0.6745
 _REACH_SIGMAS = 4.0
 _FACING = 0.95
 """Of a view's faces, that are seen from the origin if the camera stands there, as that of a scan's own frame does."""
-_PIXELS = 2.0
+_PIXELS = 1.0
 """A pixel of what a camera saw, in edges of the mesh."""
 _MARGIN = 3.0
 """How far before what a camera saw a surface has to stand, in edges of the mesh."""
@@ -46,7 +46,8 @@ class Evidence(NamedTuple):
 class Sight:
     """What the camera at a view's origin saw.
 
-    nearest_mm : (h, w), the nearest depth in each pixel and those beside it, -inf where it saw nothing. pixel : of x / z and y / z. corner : (2,) int64, of the first one.
+    nearest_mm : (h, w), the nearest depth in each pixel and those beside it, -inf where it saw nothing. pixel : of
+    x / z and y / z. corner : (2,) int64, of the first one.
     """
 
     nearest_mm: FloatArray
@@ -80,6 +81,8 @@ def seen_by(view: Mesh) -> Seen:
     if not len(facing) or facing.mean() < _FACING or points[:, 2].min() <= 0:
         return Seen(side, None)
     pixel = _PIXELS * side.spacing_mm / float(np.median(points[:, 2]))
+    # Faces seen at a slant span several pixels: their edges' middles and their own fill those between.
+    points = np.concatenate([points, (a + b) / 2, (b + c) / 2, (c + a) / 2, (a + b + c) / 3])
     at = np.floor(points[:, :2] / points[:, 2:] / pixel).astype(np.int64)
     corner = at.min(axis=0)
     nearest = np.full(tuple(at.max(axis=0) - corner + 1), np.inf)

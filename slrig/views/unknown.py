@@ -43,8 +43,8 @@ contradicts, and the pairs that it is then fitted by."""
 _APART = 2.0
 """Answers nearer to one another are the same, in what is near."""
 _ADVICE = (
-    "Scan it with something that is fixed to it and has no symmetry, or tell where to start from: the stage's angle and "
-    "axis, or poses"
+    "Scan it with something that is fixed to it and has no symmetry, or tell where to start from: the stage's angle "
+    "and axis, or poses"
 )
 
 
@@ -159,8 +159,8 @@ class _Search:
             some, others = (group == group[view] for view in (each.first, each.second))
             if each.score <= 0 or group[each.first] == group[each.second]:
                 continue
-            change = _change(each, poses)
-            pairs = product(np.flatnonzero(some).tolist(), np.flatnonzero(others).tolist())
+            pairs = list(product(np.flatnonzero(some).tolist(), np.flatnonzero(others).tolist()))
+            change = self._fitted(pairs, poses, _change(each, poses))
             if sum(_score(self._evidence(pair, poses, change, SAMPLE)) for pair in pairs) > 0:
                 poses[some] = change @ poses[some]
                 group[some] = group[each.second]
@@ -211,9 +211,12 @@ class _Search:
         if agree < _COARSE * against or agree * SAMPLE / _FEW < least:
             return -np.inf
         most = sorted(few, key=lambda each: -each[1].agree)[:_FITTED]
-        facing = [Facing(self.seen[i].side, self.seen[j].side, poses[i], poses[j]) for (i, j), _ in most]
-        at = fitted(facing, change, self.near_mm)
+        at = self._fitted([pair for pair, _ in most], poses, change)
         return sum(_score(self._evidence(pair, poses, at, SAMPLE)) for pair in pairs)
+
+    def _fitted(self, pairs: Sequence[Pair], poses: FloatArray, change: FloatArray) -> FloatArray:
+        facing = [Facing(self.seen[i].side, self.seen[j].side, poses[i], poses[j]) for i, j in pairs]
+        return fitted(facing, change, self.near_mm)
 
     def _evidence(self, pair: Pair, poses: FloatArray, change: FloatArray, most: int) -> Evidence:
         """Of a pair of views at poses, the first one's changed."""
