@@ -203,8 +203,8 @@ def _starts(
         found = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
         message = (
             "expected a stage's --angle with its axis (--stage FILE, --axis FILE, or --axis-point and "
-            f"--axis-direction), --poses FILE, or --unknown, found {found}. Where --unknown is refused, place the scans "
-            "by hand in another program, and write what it says into a file as slrig/views/README.md describes"
+            f"--axis-direction), --poses FILE, or --unknown, found {found}. Where --unknown is refused, place the "
+            "scans by hand in another program, and write what it says into a file as slrig/views/README.md describes"
         )
         raise ConfigError(message)
     if unknown:
