@@ -48,4 +48,4 @@ def test_a_vase_is_refused_in_words() -> None:
 
 @pytest.mark.slow
 def test_views_from_all_around_come_together_too() -> None:
-    require_the_known_answer(seen_from(OBJECTS["bossed box"](), around(10), seed=3))
+    require_the_known_answer(seen_from(OBJECTS["bumpy ball"](), around(10), seed=3))
