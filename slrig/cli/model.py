@@ -107,8 +107,9 @@ def model(
         from slrig.cli.model_shoot import views_there
 
         request = given(
-            views=shoot, by_hand=by_hand, poses="unknown" if unknown else None, axis=None if told is None else asdict(told),
-            start_error_mm=start_error_mm, voxel_mm=voxel_mm, cut=not no_cut,
+            views=shoot, by_hand=by_hand, poses="unknown" if unknown else None,
+            axis=None if told is None else asdict(told), start_error_mm=start_error_mm, voxel_mm=voxel_mm,
+            cut=not no_cut,
         )  # fmt: skip
         with service.client() as client:
             views_there(client, request, output)

@@ -44,7 +44,8 @@ def views_here(
     """Shoot the views that `output` lacks, each into view-N with its frames in bundle-N. Return the meshes by name,
     where they start from, and words for views that failed. Ctrl-C leaves what was shot.
 
-    axis : None for the turntable's own. unknown : the angles are not to be believed, and no axis is needed. ask : prints a prompt and returns what the person typed.
+    axis : None for the turntable's own. unknown : nobody knows the angles, and no axis is needed. ask : prints a prompt
+    and returns what the person typed.
 
     Raises
     ------
@@ -65,7 +66,9 @@ def views_here(
         if axis is None and table is not None and table.axis is not None:
             axis = StatedAxis.of(table.axis.point_mm, table.axis.direction)
         if axis is None and not unknown:
-            raise ConfigError("expected the stage's axis, which the rig does not know: say --axis, --axis-point or --unknown")
+            raise ConfigError(
+                "expected the stage's axis, which the rig does not know: say --axis, --axis-point or --unknown"
+            )
         for number in [number for number, mesh in meshes.items() if not mesh.is_file()]:
             prompt = f"turn the object by about {shoot.step_deg:g}°, to {shoot.angle_deg(number):g}° in all,"
             while not by_hand or number == 1 or answered(ask, f"{prompt} then press Enter (q: no more) > ") != "q":
