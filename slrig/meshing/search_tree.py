@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import kernel, kernel_part
+from slrig.meshing.nearest_point import on_triangle
 from slrig.model import FloatArray, IntArray
 
 _TRIANGLES_PER_LEAF = 4
@@ -90,11 +91,17 @@ def _morton_codes(points: FloatArray) -> NDArray[np.uint64]:
     low = points[finite].min(axis=0)
     extent = max(float((points[finite].max(axis=0) - low).max()), 1e-300)
     steps = np.where(finite[:, None], (points - low) * ((2**21 - 1) / extent), 0.0).astype(np.uint64)
-    codes = np.zeros(len(points), dtype=np.uint64)
-    for bit in range(21):
-        for axis in range(3):
-            codes |= (steps[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + 2 - axis)
-    return codes
+    return _spread(steps[:, 0]) << np.uint64(2) | _spread(steps[:, 1]) << np.uint64(1) | _spread(steps[:, 2])
+
+
+def _spread(steps: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """21 bits, each moved to where two zeros are above the one before (Anderson, "Bit twiddling hacks")."""
+    for shift, kept in (
+        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):  # fmt: skip
+        steps = (steps | steps << np.uint64(shift)) & np.uint64(kept)
+    return steps
 
 
 @kernel(in_every_scan=False)
@@ -143,7 +150,8 @@ def _squared_distances(
             continue
         best = np.inf
         if len(corners):
-            best = _triangle_gap(x, y, z, corners[near])  # the last point's triangle: a close bound at no cost
+            # The last point's triangle: a close bound at no cost.
+            best = on_triangle(x, y, z, corners[near], 0, 1, 2)[0]
         stack[0], gaps[0], depth = 0, _box_gap(x, y, z, boxes, 0), 1
         while depth > 0:
             depth -= 1
@@ -153,7 +161,7 @@ def _squared_distances(
             if node >= leaf_count - 1:
                 leaf = node - leaf_count + 1
                 for triangle in range(leaf * len(corners) // leaf_count, (leaf + 1) * len(corners) // leaf_count):
-                    gap = _triangle_gap(x, y, z, corners[triangle])
+                    gap = on_triangle(x, y, z, corners[triangle], 0, 1, 2)[0]
                     if gap < best:
                         best, near = gap, triangle
                 continue
@@ -169,48 +177,6 @@ def _squared_distances(
                 depth += 1
         out[index] = best
     return out
-
-
-@kernel_part
-def _triangle_gap(x: float, y: float, z: float, triangle: FloatArray) -> float:
-    """Squared distance from a point to a triangle, exact for slivers and collapsed triangles too.
-
-    The nearest point is the foot of the perpendicular if that lies inside, else it is on an edge
-    (Ericson 2004, "Real-time collision detection", 5.1).
-    """
-    ax, ay, az = triangle[0, 0] - x, triangle[0, 1] - y, triangle[0, 2] - z
-    bx, by, bz = triangle[1, 0] - x, triangle[1, 1] - y, triangle[1, 2] - z
-    cx, cy, cz = triangle[2, 0] - x, triangle[2, 1] - y, triangle[2, 2] - z
-    ux, uy, uz = bx - ax, by - ay, bz - az
-    vx, vy, vz = cx - ax, cy - ay, cz - az
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    square = nx * nx + ny * ny + nz * nz
-    if square > 0.0:
-        # The point, now the origin, is inside if it is on the inner side of each edge's upright plane.
-        in_ab = nx * (ay * bz - az * by) + ny * (az * bx - ax * bz) + nz * (ax * by - ay * bx)
-        in_bc = nx * (by * cz - bz * cy) + ny * (bz * cx - bx * cz) + nz * (bx * cy - by * cx)
-        in_ca = nx * (cy * az - cz * ay) + ny * (cz * ax - cx * az) + nz * (cx * ay - cy * ax)
-        if in_ab >= 0.0 and in_bc >= 0.0 and in_ca >= 0.0:
-            height = nx * ax + ny * ay + nz * az
-            upright: float = height * height / square
-            return upright
-    nearest: float = min(
-        _segment_gap(ax, ay, az, ux, uy, uz),
-        _segment_gap(ax, ay, az, vx, vy, vz),
-        _segment_gap(bx, by, bz, cx - bx, cy - by, cz - bz),
-    )
-    return nearest
-
-
-@kernel_part(inline="always")
-def _segment_gap(px: float, py: float, pz: float, dx: float, dy: float, dz: float) -> float:
-    """Squared distance from the origin to the segment from p to p + d."""
-    square = dx * dx + dy * dy + dz * dz
-    t = 0.0
-    if square > 0.0:
-        t = min(max(-(px * dx + py * dy + pz * dz) / square, 0.0), 1.0)
-    qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
-    return qx * qx + qy * qy + qz * qz
 
 
 @kernel(in_every_scan=False)

@@ -127,36 +127,36 @@ def new_cache() -> Any:
     return np.full(64, -1, dtype=np.int64), np.full(64, -1, dtype=np.int64)
 
 
-@kernel_part
-def _set_corners_about(sheets: Any, face: int, grid: Any, low: Any, high: Any) -> None:
-    """The corners of the cells in a triangle's box, low to high; the box is wider at a border."""
-    beyond = SEEN_BEYOND if sheets.open_edges[face] else MARGIN
-    a, b, c = sheets.faces[face, 0], sheets.faces[face, 1], sheets.faces[face, 2]
-    for axis in range(3):
-        p, q, r = sheets.points_mm[a, axis], sheets.points_mm[b, axis], sheets.points_mm[c, axis]
-        low[axis] = int((min(p, q, r) - grid.origin_mm[axis]) / grid.voxel_mm - beyond)
-        high[axis] = int((max(p, q, r) - grid.origin_mm[axis]) / grid.voxel_mm + beyond) + 1
+@kernel_part(inline="always")
+def cells_about(a: float, b: float, c: float, origin: float, per_mm: float, about: float) -> tuple[int, int]:
+    """The first and the last cell, along an axis, of those that three coordinates and `about` voxels beside them touch.
+
+    Coordinates less the origin's are positive: the grid begins beyond all triangles' reach.
+    """
+    return int((min(a, b, c) - origin) * per_mm - about), int((max(a, b, c) - origin) * per_mm + about)
 
 
 @kernel(in_every_scan=False)
 def _touched_bricks(first: int, last: int, sheets: Any, grid: Any) -> Any:
-    """Keys of the bricks with a corner that a triangle of these views may want."""
-    low, high, before = np.zeros(3, np.int64), np.zeros(3, np.int64), np.full(6, -1, dtype=np.int64)
+    """Keys of the bricks with a corner of a cell in the boxes of these views' triangles, which are wider at borders."""
+    points, faces, origin, per_mm = sheets.points_mm, sheets.faces, grid.origin_mm, 1.0 / grid.voxel_mm
+    low, high = np.full(3, -1, np.int64), np.full(3, -1, np.int64)
     found, count = np.zeros(1024, dtype=np.int64), 0
     for face in range(sheets.first_face[first], sheets.first_face[last]):
-        _set_corners_about(sheets, face, grid, low, high)
-        same = True
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        beyond, same = SEEN_BEYOND if sheets.open_edges[face] else MARGIN, True
         for axis in range(3):
-            begin, end = low[axis] >> 3, high[axis] >> 3
-            same &= before[axis] == begin and before[axis + 3] == end
-            before[axis], before[axis + 3] = begin, end
+            begin, end = cells_about(points[a, axis], points[b, axis], points[c, axis], origin[axis], per_mm, beyond)
+            begin, end = begin >> 3, (end + 1) >> 3
+            same &= low[axis] == begin and high[axis] == end
+            low[axis], high[axis] = begin, end
         if same:
             continue
-        if (before[3] - before[0] + 1) * (before[4] - before[1] + 1) * (before[5] - before[2] + 1) > _MOST_BRICKS:
+        if (high[0] - low[0] + 1) * (high[1] - low[1] + 1) * (high[2] - low[2] + 1) > _MOST_BRICKS:
             return np.arange(_MOST_BRICKS + 1)  # one triangle alone takes more than are meant
-        for x in range(before[0], before[3] + 1):
-            for y in range(before[1], before[4] + 1):
-                for z in range(before[2], before[5] + 1):
+        for x in range(low[0], high[0] + 1):
+            for y in range(low[1], high[1] + 1):
+                for z in range(low[2], high[2] + 1):
                     if count == len(found):
                         found = np.concatenate((found, np.zeros_like(found)))
                     found[count] = brick_key(x, y, z)
@@ -167,26 +167,31 @@ def _touched_bricks(first: int, last: int, sheets: Any, grid: Any) -> Any:
 @kernel(in_every_scan=False)
 def _mark_cells(sheets: Any, grid: Any, cells: Any) -> None:
     """Mark the cells of a triangle's box that its plane passes through, or nearly."""
-    low, high = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    points, faces, keys, open_edges = sheets.points_mm, sheets.faces, grid.keys, sheets.open_edges
+    ox, oy, oz, per_mm = grid.origin_mm[0], grid.origin_mm[1], grid.origin_mm[2], 1.0 / grid.voxel_mm
     cached_keys, cached = new_cache()
-    points, faces, origin, keys = sheets.points_mm, sheets.faces, grid.origin_mm, grid.keys
+    key_before, brick = -1, -1
     for face in range(len(faces)):
-        _set_corners_about(sheets, face, grid, low, high)
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        beyond = SEEN_BEYOND if open_edges[face] else MARGIN
         px, py, pz = points[a, 0], points[a, 1], points[a, 2]
+        x_low, x_high = cells_about(px, points[b, 0], points[c, 0], ox, per_mm, beyond)
+        y_low, y_high = cells_about(py, points[b, 1], points[c, 1], oy, per_mm, beyond)
+        z_low, z_high = cells_about(pz, points[b, 2], points[c, 2], oz, per_mm, beyond)
         ux, uy, uz = points[b, 0] - px, points[b, 1] - py, points[b, 2] - pz
         vx, vy, vz = points[c, 0] - px, points[c, 1] - py, points[c, 2] - pz
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         # The plane is n . x = offset, x the lowest corner of a cell in voxels, whose middle is meant.
         # A triangle without an area marks its whole box.
-        offset = (nx * (px - origin[0]) + ny * (py - origin[1]) + nz * (pz - origin[2])) / grid.voxel_mm
-        offset -= (nx + ny + nz) / 2
+        offset = (nx * (px - ox) + ny * (py - oy) + nz * (pz - oz)) * per_mm - (nx + ny + nz) / 2
         reach = (0.5 + MARGIN) * (abs(nx) + abs(ny) + abs(nz))
-        for x in range(low[0], high[0]):
-            for y in range(low[1], high[1]):
-                for z in range(low[2], high[2]):
+        for x in range(x_low, x_high + 1):
+            for y in range(y_low, y_high + 1):
+                for z in range(z_low, z_high + 1):
                     if abs(nx * x + ny * y + nz * z - offset) <= reach:
-                        brick = brick_at(keys, x >> 3, y >> 3, z >> 3, cached_keys, cached)
+                        key = brick_key(x >> 3, y >> 3, z >> 3)
+                        if key != key_before:
+                            key_before, brick = key, brick_at(keys, x >> 3, y >> 3, z >> 3, cached_keys, cached)
                         cells[CELLS * brick + 64 * (x & 7) + 8 * (y & 7) + (z & 7)] = 1
 
 

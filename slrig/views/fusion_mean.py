@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.meshing.nearest_point import on_triangle
 from slrig.model import AlbedoMark, FloatArray, IntArray
 from slrig.model.srgb import light_of
-from slrig.views.fusion_nearest import on_triangle
 from slrig.views.fusion_sheets import Sheets
 
 AGREEING_SIGMAS = 4.0  # one honest difference in 16 000 is beyond

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slrig.kernels import in_bands, kernel, kernel_part
+from slrig.meshing.nearest_point import on_triangle
 from slrig.model import FloatArray, IntArray
-from slrig.views.fusion_grid import CELLS, MARGIN, SEEN_BEYOND, Grid, brick_at, new_cache
+from slrig.views.fusion_grid import CELLS, MARGIN, SEEN_BEYOND, Grid, brick_at, cells_about, new_cache
 from slrig.views.fusion_sheets import Sheets
 
 
@@ -57,110 +58,79 @@ def _nearest(sheets: Sheets, grid: Grid, points: FloatArray, cells: IntArray, re
     return nearest
 
 
-@kernel_part
-def on_triangle(
-    px: float, py: float, pz: float, points: Any, a: int, b: int, c: int
-) -> tuple[float, float, float, float]:
-    """Squared distance from p to a triangle, and the weights of its corners in the nearest point: they add up to 1.
-
-    Weights are exactly 0 where the nearest point is on an edge. The nearest point is the foot of the perpendicular if
-    that lies inside, else it is on an edge.
-    """
-    ax, ay, az = points[a, 0] - px, points[a, 1] - py, points[a, 2] - pz
-    bx, by, bz = points[b, 0] - px, points[b, 1] - py, points[b, 2] - pz
-    cx, cy, cz = points[c, 0] - px, points[c, 1] - py, points[c, 2] - pz
-    ux, uy, uz = bx - ax, by - ay, bz - az
-    vx, vy, vz = cx - ax, cy - ay, cz - az
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    square = nx * nx + ny * ny + nz * nz
-    if square > 0.0:
-        # Areas opposite each corner, times the square of the whole.
-        at_a = nx * (by * cz - bz * cy) + ny * (bz * cx - bx * cz) + nz * (bx * cy - by * cx)
-        at_b = nx * (cy * az - cz * ay) + ny * (cz * ax - cx * az) + nz * (cx * ay - cy * ax)
-        at_c = nx * (ay * bz - az * by) + ny * (az * bx - ax * bz) + nz * (ax * by - ay * bx)
-        if at_a >= 0.0 and at_b >= 0.0 and at_c >= 0.0:
-            height = nx * ax + ny * ay + nz * az
-            return height * height / square, at_a / square, at_b / square, at_c / square
-    ab, t_ab = _on_edge(ax, ay, az, ux, uy, uz)
-    ac, t_ac = _on_edge(ax, ay, az, vx, vy, vz)
-    bc, t_bc = _on_edge(bx, by, bz, cx - bx, cy - by, cz - bz)
-    if ab <= ac and ab <= bc:
-        return ab, 1.0 - t_ab, t_ab, 0.0
-    if ac <= bc:
-        return ac, 1.0 - t_ac, 0.0, t_ac
-    return bc, 0.0, 1.0 - t_bc, t_bc
-
-
-@kernel_part(inline="always")
-def _on_edge(px: float, py: float, pz: float, dx: float, dy: float, dz: float) -> tuple[float, float]:
-    """Squared distance from the origin to the segment from p to p + d, and how far along it the nearest point is."""
-    square = dx * dx + dy * dy + dz * dz
-    t = 0.0
-    if square > 0.0:
-        t = min(max(-(px * dx + py * dy + pz * dz) / square, 0.0), 1.0)
-    qx, qy, qz = px + t * dx, py + t * dy, pz + t * dz
-    return qx * qx + qy * qy + qz * qz, t
-
-
 @kernel(in_every_scan=False)
 def _nearest_faces(
     first: int, last: int, sheets: Any, grid: Any, points: Any, cells: Any, first_point: Any, reach: Any,
     nearest: Any,
 ) -> None:  # fmt: skip
     corners, faces, origin, keys, voxel = sheets.points_mm, sheets.faces, grid.origin_mm, grid.keys, grid.voxel_mm
-    low, high, middle = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3)
-    open_edges, gaps = sheets.open_edges, np.zeros(len(points))
+    open_edges, gaps, asked = sheets.open_edges, np.zeros(len(points)), np.zeros(len(corners), np.bool_)
+    ox, oy, oz, per_mm, beside = origin[0], origin[1], origin[2], 1.0 / voxel, 1 if reach.width == 0.0 else 0
+    cached_keys, cached = new_cache()
     for view in range(first, last):
         gaps[:] = reach.furthest * voxel
-        cached_keys, cached = new_cache()
-        for face in range(sheets.first_face[view], sheets.first_face[view + 1]):
-            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-            square, about = 0.0, reach.box + (reach.border if open_edges[face] else 0.0)
-            for axis in range(3):
-                p, q, r = corners[a, axis], corners[b, axis], corners[c, axis]
-                least, most = min(p, q, r), max(p, q, r)
-                middle[axis] = (least + most) / 2
-                square += (most - least) ** 2 / 4
-                # Coordinates are positive: the grid begins beyond all triangles' reach.
-                low[axis] = int((least - origin[axis]) / voxel - about + 1.0 - reach.width)
-                high[axis] = int((most - origin[axis]) / voxel + about)
-            radius, mx, my, mz = np.sqrt(square), middle[0], middle[1], middle[2]
-            nx, ny, nz = _unit_normal(corners, a, b, c)
-            offset = nx * corners[a, 0] + ny * corners[a, 1] + nz * corners[a, 2]
-            for bx in range(low[0] >> 3, (high[0] >> 3) + 1):
-                for by in range(low[1] >> 3, (high[1] >> 3) + 1):
-                    for bz in range(low[2] >> 3, (high[2] >> 3) + 1):
-                        brick = brick_at(keys, bx, by, bz, cached_keys, cached)
-                        if brick < 0:
-                            continue
-                        z_low, z_high = max(low[2] - 8 * bz, 0), min(high[2] - 8 * bz, 7)
-                        for x in range(max(low[0] - 8 * bx, 0), min(high[0] - 8 * bx, 7) + 1):
-                            for y in range(max(low[1] - 8 * by, 0), min(high[1] - 8 * by, 7) + 1):
-                                row = CELLS * brick + 64 * x + 8 * y
-                                for cell in range(row + z_low, row + z_high + 1):
-                                    at = first_point[cell]
-                                    while at >= 0:
-                                        px, py, pz, gap = points[at, 0], points[at, 1], points[at, 2], gaps[at]
-                                        away = (px - mx) ** 2 + (py - my) ** 2 + (pz - mz) ** 2
-                                        # Neither its plane nor the ball about it is too far.
-                                        if (
-                                            abs(nx * px + ny * py + nz * pz - offset) < gap
-                                            and away < (gap + radius) ** 2
-                                        ):
-                                            gap2 = on_triangle(px, py, pz, corners, a, b, c)[0]
+        begin, end = sheets.first_face[view], sheets.first_face[view + 1]
+        # Vertices come first, as triangles without an extent: few triangles are then nearer than what is known.
+        for corner in range(4):
+            for face in range(begin, end):
+                a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                if corner < 3:
+                    a = b = c = faces[face, corner]
+                    if asked[a]:
+                        continue
+                    asked[a] = True
+                about = reach.box + (reach.border if open_edges[face] else 0.0)
+                x_low, x_high = cells_about(corners[a, 0], corners[b, 0], corners[c, 0], ox, per_mm, about)
+                y_low, y_high = cells_about(corners[a, 1], corners[b, 1], corners[c, 1], oy, per_mm, about)
+                z_low, z_high = cells_about(corners[a, 2], corners[b, 2], corners[c, 2], oz, per_mm, about)
+                # The corner of a cell that is cut is outside the box; another point of that cell may be inside.
+                x_low, y_low, z_low = x_low + beside, y_low + beside, z_low + beside
+                ax, ay, az = corners[a, 0], corners[a, 1], corners[a, 2]
+                ux, uy, uz = corners[b, 0] - ax, corners[b, 1] - ay, corners[b, 2] - az
+                vx, vy, vz = corners[c, 0] - ax, corners[c, 1] - ay, corners[c, 2] - az
+                nx, ny, nz = _unit(uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
+                # Outwards across the edges: from a to b, from c to a, and from b to c, which does not pass through a.
+                sx, sy, sz = _unit(uy * nz - uz * ny, uz * nx - ux * nz, ux * ny - uy * nx)
+                tx, ty, tz = _unit(ny * vz - nz * vy, nz * vx - nx * vz, nx * vy - ny * vx)
+                wx, wy, wz = vx - ux, vy - uy, vz - uz
+                wx, wy, wz = _unit(wy * nz - wz * ny, wz * nx - wx * nz, wx * ny - wy * nx)
+                third = wx * ux + wy * uy + wz * uz
+                for bx in range(x_low >> 3, (x_high >> 3) + 1):
+                    for by in range(y_low >> 3, (y_high >> 3) + 1):
+                        for bz in range(z_low >> 3, (z_high >> 3) + 1):
+                            brick = brick_at(keys, bx, by, bz, cached_keys, cached)
+                            if brick < 0:
+                                continue
+                            z_begin, z_end = max(z_low - 8 * bz, 0), min(z_high - 8 * bz, 7)
+                            for x in range(max(x_low - 8 * bx, 0), min(x_high - 8 * bx, 7) + 1):
+                                for y in range(max(y_low - 8 * by, 0), min(y_high - 8 * by, 7) + 1):
+                                    row = CELLS * brick + 64 * x + 8 * y
+                                    for cell in range(row + z_begin, row + z_end + 1):
+                                        at = first_point[cell]
+                                        while at >= 0:
+                                            gap = gaps[at]
+                                            px, py, pz = points[at, 0], points[at, 1], points[at, 2]
+                                            dx, dy, dz = px - ax, py - ay, pz - az
+                                            if corner < 3:
+                                                gap2 = dx * dx + dy * dy + dz * dz
+                                            else:
+                                                height = nx * dx + ny * dy + nz * dz
+                                                aside = max(sx * dx + sy * dy + sz * dz, tx * dx + ty * dy + tz * dz)
+                                                aside = max(aside, wx * dx + wy * dy + wz * dz - third, 0.0)
+                                                gap2 = height * height + aside * aside  # at least
                                             if gap2 < gap * gap:
-                                                gaps[at] = np.sqrt(gap2)
-                                                nearest[view, at] = face
-                                        at += 1
-                                        if at == len(cells) or cells[at] != cell:
-                                            break
+                                                if corner == 3:
+                                                    gap2 = on_triangle(px, py, pz, corners, a, b, c)[0]
+                                                if gap2 < gap * gap:
+                                                    gaps[at] = np.sqrt(gap2)
+                                                    nearest[view, at] = face
+                                            at += 1
+                                            if at == len(cells) or cells[at] != cell:
+                                                break
 
 
 @kernel_part(inline="always")
-def _unit_normal(points: Any, a: int, b: int, c: int) -> tuple[float, float, float]:
-    """Zero for a triangle without an area."""
-    ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
-    vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    scale = 1.0 / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-300)
-    return nx * scale, ny * scale, nz * scale
+def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Zero if it has no length."""
+    scale = 1.0 / max(np.sqrt(x * x + y * y + z * z), 1e-300)
+    return x * scale, y * scale, z * scale

@@ -12,6 +12,7 @@ from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.kernels import kernel
 from slrig.meshing.adjacency import neighbours
 from slrig.model import FloatArray, IntArray, Mesh
+from slrig.views.matching import moved, turned
 
 _RIGID = 1e-6  # a product of many poses in double precision keeps to 1e-12; what was typed or in float32 to 1e-7
 _SAMPLED_FACES = 20_000  # of each view: their median area is known to a per cent
@@ -67,8 +68,7 @@ def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray, /, *
     points, normals, insets, faces, open_edges = [], [], [], [], []
     before = 0
     for number, (view, pose) in enumerate(zip(views, poses, strict=True)):
-        turn, shift = pose[:3, :3], pose[:3, 3]
-        placed = np.ascontiguousarray(view.vertices_mm.astype(np.float64) @ turn.T + shift)
+        placed = moved(pose, view.vertices_mm)
         # One sum each: an axis of three is slow.
         sound = np.isfinite(placed[:, 0] + placed[:, 1] + placed[:, 2] + view.normals[:, 0] + view.sigma_mm)
         kept = view.faces if sound.all() else view.faces[sound[view.faces].all(axis=1)]
@@ -82,7 +82,7 @@ def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray, /, *
         inset = np.full(len(placed), inset_mm, dtype=np.float32)
         _insets(placed, np.ascontiguousarray(kept), border, inset)
         points.append(placed)
-        normals.append(view.normals @ turn.T.astype(np.float32))
+        normals.append(turned(pose, view.normals).astype(np.float32))
         insets.append(inset)
         faces.append(kept + np.int32(before))
         open_edges.append(border)

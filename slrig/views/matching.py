@@ -95,13 +95,18 @@ def side_of(view: Mesh) -> Side:
         # The same vertices for the same views: the same files for the same scans.
         order=np.random.default_rng(0).permutation(np.flatnonzero(usable)),
         spacing_mm=float(np.median(np.linalg.norm(edges, axis=1))) if len(edges) else 0.0,
-        tree=cKDTree(points),
+        tree=cKDTree(points, balanced_tree=False, compact_nodes=False),  # 0.4 of the time for as fast answers
     )
 
 
 def moved(pose: FloatArray, points_mm: NDArray[np.floating[Any]]) -> FloatArray:
     """Points (n, 3) where a pose (4, 4) takes them."""
-    return np.asarray(points_mm @ pose[:3, :3].T + pose[:3, 3])
+    return turned(pose, points_mm) + pose[:3, 3]
+
+
+def turned(pose: FloatArray, vectors: NDArray[np.floating[Any]]) -> FloatArray:
+    """Directions (n, 3) as a pose (4, 4) turns them. Not by BLAS: its threads spin for ten times what this takes."""
+    return np.einsum("nj,ij->ni", vectors.astype(np.float64), pose[:3, :3])
 
 
 def matched(first: Side, second: Side, poses: tuple[FloatArray, FloatArray], *, reach_mm: float, most: int) -> Matches:
@@ -115,8 +120,8 @@ def matched(first: Side, second: Side, poses: tuple[FloatArray, FloatArray], *, 
     found = np.flatnonzero(np.isfinite(distance))
     found = found[second.usable[nearest[found]]]
     chosen, points, nearest = chosen[found], points[found], nearest[found]
-    of_first = first.normals[chosen] @ poses[0][:3, :3].T
-    of_second = second.normals[nearest] @ poses[1][:3, :3].T
+    of_first = turned(poses[0], first.normals[chosen])
+    of_second = turned(poses[1], second.normals[nearest])
     others = moved(poses[1], second.points_mm[nearest])
     mean = of_first + of_second
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from slrig.model import FloatArray, Mesh
-from slrig.views.matching import moved
+from slrig.views.matching import moved, turned
 
 
 def put_together(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray) -> Mesh:
@@ -19,7 +19,7 @@ def put_together(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray
         ),
         faces=np.concatenate([view.faces + np.int32(begin) for view, begin in zip(views, first, strict=True)]),
         normals=np.concatenate(
-            [(view.normals @ pose[:3, :3].T).astype(np.float32) for view, pose in zip(views, poses, strict=True)]
+            [turned(pose, view.normals).astype(np.float32) for view, pose in zip(views, poses, strict=True)]
         ),
         colour=np.concatenate([view.colour for view in views]),
         mark=np.concatenate([view.mark for view in views]),
