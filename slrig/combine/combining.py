@@ -13,12 +13,14 @@ import numpy as np
 
 from slrig.bundle.poses_file import Poses, encode_poses
 from slrig.bundle.storage import write_file
-from slrig.combine.offered import MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT
+from slrig.combine.offered import MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES
+from slrig.combine.pictures import six_sides_png
 from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses, UnknownPoses
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
-from slrig.model import FloatArray, Mesh, StagePlane
+from slrig.meshing.open_borders import open_borders
+from slrig.model import AlbedoMark, FloatArray, Mesh, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
@@ -28,6 +30,8 @@ from slrig.views.registration import Registration, registered
 from slrig.views.stage_planes import cut
 from slrig.views.turntable import FoundAxis, found_axis, turntable
 from slrig.views.unknown import found_starts
+
+_TOLD_BORDERS = 10  # of the open borders, the longest ones, each by itself
 
 
 def combine_into(
@@ -107,10 +111,11 @@ def combine_into(
         report["notes"] = list(notes)
         # One at a time: each is as large as all meshes.
         files: dict[str, Callable[[], bytes]] = {
-            MODEL: lambda: encode_mesh_ply(whole.mesh),
+            MODEL: lambda: encode_mesh_ply(whole.mesh, views=whole.views),
             MODEL_GLB: lambda: encode_mesh_glb(whole.mesh),
             PLACED: lambda: encode_mesh_ply(put_together(views, found.poses)),
             POSES: lambda: encode_poses(known),
+            SIDES: lambda: six_sides_png(whole.mesh),
             REPORT: lambda: encode_report(report),
         }
         for name, encoded in files.items():
@@ -169,13 +174,33 @@ def _axis(found: FoundAxis, told: StartingPoses) -> dict[str, Any]:
 
 
 def _of_model(whole: FusedModel) -> dict[str, Any]:
-    """What report.json says of the fused mesh. seen_by : share of its vertices by how many views tell of each."""
+    """What report.json says of the fused mesh.
+
+    seen_by : share of its vertices by how many views tell of each. open : its borders, of holes and of what no view has
+    seen, see `slrig.meshing.open_borders`. marked : vertices whose colour is in doubt, by cause.
+    """
+    mesh = whole.mesh
     shares = np.bincount(whole.views) / len(whole.views)
+    borders = open_borders(mesh.vertices_mm, mesh.faces)
+    a, b, c = (mesh.vertices_mm[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
+    marked = np.bincount(mesh.mark, minlength=len(AlbedoMark))
     return {
         "vertices": len(whole.mesh.vertices_mm),
         "triangles": len(whole.mesh.faces),
         "voxel_mm": whole.voxel_mm,
         "correlated_mm": whole.correlated_mm,
-        "sigma_mm": float(np.median(whole.mesh.sigma_mm)),
+        "sigma_mm": float(np.median(mesh.sigma_mm)),
+        "area_mm2": float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2),
         "seen_by": {int(count): float(shares[count]) for count in np.flatnonzero(shares)},
+        "open": {
+            "borders": len(borders.length_mm),
+            "edges": borders.edges,
+            "length_mm": float(borders.length_mm.sum()),
+            "area_mm2": float(borders.area_mm2.sum()),
+            "largest": [
+                {"length_mm": length, "area_mm2": area}
+                for length, area in zip(borders.length_mm.tolist(), borders.area_mm2.tolist(), strict=True)
+            ][:_TOLD_BORDERS],
+        },
+        "marked_vertices": {mark.name.lower(): int(marked[mark]) for mark in AlbedoMark if mark is not AlbedoMark.NONE},
     }

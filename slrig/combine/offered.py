@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 MODEL, MODEL_GLB, PLACED, POSES, REPORT = "model.ply", "model.glb", "placed.ply", "poses.json", "report.json"
+SIDES = "sides.png"
 
 MEDIA_TYPES: Mapping[str, str] = {
     MODEL: "application/octet-stream",
     MODEL_GLB: "model/gltf-binary",
     PLACED: "application/octet-stream",
     POSES: "application/json",
+    SIDES: "image/png",
     REPORT: "application/json",
 }
 """What every model has that succeeded."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from slrig.bundle.storage import sync_folder, sync_tree, write_file
 from slrig.disk import refusals_of, staging_name
 from slrig.errors import InvalidInputError
-from slrig.model import FloatArray, Mesh, PointCurves
+from slrig.model import FloatArray, IntArray, Mesh, PointCurves
 from slrig.scan.mesh_formats import encode_mesh_obj, encode_mesh_stl
 from slrig.scan.threemf import encode_mesh_3mf
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
@@ -44,7 +44,9 @@ _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _END_OF_HEADER = b"\nend_header\n"
 _CALIBRATION_PART = "sigma_calibration_mm"
 _MARK = "albedo_mark"
+_VIEWS = "views"
 _FACE = np.dtype([("count", "<u1"), ("vertices", "<i4", (3,))])
+_NONE = np.zeros(0)
 _NO_MESH = Mesh(
     vertices_mm=np.zeros((0, 3), dtype=np.float32),
     faces=np.zeros((0, 3), dtype=np.int32),
@@ -93,15 +95,18 @@ def encode_report(report: Mapping[str, object]) -> bytes:
     return (text + "\n").encode()
 
 
-def encode_mesh_ply(mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None) -> bytes:
+def encode_mesh_ply(
+    mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = None, views: IntArray | None = None
+) -> bytes:
     """Binary little-endian PLY in mm: position, normal, colour, `albedo_mark`, `sigma_mm`, `stripe` per vertex;
     triangles.
 
     Colours are sRGB; `albedo_mark` is a number of `slrig.model.AlbedoMark`.
     sigma_calibration_mm : (V,), the part of `sigma_mm` that the calibration's own error makes, one property more; None
-    where the calibration does not state it.
+    where the calibration does not state it. views : (V,), of how many views each vertex is the mean, one property more.
     """
-    vertices = _records(len(mesh.vertices_mm), {**_vertex_properties(mesh), **_calibration_part(sigma_calibration_mm)})
+    further = _further(sigma_calibration_mm, views)
+    vertices = _records(len(mesh.vertices_mm), {**_vertex_properties(mesh), **further})
     faces = np.zeros(len(mesh.faces), dtype=_FACE)
     faces["count"] = 3
     faces["vertices"] = mesh.faces
@@ -109,7 +114,7 @@ def encode_mesh_ply(mesh: Mesh, *, sigma_calibration_mm: FloatArray | None = Non
 
 
 def decode_mesh_ply(data: bytes) -> Mesh:
-    """The mesh in a PLY that `encode_mesh_ply` made, without the calibration's part of its standard deviations.
+    """The mesh in a PLY that `encode_mesh_ply` made, without what that writes of its vertices besides.
 
     Raises
     ------
@@ -118,8 +123,8 @@ def decode_mesh_ply(data: bytes) -> Mesh:
     """
     head, mark, body = data.partition(_END_OF_HEADER)
     counts = [int(count) for count in re.findall(rb"^element \w+ (\d{1,12})$", head, re.MULTILINE)]
-    stated = np.zeros(0) if f" {_CALIBRATION_PART}\n".encode() in head else None
-    none = _records(0, {**_vertex_properties(_NO_MESH), **_calibration_part(stated)})
+    stated, views = (_NONE if f" {name}\n".encode() in head else None for name in (_CALIBRATION_PART, _VIEWS))
+    none = _records(0, {**_vertex_properties(_NO_MESH), **_further(stated, views)})
     vertex_count, face_count = counts if len(counts) == 2 else (0, 0)
     vertex_bytes = vertex_count * none.dtype.itemsize
     length = vertex_bytes + face_count * _FACE.itemsize
@@ -157,8 +162,16 @@ def _vertex_properties(mesh: Mesh) -> dict[str, tuple[str, NDArray[Any]]]:
     }
 
 
-def _calibration_part(sigma_calibration_mm: FloatArray | None) -> dict[str, tuple[str, NDArray[Any]]]:
-    return {} if sigma_calibration_mm is None else {_CALIBRATION_PART: ("f4", sigma_calibration_mm)}
+def _further(
+    sigma_calibration_mm: NDArray[Any] | None, views: NDArray[Any] | None = None
+) -> dict[str, tuple[str, NDArray[Any]]]:
+    """The properties that not every mesh has."""
+    part: dict[str, tuple[str, NDArray[Any]]] = {}
+    if sigma_calibration_mm is not None:
+        part[_CALIBRATION_PART] = "f4", sigma_calibration_mm
+    if views is not None:
+        part[_VIEWS] = "i4", views
+    return part
 
 
 def _mesh_elements(vertices: NDArray[np.void], face_count: int, *, vertex_count: int | None = None) -> list[str]:
@@ -188,7 +201,7 @@ def encode_points_ply(
             "stripe": ("i4", np.repeat(columns, np.diff(curves.offsets))),
             "source": ("u1", curves.source),
             "bridge_after": ("u1", curves.bridge_after),
-            **_calibration_part(sigma_calibration_mm),
+            **_further(sigma_calibration_mm),
         },
     )
     return _ply(_vertex_element(points), points)

@@ -83,17 +83,17 @@ def preview(mesh: Mesh, camera: Pinhole, white: Pixels, full_scale: int) -> Pict
     at_panel = resampled(camera, scale, size)
     triangles = f"{len(mesh.faces):,} triangles"
     panels = [
-        _captioned(seen, "white image" + (f", brightened {gain:.1f} x" if gain > 1 else ""), str(camera.size) + " px"),
-        _captioned(shaded(mesh, at_panel), "mesh from the camera", triangles),
+        captioned(seen, "white image" + (f", brightened {gain:.1f} x" if gain > 1 else ""), str(camera.size) + " px"),
+        captioned(shaded(mesh, at_panel), "mesh from the camera", triangles),
     ]
     if len(mesh.faces):
         sample = _sampled(mesh, camera)
         middle = np.array([sample.percentiles(ordinates, (50.0,)) for ordinates in sample.points_mm]).ravel()
-        _draw_scale(panels[1], size, at_panel.matrix[0, 0] / middle[2])
+        draw_scale(panels[1], size, at_panel.matrix[0, 0] / middle[2])
         aside = _turned_to_show(sample, middle, camera, size)
-        panels.append(_captioned(shaded(mesh, aside), f"turned by {_TURN_DEG:.0f} degrees", "backs are red"))
-        _draw_scale(panels[2], size, aside.matrix[0, 0] / middle[2])
-    return _side_by_side(panels)
+        panels.append(captioned(shaded(mesh, aside), f"turned by {_TURN_DEG:.0f} degrees", "backs are red"))
+        draw_scale(panels[2], size, aside.matrix[0, 0] / middle[2])
+    return side_by_side(panels)
 
 
 def rejection_picture(refusals: NDArray[np.uint8], white: Pixels | None = None, full_scale: int = 255) -> Picture:
@@ -208,7 +208,7 @@ def _turned_to_show(sample: _Sample, middle_mm: FloatArray, camera: Pinhole, siz
     )
 
 
-def _captioned(panel: Picture, title: str, detail: str) -> Picture:
+def captioned(panel: Picture, title: str, detail: str) -> Picture:
     """The panel with a line of text under it: what it shows on the left, a figure on the right."""
     rows, columns = panel.shape[:2]
     page = np.full((rows + _CAPTION_PX, columns, 3), _PAGE, dtype=np.uint8)
@@ -218,7 +218,7 @@ def _captioned(panel: Picture, title: str, detail: str) -> Picture:
     return page
 
 
-def _draw_scale(panel: Picture, size: Size, px_per_mm: float) -> None:
+def draw_scale(panel: Picture, size: Size, px_per_mm: float) -> None:
     """A bar of 1, 2 or 5 times a power of ten mm, about a fifth of the panel wide, in the lower left corner."""
     if not 0 < px_per_mm < math.inf:
         return  # the middle of the object lies behind the camera: no length is right
@@ -245,7 +245,8 @@ def _draw_legend(page: Picture, left: int, counts: NDArray[np.int64]) -> None:
             _text(page, figure, (left + right - _text_width(figure), row))
 
 
-def _side_by_side(panels: list[Picture]) -> Picture:
+def side_by_side(panels: list[Picture]) -> Picture:
+    """One row of panels, with gaps beside and above them."""
     rows = max(panel.shape[0] for panel in panels)
     columns = sum(panel.shape[1] for panel in panels) + _GAP_PX * (len(panels) + 1)
     page = np.full((rows + _GAP_PX, columns, 3), _PAGE, dtype=np.uint8)
