@@ -22,6 +22,7 @@ from slrig.meshing.topology import component_sizes, used_vertices
 from slrig.model import FloatArray, IntArray, Mesh
 from slrig.model.arrays import require
 from slrig.model.srgb import srgb_of
+from slrig.views.fusion_colour import to_one_scale
 from slrig.views.fusion_edges import sharpened
 from slrig.views.fusion_grid import SEEN_BEYOND, Grid, corners_mm, grid_about, wanted_corners
 from slrig.views.fusion_mean import AGREEING_SIGMAS, Means, Rule, correlated_mm, mean_values
@@ -100,6 +101,7 @@ def fused(
     rule = rule._replace(beyond_mm=SEEN_BEYOND * voxel)
     reach = _VERTEX_REACH * voxel + AGREEING_SIGMAS * float(np.nanmedian(seen.sigma_mm))
     nearest = nearest_within(seen, grid, rough.points_mm, rough.cells, reach_mm=reach)
+    to_one_scale(seen, nearest)
     means = mean_values(seen, rough.points_mm, nearest, rule, values_only=False)
     del seen, grid, nearest  # as large as all views
     points = rough.points_mm - means.value_mm[:, None] * means.normals

@@ -32,7 +32,7 @@ _SAMPLED = 200_000  # points whose differences are looked at
 _FEWEST_DIFFERENCES = 100
 _ONE_SIGMA = 68.27  # per cent of a normal distribution
 _GAP, _VALUE, _WEIGHT, _NOISE, _NX, _NY, _NZ, _B0, _B1, _B2, _BEYOND, _FACE = range(12)
-_CLEAN = int(AlbedoMark.NONE)
+_CLEAN, _UNKNOWN = int(AlbedoMark.NONE), int(AlbedoMark.UNKNOWN)
 _LIGHT = light_of(np.arange(256, dtype=np.uint8)) / light_of(np.array(255, np.uint8))
 
 
@@ -52,7 +52,8 @@ class Means(NamedTuple):
 
     normals : (n, 3) float64, unit; sigma_mm : (n,) float64; views : (n,) int32, how many counted.
     light : (n, 3) float64, linear, of white, by the views' weights; mark : (n,) uint8. Vertices with a mark are left
-    out of the light where there is one without; else the mark is that of the heaviest.
+    out of the light where there is one without, and those without a colour where there is another; the mark is that
+    of the heaviest that is left.
     """
 
     value_mm: FloatArray
@@ -194,19 +195,23 @@ def _means(first: int, last: int, sheets: Any, points: Any, nearest: Any, rule: 
 
 @kernel_part
 def _blend(sheets: Any, rows: Any, order: Any, count: int, light: Any, mark: Any, at: int) -> None:
-    """Light by weight, of the vertices without a mark; where all are marked, of all, and the mark of the heaviest."""
+    """Light by weight, of the vertices without a mark; where all have one, of those with a colour, else of all.
+
+    The mark is that of the heaviest that counts.
+    """
     total, heaviest, worst = 0.0, -1.0, 0
-    for only_clean in (True, False):
+    for allowed in range(3):
         for place in range(count):
             row = order[place]
             for corner in range(3):
                 vertex = sheets.faces[int(rows[row, _FACE]), corner]
                 w = rows[row, _WEIGHT] * rows[row, _B0 + corner]
-                if only_clean and sheets.mark[vertex] != _CLEAN:
+                because = sheets.mark[vertex]
+                if (allowed == 0 and because != _CLEAN) or (allowed == 1 and because == _UNKNOWN):
                     continue
                 total += w
                 if w > heaviest:
-                    heaviest, worst = w, sheets.mark[vertex]
+                    heaviest, worst = w, because
                 for channel in range(3):
                     light[channel] += w * _LIGHT[sheets.colour[vertex, channel]]
         if total > 0.0:

@@ -25,7 +25,8 @@ class Sheets(NamedTuple):
     points_mm : (n, 3) float64; normals : (n, 3) float32; sigma_mm : (n,) float32; colour : (n, 3) uint8, sRGB;
     mark : (n,) uint8. inset_mm : (n,) float32, how far along edges the open border of the view is, cut at a limit.
     faces : (T, 3) int32 into all points. open_edges : (T,) uint8, bit k is set where no triangle lies across the edge
-    opposite corner k. first_face : (V + 1,) int64, view v has the triangles first_face[v]:first_face[v + 1].
+    opposite corner k. first_face, first_vertex : (V + 1,) int64, view v has the triangles
+    first_face[v]:first_face[v + 1], and vertices alike.
     """
 
     points_mm: FloatArray
@@ -37,6 +38,7 @@ class Sheets(NamedTuple):
     faces: IntArray
     open_edges: NDArray[np.uint8]
     first_face: NDArray[np.int64]
+    first_vertex: NDArray[np.int64]
 
 
 def sampling_mm(views: Sequence[Mesh]) -> float:
@@ -94,7 +96,8 @@ def sheets(views: Sequence[Mesh], poses: Sequence[FloatArray] | FloatArray, /, *
     return Sheets(
         np.concatenate(points), np.concatenate(normals), np.concatenate([view.sigma_mm for view in views]),
         np.concatenate([view.colour for view in views]), np.concatenate([view.mark for view in views]),
-        np.concatenate(insets), np.concatenate(faces), np.concatenate(open_edges), first_face,
+        np.concatenate(insets), np.concatenate(faces), np.concatenate(open_edges),
+        first_face, np.cumsum([0, *map(len, points)]),
     )  # fmt: skip
 
 

@@ -11,8 +11,8 @@ import trimesh
 from slrig.errors import InvalidInputError, NothingToReconstructError
 from slrig.meshing.search_tree import SearchTree
 from slrig.meshing.topology import topology_counts
-from slrig.model import FloatArray, Mesh
-from slrig.model.srgb import light_of
+from slrig.model import AlbedoMark, FloatArray, Mesh
+from slrig.model.srgb import light_of, srgb_of
 from slrig.views.fusion import FusedModel, fused
 from tests.unit.views.known_views import Noise, View, around, plate_on_box, star, views_of
 
@@ -130,9 +130,12 @@ def test_the_two_sides_of_a_wall_do_not_cancel() -> None:
 def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other() -> None:
     pose = np.eye(4)
     light = light_of(np.array([50, 200], np.uint8)).astype(float)
-    mixed = fused([sheet(0, colour=50), sheet(0, colour=200, sigma_mm=0.02)], [pose] * 2, voxel_mm=0.5)
-    inner = np.abs(mixed.mesh.vertices_mm[:, :2]).max(axis=1) < 1.5
-    assert inner.sum() > 20
+    views = [sheet(0, colour=50), sheet(0, colour=200, sigma_mm=0.02)]
+    for view in views:  # most of the surface looks alike to both: they have one scale
+        view.colour[np.abs(view.vertices_mm[:, 0]) > 1.9] = 100
+    mixed = fused(views, [pose] * 2, voxel_mm=0.5)
+    inner = np.abs(mixed.mesh.vertices_mm[:, :2]).max(axis=1) < 1.2
+    assert inner.sum() > 10
     weights = 1 / (np.array([0.01, 0.02]) ** 2 + mixed.correlated_mm**2)
     got = light_of(mixed.mesh.colour[inner]).mean()
     assert got == pytest.approx((weights * light).sum() / weights.sum(), rel=0.03)
@@ -141,6 +144,42 @@ def test_colours_are_mixed_as_light_and_marked_ones_only_where_there_is_no_other
     assert (marked.mesh.colour[inner] == 50).all()
     assert not marked.mesh.mark[inner].any()
     assert (fused([sheet(0, mark=2)], [pose], voxel_mm=0.5).mesh.mark == 2).all()
+    # A vertex without a normal has a neutral colour, which is none: a clipped one tells more.
+    bad = fused([sheet(0, colour=60, mark=AlbedoMark.SATURATED), sheet(0, colour=128, mark=AlbedoMark.UNKNOWN)],
+                [pose] * 2, voxel_mm=0.5).mesh  # fmt: skip
+    inner = np.abs(bad.vertices_mm[:, :2]).max(axis=1) < 3
+    assert (bad.colour[inner] == 60).all()
+    assert (bad.mark[inner] == AlbedoMark.SATURATED).all()
+
+
+def test_a_painted_ball_has_one_scale_its_own_colours_and_no_seams() -> None:
+    def paint(points: FloatArray) -> FloatArray:
+        """Linear light, of white: red and blue change slowly from side to side."""
+        red, blue = (0.4 + 0.3 * np.sin(points[:, axis] / 6 + axis) for axis in (0, 2))
+        return np.stack([red, 0.5 * (red + blue), blue], axis=1)
+
+    random, views = np.random.default_rng(4), []
+    scales = random.uniform(0.5, 1.0, 8)  # each scan has its own
+    for view, scale in zip(views_of(star(), around(8), 0.2), scales, strict=True):
+        placed = view.mesh.vertices_mm @ view.pose[:3, :3].T + view.pose[:3, 3]
+        colour, mark = srgb_of(scale * paint(placed)), np.zeros(len(placed), np.uint8)
+        # A lobe that every camera sees clipped somewhere else, and a band that all see clipped.
+        lobe = random.uniform(size=3) - 0.5
+        clipped = placed @ (lobe / np.linalg.norm(lobe)) > 7
+        mark[clipped | (np.abs(placed[:, 1] - 3) < 0.8)] = AlbedoMark.SATURATED
+        colour[mark > 0] = 255
+        views.append(view._replace(mesh=replace(view.mesh, colour=colour, mark=mark)))
+    mesh = model_of(views).mesh
+    clean = mesh.mark == AlbedoMark.NONE
+    band = np.abs(mesh.vertices_mm[:, 1] - 3)
+    # An edge that a camera sees steeply may reach into the band from outside.
+    assert (mesh.mark[band < 0.5] == AlbedoMark.SATURATED).mean() > 0.95
+    assert clean[band > 1.2].mean() > 0.97  # the rest one view alone has seen, and clipped
+    true = paint(mesh.vertices_mm.astype(float))[clean]
+    off = light_of(mesh.colour[clean]) / 65535 / true
+    assert np.median(off) == pytest.approx(scales.min(), rel=0.02)
+    # Where views end there is no step: all vertices have the colour, not most of them.
+    assert np.quantile(np.abs(off / np.median(off) - 1), (0.5, 0.99)) == pytest.approx((0, 0), abs=0.03)
 
 
 def test_what_cannot_be_fused_is_refused() -> None:
