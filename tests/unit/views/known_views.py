@@ -149,3 +149,30 @@ def _painted(points: FloatArray, random: Any) -> tuple[NDArray[np.uint8], NDArra
     saturated = random.uniform(size=len(points)) < 0.1
     stripes[saturated] = 255
     return stripes, saturated.astype(np.uint8)
+
+
+def vase() -> trimesh.Trimesh:
+    """A solid of revolution with a neck and a foot, 20 mm high."""
+    z = np.linspace(-10, 10, 241)
+    outer = 6.0 + 1.8 * np.sin(0.35 * z + 0.6) + 0.5 * np.sin(0.9 * z)
+    return trimesh.creation.revolve(np.stack([[0.0, *outer, 0.0], [-10, *z, 10]], axis=1), sections=720)
+
+
+def relief() -> trimesh.Trimesh:
+    """A coin of 24 mm with letters' worth of soft and steep waves on both faces, 3 mm thick."""
+    disc = trimesh.creation.revolve(
+        np.stack([[*np.linspace(0, 12, 161), *np.linspace(12, 0, 161)], np.repeat([-1.5, 1.5], 161)], axis=1),
+        sections=720,
+    )
+    vertices = np.array(disc.vertices)
+    x, y = vertices[:, 0], vertices[:, 1]
+    fade = np.clip((11.5 - np.hypot(x, y)) / 1.5, 0, 1)
+    waves = 0.5 * np.tanh(2 * np.sin(1.1 * x + 0.4 * y)) + 0.25 * np.cos(0.9 * y - 0.5 * x)
+    vertices[:, 2] += np.sign(vertices[:, 2]) * fade * waves
+    return trimesh.Trimesh(vertices, disc.faces, process=False)
+
+
+def flange() -> trimesh.Trimesh:
+    """A mechanical part: a stepped flange with sharp edges and a bore."""
+    corners = np.array([(3, -6), (10, -6), (10, -2), (6, -2), (6, 6), (3, 6), (3, -6)], float)
+    return trimesh.creation.revolve(corners, sections=360)
