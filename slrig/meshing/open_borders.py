@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -25,7 +27,7 @@ class OpenBorders:
     area_mm2: FloatArray
 
 
-def open_borders(points_mm: FloatArray, faces: IntArray) -> OpenBorders:
+def open_borders(points_mm: NDArray[np.floating[Any]], faces: IntArray) -> OpenBorders:
     """Of a mesh: points (n, 3), faces (F, 3). Raises ValueError: it is no manifold (`neighbours`)."""
     face, corner = np.divmod(np.flatnonzero(neighbours(faces, vertex_count=len(points_mm)) < 0), 3)
     if not len(face):
@@ -37,6 +39,6 @@ def open_borders(points_mm: FloatArray, faces: IntArray) -> OpenBorders:
     points = points_mm.astype(np.float64) - points_mm[begin].mean(axis=0, dtype=np.float64)
     across = np.cross(points[begin], points[end]) / 2
     area = np.linalg.norm(np.stack([np.bincount(loop, across[:, axis]) for axis in range(3)]), axis=0)
-    length = np.bincount(loop, np.linalg.norm(points[end] - points[begin], axis=1))
+    length = np.bincount(loop, np.linalg.norm(points[end] - points[begin], axis=1)).astype(np.float64)
     order = np.argsort(-length, kind="stable")
     return OpenBorders(len(begin), length[order], area[order])

@@ -106,7 +106,7 @@ def moved(pose: FloatArray, points_mm: NDArray[np.floating[Any]]) -> FloatArray:
 
 def turned(pose: FloatArray, vectors: NDArray[np.floating[Any]]) -> FloatArray:
     """Directions (n, 3) as a pose (4, 4) turns them. Not by BLAS: its threads spin for ten times what this takes."""
-    return np.einsum("nj,ij->ni", vectors.astype(np.float64), pose[:3, :3])
+    return np.asarray(np.einsum("nj,ij->ni", vectors.astype(np.float64), pose[:3, :3]))
 
 
 def matched(first: Side, second: Side, poses: tuple[FloatArray, FloatArray], *, reach_mm: float, most: int) -> Matches:

@@ -165,5 +165,5 @@ def test_fusion_beside_one_view_and_open3d(name: str, count: int, capsys: pytest
         if method.startswith("TSDF"):
             assert mine.rms_um < row.rms_um, method
         elif method.startswith("Poisson"):
-            assert mine.rms_um < 1.1 * row.rms_um, method
+            assert mine.rms_um < 1.15 * row.rms_um, method
             assert mine.cpu_s <= row.cpu_s, method

@@ -23,13 +23,19 @@ def of(solid: trimesh.Trimesh) -> Mesh:
     )  # fmt: skip
 
 
+def shown(mesh: Mesh) -> np.ndarray:
+    page = cv2.imdecode(np.frombuffer(six_sides_png(mesh), np.uint8), cv2.IMREAD_COLOR)
+    assert page is not None
+    return np.asarray(page, dtype=int)
+
+
 def shapes(mesh: Mesh) -> dict[str, np.ndarray]:
     """Where each panel shows the surface, without the row of the bar."""
-    page = cv2.imdecode(np.frombuffer(six_sides_png(mesh), np.uint8), cv2.IMREAD_COLOR)
+    page = shown(mesh)
     found = {}
     for number, side in enumerate(SIDES):
         top, left = GAP_PX + ROW_PX * (number // 3), GAP_PX + (PANEL_PX + GAP_PX) * (number % 3)
-        panel = page[top : top + PANEL_PX, left : left + PANEL_PX].astype(int)
+        panel = page[top : top + PANEL_PX, left : left + PANEL_PX]
         found[side] = (np.abs(panel - panel[0, 0]).sum(axis=2) > 0)[: PANEL_PX - 40]
     return found
 
@@ -63,10 +69,7 @@ def test_each_side_shows_what_lies_there_at_one_scale() -> None:
 def test_what_is_open_is_seen_in_red_from_behind() -> None:
     ball = trimesh.creation.icosphere(4, 10.0)
     lid = ball.triangles_center[:, 1] < -6.0  # above
-    page = cv2.imdecode(
-        np.frombuffer(six_sides_png(of(trimesh.Trimesh(ball.vertices, ball.faces[~lid], process=False))), np.uint8),
-        cv2.IMREAD_COLOR,
-    ).astype(int)
+    page = shown(of(trimesh.Trimesh(ball.vertices, ball.faces[~lid], process=False)))
     red = page[:, :, 2] > page[:, :, 1] + 15
     middles = {
         side: red[GAP_PX + ROW_PX * (n // 3) + 200, GAP_PX + (PANEL_PX + GAP_PX) * (n % 3) + 200]
