@@ -23,12 +23,12 @@ from slrig.combine.shooting import ViewShooting
 from slrig.combine.stage import StageStore
 from slrig.config import ServiceSettings
 from slrig.jobs.audit import Audit, AuditEntry
+from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.feed import JobFeed
 from slrig.jobs.keys import RequestKeys
 from slrig.jobs.records import JobKind, JobRecord
 from slrig.jobs.store import JobStore
-from slrig.jobs.worker import Worker
 from slrig.scan.presets import Presets
 from slrig.scan.retention import ScanLimits, ScanRetention
 from slrig.scan.runner import Runner
@@ -70,7 +70,7 @@ class Service:
         folder: DataFolder,
         store: JobStore,
         runner: Runner,
-        worker: Worker,
+        worker: Compute,
         *,
         rig_name: str,
         calibration_tools: CalibrationTools | None = None,

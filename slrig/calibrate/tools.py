@@ -18,8 +18,8 @@ from slrig.calibration.judging.comparison import Comparison
 from slrig.calibration.solution import PROJECTOR
 from slrig.devices import Rig
 from slrig.errors import CalibrationStateError
+from slrig.jobs.compute import Compute
 from slrig.jobs.rig_jobs import Recorded
-from slrig.jobs.worker import Worker
 from slrig.model import Calibration, Size
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import Progress, ScanPlan
@@ -97,7 +97,7 @@ class CalibrationTools:
     warm: Callable[[], None] = lambda: None
 
 
-def calibration_tools(worker: Worker) -> CalibrationTools:
+def calibration_tools(worker: Compute) -> CalibrationTools:
     """The real ones: the shot is taken here, the mathematics is the worker's."""
     room = "slrig.calibrate"
     return CalibrationTools(

@@ -38,7 +38,9 @@ class Task:
 
     function : "module:function". It is given `progress`, `cancelled` and `made` if it takes arguments of these names,
     and `live`, what received the frames of a capture, if there were any. what : the task in words. remedy : what a
-    person can do when the worker is lost in the middle of it.
+    person can do when the worker is lost in the middle of it. movable : `given` begins with a folder that is read and
+    one that is filled, and nothing else of this machine is needed: another one may do it. where : how it came to be
+    done where it is, for a report; the function is given it if it takes an argument of this name.
     """
 
     function: str
@@ -46,6 +48,8 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
     what: str = "task"
     remedy: str = "Try again."
+    movable: bool = False
+    where: Mapping[str, str] = field(default_factory=lambda: {"where": "local"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +222,7 @@ def _answer(pipe: Connection, stops: Connection, run: Run, live: Any) -> Done | 
         return stopped
 
     try:
-        given = {"progress": progress, "cancelled": cancelled, "made": made}
+        given = {"progress": progress, "cancelled": cancelled, "made": made, "where": run.task.where}
         if live is not None:
             given["live"] = live
         return Done(run.number, _called(run.task, given))

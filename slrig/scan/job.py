@@ -16,13 +16,13 @@ from slrig.bundle.health import write_health
 from slrig.devices import Rig
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
+from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import BUNDLE, DataFolder, missing_files
 from slrig.jobs.frame_feed import FrameFeed, FrameSink
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.records import JobRecord, JobState, utc_now
 from slrig.jobs.rig_jobs import Outcome, Parts, Recorded, RigJobs
-from slrig.jobs.worker import Worker
 from slrig.jobs.worker_process import Task
 from slrig.rig.session import RigSession
 from slrig.scan.plan import ReconstructionPlan, ScanPlan
@@ -76,7 +76,7 @@ class ScanTools:
     """
 
     folder: DataFolder
-    worker: Worker
+    worker: Compute
     capture: CaptureFrames
     spare_bytes: int
     health: WatchesHealth | None = None
@@ -176,13 +176,14 @@ class _Scan:
 
 
 def reconstruction(pipeline: str, bundle: Path, folder: Path, plan: ReconstructionPlan) -> Task:
-    """The worker's job of reconstructing a bundle into a folder that is there. pipeline : `Worker.module`."""
+    """The worker's job of reconstructing a bundle into a folder that is there. pipeline : `Compute.module`."""
     return Task(
         f"{pipeline}:reconstruct_into",
         (bundle, folder),
         {"plan": plan},
         what="reconstruction",
         remedy="The bundle is kept: download bundle.zip and run `slrig reconstruct` on it, or scan again.",
+        movable=True,
     )
 
 

@@ -21,6 +21,7 @@ from slrig.bundle.stage import read_stage
 from slrig.bundle.storage import write_file
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
+from slrig.jobs.versions import computed
 from slrig.kernels import Prepared, compilations_told
 from slrig.meshing.quality import mesh_figures, score
 from slrig.meshing.surface import MeshingLimits, Stage, finished_mesh
@@ -111,11 +112,13 @@ def reconstruct_into(
     progress: Progress,
     cancelled: Callable[[], bool],
     made: Callable[[str], None] = lambda _: None,
+    where: Mapping[str, str] | None = None,
     live: LiveScan | None = None,
 ) -> dict[str, object]:
     """Reconstruct a recorded bundle into a folder that only its maker knows yet, and return the report.
 
     `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
+    where : `slrig.jobs.worker_process.Task.where`, for the report.
 
     Writes mesh.ply first, then mesh.glb and points.ply, then preview.png, two pictures of the refused pixels
     per camera, and report.json. Each file appears whole, and `made` is told its name; whoever keeps the folder has to
@@ -181,6 +184,7 @@ def reconstruct_into(
             "calibration": calibration_report(walked.devices, bundle, mesh.sigma_mm, meshed.mesh_share_mm),
             "health": read_health(bundle),
             "plan": asdict(plan),
+            "computed": computed(where or {"where": "local"}),
             "causes": described_causes(),
             "cameras": {
                 each.name: {

@@ -12,13 +12,13 @@ from uuid import UUID, uuid4
 import structlog
 
 from slrig.errors import InvalidInputError, JobNotFoundError, ScanStateError
+from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.job import Job
 from slrig.jobs.queue import JobQueue
 from slrig.jobs.records import JobRecord, utc_now
 from slrig.jobs.rig_jobs import RigJobs
 from slrig.jobs.store import JobStore
-from slrig.jobs.worker import Worker
 from slrig.rig.session import ActiveCalibration, RigFacts, RigSession
 from slrig.scan.job import CaptureFrames, ScanTools, WatchesHealth, scan_job
 from slrig.scan.plan import ScanPlan, series_of
@@ -35,7 +35,7 @@ class RunnerStatus:
 
     `active` is the calibration that takes the place of the rig's own, `misfit` why it cannot be used. `holder` and
     those of `computing` are `Holder.name`. `opening` is what the rig's driver told last, while it is opened.
-    `reconstruction` is `Worker.condition`, `preparing` whether that is on its way to ready.
+    `reconstruction` is `Compute.condition`, `preparing` whether that is on its way to ready.
     """
 
     rig: str
@@ -66,7 +66,7 @@ class Runner:
         store: JobStore,
         folder: DataFolder,
         rig: RigSession,
-        worker: Worker,
+        worker: Compute,
         *,
         capture: CaptureFrames,
         queue_length: int = 8,

@@ -14,7 +14,7 @@ from slrig.calibration.board import Board
 from slrig.calibration.health.verdict import Health, HealthState
 from slrig.calibration.health.verification import Verification
 from slrig.errors import CalibrationStateError, PoseRefusedError
-from slrig.jobs.worker import Worker
+from slrig.jobs.compute import Compute
 from slrig.model import Calibration
 from slrig.scan.acquisition import capture_frames
 from slrig.verify.store import VerificationRecord
@@ -37,7 +37,7 @@ class VerificationTools:
     judge: Callable[[Sequence[Any], Board, Calibration], Verification] = field(default_factory=lambda: _later(_JUDGE))
 
 
-def verification_tools(worker: Worker) -> VerificationTools:
+def verification_tools(worker: Compute) -> VerificationTools:
     """Those of a service: the shot is taken here, the mathematics is the worker's."""
     return VerificationTools(read=worker.task(_READ, "reading of the board"), judge=worker.task(_JUDGE, "verification"))
 

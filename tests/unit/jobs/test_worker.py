@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from ctypes import c_double
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -124,6 +125,7 @@ def task(name: str, *given: object) -> Task:
 
 def test_any_named_task_is_done_with_what_it_takes(worker: Worker) -> None:
     assert worker.run(task("process_id")) == worker.process_id
+    assert worker.run(replace(task("told_where"), where={"where": "pool"})) == {"where": "pool"}
 
 
 @pytest.mark.parametrize("refused", [StorageError("The disk is full."), KeyboardInterrupt()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -27,6 +28,7 @@ from slrig.errors import (
     ScanCancelledError,
     SlrigError,
 )
+from slrig.jobs.versions import versions
 from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Refusal, Shot, Size, White
 from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_frames
@@ -102,6 +104,7 @@ def test_a_scan_of_the_rendered_rig_is_a_mesh_with_its_files(recorded: Path, tmp
         at = (int((row + 0.5) / causes.shape[0] * height), int((column + 0.5) / causes.shape[1] * width))
         assert tuple(picture[at]) == (30, 26, 24)
     assert written["mesh"]["initial"] == report["mesh"]["initial"]  # type: ignore[index]
+    assert written["computed"] == {"where": "local", "host": platform.node(), "versions": dict(versions())}
     initial = written["mesh"]["initial"]
     assert initial["triangles"] == initial["strip_triangles"] - initial["dropped_triangles"]
 
