@@ -221,6 +221,9 @@ def default_data_dir() -> Path:
     return Path(base) / "slrig"
 
 
+_PATHS = "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file"
+
+
 class ServiceSettings(BaseSettings):
     """What the service needs to know, from `SLRIG_…` in the environment, then a TOML file, then these defaults.
 
@@ -235,8 +238,10 @@ class ServiceSettings(BaseSettings):
     quarter of an hour. The newest `keep_models` are kept. `backlog_length` is how many scans may be reconstructed, or
     wait for that, while the rig shoots the next one; what else computes counts, too. `drain_s` is how long, after
     SIGTERM, the job that has the rig and those that compute may take to come to their end before they are interrupted;
-    what waits, and what has its frames, goes on at the next start. Nobody but the service's own user may read the data,
-    and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, and JSON lines elsewhere.
+    what waits, and what has its frames, goes on at the next start. `compute` is the scheduler of a pool that
+    reconstructs for this rig, `compute_store` where bundles and results lie meanwhile, `compute_certificates` and
+    `compute_login_file` what opens the two: see slrig/compute/README.md. Nobody but the service's own user may read the
+    data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, JSON lines elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -279,13 +284,17 @@ class ServiceSettings(BaseSettings):
     mqtt_url: Annotated[str, Field(max_length=2000)] | None = None
     mqtt_login: SecretStr | None = None
     mqtt_login_file: Path | None = None
+    compute: Annotated[str, Field(max_length=2000)] | None = None
+    compute_store: Annotated[str, Field(max_length=2000)] | None = None
+    compute_certificates: Path | None = None
+    compute_login_file: Path | None = None
 
     @property
     def key_path(self) -> Path:
         """The file that holds the hashes of the service's keys."""
         return self.data_dir / "keys.json"
 
-    @field_validator("data_dir", "rig", "webhook_secret_file", "mqtt_login_file")
+    @field_validator(*_PATHS)
     @classmethod
     def _at_home(cls, path: Path | None) -> Path | None:
         return None if path is None else path.expanduser()
@@ -342,7 +351,7 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
         The file is missing or not TOML, or a value is wrong; all faults in one message.
     """
     data: dict[str, Any] = {} if path is None else read_toml(path, MOST_CONFIG_BYTES)
-    for key in ("data_dir", "rig", "webhook_secret_file", "mqtt_login_file"):
+    for key in _PATHS:
         if path is not None and isinstance(data.get(key), str):
             data[key] = str(path.resolve().parent / Path(data[key]).expanduser())
     source = "settings" if path is None else str(path)
@@ -354,6 +363,19 @@ def read_settings(path: Path | None = None, **given: object) -> ServiceSettings:
         known = tuple(ServiceSettings.model_fields)
         message = f"{source}: not valid settings of the service:\n{explain(cause, data, known)}"
         raise ConfigError(message) from cause
+
+
+def private_text(path: Path, source: str) -> str:
+    """What a file holds that nobody but its owner may read. source : which it is. Raises ConfigError."""
+    try:
+        mode, text = path.stat().st_mode, path.read_text("utf-8")
+    except (OSError, ValueError) as cause:
+        message = f"{source} cannot be read: {getattr(cause, 'strerror', None) or 'it is no text'}"
+        raise ConfigError(message) from cause
+    if os.name == "posix" and mode & 0o077:
+        message = f"{source} may be read by others. Take that from them: chmod 600 {path}"
+        raise ConfigError(message)
+    return text
 
 
 def is_loopback(host: str) -> bool:

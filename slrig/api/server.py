@@ -24,9 +24,11 @@ from slrig.api.keys import KeyRing, first_key
 from slrig.api.service import Service
 from slrig.api.sessions import LINK_PATH, Sessions
 from slrig.bundle.storage import write_file
+from slrig.compute.security import require_pool_extra
 from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, InvalidInputError, ServiceError
+from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
@@ -83,7 +85,12 @@ def open_service(
     ):
         for name in found:
             _log.warning("left by the last run", scan=str(name), found=what)
-    worker = Worker(PIPELINE)
+    try:
+        worker = _worker(settings)
+    except BaseException:
+        database.close()
+        folder.release()
+        raise
     runner = Runner(
         store,
         folder,
@@ -113,6 +120,17 @@ def open_service(
         store.database.close()
         folder.release()
         raise
+
+
+def _worker(settings: ServiceSettings) -> Compute:
+    """This machine's own, or the pool's. Raises ConfigError, ExtraMissingError."""
+    worker = Worker(PIPELINE)
+    if settings.compute is None and settings.compute_store is None:
+        return worker
+    require_pool_extra()
+    from slrig.compute.pooled import pooled
+
+    return pooled(settings, worker)
 
 
 def serve(

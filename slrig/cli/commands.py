@@ -13,13 +13,14 @@ from typing import Annotated, Any, Literal
 import typer
 import typer.core
 
-from slrig.cli import calibrate, key, preset, schedule, stage
+from slrig.cli import calibrate, key, pool, preset, schedule, stage
 from slrig.cli.backup import backup, restore
 from slrig.cli.foreign import import_images
 from slrig.cli.model import model
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
 from slrig.cli.patterns import patterns
 from slrig.cli.scan_options import ScanOptions
+from slrig.cli.serve import serve
 from slrig.errors import ConfigError, SlrigError
 
 INTERRUPTED = 130
@@ -82,36 +83,6 @@ def demo(
     from slrig.cli.demo import run_demo
 
     run_demo(rig, output)
-
-
-@app.command()
-def serve(
-    rig: RigFile,
-    host: Annotated[str | None, typer.Option(help="Address to listen on. Default 127.0.0.1: this machine.")] = None,
-    port: Annotated[int | None, typer.Option(help="Port; 0 takes any free one. Default 8731.")] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Folder for scans and records. Default: ~/.local/share/slrig.")
-    ] = None,
-    settings: Annotated[Path | None, typer.Option(help="TOML file with settings of the service.")] = None,
-    allow_host: Annotated[
-        list[str] | None, typer.Option(help="A name by which clients may call this machine; may be repeated.")
-    ] = None,
-    new_key: Annotated[bool, typer.Option("--new-key", help="Make a new API key; the old one stops working.")] = False,
-    no_key: Annotated[bool, typer.Option("--no-key", help="Ask for no API key; only on this machine.")] = False,
-    until_eof: Annotated[bool, typer.Option("--until-eof", help="Stop when standard input ends.")] = False,
-) -> None:
-    """Start the service: it holds the rig and scans over HTTP."""
-    from slrig.api.server import serve as run_service
-    from slrig.config import read_rig, read_settings
-
-    told = given(
-        host=host,
-        port=port,
-        data_dir=data,
-        allowed_hosts=tuple(allow_host or ()) or None,
-        require_key=False if no_key else None,
-    )
-    run_service(read_settings(settings, **told), read_rig(rig), new_key=new_key, until_eof=until_eof, say=typer.echo)
 
 
 @app.command()
@@ -376,6 +347,7 @@ def accept(
         raise typer.Exit(1)
 
 
+app.command()(serve)
 app.command()(model)
 app.command()(patterns)
 app.command(name="import")(import_images)
@@ -386,6 +358,8 @@ app.add_typer(schedule.app, name="schedule")
 app.add_typer(preset.app, name="preset")
 app.add_typer(stage.app, name="stage")
 app.add_typer(key.app, name="key")
+app.add_typer(pool.app, name="pool")
+app.command()(pool.worker)
 
 
 def main() -> None:

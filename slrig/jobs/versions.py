@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
 
 _LIBRARIES = ("slrig", "numpy", "numba", "llvmlite", "scipy", "opencv-python-headless")
 _PACKAGE = Path(__file__).resolve().parent.parent
@@ -24,7 +23,7 @@ def versions() -> Mapping[str, str]:
         code.update(path.relative_to(_PACKAGE).as_posix().encode())
         code.update(path.read_bytes())
     found = {name: version(name) for name in _LIBRARIES}
-    return MappingProxyType({**found, "code": code.hexdigest()[:16], "machine": platform.machine()})
+    return {**found, "code": code.hexdigest()[:16], "machine": platform.machine()}
 
 
 def computed(where: Mapping[str, str]) -> dict[str, object]:

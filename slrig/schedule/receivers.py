@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import get_args
 
 from pydantic import SecretStr
 
-from slrig.config import NoticeKind, ServiceSettings
-from slrig.errors import ConfigError
+from slrig.config import NoticeKind, ServiceSettings, private_text
 from slrig.jobs.outbox import Outbox
 from slrig.schedule.mqtt import Broker
 from slrig.schedule.sending import Sender
@@ -40,12 +38,4 @@ def _secret(given: SecretStr | None, path: Path | None, name: str) -> tuple[str 
     if given is not None or path is None:
         return None if given is None else given.get_secret_value(), name
     source = f"{name}_file: {path}"
-    try:
-        mode, secret = path.stat().st_mode, path.read_text("utf-8")
-    except (OSError, ValueError) as cause:
-        message = f"{source} cannot be read: {getattr(cause, 'strerror', None) or 'it is no text'}"
-        raise ConfigError(message) from cause
-    if os.name == "posix" and mode & 0o077:
-        message = f"{source} may be read by others. Take that from them: chmod 600 {path}"
-        raise ConfigError(message)
-    return secret, source
+    return private_text(path, source), source

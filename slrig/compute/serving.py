@@ -1,0 +1,100 @@
+"""The processes of a pool: dask's scheduler, and dask's workers with a process that computes beneath each."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import platform
+import signal
+import tempfile
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from pathlib import Path
+
+import dask
+from distributed import Scheduler, Security
+from distributed import Worker as DaskWorker
+
+from slrig.compute.cluster import CONNECT_S, join_logs
+from slrig.compute.host import Host, resource
+from slrig.compute.store import PoolStore
+from slrig.errors import WorkerLostError
+from slrig.jobs.versions import versions
+from slrig.jobs.worker import READY, Worker, prepare_kernel_cache
+from slrig.jobs.worker_wait import POLL_S
+from slrig.scan.job import PIPELINE
+
+RETURN_S = 2.0
+"""How often a worker looks for its scheduler."""
+
+LOST_WORKER_S = 30
+"""From when on a worker that was not heard of is given up by the scheduler; each is heard of once a second."""
+
+
+def serve_scheduler(address: str, security: Security | None, *, say: Callable[[str], None]) -> None:
+    """Be the scheduler of a pool at `address` until SIGTERM or Ctrl-C. Raises OSError: the address is taken."""
+
+    async def life(stopped: asyncio.Event) -> None:
+        async with Scheduler(host=address, security=security, dashboard=False) as scheduler:
+            say(f"the pool's scheduler is at {scheduler.address}. Ctrl-C stops it.")
+            await stopped.wait()
+
+    dask.config.set({"distributed.scheduler.worker-ttl": LOST_WORKER_S})
+    _until_told(life)
+
+
+def serve_worker(
+    scheduler: str, security: Security | None, store: PoolStore, *, cache: Path, say: Callable[[str], None]
+) -> None:
+    """Compute for a pool until SIGTERM or Ctrl-C. A scheduler that is not there, or is lost, is waited for.
+    cache : for kernels, where slrig's own folder is read-only. Raises WorkerLostError: kernels cannot be loaded.
+    """
+    prepare_kernel_cache(cache)
+    beneath, name = Worker(PIPELINE), f"{platform.node()}-{os.getpid()}"
+    beneath.start()
+
+    async def life(stopped: asyncio.Event) -> None:
+        told = ""
+        # A rig would wait for kernels to be compiled.
+        while beneath.condition != READY and not stopped.is_set():
+            if not beneath.loading:
+                raise WorkerLostError(beneath.condition)
+            await asyncio.sleep(POLL_S)
+        while not stopped.is_set():
+            try:
+                # A job at a time: the process beneath has one, and machines with more cores run more workers.
+                async with DaskWorker(
+                    scheduler, name=name, security=security, nthreads=1, memory_limit=0, local_directory=scratch,
+                    resources={resource(versions()): 1}, plugins=(Host(store, beneath),), death_timeout=CONNECT_S,
+                    dashboard=False,
+                ) as member:  # fmt: skip
+                    say(told := f"computes for the pool {scheduler}. Ctrl-C stops it.")
+                    ends = [asyncio.create_task(stopped.wait()), asyncio.create_task(member.finished())]
+                    await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+                    for each in ends:
+                        each.cancel()
+            except (OSError, RuntimeError) as error:
+                found = f"the scheduler {scheduler} does not answer ({type(error.__cause__ or error).__name__})"
+                if told != found:
+                    say(told := found)
+            with suppress(TimeoutError):
+                await asyncio.wait_for(stopped.wait(), RETURN_S)
+
+    try:
+        with tempfile.TemporaryDirectory(prefix="slrig-worker-") as scratch:
+            _until_told(life)
+    finally:
+        beneath.close()
+
+
+def _until_told(life: Callable[[asyncio.Event], Awaitable[None]]) -> None:
+    """Run until SIGTERM or Ctrl-C."""
+    join_logs()
+
+    async def live() -> None:
+        stopped = asyncio.Event()
+        for each in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(each, stopped.set)
+        await life(stopped)
+
+    asyncio.run(live())

@@ -1,0 +1,1 @@
+"""A pool of machines that reconstruct for rigs."""

@@ -1,0 +1,73 @@
+"""A machine of a pool: what it refuses, and when it stops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import obstore
+import pytest
+
+pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
+from slrig.compute.host import BEAT_S, POOL_FAULT, Answer, Order
+from slrig.jobs.versions import versions
+from tests.unit.compute.tame_pool import Pool, job
+
+
+@pytest.fixture
+def pool() -> Pool:
+    return Pool()
+
+
+def order(pool: Pool, folder: Path, what: str = "finish") -> Order:
+    task = job(folder, what)
+    key = pool.store.put_bundle(task.given[0], lambda: None)
+    return Order("job", key, replace(task, given=task.given[2:]), "rig", versions())
+
+
+def fault(answer: Answer) -> tuple[str, str]:
+    assert answer.fault is not None
+    assert (answer.result, dict(answer.files)) == (None, {})
+    return answer.fault.code, answer.fault.message
+
+
+def test_a_machine_of_other_versions_computes_nothing(pool: Pool, tmp_path: Path) -> None:
+    newer = replace(order(pool, tmp_path), versions={**versions(), "numba": "0"})
+    code, message = fault(pool.cluster.host.done(newer, lambda _: None))
+    assert (code, "have changed" in message) == (POOL_FAULT, True)
+    assert [task.what for task in pool.remote.done] == ["statement of versions"]
+
+
+def test_a_bundle_that_was_changed_in_the_store_is_not_computed(pool: Pool, tmp_path: Path) -> None:
+    given = order(pool, tmp_path)
+    obstore.put(pool.objects, f"bundles/{given.bundle}.tar", b"another bundle")
+    assert "not what was put there" in fault(pool.cluster.host.done(given, lambda _: None))[1]
+
+
+@pytest.mark.parametrize(("what", "code"), [("fail", "nothing-to-reconstruct"), ("break", "unexpected")])
+def test_whatever_goes_wrong_is_answered(pool: Pool, tmp_path: Path, what: str, code: str) -> None:
+    assert fault(pool.cluster.host.done(order(pool, tmp_path, what), lambda _: None))[0] == code
+
+
+def test_a_job_that_its_rig_gave_up_is_stopped_in_the_middle(pool: Pool, tmp_path: Path) -> None:
+    heard: list[Mapping[str, Any]] = []
+
+    def told(each: Mapping[str, Any]) -> None:
+        pool.clock.now_s += BEAT_S
+        heard.append(each)
+        if len(heard) == 4:
+            pool.store.stop("job")
+
+    code, _ = fault(pool.cluster.host.done(order(pool, tmp_path, "hang"), told))
+    assert code == "scan-cancelled"
+    assert {"job": "job"} in heard[1:]
+    assert not [each for each in pool.objects.list().collect() if each["path"].startswith("results/")]
+
+
+def test_a_job_ends_when_its_machine_leaves_the_pool(pool: Pool, tmp_path: Path) -> None:
+    leave: Any = pool.cluster.host.teardown
+    code, _ = fault(pool.cluster.host.done(order(pool, tmp_path, "hang"), lambda _: leave(None)))
+    assert code == "scan-cancelled"

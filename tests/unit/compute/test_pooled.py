@@ -1,0 +1,201 @@
+"""Bundles reconstructed by a pool, and by the rig's own machine whatever becomes of the pool."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import obstore
+import pytest
+
+pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
+from slrig.compute.cluster import DaskCluster
+from slrig.compute.host import Answer, Order, resource
+from slrig.compute.pooled import BEGIN_LIMIT_S, SILENCE_LIMIT_S, TRANSFER_LIMIT_S
+from slrig.compute.store import PoolError, PoolStore
+from slrig.errors import NothingToReconstructError, ScanCancelledError, ScanInterruptedError, StorageError
+from slrig.jobs.versions import versions
+from tests.unit.compute.tame_pool import Pool, job, lost
+
+FILES = {"mesh.ply", "mesh.glb", "points.ply", "preview.png", "report.json"}
+
+
+@pytest.fixture
+def pool() -> Pool:
+    return Pool()
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (folder / "staged" / "result").iterdir()}
+
+
+def test_the_pool_gives_what_this_machine_gives(pool: Pool, tmp_path: Path) -> None:
+    made: list[str] = []
+    report = pool.worker.run(job(tmp_path / "pooled"), made=made.append)
+    pool.local.run(job(tmp_path / "local"))
+    pooled, local = files(tmp_path / "pooled"), files(tmp_path / "local")
+    # The tame report names the folder.
+    assert {**pooled, "report.json": b""} == {**local, "report.json": b""}
+    assert set(made) == files(tmp_path / "pooled").keys() == FILES
+    assert report["seconds"] == 1.5
+    assert pool.remote.done[-1].where == {"where": "pool"}
+    assert [told["stage"] for told in pool.cluster.told if "stage" in told] == ["decode", "done"]
+    assert pool.cluster.orders[0].cancelled()
+    assert pool.tidied() == set()
+
+
+def gone(pool: Pool) -> None:
+    pool.cluster.there = False
+
+
+def never_begins(pool: Pool) -> None:
+    pool.cluster.acts = [pool.passes(BEGIN_LIMIT_S + 1)] * 2
+
+
+def falls_silent(pool: Pool) -> None:
+    def tells_once(order: Order) -> None:
+        begun = pool.clock.now_s > 0
+        pool.clock.now_s += SILENCE_LIMIT_S + 1 if begun else 1
+        if not begun:
+            pool.cluster.orders[-1].told({"job": order.job})
+
+    pool.cluster.acts = [tells_once]
+    pool.cluster.usable = lambda timeout_s=0.0: timeout_s == 0.0  # type: ignore[method-assign]
+
+
+def is_lost_twice(pool: Pool) -> None:
+    pool.cluster.acts = [lost, lost]
+
+
+def is_lost_for_good(pool: Pool) -> None:
+    def act(_order: Order) -> Answer:
+        pool.cluster.there = False
+        raise PoolError("the pool lost the job")
+
+    pool.cluster.acts = [act]
+
+
+def answers_wrong_bytes(pool: Pool) -> None:
+    def act(order: Order) -> Answer:
+        answer = pool.cluster.host.done(order, lambda _: None)
+        obstore.put(pool.objects, f"results/{order.job}/points.ply", b"other bytes")
+        return answer
+
+    pool.cluster.acts = [act] * 2
+
+
+def names_a_file_elsewhere(pool: Pool) -> None:
+    pool.cluster.acts = [lambda _: Answer({}, {"../../record.json": "0" * 64})] * 2
+
+
+def is_slow(pool: Pool) -> None:
+    class Slow(PoolStore):
+        def _has(self, path: str) -> bool:
+            pool.clock.now_s += TRANSFER_LIMIT_S + 1
+            return super()._has(path)
+
+    pool.worker._store = Slow("memory://", pool.objects)
+
+
+def is_full(pool: Pool) -> None:
+    class Full(PoolStore):
+        def put_bundle(self, bundle: Path, check: Callable[[], None]) -> str:  # noqa: ARG002
+            raise PoolError("the store memory:// failed (GenericError)")
+
+    pool.worker._store = Full("memory://", pool.objects)
+
+
+@pytest.mark.parametrize(
+    ("fault", "orders", "because"),
+    [
+        (gone, 0, "does not answer"),
+        (never_begins, 2, "has not begun"),
+        (falls_silent, 1, "nothing more was heard"),
+        (is_lost_twice, 2, "lost the job"),
+        (is_lost_for_good, 1, "lost the job"),
+        (answers_wrong_bytes, 2, "not what was put there"),
+        (names_a_file_elsewhere, 2, "no name of a file"),
+        (is_slow, 0, "took longer than"),
+        (is_full, 0, r"failed \(GenericError\)"),
+    ],
+)
+def test_what_the_pool_fails_to_do_this_machine_does(
+    pool: Pool, tmp_path: Path, fault: Callable[[Pool], None], orders: int, because: str
+) -> None:
+    fault(pool)
+    report = pool.worker.run(job(tmp_path))
+    assert report["seconds"] == 1.5
+    assert files(tmp_path).keys() == FILES
+    (done,) = pool.local.done
+    assert done.where["where"] == "local"
+    assert re.search(because, done.where["because"])
+    assert len(pool.cluster.orders) == orders
+    assert {path for path in pool.tidied() if not path.startswith("stops/")} == set()
+
+
+def test_a_job_that_was_lost_is_given_to_the_pool_again(pool: Pool, tmp_path: Path) -> None:
+    pool.cluster.acts = [lost]
+    assert pool.worker.run(job(tmp_path))["seconds"] == 1.5
+    assert (len(pool.cluster.orders), len(pool.remote.done), pool.local.done) == (2, 2, [])
+    assert pool.tidied() == {f"stops/{pool.cluster.orders[0].order.job}"}
+
+
+def test_what_fails_by_itself_fails_here_in_its_own_words(pool: Pool, tmp_path: Path) -> None:
+    with pytest.raises(NothingToReconstructError, match="No stripe"):
+        pool.worker.run(job(tmp_path, "fail"))
+    assert len(pool.cluster.orders) == 1
+
+
+def test_a_job_that_is_cancelled_is_stopped_where_it_is_computed(pool: Pool, tmp_path: Path) -> None:
+    pool.cluster.acts = [pool.passes(0.1)]
+    with pytest.raises(ScanCancelledError, match="reconstruction was cancelled"):
+        pool.worker.run(job(tmp_path), cancelled=lambda: pool.clock.now_s > 1)
+    (pending,) = pool.cluster.orders
+    assert pending.cancelled()
+    assert pool.tidied() == {f"stops/{pending.order.job}"}
+    assert (pool.local.done, files(tmp_path)) == ([], {})
+
+
+def test_frames_that_were_taken_here_are_computed_here(pool: Pool, tmp_path: Path) -> None:
+    assert pool.worker.feed().receiver is None
+    gone(pool)
+    feed = pool.worker.feed()
+    assert pool.local.feeds == [feed]
+    pool.cluster.there = True
+    pool.worker.run(job(tmp_path), feed=feed)
+    assert (len(pool.local.done), pool.cluster.orders) == (1, [])
+
+
+def test_workers_of_other_versions_are_not_used() -> None:
+    cluster = DaskCluster("tcp://127.0.0.1:1", None)
+    mine, newer = ({"resources": {resource(found): 1}} for found in (versions(), {**versions(), "code": "0"}))
+    assert "no workers" in str(cluster._lack([]))
+    assert "this machine's versions" in str(cluster._lack([newer]))
+    assert cluster._lack([newer, mine]) is None
+
+
+def test_other_tasks_stay_here(pool: Pool) -> None:
+    assert pool.worker.task("tests.unit.scan.fake_pipeline:process_id", "examination")() > 0
+    assert len(pool.local.done) == 1
+
+
+def test_a_service_that_ends_interrupts_what_is_in_the_pool(pool: Pool, tmp_path: Path) -> None:
+    pool.cluster.acts = [lambda _: pool.worker.close()]
+    with pytest.raises(ScanInterruptedError):
+        pool.worker.run(job(tmp_path))
+
+
+def test_a_disk_that_is_full_is_no_fault_of_the_pool(
+    pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = job(tmp_path)
+
+    def refused(*_given: object, **_options: object) -> None:
+        raise StorageError("The disk is full.")
+
+    monkeypatch.setattr(pool.local, "run", refused)
+    monkeypatch.setattr(PoolStore, "fetch_result", refused)
+    with pytest.raises(StorageError, match="disk is full"):
+        pool.worker.run(task)

@@ -1,0 +1,112 @@
+"""Who may join a pool."""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+pytest.importorskip("cryptography", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
+from slrig.cli.commands import app
+from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
+from slrig.compute.security import KEY, pool_security
+from slrig.errors import ConfigError
+
+ADDRESS = "tls://pool:8786"
+
+
+def context(folder: Path, part: str) -> ssl.SSLContext:
+    security: Any = pool_security(ADDRESS, folder)
+    found: ssl.SSLContext = getattr(security, f"get_{part}_args")(
+        *(["client"] if part == "connection" else ["scheduler"])
+    )["ssl_context"]
+    return found
+
+
+def greet(client: ssl.SSLContext, server: ssl.SSLContext) -> None:
+    """Let two shake hands, without a network. Raises ssl.SSLError: one of them refuses."""
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = [client.wrap_bio(back, there), server.wrap_bio(there, back, server_side=True)]
+    for _ in range(4):
+        for end in ends:
+            try:
+                end.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+    ends[0].write(b"hello")
+    assert ends[1].read() == b"hello"
+
+
+def test_members_of_one_pool_know_one_another_and_nobody_else(tmp_path: Path) -> None:
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    made = CliRunner().invoke(app, ["pool", "certificates", str(ours)])
+    assert made.output.split() == [str(ours / name) for name in ("scheduler", "worker", "rig")]
+    assert make_certificates(ours, ("rig", "rig-7")) == [ours / "rig-7"]
+    make_certificates(theirs, ("rig",))
+    server = context(ours / "scheduler", "listen")
+    greet(context(ours / "rig", "connection"), server)
+    greet(context(ours / "rig-7", "connection"), server)
+    with pytest.raises(ssl.SSLError):
+        greet(context(theirs / "rig", "connection"), server)
+    with pytest.raises(ssl.SSLError):
+        greet(context(ours / "rig", "connection"), context(theirs / "rig", "listen"))
+    nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    nobody.check_hostname, nobody.verify_mode = False, ssl.CERT_NONE
+    with pytest.raises(ssl.SSLError):
+        greet(nobody, server)
+    keys = [*ours.glob(f"*/{KEY}"), ours / AUTHORITY_KEY]
+    assert len(keys) == 5
+    assert {oct(path.stat().st_mode & 0o777) for path in keys} == {"0o600"}
+    assert {oct(path.parent.stat().st_mode & 0o777) for path in keys} == {"0o700"}
+
+
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    (place,) = make_certificates(tmp_path, ("worker",))
+    (place / KEY).chmod(0o644)
+    with pytest.raises(ConfigError, match="chmod 600"):
+        pool_security(ADDRESS, place)
+
+
+@pytest.mark.parametrize(
+    ("address", "why"),
+    [
+        ("tcp://pool:8786", "any code"),
+        ("tcp://0.0.0.0:8786", "any code"),
+        ("pool:8786", "no address"),
+        ("tls://pool", "no address"),
+        ("tls://pool:port", "no address"),
+        (ADDRESS, "found none"),
+    ],
+)
+def test_an_address_that_is_not_safe_is_refused(address: str, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        pool_security(address, None)
+
+
+def test_a_folder_without_certificates_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"lacks authority\.pem, certificate\.pem, key\.pem"):
+        pool_security(ADDRESS, tmp_path)
+
+
+def test_a_pool_of_this_machine_alone_needs_none() -> None:
+    assert pool_security("tcp://127.0.0.1:8786", None) is None
+
+
+def test_names_are_those_of_folders(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no name for a machine"):
+        make_certificates(tmp_path, ("../rig",))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_service_with_a_pool_needs_a_store(tmp_path: Path) -> None:
+    for options in (["--compute", "tcp://127.0.0.1:1"], ["--store", "s3://scans"]):
+        rig = str(Path(__file__).parents[3] / "config" / "rigs" / "demo.toml")
+        told = CliRunner().invoke(app, ["serve", rig, "--data", str(tmp_path / "data"), "--port", "0", *options])
+        assert (told.exit_code, "needs a store as well" in told.stderr) == (2, True), told.output
+    told = CliRunner().invoke(app, ["worker", "--scheduler", "tcp://127.0.0.1:1"])
+    assert (told.exit_code, "--store" in told.stderr) == (2, True)
