@@ -3,6 +3,7 @@ import {html, render, useEffect, useState} from "./vendor/preact-htm.js";
 import {CalibrateScreen} from "./calibrate.js";
 import {DevicesScreen} from "./devices.js";
 import {HealthScreen} from "./health.js";
+import {ModelsScreen} from "./models.js";
 import {ResultScreen} from "./result.js";
 import {ScanScreen} from "./scan.js";
 import {ask, useAction, useValue, watchProblems} from "./service.js";
@@ -10,6 +11,7 @@ import {Action, Badge, Refusal, usePlace} from "./ui.js";
 
 const SCREENS = [
   ["scan", "Scan"],
+  ["models", "Models"],
   ["calibrate", "Calibrate"],
   ["health", "Health", " and schedule"],
   ["devices", "Devices"],
@@ -69,6 +71,7 @@ function Rooms({session, left}) {
   const given = {rig, again, may, place: rest};
   const screens = {
     scan: rest.length ? html`<${ResultScreen} key=${rest[0]} id=${rest[0]} ...${given} />` : html`<${ScanScreen} ...${given} />`,
+    models: html`<${ModelsScreen} ...${given} />`,
     calibrate: html`<${CalibrateScreen} ...${given} />`,
     health: html`<${HealthScreen} ...${given} />`,
     devices: html`<${DevicesScreen} ...${given} />`,

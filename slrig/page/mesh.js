@@ -16,7 +16,10 @@ export const loadDrawing = () => {
   return drawing;
 };
 
-/** `other`: a scan shown in the same view, or null. `report` may come later. `again` takes the box of what is seen, or is null. */
+/**
+ * `scan`: a scan, or a model of several, which is `merged` and has no stripes. `other`: a scan shown in the same view, or null. `report` may come later.
+ * `again` takes the box of what is seen, or is null.
+ */
 export function Mesh({scan, other, report, again}) {
   const canvas = useRef();
   const [view, setView] = useState(null);
@@ -73,7 +76,7 @@ export function Mesh({scan, other, report, again}) {
   for (let at = 0; at + 1 < points.length; at += 2) pairs.push(points.slice(at, at + 2));
   return html`<${Refusal} problem=${problem} />
     <div class="row">
-      <${Choice} label="Colours" value=${mode} options=${WORDS} chosen=${setMode} />
+      <${Choice} label="Colours" value=${mode} options=${WORDS.filter(([name]) => name !== "stripe" || !scan.merged)} chosen=${setMode} />
       <${Action} aria-pressed=${measuring} disabled=${!view} onClick=${() => setMeasuring(!measuring)}>Measure<//>
       <${Action} disabled=${!view} onClick=${() => view.fit()}>Fit<//><${Action} disabled=${!view} onClick=${() => view.front()}>Front<//>
       ${cameras.map(([name, told]) => html`<${Action} disabled=${!view} onClick=${() => view.from(told)}>From ${name}<//>`)}
