@@ -20,15 +20,22 @@ TurnedBy = Literal["table", "hand"]
 
 
 class StageAngle(Strict):
-    """Where the stage stood. angle_deg : right-handed about its axis, from wherever its owner counts."""
+    """Where the stage stood. angle_deg : right-handed about its axis, from wherever its owner counts. count : equal
+    where a turntable's angles have one zero; None where nobody keeps that.
+    """
 
     angle_deg: Annotated[float, Field(allow_inf_nan=False)]
     turned_by: TurnedBy
+    count: Annotated[str, Field(max_length=80)] | None = None
+
+    def document(self) -> dict[str, object]:
+        """As stage.json and a scan's report have it."""
+        return self.model_dump(exclude_none=True)
 
 
 def write_stage(folder: Path, stage: StageAngle) -> None:
     """Put the angle beside the frames. Raises StorageError."""
-    write_file(folder / FILE, json_bytes(stage.model_dump()))
+    write_file(folder / FILE, json_bytes(stage.document()))
 
 
 def read_stage(folder: Path) -> StageAngle | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -13,6 +14,7 @@ import typer
 
 from slrig.api.schemas import ScanRequest, scan_plan
 from slrig.bundle.description import DESCRIPTION
+from slrig.bundle.stage import read_stage
 from slrig.cli.display import answered, progress_shown
 from slrig.cli.reconstruct import prepare_kernels
 from slrig.client import Client
@@ -24,6 +26,7 @@ from slrig.devices import Rig, Turntable
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, ServiceError, SlrigError, ViewsFailedError
 from slrig.jobs.records import utc_now
+from slrig.rig.turn_count import CountedTurntable
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.artefacts import MESH
 from slrig.scan.plan import ScanPlan
@@ -63,6 +66,8 @@ def views_here(
         table = rig.positioner if isinstance(rig.positioner, Turntable) else None
         if table is None and not by_hand:
             raise no_turntable(0.0)
+        if table is not None:
+            rig = replace(rig, positioner=CountedTurntable(table, output / "table.json"))
         if axis is None and table is not None and table.axis is not None:
             axis = StatedAxis.of(table.axis.point_mm, table.axis.direction)
         if axis is None and not unknown:
@@ -87,6 +92,13 @@ def views_here(
     if len(good) < 2:
         message = f"{len(good)} of {count} views succeeded, and a model takes two. The same command shoots the others."
         raise ViewsFailedError(message)
+    counts = {
+        None if stage is None else stage.count
+        for stage in map(read_stage, (output / f"bundle-{number}" for number in good))
+    }
+    if len(counts) > 1 and not unknown:
+        message = f"the turntable lost its place between views in {output}; shoot into another folder, or say --unknown"
+        raise ConfigError(message)
     angles_deg = tuple(shoot.angle_deg(number) for number in good)
     poses = UnknownPoses() if unknown else TurntablePoses(axis, angles_deg)
     return {mesh.parent.name: mesh for mesh in good.values()}, poses, notes

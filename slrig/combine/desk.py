@@ -193,15 +193,22 @@ class ModelDesk:
         if not isinstance(poses, TurntablePoses):
             return plan
         if poses.angles_deg is None:
-            told = {scan: self._stage_angle_deg(scan) for scan in plan.scans}
-            untold = [str(scan) for scan, angle in told.items() if angle is None]
+            told = {scan: self._angle_told(scan) for scan in plan.scans}
+            untold = [str(scan) for scan, stage in told.items() if stage is None]
             if untold:
                 message = (
                     "angles_deg: expected the stage's angle in the report of each scan, found none in "
                     f"{', '.join(untold)}; say angles_deg, one for each scan in their order, or give the poses"
                 )
                 raise ConfigError(message)
-            poses = replace(poses, angles_deg=tuple(angle for angle in told.values() if angle is not None))
+            stages = [stage for stage in told.values() if stage is not None]
+            if len({count for _, count in stages}) > 1:
+                message = (
+                    "angles_deg: expected angles with one zero, and the turntable lost its place between these scans; "
+                    'say angles_deg as they are, "poses": "unknown", or shoot them again'
+                )
+                raise ConfigError(message)
+            poses = replace(poses, angles_deg=tuple(angle_deg for angle_deg, _ in stages))
         return replace(plan, poses=poses)
 
     def cancel(self, model_id: UUID) -> JobRecord:
@@ -303,11 +310,11 @@ class ModelDesk:
             raise StorageError(message)
         return mesh
 
-    def _stage_angle_deg(self, scan_id: UUID) -> float | None:
-        """Where the stage stood, as the report of a scan says; None where it says nothing of one."""
+    def _angle_told(self, scan_id: UUID) -> tuple[float, str | None] | None:
+        """Where the stage stood, deg, and what that counts from, as a scan's report says; None where it does not."""
         try:
             report = json.loads(self._folder.read(self._folder.scan(scan_id) / "report.json"))
-            return float(report["stage"]["angle_deg"])
+            return float(report["stage"]["angle_deg"]), report["stage"].get("count")
         except (FileNotFoundError, ValueError, KeyError, TypeError):
             return None
 

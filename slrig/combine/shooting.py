@@ -14,7 +14,7 @@ from uuid import UUID, uuid4
 import structlog
 
 from slrig.combine.desk import SHOOTING_SHARE, ModelDesk
-from slrig.combine.plan import GivenPoses, ModelPlan, ShootPlan, TurntablePoses, plan_from_json, plan_json
+from slrig.combine.plan import GivenPoses, ModelPlan, ShootPlan, TurntablePoses, UnknownPoses, plan_from_json, plan_json
 from slrig.errors import (
     DeviceError,
     DriverBrokenError,
@@ -65,6 +65,12 @@ class View:
             return "it was not shot"
         last = self.scans[-1]
         return str(last.state) if last.fault is None else last.fault.message
+
+    @property
+    def count(self) -> str | None:
+        """What the turntable's angle of its good scan counts from; None where that is not kept, as by hand."""
+        found = None if self.good is None else (self.good.summary or {}).get("stage", {}).get("count")
+        return None if found is None else str(found)
 
     @property
     def again(self) -> bool:
@@ -218,6 +224,8 @@ class ViewShooting:
             shoot = _shoot_plan(plan)
             views = self._views(model_id, shoot)
             missing = [view for view in views if view.again or not (view.scans or shoot.by_hand)]
+            if not missing and all(view.ended for view in views):
+                missing = [view for view in _of_another_zero(plan, views) if len(view.scans) <= MOST_AGAIN]
             if missing:
                 _log.info("views are put in line", model=str(model_id), views=[view.number for view in missing])
                 plans = [shoot.view(view.number, model_id, utc_now()) for view in missing]
@@ -232,13 +240,15 @@ class ViewShooting:
 
     def _combine(self, record: JobRecord, shoot: ShootPlan, views: Sequence[View]) -> None:
         """Have the model made of its good views, or end it in words."""
-        good = {view.number: view.good.id for view in views if view.good is not None}
+        plan = plan_from_json(record.plan)
+        lost = {view.number for view in _of_another_zero(plan, views)}
+        good = {view.number: view.good.id for view in views if view.good is not None and view.number not in lost}
         left_out = tuple(
-            f"view {view.number} of {shoot.views}, at {shoot.angle_deg(view.number):g}°, is not in it: {view.why}"
+            f"view {view.number} of {shoot.views}, at {shoot.angle_deg(view.number):g}°, is not in it: "
+            + ("the turntable lost its place after it" if view.number in lost else view.why)
             for view in views
             if view.number not in good
         )
-        plan = plan_from_json(record.plan)
         poses = plan.poses
         if isinstance(poses, GivenPoses):
             poses = replace(poses, matrices=tuple(poses.matrices[number - 1] for number in good))
@@ -322,6 +332,17 @@ def _shoot_plan(plan: ModelPlan) -> ShootPlan:
         message = "shoot: expected what is shot, found none; POST /model makes a model of scans that there are"
         raise ScanStateError(message)
     return plan.shoot
+
+
+def _of_another_zero(plan: ModelPlan, views: Sequence[View]) -> list[View]:
+    """Good views whose angles count from another zero than those of the newest one: the turntable, or the service in
+    the middle of a turn, was restarted in between. None where no angle is used.
+    """
+    good = [view for view in views if view.good is not None]
+    if isinstance(plan.poses, UnknownPoses) or not good:
+        return []
+    newest = max(good, key=lambda view: 0 if view.good is None else view.good.number)
+    return [view for view in good if view.count != newest.count]
 
 
 def _may_pass(scan: JobRecord) -> bool:

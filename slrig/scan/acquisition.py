@@ -32,6 +32,7 @@ from slrig.errors import FrameTimeoutError, ScanCancelledError, ScanEvidenceErro
 from slrig.jobs.frame_feed import FrameSink
 from slrig.model import Shot, Truth
 from slrig.model.header import CaptureHeader
+from slrig.rig.turn_count import CountedTurntable
 from slrig.scan.bracketing import Exposing
 from slrig.scan.plan import Progress, ScanPlan
 from slrig.scan.plan_check import in_colour, no_turntable, pattern_sequence
@@ -223,12 +224,14 @@ def _turned(rig: Rig, plan: ScanPlan, progress: Progress) -> StageAngle | None:
     """Where the stage stands when the object was turned as the plan says; None where it says nothing of a stage."""
     if plan.turn_deg is None:
         return None
+    count: str | None = None
     if plan.turned_by == "table":
         if not isinstance(rig.positioner, Turntable):
             raise no_turntable(plan.turn_deg)
         progress("turn", 0.0, f"to {plan.turn_deg:g}°")
         rig.positioner.turn(plan.turn_deg)
-    return StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by)
+        count = rig.positioner.count if isinstance(rig.positioner, CountedTurntable) else None
+    return StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by, count=count)
 
 
 def _of_the_rig(rig: Rig) -> list[str]:

@@ -175,7 +175,7 @@ def reconstruct_into(
             place(name, picture)
         known = _compared_with_truth(bundle, mesh, cameras[0], plan.region, entered)
         if (stage := read_stage(bundle)) is not None:
-            known["stage"] = stage.model_dump()
+            known["stage"] = stage.document()
         entered("write report", 0.98, "")
         seconds = watch.finished()
         report = {

@@ -254,16 +254,18 @@ def killed(root: Path, leave: Callable[[ShootingBench, UUID], None], *, by_hand:
     return model_id
 
 
-def view(bench: ShootingBench, model_id: UUID, number: int, state: JobState) -> UUID:
-    """A view on record that came as far as that."""
+def view(bench: ShootingBench, model_id: UUID, number: int, state: JobState, *, count: str | None = None) -> UUID:
+    """A view on record that came as far as that. count : of the turntable's angle."""
     plan = ShootPlan(4).view(number, model_id, utc_now())
     document = scan_plan_json(plan)
     if state is JobState.SUCCEEDED:
         scan_id = kept_scan(bench.store, bench.folder)
         bench.store.delete(scan_id)
+        summary = {} if count is None else {"stage": {"count": count}}
         bench.store.restore(
-            scan_id, document, {}, rig="bench", label="cup", created_at=utc_now(), started_at=utc_now(), parent=model_id
-        )
+            scan_id, document, summary, rig="bench", label="cup", created_at=utc_now(), started_at=utc_now(),
+            parent=model_id,
+        )  # fmt: skip
         return scan_id
     [record] = bench.store.create_series([document], rig="bench", label="cup", parent=model_id)
     if state is not JobState.QUEUED:
@@ -285,6 +287,14 @@ def between_views(bench: ShootingBench, model_id: UUID) -> None:
 def within_a_view(bench: ShootingBench, model_id: UUID) -> None:
     view(bench, model_id, 1, JobState.SUCCEEDED)
     view(bench, model_id, 2, JobState.CAPTURING)
+    for number in (3, 4):
+        view(bench, model_id, number, JobState.QUEUED)
+    bench.models.advance(model_id, JobState.CAPTURING)
+
+
+def the_table_lost_its_place(bench: ShootingBench, model_id: UUID) -> None:
+    for number in (1, 2):
+        view(bench, model_id, number, JobState.SUCCEEDED, count="before")
     for number in (3, 4):
         view(bench, model_id, number, JobState.QUEUED)
     bench.models.advance(model_id, JobState.CAPTURING)
@@ -316,6 +326,7 @@ def combining(bench: ShootingBench, model_id: UUID) -> None:
         (nothing_shot, [0.0, 90.0, 180.0, 270.0]),
         (between_views, [90.0, 180.0, 270.0]),
         (within_a_view, [180.0, 270.0, 90.0]),
+        (the_table_lost_its_place, [180.0, 270.0, 0.0, 90.0]),
         (all_shot, []),
         (named, []),
         (combining, []),
