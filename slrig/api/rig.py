@@ -65,6 +65,7 @@ def look_at_rig(service: Serving) -> RigBody:
         calibrated=None if facts is None else (status.active is not None or facts.calibration is not None),
         calibration=_in_use(status),
         positions=[] if facts is None else facts.positions,
+        turntable=facts is not None and facts.turntable,
         cameras=[] if facts is None else [_camera(*each, settings.get(each[0])) for each in facts.cameras.items()],
         projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),

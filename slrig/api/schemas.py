@@ -360,6 +360,7 @@ class RigBody(BaseModel):
     calibrated: bool | None = Field(description="null before the rig was first open")
     calibration: CalibrationInUse | None = Field(description="what scans use now; null where there is none")
     positions: list[str] = Field(description="poses that the rig's positioner can take; none where a person does")
+    turntable: bool = Field(description="the positioner turns what stands on it to any angle")
     cameras: list[CameraBody]
     projector: ProjectorBody | None
     holder: str | None = Field(description="who holds the rig: the id of a scan, or other work by name")

@@ -13,7 +13,7 @@ import numpy as np
 
 from slrig.bundle.poses_file import Poses, encode_poses
 from slrig.bundle.storage import write_file
-from slrig.combine.offered import MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES
+from slrig.combine.offered import COARSE, MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES, VIEW
 from slrig.combine.pictures import six_sides_png
 from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses, UnknownPoses
 from slrig.disk import refusals_of
@@ -24,6 +24,7 @@ from slrig.model import AlbedoMark, FloatArray, Mesh, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
+from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 from slrig.views.fusion import FusedModel, fused
 from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
@@ -116,6 +117,8 @@ def combine_into(
             PLACED: lambda: encode_mesh_ply(put_together(views, found.poses)),
             POSES: lambda: encode_poses(known),
             SIDES: lambda: six_sides_png(whole.mesh),
+            VIEW: lambda: encode_view_glb(whole.mesh),
+            COARSE: lambda: encode_coarse_glb(whole.mesh),
             REPORT: lambda: encode_report(report),
         }
         for name, encoded in files.items():
@@ -176,8 +179,9 @@ def _axis(found: FoundAxis, told: StartingPoses) -> dict[str, Any]:
 def _of_model(whole: FusedModel) -> dict[str, Any]:
     """What report.json says of the fused mesh.
 
-    seen_by : share of its vertices by how many views tell of each. open : its borders, of holes and of what no view has
-    seen, see `slrig.meshing.open_borders`. marked : vertices whose colour is in doubt, by cause.
+    sigma_ends_mm : 5 % and 95 % of its vertices are below. seen_by : share of them by how many views tell of each.
+    open : its borders, of holes and of what no view has seen, see `slrig.meshing.open_borders`. marked : vertices whose
+    colour is in doubt, by cause.
     """
     mesh = whole.mesh
     shares = np.bincount(whole.views) / len(whole.views)
@@ -190,6 +194,7 @@ def _of_model(whole: FusedModel) -> dict[str, Any]:
         "voxel_mm": whole.voxel_mm,
         "correlated_mm": whole.correlated_mm,
         "sigma_mm": float(np.median(mesh.sigma_mm)),
+        "sigma_ends_mm": dict(zip(("p5", "p95"), np.percentile(mesh.sigma_mm, (5, 95)).tolist(), strict=True)),
         "area_mm2": float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2),
         "seen_by": {int(count): float(shares[count]) for count in np.flatnonzero(shares)},
         "open": {

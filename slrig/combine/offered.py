@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 MODEL, MODEL_GLB, PLACED, POSES, REPORT = "model.ply", "model.glb", "placed.ply", "poses.json", "report.json"
-SIDES = "sides.png"
+SIDES, VIEW, COARSE = "sides.png", "view.glb", "coarse.glb"
 
 MEDIA_TYPES: Mapping[str, str] = {
     MODEL: "application/octet-stream",
@@ -14,6 +14,8 @@ MEDIA_TYPES: Mapping[str, str] = {
     PLACED: "application/octet-stream",
     POSES: "application/json",
     SIDES: "image/png",
+    VIEW: "model/gltf-binary",
+    COARSE: "model/gltf-binary",
     REPORT: "application/json",
 }
 """What every model has that succeeded."""
