@@ -15,12 +15,12 @@ from slrig.bundle.poses_file import Poses, encode_poses
 from slrig.bundle.storage import write_file
 from slrig.combine.offered import COARSE, MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES, VIEW
 from slrig.combine.pictures import six_sides_png
-from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses, UnknownPoses
+from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
 from slrig.meshing.open_borders import open_borders
-from slrig.model import AlbedoMark, FloatArray, Mesh, StagePlane
+from slrig.model import AlbedoMark, Mesh, StagePlane
 from slrig.scan.artefacts import decode_mesh_ply, encode_mesh_ply, encode_report
 from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
@@ -29,7 +29,7 @@ from slrig.views.fusion import FusedModel, fused
 from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
 from slrig.views.stage_planes import cut
-from slrig.views.turntable import FoundAxis, found_axis, turntable
+from slrig.views.turntable import FoundAxis, registered_on_stage
 from slrig.views.unknown import found_starts
 
 _TOLD_BORDERS = 10  # of the open borders, the longest ones, each by itself
@@ -93,11 +93,7 @@ def combine_into(
             views.append(view)
             removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
-        starts = found_starts(views, names=names) if isinstance(poses, UnknownPoses) else _starts(poses)
-        found = registered(views, starts, names=names, start_error_mm=start_error_mm)
-        axis = None
-        if isinstance(poses, TurntablePoses) and poses.axis is not None:
-            axis = found_axis(found, np.array(poses.axis.direction))
+        found, axis = _registered(views, poses, names, start_error_mm)
         entered("fusing", 0.4)
         whole = fused(views, found.poses, voxel_mm=voxel_mm)
         entered("writing", 0.9, f"{len(whole.mesh.faces)} triangles")
@@ -136,13 +132,21 @@ def read_mesh(file: Path) -> Mesh:
         raise InvalidInputError(f"{file}: {error}") from error
 
 
-def _starts(poses: TurntablePoses | GivenPoses) -> FloatArray:
-    """(N, 4, 4). Raises ConfigError."""
-    if isinstance(poses, GivenPoses):
-        return np.array(poses.matrices)
+def _registered(
+    views: Sequence[Mesh], poses: StartingPoses, names: Sequence[str], start_error_mm: float
+) -> tuple[Registration, FoundAxis | None]:
+    """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `registered`."""
+    if not isinstance(poses, TurntablePoses):
+        starts = np.array(poses.matrices) if isinstance(poses, GivenPoses) else found_starts(views, names=names)
+        return registered(views, starts, names=names, start_error_mm=start_error_mm), None
     if poses.axis is None or poses.angles_deg is None:
         raise ConfigError("poses: expected a turntable's axis and the angle of each view, found one of them at most")
-    return turntable(np.array(poses.axis.point_mm), np.array(poses.axis.direction), np.deg2rad(poses.angles_deg))
+    point, direction, angles = (
+        np.array(poses.axis.point_mm),
+        np.array(poses.axis.direction),
+        np.deg2rad(poses.angles_deg),
+    )
+    return registered_on_stage(views, point, direction, angles, names=names, start_error_mm=start_error_mm)
 
 
 def _report(

@@ -40,8 +40,8 @@ _MOST_MISFIT = 4.0
 """Residuals over their deviations, by the median, beyond which a view's surface is not that of the others: rendered
 scans of calibrated rigs have 1 to 2."""
 
-_SHIFT_WEIGHT = 1e-4
-"""Of squared shifts beside squared turns, where nearness to the start is measured."""
+_LEAST_TURN = 0.1
+"""The part of a free motion of all views that is a turn, below which it only shifts them: noise mixes in less."""
 
 Pair = tuple[int, int]
 
@@ -68,7 +68,8 @@ class Registration:
 
     poses : (N, 4, 4) float64, view coordinates to those of view 0. covariance : (6 (N - 1), 6 (N - 1)) float64, of a
     small turn (rad) about `middle_mm` and a shift (mm) of it in the model's frame, view by view from 1 on; along free
-    motions it is 0, since the start's error is not known. inflation : factor in its deviations for errors that
+    motions it is 0, since the start's error is not known: `held` (6 (N - 1), f) has them as columns, orthonormal where
+    turns count at the object's radius. inflation : factor in its deviations for errors that
     neighbouring points share. sigma_mm : (N,) float64, rms standard deviation of where a view's vertices are put.
     radius_mm : rms distance of the object's surface from its middle.
     """
@@ -81,6 +82,7 @@ class Registration:
     radius_mm: float
     pairs: tuple[PairFit, ...]
     free: tuple[FreeMotion, ...]
+    held: FloatArray
     steps: int
 
 
@@ -194,11 +196,25 @@ def _step(problem: _Problem, poses: FloatArray, matches: Mapping[Pair, Matches])
     """
     terms = problem.terms(matches)
     known, free = directions(terms)
-    nearness = free.T * np.tile(np.repeat([1.0, _SHIFT_WEIGHT], 3), len(poses) - 1)
-    back = -free @ np.linalg.solve(nearness @ free, nearness @ problem.motions(poses))
+    back = _back(free, problem.motions(poses))
     rest = known.T @ (terms.gradient + terms.information @ back)
     step = back - known @ np.linalg.solve(known.T @ terms.information @ known, rest)
     return step, float(step @ terms.information @ step / len(step))
+
+
+def _back(free: FloatArray, motions: FloatArray) -> FloatArray:
+    """(p,): along the columns of `free` (p, f), from motions (p,) to where turns are least, and then shifts are.
+
+    The two are told apart first: a shift that noise gives a little turn would else go far to undo a turn by it.
+    """
+    turns = np.tile(np.repeat([True, False], 3), len(motions) // 6)
+    _, size, right = np.linalg.svd(free[turns])
+    turning = free @ right[: np.count_nonzero(size > _LEAST_TURN)].T
+    shifting = free @ right[np.count_nonzero(size > _LEAST_TURN) :].T
+    back = np.zeros_like(motions)
+    for columns, part in ((turning, turns), (shifting, ~turns)):
+        back -= columns @ np.linalg.lstsq(columns[part], (motions + back)[part], rcond=None)[0]
+    return back
 
 
 def _deviation(residual: FloatArray) -> float:
@@ -276,6 +292,7 @@ def _result(
         radius_mm=problem.radius_mm,
         pairs=tuple(_pair_fits(problem, matches)),
         free=tuple(free_motions(free, problem.middle_mm, problem.radius_mm, misfit)),
+        held=free,
         steps=steps,
     )
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from slrig.model import FloatArray, MeasuredAxis
-from slrig.views.registration import Registration
+from slrig.model import FloatArray, MeasuredAxis, Mesh
+from slrig.views.registration import START_ERROR_MM, Registration, registered
 
 _EXACT_MM = 1e-3
-"""Deviation that poses are given in any case, so that a motion that was held, and has none, does not outweigh all."""
+"""Deviation that poses are given in any case: none is known better."""
+_HELD_MM = 10.0
+"""Deviation of a motion that was held as the start has it: far more than any other's, and any start's error."""
+_MOST_ROUNDS = 5
+_SETTLED_MM = 0.001
+"""By which an axis that was found again may differ at the object: below what its poses are known by."""
 _LEAST_TURN_RAD = np.deg2rad(1.0)
 
 
@@ -57,8 +63,44 @@ class FoundAxis:
 
 
 def found_axis(registration: Registration, towards: FloatArray) -> FoundAxis | None:
-    """The axis and angles of a turntable that fit a registration's poses best; see `axis_of`."""
-    return axis_of(registration.poses, registration.covariance, registration.middle_mm, registration.radius_mm, towards)
+    """The axis and angles of a turntable that fit a registration's poses best; see `axis_of`. What the registration
+    held as its start has it tells nothing of them.
+    """
+    radius = registration.radius_mm
+    scale = np.tile(np.repeat([1 / radius, 1.0], 3), len(registration.poses) - 1)
+    held = registration.held * scale[:, None]
+    covariance = registration.covariance + _HELD_MM**2 * held @ held.T
+    return axis_of(registration.poses, covariance, registration.middle_mm, radius, towards)
+
+
+def registered_on_stage(
+    views: Sequence[Mesh],
+    axis_point_mm: FloatArray,
+    axis_direction: FloatArray,
+    angles_rad: FloatArray,
+    *,
+    names: Sequence[str] | None = None,
+    start_error_mm: float = START_ERROR_MM,
+) -> tuple[Registration, FoundAxis | None]:
+    """Register views of an object that a stage turned, and find the stage's axis, near which the one given is.
+
+    Motions that no shape tells of are held as the stage has them: a box leaves open how far its sides are apart. So the
+    axis has to be right first, and is found from all else, and the views are registered again from there. Parameters
+    as of `turntable` and `registered`. Raises as `registered`.
+    """
+    point, direction = axis_point_mm, axis_direction / np.linalg.norm(axis_direction)
+    for rounds in range(_MOST_ROUNDS):
+        starts = turntable(point, direction, angles_rad)
+        found = registered(views, starts, names=names, start_error_mm=start_error_mm)
+        axis = found_axis(found, direction)
+        if axis is None or not found.free or rounds == _MOST_ROUNDS - 1:
+            break
+        across = np.cross(axis.point_mm - point, direction)
+        moved_mm = np.linalg.norm(across) + found.radius_mm * np.linalg.norm(axis.direction - direction)
+        if moved_mm < _SETTLED_MM:
+            break
+        point, direction = axis.point_mm, axis.direction
+    return found, axis
 
 
 def axis_of(

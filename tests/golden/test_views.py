@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from slrig.meshing.topology import topology_counts
 from slrig.model import FloatArray
 from slrig.views.fusion import fused
+from slrig.views.matching import moved
+from slrig.views.matching import turned as turned_by
 from slrig.views.registration import Registration, registered
-from slrig.views.turntable import found_axis
+from slrig.views.turntable import found_axis, registered_on_stage, turntable
 from tests.turned_views import AXIS, bumpy, displacement_mm, off_surface_mm, seen, vase, wrong_axis
+from tests.unit.views.known_views import Noise, plate_on_box, views_of
 
+UP: FloatArray = np.array([0.0, 0.0, 1.0])
 ANGLES = [45.0 * number for number in range(8)]
 WITHIN_MM = 0.010
 SEEDS = 20
@@ -41,6 +48,30 @@ def test_eight_views_come_within_ten_micrometres_and_are_fused_to_less_error_tha
     assert np.quantile(np.abs(all_of_them), 0.99) < 0.040
     assert 0.8 < over < 1.25
     assert topology_counts(whole.mesh.faces).nonmanifold_edges == 0
+
+
+@pytest.mark.slow
+def test_a_box_whose_sides_no_view_joins_is_as_large_as_the_stage_says() -> None:
+    # Views of a single side and the top slide along it, and what joins two opposite sides is the stage alone.
+    box = plate_on_box()
+    box.apply_scale(3.0)
+    angles, lean = np.deg2rad(ANGLES), np.deg2rad(25.0)
+    turns = angles + np.deg2rad(0.03) * np.append(0.0, np.random.default_rng(1).normal(size=len(angles) - 1))
+    ring = np.stack([np.cos(lean) * np.cos(turns), -np.cos(lean) * np.sin(turns), np.full(8, np.sin(lean))], axis=1)
+    poses = turntable(np.zeros(3), UP, turns)
+    views = []
+    for view, pose in zip(views_of(box, ring, 0.7, Noise(0.010, 0.004, 3.0)), poses, strict=True):
+        seen_from = np.linalg.inv(pose) @ view.pose
+        vertices, normals = moved(seen_from, view.mesh.vertices_mm), turned_by(seen_from, view.mesh.normals)
+        views.append(replace(view.mesh, vertices_mm=vertices.astype("f4"), normals=normals.astype("f4")))
+    off = Rotation.from_rotvec(np.deg2rad(0.5) * np.array([0.6, 0.8, 0.0])).apply(UP)
+    found, axis = registered_on_stage(views, np.array([0.7, 0.7, 0.0]), off, angles)
+    assert found.free != ()
+    assert axis is not None
+    assert np.linalg.norm(np.cross(axis.direction, UP)) < np.deg2rad(0.01)
+    wrong = [displacement_mm(*each) for each in zip(views, found.poses, poses, strict=True)]
+    print(np.round(wrong, 4))  # noqa: T201
+    assert max(wrong) < 0.020
 
 
 @pytest.mark.slow
