@@ -53,7 +53,8 @@ ABOUT = {
     "a_played_sequence_gives_every_frame_in_order": "Projector.play Projector.stop Camera.arm Camera.read",
     "a_play_can_be_stopped": "Projector.play Projector.stop",
     "a_positioner_takes_its_poses_and_no_others": (
-        "Positioner.poses Positioner.move Positioner.close Turntable.axis Turntable.angles_deg Turntable.turn"
+        "Positioner.poses Positioner.move Positioner.close Turntable.axis Turntable.angles_deg Turntable.turn "
+        "Turntable.opened_at_deg"
     ),
     "the_projector_is_dark_unless_it_shows": "Projector.blank Projector.stop Projector.load Projector.show",
     "the_projector_is_dark_after_opening_and_close": "Projector.close",

@@ -91,8 +91,10 @@ def test_every_rig_of_the_repository_is_read(path: Path) -> None:
 
 def test_scan_defaults_are_the_fields_of_a_plan() -> None:
     plan = {field.name for part in (PatternPlan, ReconstructionPlan, ScanPlan) for field in fields(part)}
-    # A pose may be shot without codes, a scan may not; a request makes a series and names a preset, no rig file.
-    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes", "series", "preset"}
+    # A pose may be shot without codes, a scan may not; a request makes a series, names a preset and turns a stage, no
+    # rig file.
+    of_requests = {"series", "preset", "turn_deg", "turned_by"}
+    assert set(ScanDefaults.model_fields) == plan - {"patterns", "reconstruction", "codes"} - of_requests
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,11 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
 from obstore.store import MemoryStore
 
 from slrig.compute.cluster import Told

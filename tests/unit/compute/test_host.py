@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import obstore
 import pytest
 
+pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
+import obstore
 
 from slrig.compute.host import BEAT_S, POOL_FAULT, Answer, Order
 from slrig.jobs.versions import versions

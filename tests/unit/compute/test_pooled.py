@@ -6,10 +6,12 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-import obstore
 import pytest
 
+pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
+
+import obstore
 
 from slrig.compute.cluster import DaskCluster
 from slrig.compute.host import Answer, Order, resource

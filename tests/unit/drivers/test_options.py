@@ -14,6 +14,7 @@ from slrig.option_models import described_drivers, kinds_of, option_model
 SHIPPED = {
     *("depthai", "genicam", "gentl", "opencv", "picamera2", "v4l2"),
     *("dlpc347x", "dlpc350", "dlpc900", "kms", "screen", "serial_projector"),
+    *("grbl_turntable", "serial_turntable"),
     *("replay", "simulated"),
 }
 
@@ -46,9 +47,11 @@ def test_a_finders_id_is_taken_by_device_or_by_what_a_model_marks() -> None:
         if (model := option_model(driver)) is not None
     }
     assert {driver: names for driver, names in marked.items() if names} == {
+        "grbl_turntable": ["port"],
         "kms": ["output"],
         "screen": ["output"],
         "serial_projector": ["port"],
+        "serial_turntable": ["port"],
     }
 
 
