@@ -92,14 +92,15 @@ def views_here(
     if len(good) < 2:
         message = f"{len(good)} of {count} views succeeded, and a model takes two. The same command shoots the others."
         raise ViewsFailedError(message)
-    counts = {
-        None if stage is None else stage.count
-        for stage in map(read_stage, (output / f"bundle-{number}" for number in good))
-    }
-    if len(counts) > 1 and not unknown:
-        message = f"the turntable lost its place between views in {output}; shoot into another folder, or say --unknown"
+    stages = [stage for stage in map(read_stage, (output / f"bundle-{number}" for number in good)) if stage is not None]
+    if not unknown and (len(stages) < len(good) or len({stage.count for stage in stages}) > 1):
+        message = (
+            f"{output}: expected views whose angles have one zero, found some without one, or that the turntable lost "
+            "its place between them; shoot into another folder, or say --unknown"
+        )
         raise ConfigError(message)
-    angles_deg = tuple(shoot.angle_deg(number) for number in good)
+    # As they were shot, perhaps by a command that asked for another number of views.
+    angles_deg = tuple(stage.angle_deg for stage in stages)
     poses = UnknownPoses() if unknown else TurntablePoses(axis, angles_deg)
     return {mesh.parent.name: mesh for mesh in good.values()}, poses, notes
 
@@ -125,7 +126,7 @@ def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask
 
     Raises ServiceError: it refused, is gone, or the model failed.
     """
-    model: dict[str, Any] = client.models.shoot(**request)
+    model: dict[str, Any] = client.models.shoot(**request, if_busy="queue")
     here, events, turn = model["id"], client.models.follow(model["id"]), "begin"
     try:
         while turn:
@@ -139,8 +140,13 @@ def views_there(client: Client, request: Mapping[str, Any], output: Path, *, ask
                             break
             if turn:
                 answer = answered(ask, f"{turn}, then press Enter (a: shoot the last one again, q: no more) > ")
-                _ = client.models.combine(here) if answer == "q" else client.models.view(here, again=answer == "a")
-    except KeyboardInterrupt:
+                _ = (
+                    client.models.combine(here)
+                    if answer == "q"
+                    else client.models.view(here, again=answer == "a", if_busy="queue")
+                )
+    except (KeyboardInterrupt, ServiceError):
+        # Nobody would turn for it any more.
         with suppress(ServiceError):
             client.models.cancel(here)
         raise

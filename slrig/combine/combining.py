@@ -93,7 +93,11 @@ def combine_into(
             views.append(view)
             removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
-        found, axis = _registered(views, poses, names, start_error_mm)
+
+        def again(rounds: int) -> None:
+            entered("registering", 0.2 + 0.02 * rounds, f"{len(views)} views, round {rounds + 1}")
+
+        found, axis = _registered(views, poses, names, start_error_mm, again)
         entered("fusing", 0.4)
         whole = fused(views, found.poses, voxel_mm=voxel_mm)
         entered("writing", 0.9, f"{len(whole.mesh.faces)} triangles")
@@ -133,7 +137,11 @@ def read_mesh(file: Path) -> Mesh:
 
 
 def _registered(
-    views: Sequence[Mesh], poses: StartingPoses, names: Sequence[str], start_error_mm: float
+    views: Sequence[Mesh],
+    poses: StartingPoses,
+    names: Sequence[str],
+    start_error_mm: float,
+    begun: Callable[[int], None],
 ) -> tuple[Registration, FoundAxis | None]:
     """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `registered`."""
     if not isinstance(poses, TurntablePoses):
@@ -146,7 +154,7 @@ def _registered(
         np.array(poses.axis.direction),
         np.deg2rad(poses.angles_deg),
     )
-    return registered_on_stage(views, point, direction, angles, names=names, start_error_mm=start_error_mm)
+    return registered_on_stage(views, point, direction, angles, names=names, start_error_mm=start_error_mm, begun=begun)
 
 
 def _report(

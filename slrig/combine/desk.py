@@ -147,7 +147,9 @@ class ModelDesk:
         """
         with self._naming:
             used = self.settled(plan)
-            if len(self.jobs.unfinished()) >= self._queue.backlog_length:
+            # Those that are shot have their own line, and may wait for a hand.
+            waiting = [each for each in self.jobs.unfinished() if not plan_from_json(each.plan).being_shot]
+            if len(waiting) >= self._queue.backlog_length:
                 message = (
                     f"{self._queue.backlog_length} models are made or wait for that, as many as may. Try again later."
                 )
@@ -165,6 +167,7 @@ class ModelDesk:
             self._require_space(used)
             record = self.jobs.replan(record.id, plan_json(used))
         self._start(record)
+        self._remove_old()
 
     def with_axis(self, plan: ModelPlan) -> ModelPlan:
         """The plan with the stage's axis in it, where it leaves that to the stage. Raises ConfigError."""
@@ -178,7 +181,8 @@ class ModelDesk:
                 "in the scans' frame, or give the poses"
             )
             raise ConfigError(message)
-        return replace(plan, poses=replace(poses, axis=StatedAxis.of(axis.point_mm, axis.direction)))
+        stated = StatedAxis.of(axis.point_mm, axis.direction)
+        return replace(plan, poses=replace(poses, axis=stated, of_stage=True))
 
     def settled(self, plan: ModelPlan) -> ModelPlan:
         """The plan with the stage's axis and angles in it, where it leaves them to the stage. Raises as `combine`."""
@@ -295,13 +299,21 @@ class ModelDesk:
         found = summary(staged)
         axis = found_axis(staged)
         self.store.commit(record.id)
-        if axis is not None:
+        if axis is not None and self._tells_of_the_stage(plan):
             try:
                 self._stage.note(axis, of=str(record.id))
-            except StorageError as error:
-                # The model is there, and is no worse for that.
-                _log.warning("the axis of a model could not be noted", model=str(record.id), cause=str(error))
+            except Exception:  # noqa: BLE001 - the model is there, and is no worse for that
+                _log.exception("the axis of a model could not be noted", model=str(record.id))
         return Outcome(found)
+
+    def _tells_of_the_stage(self, plan: ModelPlan) -> bool:
+        """Whether the axis of a model is news of the stage: it was made by the stage's own, of scans that no earlier
+        model was made of.
+        """
+        if not (isinstance(plan.poses, TurntablePoses) and plan.poses.of_stage):
+            return False
+        known = {scan for each in self.jobs.finished() if each.summary is not None for scan in each.plan["scans"]}
+        return known.isdisjoint(map(str, plan.scans))
 
     def _mesh(self, scan_id: UUID) -> Path:
         mesh = self._folder.scan(scan_id) / MESH

@@ -19,6 +19,9 @@ from slrig.scan.plan import ScanPlan, SeriesPlace
 START_ERROR_MM = 3.0
 """See `slrig.views.registration.START_ERROR_MM`, which is not loaded where nothing is computed."""
 
+MOST_UNKNOWN = 24
+"""Views whose poses are to be found: eight take 15 to 20 s, and the time grows with their square."""
+
 MOST_VIEWS = 72
 """Of a model that is shot: one every 5°, closer than which neighbours tell the same."""
 
@@ -53,11 +56,12 @@ class StatedAxis:
 @dataclass(frozen=True, slots=True)
 class TurntablePoses:
     """A stage turned the object. axis : None is the stage's own. angles_deg : where it stood at each scan; None is as
-    the scans' reports say.
+    the scans' reports say. of_stage : the axis was filled in as the stage's own.
     """
 
     axis: StatedAxis | None = None
     angles_deg: tuple[float, ...] | None = None
+    of_stage: bool = False
     kind: Literal["turntable"] = "turntable"
 
 
@@ -76,7 +80,7 @@ class GivenPoses:
 
 @dataclass(frozen=True, slots=True)
 class UnknownPoses:
-    """Nobody knows where the scans belong: it is found from what they see, or refused."""
+    """Nobody knows where the scans belong: it is found from what they see, or refused. At most MOST_UNKNOWN."""
 
     kind: Literal["unknown"] = "unknown"
 
@@ -150,6 +154,12 @@ class ModelPlan:
             message = f"scans: expected each once, found {twice} twice; leave one out"
             raise ConfigError(message)
         count = self.shoot.views if self.shoot is not None and self.being_shot else len(self.scans)
+        if isinstance(self.poses, UnknownPoses) and count > MOST_UNKNOWN:
+            message = (
+                f"poses: expected at most {MOST_UNKNOWN} views whose poses nobody knows, found {count}; each is held "
+                "against all others. Say poses, or a stage's axis and angles, or take fewer"
+            )
+            raise ConfigError(message)
         name = "poses" if isinstance(self.poses, GivenPoses) else "angles_deg"
         told: Sequence[object] | None = None
         if isinstance(self.poses, GivenPoses):

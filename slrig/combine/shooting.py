@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from uuid import UUID, uuid4
 
@@ -107,7 +108,15 @@ class ViewShooting:
         for record in self._desk.jobs.unfinished():
             if plan_from_json(record.plan).being_shot:
                 self._watch(record.id)
-                self._go_on(record.id)
+                try:
+                    self._go_on(record.id)
+                except Exception:  # noqa: BLE001 - the others, and the service, go on all the same
+                    _log.exception("a model could not be gone on with", model=str(record.id))
+        # A cancellation that was cut off is completed.
+        models = self._desk.jobs.states()
+        for scan in self._scans.unfinished():
+            if scan.parent is not None and models.get(scan.parent) is JobState.CANCELLED:
+                self._runner.cancel(scan.id)
 
     def shoot(self, plan: ModelPlan, *, label: str | None, wait: bool, key: str | None = None) -> JobRecord:
         """Have the views of a model shot, and the model made of them. Returns at once.
@@ -134,7 +143,13 @@ class ViewShooting:
 
         views = [shoot.view(number, model_id, utc_now()) for number in numbers]
         with self._deciding:
-            self._runner.submit_views(views, model_id, label=label, wait=wait, begun=begun)
+            try:
+                self._runner.submit_views(views, model_id, label=label, wait=wait, begun=begun)
+            except StorageError as error:
+                # Its scans could not be put on record: it is not to wait for them.
+                with suppress(JobNotFoundError, StorageError):
+                    self._desk.jobs.finish(model_id, JobState.FAILED, fault=failure_of(error))
+                raise
             self._tell(model_id, shoot)
         self._watch(model_id)
         return self._desk.jobs.get(model_id)
@@ -192,13 +207,14 @@ class ViewShooting:
         """
         with self._deciding:
             record = self._desk.jobs.get(model_id)
-            if record.state.final or not plan_from_json(record.plan).being_shot:
+            if not plan_from_json(record.plan).being_shot:
                 return self._desk.cancel(model_id)
             fault = failure_of(ScanCancelledError("The model was cancelled while its views were shot. They stay."))
             self._desk.jobs.finish(model_id, JobState.CANCELLED, fault=fault)
-            # The last first: no other one begins meanwhile.
+            # Also of one that was cancelled before, and not wholly. The last first: no other one begins meanwhile.
             for scan in reversed(self._scans.of(model_id).get(model_id, [])):
-                self._runner.cancel(scan.id)
+                if not scan.state.final:
+                    self._runner.cancel(scan.id)
             return self._desk.jobs.get(model_id)
 
     def view_ended(self, scan: JobRecord) -> None:
@@ -223,7 +239,12 @@ class ViewShooting:
                 return
             shoot = _shoot_plan(plan)
             views = self._views(model_id, shoot)
-            missing = [view for view in views if view.again or not (view.scans or shoot.by_hand)]
+            if shoot.by_hand:
+                # The object stands as for the last that was begun; the first one needs no hand.
+                begun = [view for view in views if view.scans] or [views[0]]
+                missing = [view for view in begun[-1:] if view.again or not view.scans]
+            else:
+                missing = [view for view in views if view.again or not view.scans]
             if not missing and all(view.ended for view in views):
                 missing = [view for view in _of_another_zero(plan, views) if len(view.scans) <= MOST_AGAIN]
             if missing:
@@ -276,7 +297,7 @@ class ViewShooting:
             raise ScanStateError(message)
         views = self._views(model_id, plan.shoot)
         for view in views:
-            if view.scans and not view.ended:
+            if view.scans and (not view.ended or view.again):
                 message = (
                     f"View {view.number} of model {model_id} is being shot. Wait for its end, then turn the object."
                 )
@@ -293,7 +314,7 @@ class ViewShooting:
         under_way = next((view for view in views if view.scans and not view.ended), None)
         stage, detail = VIEW, f"view {1 if under_way is None else under_way.number} of {shoot.views}"
         if under_way is None and shoot.by_hand:
-            stage, last = TURN, [view for view in views if view.scans][-1]
+            stage, last = TURN, ([view for view in views if view.scans] or [views[0]])[-1]
             detail = (
                 f"turn the object by {shoot.step_deg:g}° for view {last.number + 1} of {shoot.views}"
                 if last.number < shoot.views
@@ -314,13 +335,18 @@ class ViewShooting:
             if not self._deciding.acquire(blocking=False):
                 return
             try:
-                begun = any(scan.state is not JobState.QUEUED for scan in self._scans.of(model_id).get(model_id, []))
-                if begun and watching:
-                    watching.pop()()
-                    if self._desk.jobs.states().get(model_id) is JobState.QUEUED:
-                        self._desk.jobs.advance(model_id, JobState.CAPTURING)
+                look_at_states()
+            except StorageError as error:
+                _log.warning("that a model is shot could not be recorded", model=str(model_id), cause=str(error))
             finally:
                 self._deciding.release()
+
+        def look_at_states() -> None:
+            begun = any(scan.state is not JobState.QUEUED for scan in self._scans.of(model_id).get(model_id, []))
+            if begun and watching:
+                watching.pop()()
+                if self._desk.jobs.states().get(model_id) is JobState.QUEUED:
+                    self._desk.jobs.advance(model_id, JobState.CAPTURING)
 
         watching: list[Callable[[], None]] = []
         watching.append(self._scans.watch(model_id, look))

@@ -36,9 +36,9 @@ class _Standing(BaseModel):
 class CountedTurntable:
     """Implements `slrig.devices.Turntable` by another one, whose angles count from its opening.
 
-    A table that kept its place since it was left goes on from the angle where it stands. One that turned when the
-    service was killed, that restarted, or that was moved meanwhile has angles that have nothing to do with those from
-    before: they are of another `count`.
+    A table whose own count is as it was left goes on from the angle where it stands. One that turned when the service
+    was killed, or that counts anew, has angles that have nothing to do with those from before: they are of another
+    `count`. A hand that moves a table without a scale of its own is not noticed.
 
     count : equal for all angles with one zero. path : the file that keeps where it stands; its folder is made.
     """
@@ -54,7 +54,7 @@ class CountedTurntable:
                 and left.at_deg is not None
                 and abs(left.own_deg - table.opened_at_deg) < SAME_PLACE_DEG
             ):
-                self.count, self._offset_deg = left.count, left.at_deg
+                self.count, self._offset_deg = left.count, left.at_deg + table.opened_at_deg - left.own_deg
             else:
                 self.count = uuid4().hex
                 _log.info("the turntable's angles count anew from where it stands", count=self.count)

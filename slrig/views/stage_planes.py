@@ -102,7 +102,7 @@ def _plane(
     points: FloatArray, seen: FloatArray, middle: FloatArray, normal: FloatArray, sigma: float, axis: StageAxis | None
 ) -> StagePlane:
     # Normals of a scan's vertices point to the side from which they were seen.
-    normal = normal * (1.0 if np.median(seen @ normal) > 0 else -1.0)
+    normal = normal * (1.0 if np.nanmedian(seen @ normal) > 0 else -1.0)
     radius = float(np.percentile(np.linalg.norm(points - middle, axis=1), 99))
     square = 0.0 if axis is None else abs(float(normal @ axis.direction))
     kind = PlaneKind.PLATE if square > _PLATE_COSINE else PlaneKind.BACKDROP

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +81,7 @@ def registered_on_stage(
     *,
     names: Sequence[str] | None = None,
     start_error_mm: float = START_ERROR_MM,
+    begun: Callable[[int], None] = lambda _: None,
 ) -> tuple[Registration, FoundAxis | None]:
     """Register views of an object that a stage turned, and find the stage's axis, near which the one given is.
 
@@ -90,6 +91,7 @@ def registered_on_stage(
     """
     point, direction = axis_point_mm, axis_direction / np.linalg.norm(axis_direction)
     for rounds in range(_MOST_ROUNDS):
+        begun(rounds)
         starts = turntable(point, direction, angles_rad)
         found = registered(views, starts, names=names, start_error_mm=start_error_mm)
         axis = found_axis(found, direction)

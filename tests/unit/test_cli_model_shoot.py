@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+from slrig.bundle.stage import StageAngle, write_stage
 from slrig.cli import model_shoot
 from slrig.cli.commands import app
 from slrig.client.events import Progress
@@ -44,6 +45,8 @@ class Bench:
         if (error := self.faults.pop(plan.turn_deg, None)) is not None:
             raise error
         (output / f"view-{number}").mkdir(parents=True)
+        (output / f"bundle-{number}").mkdir()
+        write_stage(output / f"bundle-{number}", StageAngle(angle_deg=plan.turn_deg, turned_by=plan.turned_by))
         (output / f"view-{number}" / "mesh.ply").write_bytes(encode_mesh_ply(self.meshes[plan.turn_deg]))
 
 
@@ -79,6 +82,13 @@ def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_
     report = json.loads((tmp_path / "model" / "report.json").read_bytes())
     assert [each["name"] for each in report["views"]] == ["view-1", "view-2", "view-3"]
     assert report["axis"]["stage_error_deg"] == pytest.approx([0, 0, 0], abs=0.05)
+    # Another number of views changes nothing of where those stood that there are.
+    fewer = model("--shoot", 3, "--rig", RIG, "--by-hand", "--output", tmp_path, *STAGE)
+    assert fewer.exit_code == 0, fewer.output
+    assert json.loads((tmp_path / "model" / "poses.json").read_bytes())["views"][2]["name"] == "view-3"
+    assert json.loads((tmp_path / "model" / "report.json").read_bytes())["axis"]["stage_error_deg"] == pytest.approx(
+        [0, 0, 0], abs=0.05
+    )
 
 
 def test_a_table_turns_and_a_view_that_fails_is_told(bench: Bench, tmp_path: Path) -> None:
@@ -125,8 +135,8 @@ class Models:
         for number, stage in enumerate(("view", "turn", "view", "turn", "done"), 1):
             yield Progress(number=number, stage=stage, fraction=0.1, detail=f"turn for view {number}")
 
-    def view(self, _: str, *, again: bool) -> None:
-        self.asked.append({"again": again})
+    def view(self, _: str, *, again: bool, if_busy: str) -> None:
+        self.asked.append({"again": again, "if_busy": if_busy})
 
     def combine(self, _: str) -> None:
         self.asked.append("combine")
@@ -148,9 +158,10 @@ class Asked:
 def test_a_service_is_asked_and_the_person_answers(tmp_path: Path) -> None:
     client, answers = Asked(), iter(["a", "q"])
     model_shoot.views_there(client, {"views": 3}, tmp_path / "out", ask=lambda _: next(answers))  # type: ignore[arg-type]
-    assert client.models.asked == [{"views": 3}, {"again": True}, "combine"]
+    wait = {"if_busy": "queue"}
+    assert client.models.asked == [{"views": 3, **wait}, {"again": True, **wait}, "combine"]
     assert client.fetched == [("/model/m/model.ply", tmp_path / "out" / "model.ply")]
     failed, answers = Asked("failed"), iter(["", ""])
     with pytest.raises(ServiceError, match="Model m failed: too few views"):
         model_shoot.views_there(failed, {}, tmp_path, ask=lambda _: next(answers))  # type: ignore[arg-type]
-    assert failed.models.asked == [{}, {"again": False}, {"again": False}]
+    assert failed.models.asked == [wait, {"again": False, **wait}, {"again": False, **wait}]

@@ -44,7 +44,7 @@ def test_a_model_is_asked_for_once_followed_and_fetched(
     done = over(client, model)
     assert client.post("/model", json=request, headers=key).json()["id"] == model["id"]
     assert done["state"] == "succeeded", done["error"]
-    assert done["plan"]["poses"] == {"axis": AXIS, "angles_deg": [0.0, 40.0], "kind": "turntable"}
+    assert done["plan"]["poses"] == {"axis": AXIS, "angles_deg": [0.0, 40.0], "of_stage": False, "kind": "turntable"}
     assert served.combining.asked[-1][1:] == (
         TurntablePoses(StatedAxis((4.0, 45.0, 12.0), (0.0, -1.0, 0.0)), (0.0, 40.0)), 3.0, 0.4,
     )  # fmt: skip

@@ -76,7 +76,7 @@ def test_the_axis_is_the_stages_own_unless_it_is_said(tmp_path: Path) -> None:
     scans = bench.kept_scans(None, None)
     for axis, expected in ((None, StatedAxis((1.0, 2.0, 3.0), (0.0, 0.0, 1.0))), (AXIS, AXIS)):
         plan = ModelPlan(scans, TurntablePoses(axis, (10.0, 55.0)))
-        assert bench.desk.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0))
+        assert bench.desk.settled(plan).poses == TurntablePoses(expected, (10.0, 55.0), of_stage=axis is None)
     bench.close()
 
 
@@ -85,13 +85,17 @@ def test_views_are_cut_by_the_stages_planes_and_the_axis_found_is_noted(tmp_path
     bench = ModelBench(tmp_path, axis=MeasuredAxis(np.zeros(3), np.array([0.0, 0.0, 1.0]), covariance))
     plate = StagePlane(PlaneKind.PLATE, np.zeros(3), np.array([0.0, 0.0, -1.0]), 0.03, 80.0, 1.2)
     bench.stage.put_planes([plate])
-    scans = bench.kept_scans(0.0, 40.0)
     bench.tame.axis = {
         "point_mm": [0.02, 0.0, 5.0], "direction": [0.0, 0.0, 1.0], "covariance": covariance.tolist(),
     }  # fmt: skip
     for cut in (True, False):
+        scans = bench.kept_scans(0.0, 40.0)
         made = bench.over(bench.desk.combine(ModelPlan(scans, TurntablePoses(), cut=cut)).id)
         assert [each.kind for each in bench.tame.planes] == [PlaneKind.PLATE] * cut
+        assert bench.stage.record().history[-1].of == str(made.id)
+    # The same scans once more tell nothing new, nor does an axis that somebody has said.
+    for known, poses in ((scans, TurntablePoses()), (bench.kept_scans(0.0, 40.0), TurntablePoses(AXIS))):
+        bench.over(bench.desk.combine(ModelPlan(known, poses)).id)
         assert bench.stage.record().history[-1].of == str(made.id)
     axis = bench.stage.axis()
     assert axis is not None

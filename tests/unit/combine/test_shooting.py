@@ -23,6 +23,7 @@ from slrig.errors import (
     ScanCancelledError,
     ScanEvidenceError,
     ScanStateError,
+    StorageError,
     UnsupportedByDeviceError,
     ViewsFailedError,
 )
@@ -373,3 +374,34 @@ def test_the_end_of_the_service_leaves_the_rest_to_the_next_start(tmp_path: Path
     # The one that had the rig is shot again, after those that waited.
     assert bench.shot == [90.0, 180.0, 270.0, 0.0]
     bench.close()
+
+
+def test_a_model_by_hand_whose_scans_never_came_on_record_is_begun_at_the_next_start(tmp_path: Path) -> None:
+    model_id = killed(tmp_path, nothing_shot, by_hand=True)
+    bench = ShootingBench(tmp_path)
+    bench.until_told(model_id, "turn the object by 90° for view 2 of 4")
+    assert bench.shot == [0.0]
+    bench.close()
+
+
+def test_a_cancellation_that_was_cut_off_is_completed_at_the_next_start(tmp_path: Path) -> None:
+    def cancelled(bench: ShootingBench, model_id: UUID) -> None:
+        between_views(bench, model_id)
+        bench.models.finish(model_id, JobState.CANCELLED)
+
+    model_id = killed(tmp_path, cancelled)
+    bench = ShootingBench(tmp_path)
+    ended = [bench.until(scan.id).state for scan in bench.runner.series(model_id)]
+    assert ended == [JobState.SUCCEEDED, *[JobState.CANCELLED] * 3]
+    bench.close()
+
+
+def test_a_disk_that_refuses_the_scans_fails_their_model(bench: ShootingBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object, **__: object) -> None:
+        message = "the disk is full"
+        raise StorageError(message)
+
+    monkeypatch.setattr(bench.store, "create_series", refused)
+    with pytest.raises(StorageError, match="full"):
+        started(bench)
+    assert list(bench.models.states().values()) == [JobState.FAILED]
