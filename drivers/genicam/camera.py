@@ -135,8 +135,9 @@ class GenicamCamera:
     def disarm(self) -> None:
         """See `Camera`."""
         if self._state.armed is not None:
+            # One that runs free is in the middle of an exposure, and may send it later than it is told to stop.
+            self._owes = self._owes or self._state.armed is Trigger.FREE or self._session.owed()
             self._state.armed = None
-            self._owes = self._owes or self._session.owed()
             self._session.end()
 
     def close(self) -> None:
