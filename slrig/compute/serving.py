@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import dask
 from distributed import Scheduler, Security
@@ -18,7 +19,8 @@ from distributed import Worker as DaskWorker
 from slrig.compute.cluster import CONNECT_S, join_logs
 from slrig.compute.host import Host, resource
 from slrig.compute.store import PoolStore
-from slrig.errors import WorkerLostError
+from slrig.config import is_loopback
+from slrig.errors import ServiceError, WorkerLostError
 from slrig.jobs.versions import versions
 from slrig.jobs.worker import READY, Worker, prepare_kernel_cache
 from slrig.jobs.worker_wait import POLL_S
@@ -31,15 +33,28 @@ LOST_WORKER_S = 30
 """From when on a worker that was not heard of is given up by the scheduler; each is heard of once a second."""
 
 
+_PAGES = "127.0.0.1:0"
+"""Where dask's HTTP server listens, which cannot be left out and asks nobody for a certificate. It has no pages."""
+
+_NO_PAGES: dict[str, list[str]] = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+
+
 def serve_scheduler(address: str, security: Security | None, *, say: Callable[[str], None]) -> None:
-    """Be the scheduler of a pool at `address` until SIGTERM or Ctrl-C. Raises OSError: the address is taken."""
+    """Be the scheduler of a pool at `address` until SIGTERM or Ctrl-C. Raises ServiceError: it cannot listen there."""
 
     async def life(stopped: asyncio.Event) -> None:
-        async with Scheduler(host=address, security=security, dashboard=False) as scheduler:
+        scheduler = Scheduler(host=address, security=security, dashboard=False, dashboard_address=_PAGES)
+        try:
+            await scheduler
+        except (OSError, RuntimeError) as error:
+            cause = error.__cause__ or error
+            message = f"The pool's scheduler cannot listen at {address}: {cause}. Choose another --host or --port."
+            raise ServiceError(message) from error
+        async with scheduler:
             say(f"the pool's scheduler is at {scheduler.address}. Ctrl-C stops it.")
             await stopped.wait()
 
-    dask.config.set({"distributed.scheduler.worker-ttl": LOST_WORKER_S})
+    dask.config.set({"distributed.scheduler.worker-ttl": LOST_WORKER_S, **_NO_PAGES})
     _until_told(life)
 
 
@@ -49,7 +64,10 @@ def serve_worker(
     """Compute for a pool until SIGTERM or Ctrl-C. A scheduler that is not there, or is lost, is waited for.
     cache : for kernels, where slrig's own folder is read-only. Raises WorkerLostError: kernels cannot be loaded.
     """
+    dask.config.set(_NO_PAGES)
     prepare_kernel_cache(cache)
+    # dask's own choice is every interface, also where there are no certificates.
+    host = "127.0.0.1" if is_loopback(urlsplit(scheduler).hostname or "") else None
     beneath, name = Worker(PIPELINE), f"{platform.node()}-{os.getpid()}"
     beneath.start()
 
@@ -66,7 +84,7 @@ def serve_worker(
                 async with DaskWorker(
                     scheduler, name=name, security=security, nthreads=1, memory_limit=0, local_directory=scratch,
                     resources={resource(versions()): 1}, plugins=(Host(store, beneath),), death_timeout=CONNECT_S,
-                    dashboard=False,
+                    dashboard=False, dashboard_address=_PAGES, host=host,
                 ) as member:  # fmt: skip
                     say(told := f"computes for the pool {scheduler}. Ctrl-C stops it.")
                     ends = [asyncio.create_task(stopped.wait()), asyncio.create_task(member.finished())]
