@@ -11,7 +11,7 @@ import os
 import tarfile
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 CHUNK_BYTES = 5 * 2**20
 """The least part of S3's uploads in parts, but for the last."""
+
+_AT_ONCE = 1
+"""Parts under way at a time: more of them would share the line, and none be through in its time."""
 
 _CLIENT: ClientConfig = {"connect_timeout": "3s", "timeout": "20s"}
 """Of one request, which carries one chunk: 2 Mbit/s will do."""
@@ -79,7 +82,7 @@ class PoolStore:
             with self._faults():
                 if not self._has(_bundle(key)):
                     packed.seek(0)
-                    obstore.put(self._objects, _bundle(key), _chunks(packed, check), chunk_size=CHUNK_BYTES)
+                    self._put(_bundle(key), packed, check)
         return key
 
     def fetch_bundle(self, key: str, bundle: Path, check: Check) -> None:
@@ -98,7 +101,7 @@ class PoolStore:
                 found[path.name] = hashlib.file_digest(file, "sha256").hexdigest()
                 file.seek(0)
                 with self._faults():
-                    obstore.put(self._objects, _result(job, path.name), _chunks(file, check), chunk_size=CHUNK_BYTES)
+                    self._put(_result(job, path.name), file, check)
         return found
 
     def fetch_result(self, job: str, hashes: Mapping[str, str], folder: Path, check: Check) -> Iterator[str]:
@@ -133,10 +136,20 @@ class PoolStore:
         """Remove a bundle, or what a job left. Raises PoolError."""
         with self._faults():
             if bundle is not None:
-                obstore.delete(self._objects, _bundle(bundle))
+                self._delete(_bundle(bundle))
             if job is not None:
                 listed = obstore.list(self._objects, prefix=f"results/{job}").collect()
-                obstore.delete(self._objects, [*(each["path"] for each in listed), _stop(job)])
+                for path in (*(each["path"] for each in listed), _stop(job)):
+                    self._delete(path)
+
+    def _put(self, path: str, file: IO[bytes], check: Check) -> None:
+        chunks = _chunks(file, check)
+        obstore.put(self._objects, path, chunks, chunk_size=CHUNK_BYTES, max_concurrency=_AT_ONCE)
+
+    def _delete(self, path: str) -> None:
+        # A folder tells that there is none; S3 does not.
+        with suppress(FileNotFoundError):
+            obstore.delete(self._objects, path)
 
     def _has(self, path: str) -> bool:
         try:
@@ -177,11 +190,13 @@ def open_store(address: str, login: Path | None = None) -> PoolStore:
     Raises
     ------
     ConfigError
-        The address is none, its credentials are missing, may be read by others, or would travel unencrypted.
+        The address is none, its folder cannot be made, its credentials are missing, may be read by others, or would
+        travel unencrypted.
     """
     parts = urlsplit(address)
     if parts.scheme == "file" and parts.path and not parts.netloc:
-        return PoolStore(address, LocalStore(prefix=parts.path, mkdir=True))
+        with _unusable(address):
+            return PoolStore(address, LocalStore(prefix=parts.path, automatic_cleanup=True, mkdir=True))
     if parts.scheme != "s3" or not parts.hostname or parts.username or parts.query:
         # What was found is not repeated: it may hold a secret.
         message = "The pool's store has no address: expected s3://BUCKET/PREFIX, or file:///FOLDER that all share."
@@ -208,8 +223,21 @@ def open_store(address: str, login: Path | None = None) -> PoolStore:
     options["region"] = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
     client: ClientConfig = {**_CLIENT, "allow_http": plain}
     prefix = parts.path.strip("/") or None
-    objects = S3Store(parts.netloc, prefix=prefix, client_options=client, retry_config=_RETRIES, **options)
+    with _unusable(address):
+        objects = S3Store(parts.netloc, prefix=prefix, client_options=client, retry_config=_RETRIES, **options)
     return PoolStore(address, objects)
+
+
+@contextmanager
+def _unusable(address: str) -> Iterator[None]:
+    try:
+        yield
+    except (BaseError, OSError, ValueError) as error:
+        message = (
+            f"{address}: the pool's store cannot be opened ({type(error).__name__}). Name a folder that can be made "
+            "and written, or a bucket; see to AWS_ENDPOINT_URL and AWS_REGION as well."
+        )
+        raise ConfigError(message) from None
 
 
 def _bundle(key: str) -> str:

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("obstore", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 
+import obstore
 from obstore.store import MemoryStore
 
 from slrig.compute.store import CHUNK_BYTES, PoolError, PoolStore, open_store
@@ -59,6 +60,35 @@ def test_a_transfer_that_is_to_end_leaves_nothing(tmp_path: Path) -> None:
         PoolStore("memory://", objects).put_bundle(bundle(tmp_path / "bundle"), check)
     assert objects.list().collect() == []
     assert [path.name for path in tmp_path.iterdir()] == ["bundle"]
+
+
+def test_a_store_that_is_tidied_holds_nothing_and_may_be_tidied_again(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    store = open_store(shared.as_uri())
+    key = store.put_bundle(bundle(tmp_path / "bundle"), lambda: None)
+    store.put_result("job", tmp_path / "bundle" / "frames", lambda: None)
+    for _ in range(2):
+        store.clear(bundle=key, job="job")
+        assert list(shared.iterdir()) == []
+
+
+def test_a_slow_line_carries_one_part_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def put(*_args: object, max_concurrency: int = 12, **_options: object) -> None:
+        asked.append(max_concurrency)
+
+    monkeypatch.setattr(obstore, "put", put)
+    store = PoolStore("memory://", MemoryStore())
+    store.put_bundle(bundle(tmp_path / "bundle"), lambda: None)
+    store.put_result("job", tmp_path / "bundle" / "frames", lambda: None)
+    assert asked == [1, 1]
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/shared: the pool's store cannot be opened \(OSError\)"):
+        open_store((tmp_path / "file" / "shared").as_uri())
 
 
 def test_a_store_that_is_gone_is_named_and_nothing_else(tmp_path: Path) -> None:
