@@ -14,6 +14,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from slrig.bundle.storage import write_file
 from slrig.compute.security import AUTHORITY, CERTIFICATE, KEY
 from slrig.config import private_text
+from slrig.disk import refusals_of
 from slrig.errors import ConfigError
 from slrig.jobs.records import utc_now
 
@@ -22,6 +23,9 @@ AUTHORITY_KEY = "authority-key.pem"
 
 AUTHORITY_DAYS, MACHINE_DAYS = 3650, 825
 """825 days is the longest that systems take a server's certificate for (CA/Browser Forum, ballot 193)."""
+
+LONGEST_NAME = 64
+"""Of a common name in a certificate: RFC 5280, ub-common-name."""
 
 _CLOCKS = timedelta(hours=1)
 """How far the clock of a machine may be behind."""
@@ -39,10 +43,14 @@ def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
         The disk refused.
     """
     for name in names:
-        if not name.replace("-", "").replace("_", "").isalnum():
-            message = f"'{name}' is no name for a machine: expected letters, digits, - and _, such as rig-7."
+        if not name.replace("-", "").replace("_", "").isalnum() or len(name) > LONGEST_NAME:
+            message = (
+                f"'{name}' is no name for a machine: expected letters, digits, - and _, {LONGEST_NAME} of them at "
+                "most, such as rig-7."
+            )
             raise ConfigError(message)
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with refusals_of(folder):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     key_path, certificate_path = folder / AUTHORITY_KEY, folder / AUTHORITY
     if not key_path.exists():
         key = ec.generate_private_key(ec.SECP256R1())
@@ -55,7 +63,8 @@ def make_certificates(folder: Path, names: Sequence[str]) -> list[Path]:
         place = folder / name
         if (place / CERTIFICATE).exists():
             continue
-        place.mkdir(mode=0o700, exist_ok=True)
+        with refusals_of(place):
+            place.mkdir(mode=0o700, exist_ok=True)
         own = ec.generate_private_key(ec.SECP256R1())
         _write_key(place / KEY, own)
         write_file(place / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
@@ -114,5 +123,6 @@ def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    path.touch(mode=0o600)
-    path.write_bytes(text)
+    with refusals_of(path):
+        path.touch(mode=0o600)
+        path.write_bytes(text)

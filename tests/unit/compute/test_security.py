@@ -15,7 +15,7 @@ pytest.importorskip("cryptography", reason="needs a pool's libraries: pip instal
 from slrig.cli.commands import app
 from slrig.compute.certificates import AUTHORITY_KEY, make_certificates
 from slrig.compute.security import KEY, pool_security
-from slrig.errors import ConfigError
+from slrig.errors import ConfigError, StorageError
 
 ADDRESS = "tls://pool:8786"
 
@@ -97,10 +97,18 @@ def test_a_pool_of_this_machine_alone_needs_none() -> None:
     assert pool_security("tcp://127.0.0.1:8786", None) is None
 
 
-def test_names_are_those_of_folders(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no name for a machine"):
-        make_certificates(tmp_path, ("../rig",))
+@pytest.mark.parametrize("name", ["../rig", "r" * 65])
+def test_names_are_those_of_folders_and_of_certificates(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match=r"no name for a machine.*64"):
+        make_certificates(tmp_path, (name,))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "certificates"):
+        with pytest.raises(StorageError, match="choose another folder"):
+            make_certificates(folder, ("rig",))
 
 
 def test_a_service_with_a_pool_needs_a_store(tmp_path: Path) -> None:
