@@ -168,8 +168,9 @@ class PooledWorker:
     ) -> Answer:
         heard_s, begun = self._clock(), False
         while True:
+            answer = None
             try:
-                return coming.result(POLL_S)
+                answer = coming.result(POLL_S)
             except TimeoutError:
                 pass
             except CancelledError as error:
@@ -179,6 +180,8 @@ class PooledWorker:
                 heard, heard_s, begun = told.get(), self._clock(), True
                 if "stage" in heard:
                     progress(heard["stage"], heard["fraction"], heard["detail"])
+            if answer is not None:
+                return answer
             self._stay(task, cancelled)
             if self._clock() - heard_s > (SILENCE_LIMIT_S if begun else BEGIN_LIMIT_S):
                 silence = "nothing more was heard of the job" if begun else "the job has not begun"
