@@ -12,12 +12,15 @@ alone may come while the board turns.
     STOP            stop, if it turns, and answer OK <angle where it stands>; a TURN that is stopped is not answered
     anything else   ERR <what is wrong, in words>; so is a TURN that cannot be obeyed
 
-When it starts, also when it is reset, the board sends START: its angle is 0 again, wherever it stands. The host asks
-ID? until it is answered, then STOP to learn the angle. Lines that are neither are passed over, so a board may chat.
+When it starts, also when it is reset, the board sends START: its angle is 0 again, wherever it stands. The host
+sends STOP, because a host before it may have been killed in a turn, then ID?, both again until that one is answered,
+then STOP to learn the angle. Lines that are neither are passed over, so a board may chat.
 
 A session, `>` to the board, `<` from it:
 
     < START
+    > STOP
+    < OK 0.000
     > ID?
     < slrig-turntable 1 3200
     > STOP

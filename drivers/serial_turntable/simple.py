@@ -48,6 +48,13 @@ class SimpleController:
     def _steps_per_turn(self, until_ns: int) -> int:
         heard: str | None = None
         while self._lines.clock.now_ns() < until_ns:
+            # A host that was killed may have left the board turning, and then it heeds nothing but STOP.
+            self._lines.send("STOP")
+            again_ns = self._lines.after(_AGAIN_S)
+            while (line := self._lines.next(again_ns)) is not None:
+                heard = line
+                if _REACHED.fullmatch(line):
+                    break
             self._lines.send("ID?")
             again_ns = self._lines.after(_AGAIN_S)
             while (line := self._lines.next(again_ns)) is not None:

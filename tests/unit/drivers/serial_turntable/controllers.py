@@ -199,9 +199,14 @@ class LineBoard(Board):
     at_deg: float = 0.0
     off_deg: float = 0.0
     """How far beyond what was asked for it stops."""
+    turning: bool = False
+    """In a turn that nobody waits for: it heeds STOP alone."""
 
     def obey(self, line: str) -> bytes:
         verb, _, rest = line.partition(" ")
+        self.turning = self.turning and verb != "STOP"
+        if self.turning:
+            return b""
         if verb == "ID?":
             return f"slrig-turntable 1 {self.steps}\n".encode()
         if verb == "TURN":

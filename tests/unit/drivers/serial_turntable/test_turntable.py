@@ -40,6 +40,14 @@ class Bench(ExitStack):
 
 
 @pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is sent twice, however late a busy machine lets a board answer."""
+    for controller in ("grbl", "simple"):
+        for window in ("_AGAIN_S", "_REPLY_S"):
+            monkeypatch.setattr(f"drivers.serial_turntable.{controller}.{window}", 30.0)
+
+
+@pytest.fixture
 def bench() -> Iterator[Bench]:
     with Bench() as each:
         yield each
@@ -58,7 +66,7 @@ def test_a_turn_ends_when_the_controller_is_idle_at_the_place(bench: Bench) -> N
     assert board.reports - seen >= 5
     table.move(1)
     assert board.places[0] == 22.5
-    assert bench.clock.waits_s[-1] == pytest.approx(0.5, abs=0.01)
+    assert bench.clock.waits_s[-1] == pytest.approx(0.5, abs=0.1)
 
 
 def test_it_counts_from_where_the_controller_stood_and_backwards_if_it_is_reversed(bench: Bench) -> None:
@@ -114,7 +122,7 @@ def test_marlin_is_named_and_not_served(bench: Bench) -> None:
     board = GrblBoard()
     board.banner = lambda: b"start\r\necho:Marlin 2.1.2\r\n"  # type: ignore[method-assign]
     with pytest.raises(UnsupportedByDeviceError, match=r"'echo:Marlin 2.1.2'.*Marlin is not served"):
-        bench.opened(board, **X, open_s=0.2)
+        bench.opened(board, **X, open_s=0.6)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +149,7 @@ def test_what_the_controller_refuses_is_told_in_words_and_nothing_is_turned_any_
     assert board.moved == before
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize(
     ("report", "words"),
     [
@@ -211,16 +220,26 @@ def test_a_board_turns_and_tells_the_angle_that_it_reached(bench: Bench) -> None
     assert [line for line in board.heard if line.startswith("TURN")] == ["TURN 155.000"]
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_session_is_as_the_documentation_has_it(bench: Bench) -> None:
     board = LineBoard()
     table = bench.opened(board)
     table.turn(45.0)
     table.turn(10.0)
-    assert board.heard == ["ID?", "STOP", "STOP", "TURN 45.000", "STOP", "TURN 10.000"]
+    assert board.heard == ["STOP", "ID?", "STOP", "STOP", "TURN 45.000", "STOP", "TURN 10.000"]
     assert board.obey("SPIN") == b"ERR unknown command SPIN\n"
     assert board.obey("STOP") == b"OK 10.012\n"
 
 
+@pytest.mark.usefixtures("patient")
+def test_a_board_that_was_left_turning_is_stopped_before_it_is_asked(bench: Bench) -> None:
+    board = LineBoard(at_deg=33.75, turning=True)
+    table = bench.opened(board)
+    assert (board.heard, board.turning) == (["STOP", "ID?", "STOP"], False)
+    assert table.opened_at_deg == 33.75
+
+
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize(
     ("board", "answer", "words"),
     [
@@ -235,7 +254,8 @@ def test_what_a_board_says_instead_is_told(
     bench: Bench, board: dict[str, Any], answer: bytes | None, words: str
 ) -> None:
     made = LineBoard(**board)
-    table = bench.opened(made, turn_s=0.2)
+    in_time = {"turn_s": 0.2} if answer == b"OK 90\xff\n" else {}
+    table = bench.opened(made, **in_time)
     made.on_line = lambda line: answer if line.startswith("TURN") else None
     with pytest.raises(DeviceError, match=words):
         table.turn(90.0)
