@@ -32,7 +32,6 @@ RETURN_S = 2.0
 LOST_WORKER_S = 30
 """From when on a worker that was not heard of is given up by the scheduler; each is heard of once a second."""
 
-
 _PAGES = "127.0.0.1:0"
 """Where dask's HTTP server listens, which cannot be left out and asks nobody for a certificate. It has no pages."""
 
@@ -48,7 +47,7 @@ def serve_scheduler(address: str, security: Security | None, *, say: Callable[[s
             await scheduler
         except (OSError, RuntimeError) as error:
             cause = error.__cause__ or error
-            message = f"The pool's scheduler cannot listen at {address}: {cause}. Choose another --host or --port."
+            message = f"The pool's scheduler cannot listen at {address}: {cause}. Choose another host or port."
             raise ServiceError(message) from error
         async with scheduler:
             say(f"the pool's scheduler is at {scheduler.address}. Ctrl-C stops it.")
