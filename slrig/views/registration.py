@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from slrig.errors import RegistrationRefusedError
 from slrig.model import FloatArray, Mesh
 from slrig.views.freedom import FreeMotion, directions, free_motions
+from slrig.views.markers import moved_by
 from slrig.views.matching import Matches, Side, Terms, assembled, matched, moved, side_of, terms_of
 from slrig.views.uncertainty import inflation
 
@@ -68,8 +69,8 @@ class Registration:
 
     poses : (N, 4, 4) float64, view coordinates to those of view 0. covariance : (6 (N - 1), 6 (N - 1)) float64, of a
     small turn (rad) about `middle_mm` and a shift (mm) of it in the model's frame, view by view from 1 on; along free
-    motions it is 0, since the start's error is not known: `held` (6 (N - 1), f) has them as columns, orthonormal where
-    turns count at the object's radius. inflation : factor in its deviations for errors that
+    motions it is what the start's own is, and 0 where that is not known: `held` (6 (N - 1), f) has them as columns,
+    orthonormal where turns count at the object's radius. inflation : factor in its deviations for errors that
     neighbouring points share. sigma_mm : (N,) float64, rms standard deviation of where a view's vertices are put.
     radius_mm : rms distance of the object's surface from its middle.
     """
@@ -92,10 +93,13 @@ def registered(
     *,
     names: Sequence[str] | None = None,
     start_error_mm: float = START_ERROR_MM,
+    start_covariance: FloatArray | None = None,
 ) -> Registration:
     """Put views into the frame of the first. starts : a pose (4, 4) for each, near where it belongs.
 
     names : of the views, for messages. start_error_mm : how far a surface may lie from where its start puts it.
+    start_covariance : (6 (N - 1), 6 (N - 1)), of a small turn (rad) about the origin of the first view's frame and a
+    shift (mm) of it, where it is known how well the starts are.
 
     Raises
     ------
@@ -109,7 +113,7 @@ def registered(
     problem = _problem([side_of(view) for view in views], np.asarray(starts, dtype=np.float64), names)
     poses, matches, reach_mm, steps = _settled(problem, start_error_mm)
     _require_agreement(matches, names)
-    return _result(problem, poses, matches, reach_mm, steps)
+    return _result(problem, poses, matches, reach_mm, steps, start_covariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +207,7 @@ def _step(problem: _Problem, poses: FloatArray, matches: Mapping[Pair, Matches])
 
 
 def _back(free: FloatArray, motions: FloatArray) -> FloatArray:
-    """(p,): along the columns of `free` (p, f), from motions (p,) to where turns are least, and then shifts are.
+    """Along the columns of `free` (p, f), from motions (p,) or (p, k) to where turns are least, and then shifts are.
 
     The two are told apart first: a shift that noise gives a little turn would else go far to undo a turn by it.
     """
@@ -215,6 +219,19 @@ def _back(free: FloatArray, motions: FloatArray) -> FloatArray:
     for columns, part in ((turning, turns), (shifting, ~turns)):
         back -= columns @ np.linalg.lstsq(columns[part], (motions + back)[part], rcond=None)[0]
     return back
+
+
+def _held_covariance(known: FloatArray, free: FloatArray, start: FloatArray, problem: _Problem) -> FloatArray:
+    """(p, p): of motions (mm), what the start's error leaves in poses that are held as the start has them.
+
+    Surfaces take from an error e of the start what they tell of, K e; poses then go back along free motions to where
+    they are nearest to the start.
+    """
+    about = np.block([[problem.radius_mm * np.eye(3), np.zeros((3, 3))], [moved_by(problem.middle_mm)]])
+    to_motions = np.kron(np.eye(len(start) // 6), about)
+    taken = -known @ known.T
+    left = np.eye(len(start)) + taken + _back(free, taken)
+    return np.asarray(left @ to_motions @ start @ to_motions.T @ left.T)
 
 
 def _deviation(residual: FloatArray) -> float:
@@ -264,7 +281,12 @@ def _unended(problem: _Problem, matches: Mapping[Pair, Matches], step: FloatArra
 
 
 def _result(
-    problem: _Problem, poses: FloatArray, matches: Mapping[Pair, Matches], reach_mm: float, steps: int
+    problem: _Problem,
+    poses: FloatArray,
+    matches: Mapping[Pair, Matches],
+    reach_mm: float,
+    steps: int,
+    start_covariance: FloatArray | None,
 ) -> Registration:
     terms = problem.terms(matches)
     known, free = directions(terms)
@@ -272,6 +294,8 @@ def _result(
     covariance = known @ np.linalg.inv(known.T @ terms.agreed @ known) @ known.T
     factor = inflation(matches, len(poses), problem.middle_mm, problem.radius_mm, covariance)
     covariance *= factor**2
+    if start_covariance is not None:
+        covariance += _held_covariance(known, free, start_covariance, problem)
     scale = np.tile(np.repeat([1 / problem.radius_mm, 1.0], 3), len(poses) - 1)
 
     def misfit(view: int, motion: FloatArray) -> float:
@@ -310,9 +334,7 @@ def _displacement_sigma_mm(problem: _Problem, poses: FloatArray, covariance: Flo
 
 def _rows(points: FloatArray, problem: _Problem) -> FloatArray:
     """(n, 3, 6): how points move with a motion, dx = (ρ ω) × (x - middle) / ρ + t."""
-    arm = (points - problem.middle_mm) / problem.radius_mm
-    turned = np.cross(np.eye(3)[None], arm[:, None])
-    return np.concatenate([turned.swapaxes(1, 2), np.broadcast_to(np.eye(3), turned.shape)], axis=2)
+    return moved_by((points - problem.middle_mm) / problem.radius_mm)
 
 
 def _pair_fits(problem: _Problem, matches: Mapping[Pair, Matches]) -> list[PairFit]:
