@@ -68,6 +68,17 @@ def stage_planes(empty: Mesh, axis: StageAxis | None = None) -> tuple[StagePlane
     return tuple(found)
 
 
+def fitted_plane(points: FloatArray) -> tuple[FloatArray, FloatArray, float] | None:
+    """A point (3,) and the normal (3,) of the plane that most points (n, 3) lie on, and the deviation of those; None
+    where that is not half of them.
+    """
+    if len(points) < 3:
+        return None
+    everywhere = np.ones(len(points), dtype=np.bool_)
+    mine, middle, normal, sigma = _fitted(points, everywhere, *_commonest(points, np.random.default_rng(len(points))))
+    return (middle, normal, sigma) if mine.mean() > 0.5 else None
+
+
 def _commonest(points: FloatArray, random: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """A point and the normal of the plane through three points that is near to most."""
     tried = points[random.integers(len(points), size=_TRIED)]

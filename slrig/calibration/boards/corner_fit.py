@@ -5,7 +5,8 @@ A corner is where two straight edges cross. With d1, d2 the distances of a pixel
     I = b + b' . r + (a + a' . r) erf(d1 / (sqrt(2) s)) erf(d2 / (sqrt(2) s)),    r = the pixel's place from the start,
 
 exact for a Gaussian blur and edges at right angles. Edges that meet at another angle change I by a term that is the
-same at r and -r about the corner, so the corner's place stays. A circle is an ellipse |Q (p - c)| = 1,
+same at r and -r about the corner, so the corner's place stays. At the corner of a marker one square of the four has
+another level: (1 + erf) / 2 for each erf. A circle is an ellipse |Q (p - c)| = 1,
 
     I = b + b' . r + (a + a' . r) erf(d / (sqrt(2) s)),    d = (|Q (p - c)| - 1) / |gradient of |Q (p - c)||.
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,15 +163,18 @@ def patch_offsets(half_px: int) -> NDArray[np.int64]:
 
 
 def fitted_corners(
-    image: FloatArray, start_px: FloatArray, edges: FloatArray, usable: NDArray[np.bool_], /, *, half_px: int
-) -> FittedPlaces:
-    """Corners where two edges cross.
+    image: FloatArray, start_px: FloatArray, edges: FloatArray, usable: NDArray[np.bool_], /, *, half_px: int,
+    outer: bool = False,
+) -> FittedPlaces:  # fmt: skip
+    """Corners where two edges cross, or end in one another.
 
     image : (H, W) float64; start_px : (n, 2) float64, within two pixels or so; edges : (n, 2, 2) float64, the
     directions of the two edges at each, rows; usable : (n, m) bool, which pixels of the patch of `half_px` about the
-    nearest pixel belong to the four squares that meet there.
+    nearest pixel belong to the four squares that meet there. outer : only the square differs that lies to the right of
+    both edges, as one looks along them in an image whose rows count downwards.
     """
-    return _fitted(_corner_model, np.arctan2(edges[..., 0], -edges[..., 1]), image, start_px, usable, half_px)[0]
+    model = partial(_corner_model, least=0.5) if outer else _corner_model
+    return _fitted(model, np.arctan2(edges[..., 0], -edges[..., 1]), image, start_px, usable, half_px)[0]
 
 
 def fitted_circles(
@@ -185,15 +190,15 @@ def fitted_circles(
     return places, np.stack([q[:, [2, 3]], q[:, [3, 4]]], axis=1)
 
 
-def _corner_model(given: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Parameters: x, y, two angles of the normals, blur, b, b'x, b'y, a, a'x, a'y."""
+def _corner_model(given: FloatArray, pixels: FloatArray, *, least: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Parameters: x, y, two angles of the normals, blur, b, b'x, b'y, a, a'x, a'y. least : 0.5 for (1 + erf) / 2."""
     x, y = pixels[..., 0], pixels[..., 1]
     off_x, off_y = x - given[:, :1], y - given[:, 1:2]
     blur, step = given[:, 4:5], given[:, 8:9] + given[:, 9:10] * x + given[:, 10:11] * y
     cosine, sine = np.cos(given[:, 2:4]).T[..., None], np.sin(given[:, 2:4]).T[..., None]
     scaled = (cosine * off_x + sine * off_y) / blur
-    rises = erf(scaled / _ROOT_2)
-    by = step * (_SLOPE / blur * np.exp(-0.5 * scaled**2)) * rises[::-1]
+    rises = least + (1 - least) * erf(scaled / _ROOT_2)
+    by = step * ((1 - least) * _SLOPE / blur * np.exp(-0.5 * scaled**2)) * rises[::-1]
     turned = by * (-sine * off_x + cosine * off_y)
     by_shape = [-(by * cosine).sum(axis=0), -(by * sine).sum(axis=0), *turned, -(by * scaled).sum(axis=0)]
     return _shaded(given[:, 5:8], x, y, step, rises[0] * rises[1], by_shape)
