@@ -15,12 +15,14 @@ from slrig.api.openapi import problems
 from slrig.api.schemas import JobBody, JobLinks, filled
 from slrig.api.service import Cursor, PageLength, Service, Serving, paged
 from slrig.bundle.faults import Strict
-from slrig.bundle.free_text import FreeText
+from slrig.bundle.free_text import FreeText, SafeText
 from slrig.bundle.poses_file import MOST_VIEWS, AxisEntry, PoseEntry, rotating
 from slrig.combine.offered import MEDIA_TYPES
 from slrig.combine.plan import (
+    MARKER_DICTIONARY,
     START_ERROR_MM,
     GivenPoses,
+    MarkerPoses,
     ModelPlan,
     ShootPlan,
     StartingPoses,
@@ -36,11 +38,17 @@ router = APIRouter(prefix="/model", tags=["model"])
 class MadeRequest(Strict):
     """How a model is made of its scans, whether those are on record or still to be shot."""
 
-    poses: Literal["turntable", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = Field(
-        default="turntable",
-        description='about where the scans belong. "turntable": a stage turned the object. "unknown": found from what '
-        "they see, or refused, as of an object that is symmetric. Or of each scan a motion, 4 × 4, that takes its mm "
-        "to a common frame",
+    poses: Literal["turntable", "markers", "unknown"] | Annotated[list[PoseEntry], Field(max_length=MOST_VIEWS)] = (
+        Field(
+            default="turntable",
+            description='about where the scans belong. "turntable": a stage turned the object. "markers": '
+            'printed ones turn with it. "unknown": found from what they see, or refused, as of an object that is '
+            "symmetric. Or of each scan a motion, 4 × 4, that takes its mm "
+            "to a common frame",
+        )
+    )
+    dictionary: Annotated[SafeText, Field(min_length=1, max_length=64)] | None = Field(
+        default=None, description=f"OpenCV's name for that of the markers. Default: {MARKER_DICTIONARY}"
     )
     axis: AxisEntry | None = Field(
         default=None, description="of a turntable, in the scans' frame. Default: the stage's own, where it is known"
@@ -62,6 +70,9 @@ class MadeRequest(Strict):
         if self.poses != "turntable" and told:
             message = f'{told[0]}: expected "poses": "turntable" beside it, found other poses; leave one of them out'
             raise ValueError(message)
+        if self.poses != "markers" and self.dictionary is not None:
+            message = 'dictionary: expected "poses": "markers" beside it, found other poses; leave one of them out'
+            raise ValueError(message)
         return self
 
     def plan(
@@ -71,6 +82,8 @@ class MadeRequest(Strict):
         poses: StartingPoses
         if self.poses == "unknown":
             poses = UnknownPoses()
+        elif self.poses == "markers":
+            poses = MarkerPoses(self.dictionary or MARKER_DICTIONARY)
         elif self.poses != "turntable":
             poses = GivenPoses.of(map(rotating, self.poses))
         else:

@@ -64,6 +64,12 @@ def model(
     unknown: Annotated[
         bool, typer.Option("--unknown", help="Nobody knows where the scans belong: find it from what they see.")
     ] = False,
+    markers: Annotated[
+        bool, typer.Option("--markers", help="ArUco markers that turn with the object tell where the scans belong.")
+    ] = False,
+    dictionary: Annotated[
+        str | None, typer.Option(metavar="NAME", help="With --markers: OpenCV's name for theirs; else DICT_5X5_250.")
+    ] = None,
     start_error_mm: Annotated[
         float, typer.Option(min=0.01, max=100.0, help="How far a surface may be from where angle or poses put it.")
     ] = 3.0,
@@ -74,14 +80,14 @@ def model(
 ) -> None:
     """Make one mesh of scans of an object from several sides.
 
-    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle, poses, or
-    unknown. Where no scan has seen the object, the mesh is open.
+    Says how well they agree, and which motions their shape leaves open. The start is a stage's angle, poses,
+    markers, or unknown. Where no scan has seen the object, the mesh is open.
     """
     from slrig.bundle.stage_file import StageRecord, read_stage
     from slrig.cli.display import progress_shown
     from slrig.cli.reconstruct import keep_kernels
     from slrig.combine.offered import POSES, REPORT, REPORT_FORMAT
-    from slrig.combine.plan import StatedAxis
+    from slrig.combine.plan import MARKER_DICTIONARY, MarkerPoses, StatedAxis, UnknownPoses
     from slrig.logs import set_up_logs_for_a_person
     from slrig.scan.artefacts import staged_folder
 
@@ -89,25 +95,32 @@ def model(
     keep_kernels()
     known, notes = StageRecord() if stage is None else read_stage(stage), list[str]()
     told = _axis(axis, axis_point, axis_direction)
-    if told is None and known.axis is not None and poses is None and not unknown:
+    if told is None and known.axis is not None and poses is None and not (unknown or markers):
         told = StatedAxis.of(known.axis.point_mm, known.axis.direction)
     if (shoot is None) == (not scans) or (shoot is None and (rig or by_hand)):
         raise ConfigError("expected scans, or --shoot N (with --rig or a service, and --by-hand), and not both")
+    if dictionary is not None and not markers:
+        raise ConfigError("--dictionary: expected --markers beside it, whose dictionary it is; leave it out")
+    found = MarkerPoses(dictionary or MARKER_DICTIONARY) if markers else UnknownPoses() if unknown else None
+    if found is not None and ((unknown and markers) or (shoot is not None and told is not None)):
+        raise ConfigError(
+            "--markers and --unknown each find by themselves where scans belong: leave out the other one, and an axis"
+        )
     if shoot is None:
         files = _named_meshes(scans or ())
-        start = _starts(list(files), angle, told, poses, unknown=unknown)
+        start = _starts(list(files), angle, told, poses, found)
     elif angle is not None or poses is not None:
         raise ConfigError("--shoot: it says itself where the views stand; leave --angle and --poses out")
     elif rig is not None:
         from slrig.cli.model_shoot import views_here
 
-        files, start, notes = views_here(rig, shoot, output, by_hand=by_hand, axis=told, unknown=unknown)
+        files, start, notes = views_here(rig, shoot, output, by_hand=by_hand, axis=told, found=found)
         output /= "model"
     else:
         from slrig.cli.model_shoot import views_there
 
         request = given(
-            views=shoot, by_hand=by_hand, poses="unknown" if unknown else None,
+            views=shoot, by_hand=by_hand, poses=None if found is None else found.kind, dictionary=dictionary,
             axis=None if told is None else asdict(told), start_error_mm=start_error_mm, voxel_mm=voxel_mm,
             cut=not no_cut,
         )  # fmt: skip
@@ -172,12 +185,23 @@ def _tell(report: Mapping[str, Any]) -> None:
     removed = [sum(each["share"] for each in view["removed"]) for view in report["views"] if view["removed"]]
     if removed:
         typer.echo(f"{'cut':<10}{min(removed):.0%} to {max(removed):.0%} of the views lay behind the stage's planes")
+    holds = "held as the start has it" if report["markers"] is None else "held by the markers"
     for kind in dict.fromkeys(each["motion"] for each in report["free"]):
         mine = [each for each in report["free"] if each["motion"] == kind]
         who = counted(len({each["view"] for each in mine}), "view")
         limits_mm = [each["free_mm"] for each in mine if each["free_mm"] is not None]
         far = f"by {min(limits_mm):.2g} mm and more" if limits_mm else "without a limit"
-        typer.echo(f"{'free':<10}{who} may {mine[0]['words']} {far}: no surface tells, held as the start has it")
+        typer.echo(f"{'free':<10}{who} may {mine[0]['words']} {far}: no surface tells, {holds}")
+    if (marked := report["markers"]) is not None:
+        counts = [len(each["used"]) for each in marked]
+        sigma_mm = max(each["sigma_mm"] for each in marked)
+        typer.echo(f"{'markers':<10}{min(counts)} to {max(counts)} of a view put it to {sigma_mm:.4f} mm or better")
+        for each in marked:
+            for off in each["left_out"]:
+                typer.echo(
+                    f"{'left out':<10}marker {off['marker']} in {each['view']}, {off['off_mm']:.2g} mm off: it moved "
+                    "or was misread"
+                )
     if (turned := report["axis"]) is not None:
         x, y, z = turned["point_mm"]
         a, b, c = turned["direction"]
@@ -190,26 +214,34 @@ def _tell(report: Mapping[str, Any]) -> None:
 
 
 def _starts(
-    names: Sequence[str], angle: float | None, axis: StatedAxis | None, file: Path | None, *, unknown: bool
+    names: Sequence[str],
+    angle: float | None,
+    axis: StatedAxis | None,
+    file: Path | None,
+    found: StartingPoses | None,
 ) -> StartingPoses:
-    """Where the scans start from. Raises ConfigError: that is not told in one way alone, or not of all scans."""
+    """Where the scans start from. found : unknown, or by markers. Raises ConfigError: that is not told in one way
+    alone, or not of all scans.
+    """
     from slrig.bundle.poses_file import read_poses
-    from slrig.combine.plan import GivenPoses, TurntablePoses, UnknownPoses
+    from slrig.combine.plan import GivenPoses, TurntablePoses
 
-    ways = [angle is not None, file is not None, unknown]
+    ways = [angle is not None, file is not None, found is not None]
     if sum(ways) != 1 or (angle is None) != (axis is None):
         told = {
-            "--angle": angle, "--axis, --axis-point or --stage": axis, "--poses": file, "--unknown": unknown or None,
+            "--angle": angle, "--axis, --axis-point or --stage": axis, "--poses": file,
+            "--unknown or --markers": found,
         }  # fmt: skip
-        found = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
+        said = ", ".join(way for way, value in told.items() if value is not None) or "none of them"
         message = (
             "expected a stage's --angle with its axis (--stage FILE, --axis FILE, or --axis-point and "
-            f"--axis-direction), --poses FILE, or --unknown, found {found}. Where --unknown is refused, place the "
-            "scans by hand in another program, and write what it says into a file as slrig/views/README.md describes"
+            f"--axis-direction), --poses FILE, --markers, or --unknown, found {said}. Where --unknown is refused, "
+            "place the scans by hand in another program, and write what it says into a file as slrig/views/README.md "
+            "describes"
         )
         raise ConfigError(message)
-    if unknown:
-        return UnknownPoses()
+    if found is not None:
+        return found
     if file is None:
         return TurntablePoses(axis, tuple((angle or 0.0) * number for number in range(len(names))))
     known = read_poses(file).poses

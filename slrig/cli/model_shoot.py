@@ -19,7 +19,7 @@ from slrig.cli.display import answered, progress_shown
 from slrig.cli.reconstruct import prepare_kernels
 from slrig.client import Client
 from slrig.client.events import Progress
-from slrig.combine.plan import ShootPlan, StartingPoses, StatedAxis, TurntablePoses, UnknownPoses
+from slrig.combine.plan import ShootPlan, StartingPoses, StatedAxis, TurntablePoses
 from slrig.combine.shooting import TURN
 from slrig.config import read_rig
 from slrig.devices import Rig, Turntable
@@ -41,13 +41,14 @@ def views_here(
     *,
     by_hand: bool,
     axis: StatedAxis | None,
-    unknown: bool = False,
+    found: StartingPoses | None = None,
     ask: Callable[[str], str] = input,
 ) -> tuple[dict[str, Path], StartingPoses, list[str]]:
     """Shoot the views that `output` lacks, each into view-N with its frames in bundle-N. Return the meshes by name,
     where they start from, and words for views that failed. Ctrl-C leaves what was shot.
 
-    axis : None for the turntable's own. unknown : nobody knows the angles, and no axis is needed. ask : prints a prompt
+    axis : None for the turntable's own. found : unknown, or by markers: no
+    angle and no axis is needed. ask : prints a prompt
     and returns what the person typed.
 
     Raises
@@ -70,9 +71,10 @@ def views_here(
             rig = replace(rig, positioner=CountedTurntable(table, output / "table.json"))
         if axis is None and table is not None and table.axis is not None:
             axis = StatedAxis.of(table.axis.point_mm, table.axis.direction)
-        if axis is None and not unknown:
+        if axis is None and found is None:
             raise ConfigError(
-                "expected the stage's axis, which the rig does not know: say --axis, --axis-point or --unknown"
+                "expected the stage's axis, which the rig does not know: say --axis, --axis-point, --markers or "
+                "--unknown"
             )
         for number in [number for number, mesh in meshes.items() if not mesh.is_file()]:
             prompt = f"turn the object by about {shoot.step_deg:g}°, to {shoot.angle_deg(number):g}° in all,"
@@ -93,7 +95,7 @@ def views_here(
         message = f"{len(good)} of {count} views succeeded, and a model takes two. The same command shoots the others."
         raise ViewsFailedError(message)
     stages = [stage for stage in map(read_stage, (output / f"bundle-{number}" for number in good)) if stage is not None]
-    if not unknown and (len(stages) < len(good) or len({stage.count for stage in stages}) > 1):
+    if found is None and (len(stages) < len(good) or len({stage.count for stage in stages}) > 1):
         message = (
             f"{output}: expected views whose angles have one zero, found some without one, or that the turntable lost "
             "its place between them; shoot into another folder, or say --unknown"
@@ -101,7 +103,7 @@ def views_here(
         raise ConfigError(message)
     # As they were shot, perhaps by a command that asked for another number of views.
     angles_deg = tuple(stage.angle_deg for stage in stages)
-    poses = UnknownPoses() if unknown else TurntablePoses(axis, angles_deg)
+    poses = TurntablePoses(axis, angles_deg) if found is None else found
     return {mesh.parent.name: mesh for mesh in good.values()}, poses, notes
 
 

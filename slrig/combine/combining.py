@@ -13,9 +13,10 @@ import numpy as np
 
 from slrig.bundle.poses_file import Poses, encode_poses
 from slrig.bundle.storage import write_file
+from slrig.combine.markers import markers_of
 from slrig.combine.offered import COARSE, MODEL, MODEL_GLB, PLACED, POSES, REPORT, REPORT_FORMAT, SIDES, VIEW
 from slrig.combine.pictures import six_sides_png
-from slrig.combine.plan import START_ERROR_MM, GivenPoses, StartingPoses, TurntablePoses
+from slrig.combine.plan import START_ERROR_MM, GivenPoses, MarkerPoses, StartingPoses, TurntablePoses
 from slrig.disk import refusals_of
 from slrig.errors import ConfigError, InvalidInputError, ScanCancelledError
 from slrig.kernels import compilations_told
@@ -26,12 +27,15 @@ from slrig.scan.mesh_formats import encode_mesh_glb
 from slrig.scan.plan import Progress
 from slrig.scan.view_format import encode_coarse_glb, encode_view_glb
 from slrig.views.fusion import FusedModel, fused
+from slrig.views.markers import MarkerFit, MarkersSeen, marker_poses
 from slrig.views.placing import put_together
 from slrig.views.registration import Registration, registered
 from slrig.views.stage_planes import cut
 from slrig.views.turntable import FoundAxis, registered_on_stage
 from slrig.views.unknown import found_starts
 
+_SURFACE_POINTS = 500  # of a view, at which it is told how well markers put it
+_START_SIGMAS = 3.0  # of starts by markers, that have to lie within the start's error
 _TOLD_BORDERS = 10  # of the open borders, the longest ones, each by itself
 
 
@@ -51,7 +55,8 @@ def combine_into(
     only its maker knows yet; see `slrig.combine.offered`.
 
     meshes : the mesh.ply of each view, by the view's name, in the order of `poses`. poses : near where they belong; of
-    a turntable, with its axis and angles; or unknown. start_error_mm : how far a surface may be from there. voxel_mm :
+    a turntable, with its axis and angles; of markers, which are looked for in the frames beside each mesh and hold what
+    shape leaves free; or unknown. start_error_mm : how far a surface may be from there. voxel_mm :
     length of the model's edges; None is 1.25 times that of the views'. planes : in the views' frame, what lies behind
     them is cut away first. notes : for the report.
 
@@ -60,7 +65,10 @@ def combine_into(
     ConfigError
         The turntable's axis or angles are not told.
     RegistrationRefusedError
-        A view overlaps no other, or does not agree with them; or poses were to be found, and none or two were.
+        A view overlaps no other, or does not agree with them; poses were to be found, and none or two were; or views
+        share too few markers.
+    BundleError, CalibrationError
+        Markers were to be found, and a scan has no frames or no calibration, or there is no such dictionary.
     StageRefusedError
         All but nothing of a view would be left before the planes.
     InvalidInputError
@@ -86,18 +94,23 @@ def combine_into(
         progress(*at, f"preparing kernels, first time only: {kernel}")
 
     with compilations_told(compiling):
-        names, views, removed = list(meshes), [], []
+        names, views, removed, seen = list(meshes), [], [], list[MarkersSeen]()
         for number, (name, file) in enumerate(meshes.items()):
             entered("reading", 0.2 * number / len(meshes), name)
-            view, taken = cut(read_mesh(file), planes, name=name)
+            mesh = read_mesh(file)
+            if isinstance(poses, MarkerPoses):
+                # Before the cut: they lie on the plate.
+                seen.append(markers_of(file, mesh, poses.dictionary))
+            view, taken = cut(mesh, planes, name=name)
             views.append(view)
             removed.append(taken)
         entered("registering", 0.2, f"{len(views)} views")
+        marked = _marked(views, seen, names, start_error_mm) if isinstance(poses, MarkerPoses) else None
 
         def again(rounds: int) -> None:
             entered("registering", 0.2 + 0.02 * rounds, f"{len(views)} views, round {rounds + 1}")
 
-        found, axis = _registered(views, poses, names, start_error_mm, again)
+        found, axis = _registered(views, poses, marked, names, start_error_mm, again)
         entered("fusing", 0.4)
         whole = fused(views, found.poses, voxel_mm=voxel_mm)
         entered("writing", 0.9, f"{len(whole.mesh.faces)} triangles")
@@ -109,6 +122,7 @@ def combine_into(
             view_told["removed"] = [
                 {"kind": plane.kind, "share": share} for plane, share in zip(planes, taken, strict=True)
             ]
+        report["markers"] = None if marked is None else _of_markers(marked, seen, names)
         report["notes"] = list(notes)
         # One at a time: each is as large as all meshes.
         files: dict[str, Callable[[], bytes]] = {
@@ -136,14 +150,30 @@ def read_mesh(file: Path) -> Mesh:
         raise InvalidInputError(f"{file}: {error}") from error
 
 
+def _marked(
+    views: Sequence[Mesh], seen: Sequence[MarkersSeen], names: Sequence[str], start_error_mm: float
+) -> MarkerFit:
+    """Where markers put the views. Raises RegistrationRefusedError."""
+    surfaces = [
+        view.vertices_mm[:: max(1, len(view.vertices_mm) // _SURFACE_POINTS)].astype(np.float64) for view in views
+    ]
+    return marker_poses(seen, surfaces, names=names, most_sigma_mm=start_error_mm / _START_SIGMAS)
+
+
 def _registered(
     views: Sequence[Mesh],
     poses: StartingPoses,
+    marked: MarkerFit | None,
     names: Sequence[str],
     start_error_mm: float,
     begun: Callable[[int], None],
 ) -> tuple[Registration, FoundAxis | None]:
     """Where the views belong, and of a turntable the axis that they tell. Raises ConfigError; as `registered`."""
+    if marked is not None:
+        found = registered(
+            views, marked.poses, names=names, start_error_mm=start_error_mm, start_covariance=marked.covariance
+        )
+        return found, None
     if not isinstance(poses, TurntablePoses):
         starts = np.array(poses.matrices) if isinstance(poses, GivenPoses) else found_starts(views, names=names)
         return registered(views, starts, names=names, start_error_mm=start_error_mm), None
@@ -179,6 +209,27 @@ def _report(
         "axis": axis,
         "model": _of_model(whole),
     }
+
+
+def _of_markers(found: MarkerFit, seen: Sequence[MarkersSeen], names: Sequence[str]) -> list[dict[str, Any]]:
+    """What report.json says of each view's markers: those seen, those of them that another view shares, how well they
+    put its surface, and what was left out.
+    """
+    return [
+        {
+            "view": name,
+            "seen": sorted(seen[v]),
+            "used": found.used[v],
+            "sigma_mm": float(found.sigma_mm[v]),
+            "rms_over_sigma": float(found.rms_over_sigma[v]),
+            "left_out": [
+                {"marker": each.marker, "off_mm": each.off_mm, "off_over_sigma": each.off_over_sigma}
+                for each in found.left_out
+                if each.view == v
+            ],
+        }
+        for v, name in enumerate(names)
+    ]
 
 
 def _axis(found: FoundAxis, told: StartingPoses) -> dict[str, Any]:

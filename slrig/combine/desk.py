@@ -14,12 +14,20 @@ from uuid import UUID
 import structlog
 
 from slrig.combine.offered import missing_files
-from slrig.combine.plan import ModelPlan, StartingPoses, StatedAxis, TurntablePoses, plan_from_json, plan_json
+from slrig.combine.plan import (
+    MarkerPoses,
+    ModelPlan,
+    StartingPoses,
+    StatedAxis,
+    TurntablePoses,
+    plan_from_json,
+    plan_json,
+)
 from slrig.combine.stage import StageStore
 from slrig.combine.store import ModelStore, found_axis, summary
 from slrig.errors import ConfigError, JobNotFoundError, QueueFullError, ScanStateError, StorageError
 from slrig.failure import failure_of
-from slrig.jobs.data_folder import DataFolder
+from slrig.jobs.data_folder import BUNDLE, DataFolder
 from slrig.jobs.job import Holder, Job
 from slrig.jobs.progress import ProgressRecorder
 from slrig.jobs.queue import JobQueue
@@ -139,7 +147,8 @@ class ModelDesk:
         ScanStateError
             A scan did not succeed, or not yet.
         ConfigError
-            The poses are to be a turntable's, and the axis or an angle is not known.
+            The poses are to be a turntable's, and the axis or an angle is not known; or of markers, and a scan's frames
+            are gone.
         QueueFullError
             As many models wait as may.
         StorageError
@@ -194,6 +203,14 @@ class ModelDesk:
                 )
                 raise ScanStateError(message)
         poses = self.with_axis(plan).poses
+        if isinstance(poses, MarkerPoses):
+            without = [str(each) for each in plan.scans if not (self._folder.scan(each) / BUNDLE).is_dir()]
+            if without:
+                message = (
+                    "poses: expected the frames of each scan, in which markers are looked for, found none of "
+                    f"{', '.join(without)}; leave those out, or give the poses in another way"
+                )
+                raise ConfigError(message)
         if not isinstance(poses, TurntablePoses):
             return plan
         if poses.angles_deg is None:

@@ -22,6 +22,9 @@ START_ERROR_MM = 3.0
 MOST_UNKNOWN = 24
 """Views whose poses are to be found: eight take 15 to 20 s, and the time grows with their square."""
 
+MARKER_DICTIONARY = "DICT_5X5_250"
+"""That of the boards, see `slrig.calibration.board.DICTIONARY`."""
+
 MOST_VIEWS = 72
 """Of a model that is shot: one every 5°, closer than which neighbours tell the same."""
 
@@ -85,7 +88,15 @@ class UnknownPoses:
     kind: Literal["unknown"] = "unknown"
 
 
-StartingPoses = TurntablePoses | GivenPoses | UnknownPoses
+@dataclass(frozen=True, slots=True)
+class MarkerPoses:
+    """Markers that turn with the object tell where the scans belong. dictionary : OpenCV's name for theirs."""
+
+    dictionary: str = MARKER_DICTIONARY
+    kind: Literal["markers"] = "markers"
+
+
+StartingPoses = TurntablePoses | GivenPoses | UnknownPoses | MarkerPoses
 
 
 @dataclass(frozen=True, slots=True)

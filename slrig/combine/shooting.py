@@ -15,7 +15,16 @@ from uuid import UUID, uuid4
 import structlog
 
 from slrig.combine.desk import SHOOTING_SHARE, ModelDesk
-from slrig.combine.plan import GivenPoses, ModelPlan, ShootPlan, TurntablePoses, UnknownPoses, plan_from_json, plan_json
+from slrig.combine.plan import (
+    GivenPoses,
+    MarkerPoses,
+    ModelPlan,
+    ShootPlan,
+    TurntablePoses,
+    UnknownPoses,
+    plan_from_json,
+    plan_json,
+)
 from slrig.errors import (
     DeviceError,
     DriverBrokenError,
@@ -365,7 +374,7 @@ def _of_another_zero(plan: ModelPlan, views: Sequence[View]) -> list[View]:
     the middle of a turn, was restarted in between. None where no angle is used.
     """
     good = [view for view in views if view.good is not None]
-    if isinstance(plan.poses, UnknownPoses) or not good:
+    if isinstance(plan.poses, UnknownPoses | MarkerPoses) or not good:
         return []
     newest = max(good, key=lambda view: 0 if view.good is None else view.good.number)
     return [view for view in good if view.count != newest.count]

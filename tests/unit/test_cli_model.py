@@ -125,6 +125,9 @@ def test_what_is_missing_is_said(scans: Path, tmp_path: Path) -> None:
         ([folder / "scan-9", folder / "scan-9", *to, *STAGE], "two called scan-9"),
         ([tmp_path, *to, *STAGE], "expected a scan's folder with mesh.ply"),
         ([folder, *to, *STAGE[:2], *STAGE[6:]], "together"),
+        ([folder, *to, "--markers"], "expected the frames that it was made of"),
+        ([folder, *to, "--markers", "--unknown"], "leave out the other one"),
+        ([folder, *to, "--unknown", "--dictionary", "DICT_4X4_50"], "expected --markers beside it"),
     ):
         refused = model(*words)
         assert (refused.exit_code, expected in refused.stderr) == (2, True), (words, refused.output)

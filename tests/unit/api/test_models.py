@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from slrig.combine.offered import MEDIA_TYPES
-from slrig.combine.plan import GivenPoses, StatedAxis, TurntablePoses, UnknownPoses
+from slrig.combine.plan import GivenPoses, MarkerPoses, StatedAxis, TurntablePoses, UnknownPoses
 from slrig.errors import RegistrationRefusedError
 from tests.unit.api.conftest import ServedBench
 from tests.unit.combine.model_bench import kept_scan
@@ -61,6 +61,13 @@ def test_a_model_is_asked_for_once_followed_and_fetched(
     found = client.post("/model", json={"scans": scans, "poses": "unknown"}).json()
     assert over(client, found)["plan"]["poses"] == {"kind": "unknown"}
     assert isinstance(asked[2][1], UnknownPoses)
+    for scan in scans:
+        (served.service.folder.scan(UUID(scan)) / "bundle").mkdir()
+    request = {"scans": scans, "poses": "markers", "dictionary": "DICT_4X4_50"}
+    marked = over(client, client.post("/model", json=request).json())
+    assert marked["plan"]["poses"] == {"kind": "markers", "dictionary": "DICT_4X4_50"}
+    assert asked[3][1] == MarkerPoses("DICT_4X4_50")
+    assert client.delete(marked["links"]["self"]).status_code == 204
     assert client.delete(found["links"]["self"]).status_code == 204
     page = client.get("/model", params={"limit": 1}).json()
     assert [each["id"] for each in page["models"]] == [second["id"]]
@@ -106,6 +113,8 @@ def test_what_cannot_be_made_is_refused_and_not_on_record(client: TestClient, sc
         (422, "leave one of them out", {"scans": scans, "poses": [STILL, STILL], "axis": AXIS}),
         (422, "leave one of them out", {"scans": scans, "poses": "unknown", "angles_deg": [0.0, 1.0]}),
         (422, "poses", {"scans": scans, "poses": "somewhere"}),
+        (422, "expected the frames of each scan", {"scans": scans, "poses": "markers"}),
+        (422, "dictionary", {"scans": scans, "poses": "unknown", "dictionary": "DICT_4X4_50"}),
     ):
         refused = client.post("/model", json=request)
         assert (refused.status_code, words in refused.text) == (status, True), (request, refused.text)
