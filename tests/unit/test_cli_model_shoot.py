@@ -67,6 +67,7 @@ def model(*words: object, typed: str = "") -> Result:
     return CliRunner().invoke(app, ["model", *map(str, words)], input=typed, env={"COLUMNS": "120"})
 
 
+@pytest.mark.slow
 def test_a_person_turns_leaves_and_goes_on_in_the_same_folder(bench: Bench, tmp_path: Path) -> None:
     shoot = ["--shoot", 9, "--rig", RIG, "--by-hand", "--output", tmp_path, *STAGE]
     bench.faults = {40.0: DeviceGoneError("left was unplugged")}
