@@ -13,6 +13,7 @@ import pytest
 from slrig.client import Client
 from slrig.client.events import Progress, StateChange
 from slrig.combine.offered import MEDIA_TYPES
+from slrig.rig.turn_count import FROM_THE_START
 from tests.e2e.conftest import Start
 from tests.e2e.faulty_rig import scenery
 from tests.e2e.faulty_rig.desk import Desk, Step
@@ -71,12 +72,14 @@ def test_after_kills_between_views_and_within_one_the_missing_views_are_shot(sta
         shot = views(client, model)
         # Each succeeded once, whatever was shot in vain when the service was killed.
         assert sorted(number for number, state in shot if state == "succeeded") == list(range(1, VIEWS + 1))
-        assert [(number, state) for number, state in shot if state != "succeeded"] == [(3, "interrupted")]
+        # On a busy machine a later one may be shot by then, or none.
+        assert [state for _, state in shot if state != "succeeded"] in (["interrupted"], [])
         report = json.loads(client.models.file(model, "report.json"))
         assert report["axis"]["stage_error_deg"] == pytest.approx([0.0] * VIEWS, abs=0.1)
         for scan in client.scans.series(model)["scans"]:
             if scan["state"] == "succeeded":
-                assert scan["summary"]["stage"] == {"angle_deg": scan["plan"]["turn_deg"], "turned_by": "table"}
+                told = {"angle_deg": scan["plan"]["turn_deg"], "turned_by": "table", "count": FROM_THE_START}
+                assert scan["summary"]["stage"] == told
     assert second.stop() == 0
 
 
