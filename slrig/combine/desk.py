@@ -314,9 +314,9 @@ class ModelDesk:
             )
             raise StorageError(message)
         found = summary(staged)
-        axis = found_axis(staged)
+        axis = found_axis(staged) if self._tells_of_the_stage(plan) else None
         self.store.commit(record.id)
-        if axis is not None and self._tells_of_the_stage(plan):
+        if axis is not None:
             try:
                 self._stage.note(axis, of=str(record.id))
             except Exception:  # noqa: BLE001 - the model is there, and is no worse for that

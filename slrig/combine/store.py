@@ -60,7 +60,8 @@ class ModelStore:
 
     def put_aside(self, known: set[UUID]) -> Sequence[str]:
         """Move what is no model on record to DATA/.orphans; return the names."""
-        strays = [place for place in self._root.iterdir() if place.name not in set(map(str, known))]
+        names = set(map(str, known))
+        strays = [place for place in self._root.iterdir() if place.name not in names]
         for stray in strays:
             self._data.orphans.mkdir(exist_ok=True)
             stray.rename(self._data.orphans / f"model-{stray.name}")

@@ -13,6 +13,7 @@ import select
 import threading
 import time
 import tty
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -37,7 +38,7 @@ class SkippingClock:
 
 
 @dataclass
-class Board:
+class Board(ABC):
     """What sits at the end of the line; its own thread serves it. `heard` : all lines and realtime bytes."""
 
     heard: list[str] = field(default_factory=list, init=False)
@@ -78,8 +79,9 @@ class Board:
         del byte
         return False
 
+    @abstractmethod
     def obey(self, line: str) -> bytes:
-        raise NotImplementedError
+        """The answer to a line."""
 
     def _serve(self) -> None:
         while not self._unplugged.is_set():
