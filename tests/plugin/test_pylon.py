@@ -33,6 +33,7 @@ features = {{ Width = 320, Height = 240, {more} }}
 SEES = 'TestImageSelector = "Off", ImageFilename = "{scene}", ImageFileMode = "On"'
 CANNOT = (
     "a free-running camera",
+    "a positioner",
     "a camera that is triggered by wire",
     "a projector that plays sequences by itself, and a camera that it triggers by wire",
 )
