@@ -25,7 +25,15 @@ from slrig.model.srgb import srgb_of
 from slrig.views.fusion_colour import to_one_scale
 from slrig.views.fusion_edges import sharpened
 from slrig.views.fusion_grid import SEEN_BEYOND, Grid, corners_mm, grid_about, wanted_corners
-from slrig.views.fusion_mean import AGREEING_SIGMAS, Means, Rule, correlated_mm, mean_values
+from slrig.views.fusion_mean import (
+    AGREEING_SIGMAS,
+    Means,
+    PoseErrors,
+    Rule,
+    exact_poses,
+    mean_values,
+    with_correlated,
+)
 from slrig.views.fusion_nearest import nearest_to_corners, nearest_within
 from slrig.views.fusion_net import Net, net
 from slrig.views.fusion_sheets import Sheets, sampling_mm, sheets
@@ -70,12 +78,14 @@ def fused(
     *,
     voxel_mm: float | None = None,
     shared_mm: float = SHARED_MM,
+    pose_errors: PoseErrors | None = None,
 ) -> FusedModel:
     """The mean surface of the views, where at least one has seen it.
 
     views : each in a frame of its own. poses : (4, 4) float64 each, X_model = R X_view + t. voxel_mm : side of the
     grid's cells, about the length of the mesh's edges; 1.25 times as far as the views' vertices are apart unless given.
     shared_mm : standard deviation of the error that all views have in common, which no comparison of them can show.
+    pose_errors : how well the poses are known, which counts in the mesh's σ; exactly unless given.
 
     Raises
     ------
@@ -97,7 +107,9 @@ def fused(
     border = _BORDER * voxel
     seen = sheets(views, poses, inset_mm=border)
     grid = grid_about(seen, voxel)
-    rule, rough = _netted(seen, grid, Rule(LEAST_CORRELATED_MM, shared_mm, _CORNER_BEYOND * voxel, border))
+    known = exact_poses(len(views)) if pose_errors is None else pose_errors
+    least = LEAST_CORRELATED_MM
+    rule, rough = _netted(seen, grid, Rule(least, least, shared_mm, _CORNER_BEYOND * voxel, border, known))
     rule = rule._replace(beyond_mm=SEEN_BEYOND * voxel)
     reach = _VERTEX_REACH * voxel + AGREEING_SIGMAS * float(np.nanmedian(seen.sigma_mm))
     nearest = nearest_within(seen, grid, rough.points_mm, rough.cells, reach_mm=reach)
@@ -122,11 +134,11 @@ def fused(
 
 
 def _netted(seen: Sheets, grid: Grid, rule: Rule) -> tuple[Rule, Net]:
-    """The rule with c as the views tell it, and the surface as the grid has it."""
+    """The rule with c and d as the views tell them, and the surface as the grid has it."""
     cells = wanted_corners(seen, grid)
     corners = corners_mm(grid, cells)
     nearest = nearest_to_corners(seen, grid, corners, cells)
-    rule = rule._replace(correlated_mm=correlated_mm(seen, corners, nearest, rule, within_mm=_TELLING * grid.voxel_mm))
+    rule = with_correlated(rule, seen, corners, nearest, within_mm=_TELLING * grid.voxel_mm)
     values = np.full(512 * len(grid.keys), np.nan, dtype=np.float32)
     values[cells] = mean_values(seen, corners, nearest, rule, values_only=True).value_mm
     return rule, net(grid, values)

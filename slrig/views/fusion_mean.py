@@ -7,9 +7,11 @@ far side of a thin wall is another surface, and must not cancel the near one. Se
 with their weighted median within k σ of the difference: where views contradict each other the heavier side is right,
 everywhere alike, instead of the one that happens to be nearer, which would add a third surface in between.
 
-σ² = Σ w² (s² + c²) / (Σ w)² + f², w = share / (σ² + c²) : s² is the noise of a point between three vertices, Σ b² σ²
-with their weights b. c is the error that neighbouring points of one view have in common, poses included: it is found
-from what is left of the views' differences when their noise is taken away. f is what all views have in common.
+σ² = Σ w² (s² + d²) / (Σ w)² + p² + f², w = share / (σ² + c²) : s² is the noise of a point between three vertices,
+Σ b² σ² with their weights b. c is the error that neighbouring points of one view have in common, poses included: it is
+found from what is left of the views' differences when their noise is taken away. d is c without the poses' part of it.
+p² = Σ w_j w_k gᵀ C_jk g / (Σ w)² is what the poses' own covariance C makes of the mean: views beside each other err
+alike, which their differences do not show; g = ((x - m) × n, n). f is what all views have in common.
 """
 
 from __future__ import annotations
@@ -31,20 +33,39 @@ _LEAST_SHARE = 0.01  # at a view's border, and beyond
 _SAMPLED = 200_000  # points whose differences are looked at
 _FEWEST_DIFFERENCES = 100
 _ONE_SIGMA = 68.27  # per cent of a normal distribution
-_GAP, _VALUE, _WEIGHT, _NOISE, _NX, _NY, _NZ, _B0, _B1, _B2, _BEYOND, _FACE = range(12)
+_GAP, _VALUE, _WEIGHT, _NOISE, _NX, _NY, _NZ, _B0, _B1, _B2, _BEYOND, _FACE, _VIEW = range(13)
+_COLUMNS = 13
 _CLEAN, _UNKNOWN = int(AlbedoMark.NONE), int(AlbedoMark.UNKNOWN)
 _LIGHT = light_of(np.arange(256, dtype=np.uint8)) / light_of(np.array(255, np.uint8))
 
 
+class PoseErrors(NamedTuple):
+    """How well the poses of V views are known.
+
+    covariance : (6 V, 6 V) float64, C above, view by view of a small turn (rad) about `middle_mm` and a shift (mm) of
+    it, in the model's frame. middle_mm : (3,) float64, m above.
+    """
+
+    covariance: FloatArray
+    middle_mm: FloatArray
+
+
+def exact_poses(views: int) -> PoseErrors:
+    """Of poses without an error."""
+    return PoseErrors(np.zeros((6 * views, 6 * views)), np.zeros(3))
+
+
 class Rule(NamedTuple):
-    """correlated_mm : c above; shared_mm : f. beyond_mm : how far beyond a border a view still counts;
+    """correlated_mm : c above; own_mm : d; shared_mm : f. beyond_mm : how far beyond a border a view still counts;
     inset_mm : how far from its border a view has its full weight.
     """
 
     correlated_mm: float
+    own_mm: float
     shared_mm: float
     beyond_mm: float
     inset_mm: float
+    poses: PoseErrors
 
 
 class Means(NamedTuple):
@@ -64,20 +85,25 @@ class Means(NamedTuple):
     mark: NDArray[np.uint8]
 
 
-def correlated_mm(sheets: Sheets, points_mm: FloatArray, nearest: IntArray, rule: Rule, *, within_mm: float) -> float:
-    """C above: of two views' differences, the part that their vertices' noise does not explain, shared between them.
+def with_correlated(rule: Rule, sheets: Sheets, points_mm: FloatArray, nearest: IntArray, *, within_mm: float) -> Rule:
+    """The rule with c and d as two views' differences tell them: the part that their vertices' noise does not explain,
+    shared between them, and what is left of it without the poses.
 
     points_mm : (n, 3) float64; nearest : (V, n) int32, the views' nearest triangles, -1 for none. within_mm : points
-    further from a view tell nothing of it. The least that is said is `rule.correlated_mm`.
+    further from a view tell nothing of it. The least that is said is what the rule has.
     """
     step = max(1, points_mm.shape[0] // _SAMPLED)
     places = np.arange(0, len(points_mm), step)
     found = in_bands(_differences, len(places), sheets, points_mm, nearest, places, rule, within_mm)
-    differences, noise = (np.concatenate(each) for each in zip(*found, strict=True))
+    differences, noise, by_poses = (np.concatenate(each) for each in zip(*found, strict=True))
     if len(differences) < _FEWEST_DIFFERENCES:
-        return rule.correlated_mm
+        return rule
     excess = float(np.percentile(np.abs(differences), _ONE_SIGMA)) ** 2 - float(np.median(noise))
-    return max(rule.correlated_mm, float(np.sqrt(max(excess, 0.0) / 2)))
+    own = excess - float(np.median(by_poses))
+    return rule._replace(
+        correlated_mm=max(rule.correlated_mm, float(np.sqrt(max(excess, 0.0) / 2))),
+        own_mm=max(rule.own_mm, float(np.sqrt(max(own, 0.0) / 2))),
+    )
 
 
 def mean_values(sheets: Sheets, points_mm: FloatArray, nearest: IntArray, rule: Rule, *, values_only: bool) -> Means:
@@ -130,12 +156,27 @@ def _view_at(sheets: Any, face: int, x: float, y: float, z: float, rule: Any, ro
 
 
 @kernel_part
+def _pose_covariance(
+    poses: Any, j: int, k: int, x: float, y: float, z: float, nx: float, ny: float, nz: float
+) -> float:
+    """gᵀ C_jk g : of where two views' poses put the surface at a point, along its normal, mm²."""
+    x, y, z = x - poses.middle_mm[0], y - poses.middle_mm[1], z - poses.middle_mm[2]
+    g = (y * nz - z * ny, z * nx - x * nz, x * ny - y * nx, nx, ny, nz)
+    total = 0.0
+    for a in range(6):
+        for b in range(6):
+            total += g[a] * poses.covariance[6 * j + a, 6 * k + b] * g[b]
+    return total
+
+
+@kernel_part
 def _counting(sheets: Any, points: Any, nearest: Any, at: int, rule: Any, rows: Any, order: Any) -> int:
     """How many views count at a point; `order` begins with their rows, by their values."""
     count, near = 0, 0
     for view in range(len(nearest)):
         face = nearest[view, at]
         if face >= 0 and _view_at(sheets, face, points[at, 0], points[at, 1], points[at, 2], rule, rows, count):
+            rows[count, _VIEW] = view
             if rows[count, _GAP] < rows[near, _GAP]:
                 near = count
             count += 1
@@ -170,7 +211,7 @@ def _counting(sheets: Any, points: Any, nearest: Any, at: int, rule: Any, rows: 
 
 @kernel(in_every_scan=False)
 def _means(first: int, last: int, sheets: Any, points: Any, nearest: Any, rule: Any, means: Any) -> None:
-    rows, order = np.zeros((len(nearest), 12)), np.zeros(len(nearest), np.int64)
+    rows, order = np.zeros((len(nearest), _COLUMNS)), np.zeros(len(nearest), np.int64)
     for at in range(first, last):
         count = _counting(sheets, points, nearest, at, rule, rows, order)
         if count == 0:
@@ -181,13 +222,20 @@ def _means(first: int, last: int, sheets: Any, points: Any, nearest: Any, rule: 
             w = rows[row, _WEIGHT]
             weight += w
             value += w * rows[row, _VALUE]
-            variance += w * w * (rows[row, _NOISE] + rule.correlated_mm**2)
+            variance += w * w * (rows[row, _NOISE] + rule.own_mm**2)
             nx, ny, nz = nx + w * rows[row, _NX], ny + w * rows[row, _NY], nz + w * rows[row, _NZ]
             inside += rows[row, _BEYOND] == 0.0
         means.value_mm[at] = value / weight
         if len(means.views):
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            means.normals[at, 0], means.normals[at, 1], means.normals[at, 2] = nx / length, ny / length, nz / length
+            nx, ny, nz = nx / length, ny / length, nz / length
+            means.normals[at, 0], means.normals[at, 1], means.normals[at, 2] = nx, ny, nz
+            x, y, z = points[at, 0], points[at, 1], points[at, 2]
+            for one in range(count):
+                j, w = int(rows[order[one], _VIEW]), rows[order[one], _WEIGHT]
+                for other in range(count):
+                    k, v = int(rows[order[other], _VIEW]), rows[order[other], _WEIGHT]
+                    variance += w * v * _pose_covariance(rule.poses, j, k, x, y, z, nx, ny, nz)
             means.sigma_mm[at] = np.sqrt(variance / (weight * weight) + rule.shared_mm**2)
             means.views[at] = max(inside, 1)
             _blend(sheets, rows, order, count, means.light[at], means.mark, at)
@@ -224,17 +272,22 @@ def _blend(sheets: Any, rows: Any, order: Any, count: int, light: Any, mark: Any
 @kernel(in_every_scan=False)
 def _differences(
     first: int, last: int, sheets: Any, points: Any, nearest: Any, places: Any, rule: Any, within: float
-) -> tuple[FloatArray, FloatArray]:
-    """Differences of two views' values at points that neither has a border near, and the variance of their noise."""
-    rows = np.zeros((2, 12))
-    differences, noise, count = np.zeros(last - first), np.zeros(last - first), 0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Differences of two views' values at points that neither has a border near, and their variances: of the noise, and
+    by the poses.
+    """
+    rows = np.zeros((2, _COLUMNS))
+    differences, noise, by_poses = np.zeros(last - first), np.zeros(last - first), np.zeros(last - first)
+    count = 0
     for place in range(first, last):
         at, known = places[place], 0
         for step in range(len(nearest)):
             # Another view begins each time, so that all pairs have their turn.
-            face = nearest[(place + step) % len(nearest), at]
+            view = (place + step) % len(nearest)
+            face = nearest[view, at]
             if face < 0 or not _view_at(sheets, face, points[at, 0], points[at, 1], points[at, 2], rule, rows, known):
                 continue
+            rows[known, _VIEW] = view
             if rows[known, _BEYOND] == 0.0 and rows[known, _GAP] < within * within:
                 known += 1
             if known == 2:
@@ -244,5 +297,17 @@ def _differences(
             if cosine > _SAME_SIDE:
                 differences[count] = rows[0, _VALUE] - rows[1, _VALUE]
                 noise[count] = rows[0, _NOISE] + rows[1, _NOISE]
+                j, k = int(rows[0, _VIEW]), int(rows[1, _VIEW])
+                x, y, z, nx, ny, nz = (
+                    points[at, 0],
+                    points[at, 1],
+                    points[at, 2],
+                    rows[0, _NX],
+                    rows[0, _NY],
+                    rows[0, _NZ],
+                )
+                apart = _pose_covariance(rule.poses, j, j, x, y, z, nx, ny, nz)
+                apart += _pose_covariance(rule.poses, k, k, x, y, z, nx, ny, nz)
+                by_poses[count] = apart - 2 * _pose_covariance(rule.poses, j, k, x, y, z, nx, ny, nz)
                 count += 1
-    return differences[:count], noise[:count]
+    return differences[:count], noise[:count], by_poses[:count]

@@ -19,8 +19,8 @@ from tests.unit.views.known_views import Noise, View, around, plate_on_box, star
 QUIET = Noise(sigma_mm=0.001, slow_mm=0.0)
 
 
-def model_of(views: list[View], **options: float) -> FusedModel:
-    return fused([view.mesh for view in views], [view.pose for view in views], **options)
+def model_of(views: list[View], *, voxel_mm: float | None = None) -> FusedModel:
+    return fused([view.mesh for view in views], [view.pose for view in views], voxel_mm=voxel_mm)
 
 
 def tree(truth: trimesh.Trimesh) -> SearchTree:

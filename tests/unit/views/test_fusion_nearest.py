@@ -8,18 +8,21 @@ import pytest
 from slrig.meshing.search_tree import SearchTree
 from slrig.model import FloatArray
 from slrig.views.fusion_grid import corners_mm, grid_about, wanted_corners
-from slrig.views.fusion_mean import AGREEING_SIGMAS, Rule, mean_values
+from slrig.views.fusion_mean import AGREEING_SIGMAS, PoseErrors, Rule, mean_values
 from slrig.views.fusion_nearest import nearest_to_corners, nearest_within
 from slrig.views.fusion_sheets import Sheets, sheets
 from tests.unit.views.known_views import around, plate_on_box, views_of
 
 VOXEL_MM = 1.1
-RULE = Rule(correlated_mm=0.01, shared_mm=0.002, beyond_mm=0.6, inset_mm=4.0)
+VIEWS = 4
+_ROOT = np.random.default_rng(3).normal(size=(6 * VIEWS, 6 * VIEWS)) * np.tile([1e-4] * 3 + [1e-3] * 3, VIEWS)[:, None]
+POSES = PoseErrors(_ROOT @ _ROOT.T, np.array([1.0, -2.0, 0.5]))
+RULE = Rule(correlated_mm=0.01, own_mm=0.006, shared_mm=0.002, beyond_mm=0.6, inset_mm=4.0, poses=POSES)
 
 
 @pytest.fixture(scope="module")
 def seen() -> Sheets:
-    views = views_of(plate_on_box(), around(4), 0.9)
+    views = views_of(plate_on_box(), around(VIEWS), 0.9)
     return sheets([view.mesh for view in views], [view.pose for view in views], inset_mm=RULE.inset_mm)
 
 
@@ -39,7 +42,7 @@ def plain_nearest(point: FloatArray, triangle: FloatArray) -> tuple[float, Float
 def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[float, float, int]:
     """Mean value, σ and number of views, by the rules of the module's docstring."""
     rows = []
-    for face in (each for each in nearest if each >= 0):
+    for view, face in ((view, face) for view, face in enumerate(nearest) if face >= 0):
         corners = seen.faces[face]
         gap, weights = plain_nearest(point, seen.points_mm[corners])
         normal = weights @ seen.normals[corners].astype(float)
@@ -55,7 +58,7 @@ def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[fl
             share = max(min(inset / RULE.inset_mm, 1), 0.01)
             w = share / (sigma.sum() ** 2 + RULE.correlated_mm**2)
             value = along if border else np.copysign(gap, along)
-            rows.append((value, gap, w, (sigma**2).sum(), normal, beyond))
+            rows.append((value, gap, w, (sigma**2).sum(), normal, beyond, view))
     if not rows:
         return np.nan, np.nan, 0
     first = min(rows, key=lambda row: row[1])
@@ -65,7 +68,13 @@ def plain_value(seen: Sheets, point: FloatArray, nearest: list[int]) -> tuple[fl
     common = 2 * RULE.correlated_mm**2
     rows = [row for row in rows if abs(row[0] - middle[0]) <= AGREEING_SIGMAS * np.sqrt(row[3] + middle[3] + common)]
     w = np.array([row[2] for row in rows])
-    variance = (w**2 * [row[3] + RULE.correlated_mm**2 for row in rows]).sum() / w.sum() ** 2 + RULE.shared_mm**2
+    variance = (w**2 * [row[3] + RULE.own_mm**2 for row in rows]).sum() / w.sum() ** 2 + RULE.shared_mm**2
+    mean = np.sum([each * row[4] for each, row in zip(w, rows, strict=True)], axis=0)
+    mean /= np.linalg.norm(mean)
+    moves = np.zeros(6 * VIEWS)  # how the mean moves along its normal with turns and shifts of the views
+    for each, row in zip(w / w.sum(), rows, strict=True):
+        moves[6 * row[6] : 6 * row[6] + 6] = each * np.append(np.cross(point - POSES.middle_mm, mean), mean)
+    variance += moves @ POSES.covariance @ moves
     value = float((w * [row[0] for row in rows]).sum() / w.sum())
     return value, float(np.sqrt(variance)), max(1, sum(row[5] == 0 for row in rows))
 
