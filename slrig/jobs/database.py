@@ -11,12 +11,13 @@ from alembic import command
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import Connection, Engine, create_engine, event
+from sqlalchemy import Connection, Engine, MetaData, create_engine, event
 from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import DatabaseError, OperationalError
 from sqlalchemy.orm import Session
 
 from slrig.errors import StorageError
+from slrig.jobs.tables import Base
 
 PATIENCE_S = 10.0
 """How long a change waits for another program that has the file locked, as some backups do. A person who asked waits as
@@ -40,18 +41,20 @@ class Database:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._writing = threading.Lock()
-        self._engine = create_engine(f"sqlite:///{path}")
-        event.listen(self._engine, "connect", _set_up)
-        event.listen(self._engine, "begin", _begin)
-        with self._refusals(), self._writer(PATIENCE_S).begin() as connection:
-            _upgrade(connection, path)
+        self._engine = sqlite_engine(path)
+        with self._refusals(), writing(self._engine, PATIENCE_S).begin() as connection:
+            if unknown := upgrade(connection, "slrig.jobs:migrations/versions", Base.metadata):
+                message = (
+                    f"{path} was written by another version of slrig (its records are of version {unknown}), and this "
+                    "one cannot read it. Move that file out of the data folder: finished scans and calibrations are "
+                    "found again by their own files, schedules have to be made anew. Or name another folder with "
+                    "--data."
+                )
+                raise StorageError(message)
 
     def close(self) -> None:
         """Let the file go. Idempotent."""
         self._engine.dispose()
-
-    def _writer(self, patience_s: float) -> Engine:
-        return self._engine.execution_options(**{_PATIENCE: int(1000 * patience_s)})
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -65,7 +68,7 @@ class Database:
 
         patience_s : how long to wait for another program that has the file locked; None stands for `PATIENCE_S`.
         """
-        writer = self._writer(PATIENCE_S if patience_s is None else patience_s)
+        writer = writing(self._engine, PATIENCE_S if patience_s is None else patience_s)
         # SQLite has one writer; a lock here keeps a second thread from ever seeing "database is locked".
         with self._refusals(), self._writing, Session(writer, expire_on_commit=False) as session, session.begin():
             yield session
@@ -88,6 +91,19 @@ class Database:
             raise StorageError(message) from error
 
 
+def sqlite_engine(path: Path) -> Engine:
+    """A SQLite file with a write-ahead log; what was committed survives a power cut."""
+    engine = create_engine(f"sqlite:///{path}")
+    event.listen(engine, "connect", _set_up)
+    event.listen(engine, "begin", _begin)
+    return engine
+
+
+def writing(engine: Engine, patience_s: float) -> Engine:
+    """The same file, whose transactions have its one write lock from their beginning; how long they wait for it."""
+    return engine.execution_options(**{_PATIENCE: int(1000 * patience_s)})
+
+
 def _set_up(connection: DBAPIConnection, _record: object) -> None:
     # The driver begins no transactions of its own: `_begin` does.
     connection.isolation_level = None
@@ -104,18 +120,17 @@ def _begin(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN" if patience_ms is None else "BEGIN IMMEDIATE")
 
 
-def _upgrade(connection: Connection, path: Path) -> None:
-    """Bring the tables up to date by the scripts of `slrig.jobs.migrations`. Does nothing when they are."""
+def upgrade(connection: Connection, scripts: str, tables: MetaData) -> str:
+    """Bring tables up to date by Alembic's scripts in `PACKAGE:FOLDER`. Does nothing when they are; changes nothing,
+    and returns the versions that the scripts do not know, where another slrig made them, else "".
+    """
     config = Config()
     config.set_main_option("script_location", "slrig.jobs:migrations")
-    config.set_main_option("path_separator", "os")
-    config.attributes["connection"] = connection
+    config.set_main_option("version_locations", scripts)
+    config.set_main_option("path_separator", "newline")
+    config.attributes.update(connection=connection, tables=tables)
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
-    if found := set(MigrationContext.configure(connection).get_current_heads()) - known:
-        message = (
-            f"{path} was written by another version of slrig (its records are of version {', '.join(sorted(found))}), "
-            "and this one cannot read it. Move that file out of the data folder: finished scans and calibrations are "
-            "found again by their own files, schedules have to be made anew. Or name another folder with --data."
-        )
-        raise StorageError(message)
-    command.upgrade(config, "head")
+    unknown = set(MigrationContext.configure(connection).get_current_heads()) - known
+    if not unknown:
+        command.upgrade(config, "head")
+    return ", ".join(sorted(unknown))

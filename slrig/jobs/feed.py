@@ -8,8 +8,8 @@ from uuid import UUID
 from sqlalchemy import func, select
 
 from slrig.jobs.records import JobEvent, reference
-from slrig.jobs.store import EVERY_JOB, JobStore, record_of
-from slrig.jobs.tables import EventRow, JobRow
+from slrig.jobs.store import EVERY_JOB, JobStore
+from slrig.jobs.tables import EventRow, JobRow, record_of
 
 
 class JobFeed:

@@ -15,6 +15,7 @@ from sqlalchemy import ColumnElement, delete, event, func, select
 from sqlalchemy.orm import Session
 
 from slrig.config import NoticeKind
+from slrig.jobs.copies import Copies
 from slrig.jobs.database import Database
 from slrig.jobs.records import Clock, JobRecord, JobState, reference, stamp, utc_now
 from slrig.jobs.tables import NoticeRow
@@ -44,7 +45,7 @@ class Outbox:
 
     rig : the name that notices bear. wanted : the kinds that each receiver wants, by its name; all others are let go.
     most : may wait for one; the oldest make room. `news` is set when one more waits, `dropped` counts those that were
-    never sent.
+    never sent. copies : takes every job that ends, for a catalogue; None where there is none.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class Outbox:
         wanted: Mapping[str, Collection[NoticeKind]] | None = None,
         clock: Clock = utc_now,
         most: int = MOST_WAITING,
+        copies: Copies | None = None,
     ) -> None:
         self.database = database
         self._rig = rig
@@ -63,6 +65,7 @@ class Outbox:
         self._most = most
         self.news = {receiver: threading.Event() for receiver in self._wanted}
         self.dropped = 0
+        self.copies = copies
 
     def put(self, session: Session, kind: NoticeKind, words: str, /, **members: Mapping[str, Any]) -> None:
         """Have a notice sent once the session's changes are kept. words : what it says to people, but for the rig."""
@@ -89,6 +92,11 @@ class Outbox:
         told = {**reference(job), "state": str(job.state), "error": fault, "requested_by": job.requested_by, **moments}
         state = job.state if job.state in {JobState.SUCCEEDED, JobState.FAILED} else f"was {job.state}"
         self.put(session, "job.ended", f"{job.kind} {job.id} {state}{more}", job=told)
+
+    def closed(self, session: Session, job: JobRecord) -> None:
+        """Have a catalogue know of a job in its final state, and of each change of that."""
+        if self.copies is not None:
+            self.copies.put(session, job)
 
     def oldest(self, receiver: str) -> Notice | None:
         """The notice to send next. Drops those that have waited for too long."""

@@ -17,7 +17,7 @@ from slrig.failure import JobFailure
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
 from slrig.jobs.records import Clock, JobEvent, JobKind, JobProgress, JobRecord, JobState, actor, stamp, utc_now
-from slrig.jobs.tables import EventRow, JobRow, KeyRow
+from slrig.jobs.tables import EventRow, JobRow, KeyRow, record_of
 
 _LISTED = {
     JobKind.SCAN: "GET /scan lists those that are.",
@@ -327,6 +327,7 @@ class JobStore:
             row.failure_code, row.failure_message = fault.code, fault.message
         error = None if fault is None else {"code": fault.code, "message": fault.message}
         _append(session, row, "state", {"state": state, "time": row.finished_at, "error": error})
+        self.outbox.closed(session, record_of(row))
 
     def _now(self) -> str:
         return stamp(self._clock())
@@ -365,34 +366,8 @@ def _append(session: Session, row: JobRow, kind: str, data: dict[str, Any]) -> N
     session.add(EventRow(job_id=row.id, number=row.last_event, kind=kind, data=data))
 
 
-def record_of(row: JobRow) -> JobRecord:
-    """A row as the record that it is."""
-    return JobRecord(
-        number=row.number,
-        id=UUID(row.id),
-        kind=JobKind(row.kind),
-        state=JobState(row.state),
-        label=row.label,
-        rig=row.rig,
-        plan=row.plan,
-        created_at=datetime.fromisoformat(row.created_at),
-        started_at=_moment(row.started_at),
-        finished_at=_moment(row.finished_at),
-        progress=JobProgress(row.stage, row.fraction, row.detail),
-        fault=None if row.failure_code is None else JobFailure(row.failure_code, row.failure_message or ""),
-        summary=row.summary,
-        pinned=row.pinned,
-        parent=None if row.parent is None else UUID(row.parent),
-        requested_by=row.requested_by,
-    )
-
-
 def unfinished_ids(database: Database) -> set[str]:
     """The jobs of every kind that are in no final state."""
     running = [state for state in JobState if not state.final]
     with database.reading() as session:
         return set(session.scalars(select(JobRow.id).where(JobRow.state.in_(running))))
-
-
-def _moment(stamp: str | None) -> datetime | None:
-    return None if stamp is None else datetime.fromisoformat(stamp)

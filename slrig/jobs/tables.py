@@ -5,10 +5,15 @@ Times are ISO 8601 text in UTC, which sorts as it reads.
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Any
+from uuid import UUID
 
 from sqlalchemy import JSON, Boolean, Float, ForeignKey, Index, Integer, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from slrig.failure import JobFailure
+from slrig.jobs.records import JobKind, JobProgress, JobRecord, JobState
 
 
 class Base(DeclarativeBase):
@@ -111,6 +116,19 @@ class NoticeRow(Base):
     __table_args__ = ({"sqlite_autoincrement": True},)
 
 
+class CopyRow(Base):
+    """One finished job that a catalogue has not taken yet; `number` is the order in which they ended."""
+
+    __tablename__ = "job_copy"
+
+    number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
+    at: Mapped[str] = mapped_column(String(32))
+    job_id: Mapped[str] = mapped_column(String(36))
+    body: Mapped[dict[str, Any]] = mapped_column(JSON)
+
+    __table_args__ = ({"sqlite_autoincrement": True},)
+
+
 class ScheduleRow(Base):
     """One schedule."""
 
@@ -177,3 +195,29 @@ class VerificationRow(Base):
         Index("ix_verification_at", "at"),
         {"sqlite_autoincrement": True},
     )
+
+
+def record_of(row: JobRow) -> JobRecord:
+    """A row as the record that it is."""
+    return JobRecord(
+        number=row.number,
+        id=UUID(row.id),
+        kind=JobKind(row.kind),
+        state=JobState(row.state),
+        label=row.label,
+        rig=row.rig,
+        plan=row.plan,
+        created_at=datetime.fromisoformat(row.created_at),
+        started_at=_moment(row.started_at),
+        finished_at=_moment(row.finished_at),
+        progress=JobProgress(row.stage, row.fraction, row.detail),
+        fault=None if row.failure_code is None else JobFailure(row.failure_code, row.failure_message or ""),
+        summary=row.summary,
+        pinned=row.pinned,
+        parent=None if row.parent is None else UUID(row.parent),
+        requested_by=row.requested_by,
+    )
+
+
+def _moment(stamp: str | None) -> datetime | None:
+    return None if stamp is None else datetime.fromisoformat(stamp)
