@@ -221,7 +221,10 @@ def default_data_dir() -> Path:
     return Path(base) / "slrig"
 
 
-_PATHS = "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file"
+_PATHS = (
+    "data_dir", "rig", "webhook_secret_file", "mqtt_login_file", "compute_certificates", "compute_login_file",
+    "catalogue_login_file", "catalogue_authority",
+)  # fmt: skip
 
 
 class ServiceSettings(BaseSettings):
@@ -240,8 +243,10 @@ class ServiceSettings(BaseSettings):
     SIGTERM, the job that has the rig and those that compute may take to come to their end before they are interrupted;
     what waits, and what has its frames, goes on at the next start. `compute` is the scheduler of a pool that
     reconstructs for this rig, `compute_store` where bundles and results lie meanwhile, `compute_certificates` and
-    `compute_login_file` what opens the two: see slrig/compute/README.md. Nobody but the service's own user may read the
-    data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, JSON lines elsewhere.
+    `compute_login_file` what opens the two: see slrig/compute/README.md. `catalogue` is a database that rigs share,
+    `catalogue_authority` who signed its certificate: see slrig/catalogue/README.md. Nobody but the service's own user
+    may read the data, and the users of `data_group`, if it is set. `log_format` auto is text on a terminal, JSON lines
+    elsewhere.
     """
 
     model_config = SettingsConfigDict(
@@ -288,6 +293,10 @@ class ServiceSettings(BaseSettings):
     compute_store: Annotated[str, Field(max_length=2000)] | None = None
     compute_certificates: Path | None = None
     compute_login_file: Path | None = None
+    catalogue: Annotated[str, Field(max_length=2000)] | None = None
+    catalogue_login: SecretStr | None = None
+    catalogue_login_file: Path | None = None
+    catalogue_authority: Path | None = None
 
     @property
     def key_path(self) -> Path:
@@ -304,7 +313,7 @@ class ServiceSettings(BaseSettings):
     def _split(cls, names: object) -> object:
         return tuple(name.strip() for name in names.split(",") if name.strip()) if isinstance(names, str) else names
 
-    @field_validator("webhook_secret", "mqtt_login", mode="before")
+    @field_validator("webhook_secret", "mqtt_login", "catalogue_login", mode="before")
     @classmethod
     def _a_text(cls, secret: object) -> object:
         if not isinstance(secret, str | SecretStr | None):
@@ -312,7 +321,7 @@ class ServiceSettings(BaseSettings):
             raise ValueError(message)  # noqa: TRY004 - what pydantic collects
         return secret or None
 
-    @field_validator("mqtt_url")
+    @field_validator("mqtt_url", "catalogue")
     @classmethod
     def _empty_is_none(cls, url: str | None) -> str | None:
         return url or None

@@ -223,6 +223,12 @@ class ServiceError(SlrigError, code="service"):
     """The slrig service, asked as a client, could not be reached or answered with an error of its own."""
 
 
+class CatalogueError(SlrigError, code="catalogue"):
+    """The catalogue that rigs share cannot be reached, refuses, or there is none. The rig scans on: what it has to tell
+    waits on its own disk.
+    """
+
+
 class WorkerLostError(SlrigError, code="worker-lost"):
     """The process that computes ended, or stood still, in the middle of its work: killed, stopped, or out of memory."""
 

@@ -16,6 +16,8 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
+from tests.postgres import Postgres
+
 # Before numpy is loaded, here and in what tests start: where processes outnumber cores, threads of OpenBLAS wait for
 # one another by spinning, and small matrices take four times the processor time.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -116,3 +118,10 @@ def logs_as_they_come() -> Iterator[None]:
     """A command that a test runs sets up the logs of the whole process: afterwards they are as they were."""
     yield
     structlog.reset_defaults()
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Postgres]:
+    """A Postgres server that runs. Skips where there is none, or no driver. Who kills it makes one of their own."""
+    with Postgres() as server:
+        yield server

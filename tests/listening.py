@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+import socket
 from importlib import import_module
+
+
+def free_port() -> int:
+    """A port of loopback that nobody listens on."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port: int = found.getsockname()[1]
+        return port
 
 
 def listening_at(pid: int | None = None) -> set[str]:

@@ -32,7 +32,7 @@ _CODES = {
     501: "extra-missing",
     502: "scan-evidence device service",
     503: "device-gone device-busy driver-not-found driver-broken library-missing scan-interrupted data-folder-gone "
-    "worker-busy",
+    "worker-busy catalogue",
     504: "frame-timeout",
     507: "storage",
 }

@@ -29,6 +29,7 @@ from slrig.config import RigConfig, ServiceSettings, is_loopback
 from slrig.discovery import open_rig
 from slrig.errors import ConfigError, InvalidInputError, ServiceError
 from slrig.jobs.compute import Compute
+from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
 from slrig.jobs.outbox import Outbox
@@ -70,7 +71,8 @@ def open_service(
     try:
         prepare_kernel_cache(folder.root / "cache")
         database = Database(folder.database)
-        outbox = Outbox(database, rig=rig.name, wanted=wanted_kinds(settings))
+        copies = None if settings.catalogue is None else Copies(database)
+        outbox = Outbox(database, rig=rig.name, wanted=wanted_kinds(settings), copies=copies)
         store = JobStore(database, JobKind.SCAN, outbox=outbox)
         swept = sweep(store, folder)
     except BaseException:

@@ -18,6 +18,9 @@ from slrig.calibrate.calibrating import Calibrations
 from slrig.calibrate.retention import Retention
 from slrig.calibrate.tools import CalibrationTools
 from slrig.calibrate.tools import calibration_tools as usual_calibration_tools
+from slrig.catalogue.copying import Copier
+from slrig.catalogue.standing import standing
+from slrig.catalogue.store import catalogue_of
 from slrig.combine.desk import CombineInto, ModelDesk
 from slrig.combine.shooting import ViewShooting
 from slrig.combine.stage import StageStore
@@ -27,7 +30,7 @@ from slrig.jobs.compute import Compute
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.feed import JobFeed
 from slrig.jobs.keys import RequestKeys
-from slrig.jobs.records import JobKind, JobRecord
+from slrig.jobs.records import JobKind, JobRecord, utc_now
 from slrig.jobs.store import JobStore
 from slrig.scan.presets import Presets
 from slrig.scan.retention import ScanLimits, ScanRetention
@@ -60,7 +63,9 @@ class Service:
         The disk refused. What was given is still the caller's to close.
     ConfigError
         The environment asks for traces, and the library that sends them is not installed. Or a receiver of notices
-        cannot be told: see `senders_of`.
+        cannot be told: see `senders_of`. Or the catalogue has no address, or no login.
+    ExtraMissingError
+        The catalogue's driver is not installed.
     """
 
     def __init__(
@@ -153,12 +158,22 @@ class Service:
             keep=settings.keep_calibrations,
             named=lambda: {test.calibration for test in self.acceptance.latest()},
         )
+        self.copier = self._copier()
+        self._tellers = (*self.senders, *(() if self.copier is None else (self.copier,)))
         limits = ScanLimits(settings.keep_scans, settings.keep_scans_days, settings.keep_scans_bytes)
         self.scan_retention = ScanRetention(store, folder, limits, runner.delete)
         self.schedules = ScheduleStore(database, notice=partial(tell_run, outbox))
         self.tasks = Tasks(runner.queue, self.calibrations, self.verifications, self.acceptance, tidy=self.retention)
         # The folder's lock keeps every other process out.
         self.scheduler = Scheduler(self.schedules, self.tasks, alone=True)
+
+    def _copier(self) -> Copier | None:
+        """What tells the catalogue of this rig, if the settings name one. Raises ConfigError, ExtraMissingError."""
+        catalogue, copies = catalogue_of(self.settings), self.store.outbox.copies
+        if catalogue is None or copies is None:
+            return None
+        told = partial(standing, self.runner, self.verifications, data=self.folder.root.resolve(), started_at=utc_now())
+        return Copier(catalogue, copies, told)
 
     def _ended(self, jobs: JobStore, record: JobRecord) -> None:
         """Measure a job that is over, and go on with the model of a view, and make room, after a scan."""
@@ -175,7 +190,7 @@ class Service:
 
     def start(self) -> None:
         """Open the rig, look at the clock, send what waits, and remove what is old."""
-        for sender in self.senders:
+        for sender in self._tellers:
             sender.start()
         self.runner.start()
         self.scheduler.start()
@@ -203,7 +218,7 @@ class Service:
     def close(self) -> None:
         """Stop scanning, then let records and data folder go. Idempotent."""
         self.end_work()
-        for sender in self.senders:
+        for sender in self._tellers:
             sender.close()
         if self.traces is not None:
             self.traces.close()

@@ -25,15 +25,15 @@ def senders_of(settings: ServiceSettings, outbox: Outbox) -> list[Sender]:
     """One for each receiver. Raises ConfigError: an address or a secret is none, or an extra is not installed."""
     found: list[Sender] = []
     if settings.webhook_url is not None:
-        secret, source = _secret(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
+        secret, source = secret_of(settings.webhook_secret, settings.webhook_secret_file, "webhook_secret")
         found.append(Webhook(outbox, settings.webhook_url, None if secret is None else signing_key(secret, source)))
     if settings.mqtt_url is not None:
-        login, _ = _secret(settings.mqtt_login, settings.mqtt_login_file, "mqtt_login")
+        login, _ = secret_of(settings.mqtt_login, settings.mqtt_login_file, "mqtt_login")
         found.append(Broker(outbox, settings.mqtt_url, login))
     return found
 
 
-def _secret(given: SecretStr | None, path: Path | None, name: str) -> tuple[str | None, str]:
+def secret_of(given: SecretStr | None, path: Path | None, name: str) -> tuple[str | None, str]:
     """A secret, or what a file holds that nobody but its owner may read; and which it was. Raises ConfigError."""
     if given is not None or path is None:
         return None if given is None else given.get_secret_value(), name

@@ -13,15 +13,9 @@ from pathlib import Path
 
 import httpx2
 
+from tests.listening import free_port
+
 START_LIMIT_S = 60.0
-
-
-def free_port() -> int:
-    """A port that nobody listens on."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port: int = found.getsockname()[1]
-        return port
 
 
 class Process:

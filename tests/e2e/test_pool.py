@@ -19,8 +19,8 @@ from slrig.jobs.worker import Worker
 from slrig.scan.job import PIPELINE, reconstruction
 from slrig.scan.plan import ReconstructionPlan
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.pool_processes import Process, S3Server, Wire, free_port
-from tests.listening import listening_at
+from tests.e2e.pool_processes import Process, S3Server, Wire
+from tests.listening import free_port, listening_at
 from tests.npm import lacking
 
 SECRET = "the-secret-of-the-store"  # noqa: S105 - nothing but a test's

@@ -1,0 +1,45 @@
+"""How a rig is, as its service knows it: what the catalogue is told of it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from slrig.jobs.worker import READY
+from slrig.scan.runner import Runner, RunnerStatus
+from slrig.verify.job import VerificationDesk
+
+
+def standing(runner: Runner, verifications: VerificationDesk, *, data: Path, started_at: datetime) -> dict[str, Any]:
+    """The columns of a rig's row, but for when it is seen and what is not copied. data : the service's folder."""
+    status = runner.status()
+    health, latest, _ = verifications.health()
+    state, words = _state(status)
+    return {
+        "name": status.rig,
+        "origin": f"{platform.node()}:{data}",
+        "host": platform.node(),
+        "version": importlib.metadata.version("slrig"),
+        "started_at": started_at,
+        "state": state,
+        "words": words,
+        "waiting": status.waiting,
+        "computing": len(status.computing),
+        "health": str(health.state),
+        "health_words": "; ".join(health.reasons),
+        "verified_at": None if latest is None else latest.at,
+    }
+
+
+def _state(status: RunnerStatus) -> tuple[str, str]:
+    """What a rig is at, and in words."""
+    if status.fault is not None:
+        return "fault", status.fault
+    if status.facts is None:
+        return "opening", status.opening
+    if status.reconstruction != READY and not status.preparing:
+        return "fault", status.reconstruction
+    return ("ready", "") if status.holder is None else ("busy", status.holder)

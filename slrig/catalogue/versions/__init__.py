@@ -1,0 +1,1 @@
+"""The steps from one shape of the catalogue to the next, oldest first."""

@@ -1,0 +1,184 @@
+"""The catalogue itself, on SQLite and on Postgres alike."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import text, update
+
+from slrig.catalogue import store
+from slrig.catalogue.store import Catalogue, open_catalogue
+from slrig.catalogue.tables import CatalogueBase, RigRow
+from slrig.errors import CatalogueError, ConfigError
+from tests.listening import free_port
+from tests.postgres import LOGIN, PASSWORD, Postgres
+
+NOW = datetime.now(UTC).replace(microsecond=0)
+
+
+def job(rig: str = "hall-3", **other: Any) -> dict[str, Any]:
+    at = NOW.isoformat(timespec="milliseconds")
+    return {
+        "job": str(uuid4()), "rig": rig, "kind": "scan", "label": None, "parent": None, "state": "succeeded",
+        "requested_by": None, "created_at": at, "started_at": at, "finished_at": at, "fault_code": None,
+        "fault_message": None, "points": 561881, "triangles": 1116597, "sigma_mm": 0.0072, "computed_where": "pool",
+        "computed_host": "worker-1", **other,
+    }  # fmt: skip
+
+
+def row(name: str = "hall-3", **other: Any) -> dict[str, Any]:
+    return {
+        "name": name, "origin": f"{name}:/data", "host": name, "version": "0.1.0", "started_at": NOW, "state": "busy",
+        "words": "scan 1", "waiting": 2, "computing": 1, "uncopied": 4, "health": "valid", "health_words": "",
+        "verified_at": NOW, **other,
+    }  # fmt: skip
+
+
+def sql(catalogue: Catalogue, statement: str) -> list[Any]:
+    with catalogue._writer.begin() as connection:
+        result = connection.execute(text(statement))
+        return [tuple(each) for each in result] if result.returns_rows else []
+
+
+def unseen_for_an_hour(catalogue: Catalogue, name: str) -> None:
+    with catalogue._writer.begin() as connection:
+        connection.execute(update(RigRow).where(RigRow.name == name).values(seen_at=NOW - timedelta(hours=1)))
+
+
+def test_migrations_give_the_tables_that_the_code_uses_whoever_comes_first(address: str) -> None:
+    rigs = [open_catalogue(address, LOGIN, None) for _ in range(4)]
+    with ThreadPoolExecutor(len(rigs)) as together:
+        for done in [together.submit(each.open) for each in rigs]:
+            done.result()
+    with rigs[0]._engine.connect() as connection:
+        assert compare_metadata(MigrationContext.configure(connection), CatalogueBase.metadata) == []
+    for each in rigs:
+        each.close()
+
+
+def test_a_job_is_one_row_however_often_it_comes(catalogue: Catalogue) -> None:
+    catalogue.open()
+    jobs = [job(label=f"part {number}\0\ud800") for number in range(5)]
+    catalogue.copy(jobs[:3])
+    lost = {**jobs[1], "state": "failed", "fault_code": "storage", "fault_message": "its files are gone"}
+    catalogue.copy([jobs[1], *jobs[2:], lost])
+    found = sql(catalogue, "SELECT job, label, state FROM finished_job ORDER BY number")
+    assert found == [
+        (each["job"], f"part {number}\\0\\ud800", "failed" if number == 1 else "succeeded")
+        for number, each in enumerate(jobs)
+    ]
+    assert catalogue.known([jobs[0]["job"], "another"]) == {jobs[0]["job"]}
+
+
+def test_a_fleet_is_told_with_what_is_known_and_no_more(catalogue: Catalogue) -> None:
+    catalogue.open()
+    for name in ("hall-3", "hall-1", "hall-2"):
+        catalogue.see(row(name, state="stopped" if name == "hall-2" else "busy"))
+    earlier = (NOW - timedelta(days=2)).isoformat()
+    scans = [
+        job(finished_at=earlier),
+        job(label="the last", state="failed", fault_message="too dark"),
+        job(kind="model"),
+        job("hall-1", finished_at=earlier),
+    ]
+    catalogue.copy(scans)
+    unseen_for_an_hour(catalogue, "hall-1")
+    one, two, three = catalogue.fleet().rigs
+    assert (three.name, three.state, three.words, three.waiting, three.health) == (
+        "hall-3",
+        "busy",
+        "scan 1",
+        2,
+        "valid",
+    )
+    assert three.last_scan is not None
+    assert asdict(three.last_scan) == {
+        "id": scans[1]["job"], "label": "the last", "state": "failed", "finished_at": NOW, "error": "too dark",
+    }  # fmt: skip
+    assert (three.scans_of_day, three.failed_of_day) == (1, 1)
+    assert three.seen_s < 60
+    for other, state in ((one, "unseen"), (two, "stopped")):
+        assert (other.state, other.words, other.waiting, other.computing, other.health) == (state, "", None, None, None)
+    assert one.seen_s == pytest.approx(3600, abs=60)
+    assert (one.scans_of_day, one.last_scan and one.last_scan.id) == (0, scans[3]["job"])
+    assert two.last_scan is None
+
+
+def test_two_services_are_not_one_rig(catalogue: Catalogue) -> None:
+    catalogue.open()
+    for _ in range(2):
+        catalogue.see(row())
+    with pytest.raises(CatalogueError, match=r"Two services say that they are rig 'hall-3'.*hall-3:/data.*name of its"):
+        catalogue.see(row(origin="elsewhere:/data"))
+    # The computer of a rig was exchanged.
+    unseen_for_an_hour(catalogue, "hall-3")
+    catalogue.see(row(origin="elsewhere:/data"))
+    assert sql(catalogue, "SELECT origin FROM rig") == [("elsewhere:/data",)]
+
+
+def test_tables_of_another_slrig_are_refused_and_left_as_they_are(catalogue: Catalogue) -> None:
+    sql(catalogue, "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL)")
+    sql(catalogue, "INSERT INTO alembic_version VALUES ('catalogue99')")
+    with pytest.raises(CatalogueError, match=r"another slrig.*of version catalogue99.*Install the newer"):
+        catalogue.open()
+    assert sql(catalogue, "SELECT version_num FROM alembic_version") == [("catalogue99",)]
+    with pytest.raises(CatalogueError):
+        catalogue.fleet()
+
+
+def test_a_rig_needs_no_right_but_to_read_and_write_rows(postgres: Postgres) -> None:
+    postgres.execute("CREATE DATABASE rights")
+    owner = open_catalogue(postgres.address("rights"), LOGIN, None)
+    rig = open_catalogue(postgres.address("rights"), "rig:its-own", None)
+    postgres.execute("CREATE ROLE rig LOGIN PASSWORD 'its-own'")
+    with pytest.raises(CatalogueError, match="permission denied"):
+        rig.open()
+    owner.open()
+    postgres.execute("GRANT SELECT, INSERT, UPDATE ON ALL TABLES IN SCHEMA public TO rig", "rights")
+    rig.open()
+    rig.copy([job()])
+    rig.see(row())
+    assert [each.scans_of_day for each in rig.fleet().rigs] == [1]
+    owner.close()
+    rig.close()
+
+
+@pytest.mark.parametrize(
+    ("address", "login", "why"),
+    [
+        ("mysql://db/fleet", LOGIN, "expected postgresql://"),
+        ("postgresql://db", LOGIN, "expected postgresql://"),
+        ("postgresql://db:port/fleet", LOGIN, "expected postgresql://"),
+        (f"postgresql://slrig:{PASSWORD}@db/fleet", None, "expected postgresql://"),
+        ("sqlite://", None, "expected postgresql://"),
+        ("postgresql://db/fleet", None, "no login"),
+        ("postgresql://db/fleet", "slrig", "no login"),
+    ],
+)
+def test_an_address_that_cannot_be_used_is_refused_and_not_repeated(address: str, login: str | None, why: str) -> None:
+    with pytest.raises(ConfigError, match=why) as refused:
+        open_catalogue(address, login, None)
+    assert PASSWORD not in str(refused.value)
+
+
+def test_a_database_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pg8000", reason="needs Postgres's driver: pip install 'slrig[fleet]'")
+    monkeypatch.setattr(store, "PATIENCE_S", 0.2)
+    nobody = open_catalogue(f"postgresql://127.0.0.1:{free_port()}/fleet", LOGIN, None)
+    with pytest.raises(CatalogueError, match="Connection refused"):
+        nobody.open()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        deaf = open_catalogue(f"postgresql://127.0.0.1:{silent.getsockname()[1]}/fleet", LOGIN, None)
+        with pytest.raises(CatalogueError, match="did not answer within") as refused:
+            deaf.open()
+    assert PASSWORD not in str(refused.value)
+    assert threading.active_count() < 20
