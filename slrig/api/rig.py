@@ -69,6 +69,7 @@ def look_at_rig(service: Serving) -> RigBody:
         cameras=[] if facts is None else [_camera(*each, settings.get(each[0])) for each in facts.cameras.items()],
         projector=None if facts is None else filled(ProjectorBody, facts.projector, size_px=facts.projector.size),
         scan_defaults=service.scan_defaults.model_dump(exclude_none=True),
+        fleet=service.copier is not None,
     )
 
 

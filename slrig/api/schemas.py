@@ -373,6 +373,7 @@ class RigBody(BaseModel):
     )
     backlog_length: int = Field(description="while as many are computed, the next scan waits before it begins")
     scan_defaults: dict[str, Any] = Field(description="what the rig file says; a request may say otherwise")
+    fleet: bool = Field(description="it shares a catalogue with other rigs: GET /fleet")
 
 
 class Probe(BaseModel):

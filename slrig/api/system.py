@@ -65,6 +65,7 @@ class _Figures(Collector):
         yield from self._calibration()
         yield from self._schedule()
         yield from self._notices()
+        yield from self._catalogue()
 
     def _calibration(self) -> Iterator[Metric]:
         health, latest, calibration = self._service.verifications.health()
@@ -97,6 +98,16 @@ class _Figures(Collector):
             ages.add_metric([receiver], oldest_s)
         yield from (waiting, ages)
         yield CounterMetricFamily("slrig_notices_dropped", "Notices that were never sent.", outbox.dropped)
+
+    def _catalogue(self) -> Iterator[Metric]:
+        if self._service.copier is None:
+            return
+        found = self._service.copier.status()
+        yield GaugeMetricFamily("slrig_catalogue_reached", "1 while the catalogue is told.", float(found.fault is None))
+        yield GaugeMetricFamily("slrig_catalogue_waiting", "Ended jobs that are not copied yet.", found.waiting)
+        yield GaugeMetricFamily(
+            "slrig_catalogue_oldest_age_seconds", "How long the oldest of them has waited.", found.oldest_s
+        )
 
     def _schedule(self) -> Iterator[Metric]:
         counts = self._service.schedules.counts()

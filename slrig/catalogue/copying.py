@@ -65,6 +65,7 @@ class Copier:
         self._fault: str | None = "It was not reached yet"
         self._failures = 0
         self._beat_at_s = -float("inf")
+        self._told_uncopied = 0
         self._left = threading.Event()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="slrig-catalogue", daemon=True)
@@ -118,10 +119,11 @@ class Copier:
         return self._beat_at_s + BEAT_S - self._clock()
 
     def _say_how_it_is(self, **other: Any) -> None:
-        if other or self._clock() >= self._beat_at_s + BEAT_S:
-            uncopied, _ = self._copies.waiting()
+        """If that is due, or the backlog that was told last is gone."""
+        uncopied, _ = self._copies.waiting()
+        if other or self._clock() >= self._beat_at_s + BEAT_S or (self._told_uncopied and not uncopied):
             self._catalogue.see({**self._standing(), "uncopied": uncopied, **other})
-            self._beat_at_s = self._clock()
+            self._beat_at_s, self._told_uncopied = self._clock(), uncopied
 
     def _copy_what_it_lacks(self) -> None:
         """Bring up what ended before there was this catalogue, or what it lost: it may be an older backup of itself."""

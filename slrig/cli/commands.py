@@ -15,6 +15,7 @@ import typer.core
 
 from slrig.cli import calibrate, key, pool, preset, schedule, stage
 from slrig.cli.backup import backup, restore
+from slrig.cli.fleet import fleet
 from slrig.cli.foreign import import_images
 from slrig.cli.model import model
 from slrig.cli.options import AcceptanceOptions, AsJson, BoardOptions, MeshOptions, RigFile, Service, given, grouped
@@ -360,6 +361,7 @@ app.add_typer(stage.app, name="stage")
 app.add_typer(key.app, name="key")
 app.add_typer(pool.app, name="pool")
 app.command()(pool.worker)
+app.command()(fleet)
 
 
 def main() -> None:

@@ -350,6 +350,7 @@ class System(Remote[W]):
         return {"checks": dict(found["checks"]), "pending": list(found.get("pending", ()))}
 
     metrics = entry("GET /metrics", _text, "Figures for Prometheus.")
+    fleet = entry("GET /fleet", _told, "The rigs that share a catalogue: how each is, its last scan, its backlog.")
     audit = entry("GET /audit", paged, "A page of who did what, from new to old.")
     explain = entry("GET /problems/{name}", told_of, "What a kind of problem means.")
     session = entry("GET /session", _told, "Whom the service takes this client for.")

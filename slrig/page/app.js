@@ -2,6 +2,7 @@
 import {html, render, useEffect, useState} from "./vendor/preact-htm.js";
 import {CalibrateScreen} from "./calibrate.js";
 import {DevicesScreen} from "./devices.js";
+import {FleetScreen} from "./fleet.js";
 import {HealthScreen} from "./health.js";
 import {ModelsScreen} from "./models.js";
 import {ResultScreen} from "./result.js";
@@ -15,6 +16,7 @@ const SCREENS = [
   ["calibrate", "Calibrate"],
   ["health", "Health", " and schedule"],
   ["devices", "Devices"],
+  ["fleet", "Fleet"],
 ];
 
 function Page() {
@@ -75,12 +77,14 @@ function Rooms({session, left}) {
     calibrate: html`<${CalibrateScreen} ...${given} />`,
     health: html`<${HealthScreen} ...${given} />`,
     devices: html`<${DevicesScreen} ...${given} />`,
+    fleet: html`<${FleetScreen} ...${given} />`,
   };
+  const offered = SCREENS.filter(([name]) => name !== "fleet" || rig?.fleet);
   return html`
     <a class="skip" href="#content">Skip to the content</a>
     <header>
       <h1>${rig?.name ?? "slrig"}</h1><${RigState} rig=${rig} />
-      <nav aria-label="Screens">${SCREENS.map(([name, words, more]) => html`<a href=${`#/${name}`} aria-current=${name === room ? "page" : null}>${words}${more && html`<span>${more}</span>`}</a>`)}</nav>
+      <nav aria-label="Screens">${offered.map(([name, words, more]) => html`<a href=${`#/${name}`} aria-current=${name === room ? "page" : null}>${words}${more && html`<span>${more}</span>`}</a>`)}</nav>
       ${session.name !== "anyone" && html`<span class="who quiet">${session.name}</span><${Action} kind="plain" onClick=${leave}>Log out<//>`}
     </header>
     <main id="content" tabindex="-1">${screens[room] ?? html`<p>There is no such screen. <a href="#/scan">Scan</a></p>`}</main>`;

@@ -15,8 +15,10 @@ from slrig.api.keys import KeyRing
 from slrig.api.service import Service
 from slrig.bundle.scan_options import ScanDefaults
 from slrig.config import ServiceSettings
+from slrig.jobs.copies import Copies
 from slrig.jobs.data_folder import DataFolder
 from slrig.jobs.database import Database
+from slrig.jobs.outbox import Outbox
 from slrig.jobs.records import JobKind
 from slrig.jobs.store import JobStore
 from slrig.jobs.worker import Worker
@@ -39,7 +41,9 @@ class ServedBench(TameBench):
             data_dir=root, queue_length=1, max_event_streams=1, max_body_bytes=4096, requests_per_s=1e6, **settings
         )
         folder = DataFolder(root, free=lambda _: self.free_bytes)
-        store = JobStore(Database(folder.database), JobKind.SCAN)
+        database = Database(folder.database)
+        copies = Copies(database) if "catalogue" in settings else None
+        store = JobStore(database, JobKind.SCAN, outbox=Outbox(database, copies=copies))
         self.worker = Worker("tests.unit.scan.fake_pipeline")
         rig = RigSession("bench", self.open_rig)
         runner = Runner(store, folder, rig, self.worker, capture=self.capture, queue_length=1)

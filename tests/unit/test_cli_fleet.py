@@ -1,0 +1,90 @@
+"""`slrig fleet`, and what a service answers to it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+from typer.testing import CliRunner
+
+from slrig.catalogue.store import Catalogue, open_catalogue
+from slrig.cli.commands import app
+from tests.postgres import LOGIN, Postgres
+from tests.unit.api.conftest import KEY, ServedBench
+from tests.unit.catalogue.test_store import job, row, unseen_for_an_hour
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> str:
+    return f"sqlite:///{tmp_path}/fleet.sqlite"
+
+
+@pytest.fixture
+def catalogue(address: str) -> Iterator[Catalogue]:
+    found = open_catalogue(address, None, None)
+    found.open()
+    yield found
+    found.close()
+
+
+def test_a_fleet_is_listed_with_its_ages(address: str, catalogue: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    told = CliRunner().invoke(app, ["fleet", "--catalogue", address])
+    assert (told.exit_code, "no rig writes to" in told.output) == (0, True), told.output
+    for name in ("hall-1", "hall-2"):
+        catalogue.see(row(name))
+    catalogue.copy([job("hall-1", state="failed", fault_message="too dark"), job("hall-2")])
+    unseen_for_an_hour(catalogue, "hall-2")
+    told = CliRunner().invoke(app, ["fleet"], env={"SLRIG_CATALOGUE": address})
+    _, one, two = [line.split() for line in told.output.splitlines() if line.strip() and "━" not in line]
+    assert one[:2] == ["hall-1", "busy"]
+    assert {"failed", "3,", "4", "copy"} <= set(one)
+    assert two[:5] == ["hall-2", "unseen", "60", "min", "ago"]
+    assert "?" in two
+    told = CliRunner().invoke(app, ["fleet", "--catalogue", address, "--json"])
+    assert [each["state"] for each in json.loads(told.output)["rigs"]] == ["busy", "unseen"]
+
+
+def test_a_service_says_what_its_catalogue_says_or_what_to_set(
+    address: str, catalogue: Catalogue, tmp_path: Path
+) -> None:
+    headers = {"Authorization": f"Bearer {KEY}"}
+    without = ServedBench(tmp_path / "without")
+    with TestClient(without.app, base_url="http://127.0.0.1", headers=headers) as client:
+        refused = client.get("/fleet")
+        assert (refused.status_code, "catalogue_login_file" in refused.json()["detail"]) == (404, True)
+        assert client.get("/rig").json()["fleet"] is False
+        assert "slrig_catalogue" not in client.get("/metrics").text
+    served = ServedBench(tmp_path / "data", catalogue=address)
+    assert served.service.copier is not None
+    with TestClient(served.app, base_url="http://127.0.0.1", headers=headers) as client:
+        assert client.get("/rig").json()["fleet"] is True
+        served.service.copier.step()
+        found = client.get("/fleet").json()
+        assert [each["name"] for each in found["rigs"]] == ["bench"]
+        told = CliRunner().invoke(app, ["fleet", "--catalogue", address, "--json"])
+        (here,), (there,) = found["rigs"], json.loads(told.output)["rigs"]
+        assert here | {"seen_s": 0} == there | {"seen_s": 0}
+        assert "slrig_catalogue_waiting 0.0" in client.get("/metrics").text
+
+
+def test_the_login_is_told_to_nobody(postgres: Postgres, tmp_path: Path) -> None:
+    login = tmp_path / "login"
+    login.write_text(LOGIN + "\n")
+    settings = tmp_path / "settings.toml"
+    settings.write_text(f'catalogue = "{postgres.address("cli")}"\ncatalogue_login_file = "login"\n')
+    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
+    assert (told.exit_code, "chmod 600" in told.stderr) == (2, True)
+    login.chmod(0o600)
+    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
+    assert (told.exit_code, 'database "cli" does not exist' in told.stderr) == (2, True)
+    postgres.execute("CREATE DATABASE cli")
+    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
+    assert (told.exit_code, "no rig writes to postgresql://127.0.0.1" in told.output) == (0, True)
+    login.write_text("slrig:another")
+    told = CliRunner().invoke(app, ["fleet", "--settings", str(settings)])
+    assert (told.exit_code, "password authentication failed" in told.stderr) == (2, True)
+    assert "another" not in told.output + told.stderr
