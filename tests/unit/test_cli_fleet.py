@@ -48,9 +48,7 @@ def test_a_fleet_is_listed_with_its_ages(address: str, catalogue: Catalogue, mon
     assert [each["state"] for each in json.loads(told.output)["rigs"]] == ["busy", "unseen"]
 
 
-def test_a_service_says_what_its_catalogue_says_or_what_to_set(
-    address: str, catalogue: Catalogue, tmp_path: Path
-) -> None:
+def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp_path: Path) -> None:
     headers = {"Authorization": f"Bearer {KEY}"}
     without = ServedBench(tmp_path / "without")
     with TestClient(without.app, base_url="http://127.0.0.1", headers=headers) as client:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import socket
-import threading
+import ssl
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
@@ -21,6 +22,7 @@ from slrig.catalogue.tables import CatalogueBase, RigRow
 from slrig.errors import CatalogueError, ConfigError
 from tests.listening import free_port
 from tests.postgres import LOGIN, PASSWORD, Postgres
+from tests.unit.schedule.hook import own_certificate
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 
@@ -170,6 +172,35 @@ def test_an_address_that_cannot_be_used_is_refused_and_not_repeated(address: str
     assert PASSWORD not in str(refused.value)
 
 
+def test_a_certificate_has_to_be_of_the_authority_and_of_the_host(tmp_path: Path) -> None:
+    pem = own_certificate(tmp_path)
+    with Postgres(certificate=pem) as server:
+        known = open_catalogue(server.address(), LOGIN, pem)
+        known.open()
+        with known._engine.connect() as connection:
+            encrypted = "SELECT ssl FROM pg_stat_ssl WHERE pid = pg_backend_pid()"
+            assert connection.scalar(text(encrypted)) is True
+        known.close()
+        (tmp_path / "other").mkdir()
+        stranger = open_catalogue(server.address(), LOGIN, own_certificate(tmp_path / "other"))
+        with pytest.raises(CatalogueError, match=r"certificate is not trusted.*see catalogue_authority"):
+            stranger.open()
+        misnamed = open_catalogue(server.address().replace("127.0.0.1", "localhost"), LOGIN, pem)
+        with pytest.raises(CatalogueError, match="not trusted"):
+            misnamed.open()
+    plain = store._tls("db.hall.example", None)
+    assert isinstance(plain, ssl.SSLContext)
+    assert (plain.check_hostname, plain.verify_mode) == (True, ssl.CERT_REQUIRED)
+    with pytest.raises(ConfigError, match="PEM file"):
+        open_catalogue("postgresql://127.0.0.1/fleet", LOGIN, tmp_path / "none.pem")
+
+
+def test_a_server_without_tls_is_refused_where_it_is_asked_for(postgres: Postgres, tmp_path: Path) -> None:
+    asked = open_catalogue(postgres.address(), LOGIN, own_certificate(tmp_path))
+    with pytest.raises(CatalogueError, match="refuses SSL"):
+        asked.open()
+
+
 def test_a_database_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pg8000", reason="needs Postgres's driver: pip install 'slrig[fleet]'")
     monkeypatch.setattr(store, "PATIENCE_S", 0.2)
@@ -181,4 +212,3 @@ def test_a_database_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyP
         with pytest.raises(CatalogueError, match="did not answer within") as refused:
             deaf.open()
     assert PASSWORD not in str(refused.value)
-    assert threading.active_count() < 20
