@@ -30,7 +30,7 @@ function Row({each, here, stale}) {
   const known = !stale && each.health !== null;
   const last = each.last_scan;
   return html`<tr>
-    <th scope="row">${each.name}${here && html` <span class="quiet">this one</span>`}<div class="quiet">${each.host}</div></th>
+    <th scope="row">${each.name}<div class="quiet">${here && "this one, on "}${each.host}</div></th>
     <td><${Badge} kind=${kind}>${word}<//><div class="quiet">seen ${moment(new Date(Date.now() - 1000 * each.seen_s).toISOString())}</div>${known && each.words && html`<div class="quiet clip">${each.words}</div>`}</td>
     <td>${known ? html`<${Badge} kind=${HEALTH[each.health] ?? ""}>${each.health === "unknown" ? "not known" : each.health}<//>` : "not known"}
       ${known && each.health !== "good" && html`<div class="quiet clip">${each.health_words}</div>`}</td>
