@@ -23,9 +23,10 @@ def fleet(
     service: Service,
     as_json: AsJson = False,
 ) -> None:
-    """List the rigs that share a catalogue: how they are, their last scans, what waits.
+    """List the rigs that share a catalogue.
 
-    Asks a service, or the catalogue itself where that is named, here or as SLRIG_CATALOGUE.
+    How each is, its health, its last scan and its backlog. Asks a service, or the catalogue itself where that is named,
+    here or as SLRIG_CATALOGUE.
     """
     from slrig.cli.display import print_json, print_table
 
