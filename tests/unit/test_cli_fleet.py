@@ -60,7 +60,8 @@ def test_a_service_says_what_its_catalogue_says_or_what_to_set(address: str, tmp
     assert served.service.copier is not None
     with TestClient(served.app, base_url="http://127.0.0.1", headers=headers) as client:
         assert client.get("/rig").json()["fleet"] is True
-        served.service.copier.step()
+        while served.service.copier.status().fault is not None:
+            served.service.copier._ending.wait(0.01)
         found = client.get("/fleet").json()
         assert [each["name"] for each in found["rigs"]] == ["bench"]
         told = CliRunner().invoke(app, ["fleet", "--catalogue", address, "--json"])
