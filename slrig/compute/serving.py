@@ -7,20 +7,22 @@ import os
 import platform
 import signal
 import tempfile
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import dask
 from distributed import Scheduler, Security
 from distributed import Worker as DaskWorker
+from distributed.diskutils import WorkSpace
 
 from slrig.compute.cluster import CONNECT_S, join_logs
 from slrig.compute.host import Host, resource
 from slrig.compute.store import PoolStore
 from slrig.config import is_loopback
-from slrig.errors import ServiceError, WorkerLostError
+from slrig.disk import refusals_of
+from slrig.errors import ConfigError, ServiceError, WorkerLostError
 from slrig.jobs.versions import versions
 from slrig.jobs.worker import READY, Worker, prepare_kernel_cache
 from slrig.jobs.worker_wait import POLL_S
@@ -68,7 +70,6 @@ def serve_worker(
     # dask's own choice is every interface, also where there are no certificates.
     host = "127.0.0.1" if is_loopback(urlsplit(scheduler).hostname or "") else None
     beneath, name = Worker(PIPELINE), f"{platform.node()}-{os.getpid()}"
-    beneath.start()
 
     async def life(stopped: asyncio.Event) -> None:
         told = ""
@@ -81,9 +82,10 @@ def serve_worker(
             try:
                 # A job at a time: the process beneath has one, and machines with more cores run more workers.
                 async with DaskWorker(
-                    scheduler, name=name, security=security, nthreads=1, memory_limit=0, local_directory=scratch,
-                    resources={resource(versions()): 1}, plugins=(Host(store, beneath),), death_timeout=CONNECT_S,
-                    dashboard=False, dashboard_address=_PAGES, host=host,
+                    scheduler, name=name, security=security, nthreads=1, memory_limit=0, host=host,
+                    local_directory=tempfile.gettempdir(), resources={resource(versions()): 1},
+                    plugins=(Host(store, beneath),), death_timeout=CONNECT_S,
+                    dashboard=False, dashboard_address=_PAGES,
                 ) as member:  # fmt: skip
                     say(told := f"computes for the pool {scheduler}. Ctrl-C stops it.")
                     ends = [asyncio.create_task(stopped.wait()), asyncio.create_task(member.finished())]
@@ -98,10 +100,31 @@ def serve_worker(
                 await asyncio.wait_for(stopped.wait(), RETURN_S)
 
     try:
-        with tempfile.TemporaryDirectory(prefix="slrig-worker-") as scratch:
+        with _scratch():
+            beneath.start()
             _until_told(life)
     finally:
         beneath.close()
+
+
+@contextmanager
+def _scratch() -> Iterator[None]:
+    """Have what this process and those beneath it put into TMPDIR lie in a folder of its own there, and remove what a
+    worker of the same user left that was killed.
+    """
+    place = Path(tempfile.gettempdir(), f"slrig-workers-{os.getuid()}")
+    with refusals_of(place):
+        place.mkdir(mode=0o700, exist_ok=True)
+        if place.lstat().st_uid != os.getuid():
+            message = f"{place} belongs to somebody else. Set TMPDIR to a folder of your own."
+            raise ConfigError(message)
+    # dask's own: it locks the folder as long as this process lives.
+    folder = WorkSpace(str(place)).new_work_dir(prefix="worker-")
+    os.environ["TMPDIR"] = tempfile.tempdir = folder.dir_path
+    try:
+        yield
+    finally:
+        folder.release()
 
 
 def _until_told(life: Callable[[asyncio.Event], Awaitable[None]]) -> None:

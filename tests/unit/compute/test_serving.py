@@ -1,17 +1,21 @@
-"""Where a pool's scheduler listens."""
+"""Where a pool's scheduler listens, and what its workers leave on a disk."""
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 
-from slrig.compute.serving import serve_scheduler
+from slrig.compute.serving import _scratch, serve_scheduler
+from slrig.errors import ConfigError
 from tests.listening import listening_at
 
 
@@ -38,3 +42,38 @@ def test_an_address_that_is_taken_is_named() -> None:
     assert "Traceback" not in done.stderr
     assert f"cannot listen at tcp://127.0.0.1:{port}: " in done.stderr
     assert "in use" in done.stderr
+
+
+def test_what_a_killed_worker_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    lives = (
+        "import os, sys, tempfile; from slrig.compute.serving import _scratch\n"
+        "with _scratch(): os.mkdir(tempfile.mkdtemp() + '/bundle'); print(flush=True); sys.stdin.read()"
+    )
+
+    def worker() -> subprocess.Popen[bytes]:
+        started = subprocess.Popen(  # noqa: S603 - our own
+            [sys.executable, "-c", lives], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
+        )  # fmt: skip
+        assert started.stdout is not None
+        assert started.stdout.readline()
+        return started
+
+    with worker() as lasting, worker() as killed:
+        assert len([*tmp_path.rglob("bundle")]) == 2
+        killed.kill()
+        killed.wait()
+        with worker() as later:
+            assert len([*tmp_path.rglob("bundle")]) == 2
+            for each in (lasting, later):
+                each.communicate()
+                assert each.returncode == 0
+    assert {path.name for path in tmp_path.glob("*/*")} == {"global.lock", "purge.lock"}
+
+
+def test_workers_use_no_folder_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / f"slrig-workers-{os.getuid()}").mkdir()
+    monkeypatch.setattr(Path, "lstat", lambda _: os.stat_result((0o40777, 0, 0, 1, os.getuid() + 1, *[0] * 5)))
+    with pytest.raises(ConfigError, match="belongs to somebody else"), _scratch():
+        pass
