@@ -116,7 +116,8 @@ class DaskCluster:
     def _live(self) -> None:
         join_logs()
         # A rig computes by itself while it has no connection, and says so once.
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        for name in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         with suppress(asyncio.CancelledError):
             asyncio.run(self._keep_connected())
 

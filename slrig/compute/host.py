@@ -16,13 +16,16 @@ from distributed import Worker as DaskWorker
 from distributed import WorkerPlugin, get_worker
 
 from slrig.compute.store import PoolError, PoolStore
-from slrig.errors import ScanCancelledError
+from slrig.errors import ScanCancelledError, WorkerLostError
 from slrig.failure import JobFailure, failure_of
 from slrig.jobs.compute import Compute
 from slrig.jobs.worker_process import Task
 
 BEAT_S = 2.0
 """How often a machine says that it works at a job, and looks whether it is to stop."""
+
+TELL_S = 0.2
+"""How often a stage's progress is told at most: each time passes through this machine, the scheduler and the rig."""
 
 POOL_FAULT = "pool"
 """The code of a fault that is not the task's own: another try may go well."""
@@ -101,7 +104,8 @@ class Host(WorkerPlugin):
         _log.info("computes for a rig", job=order.job, what=order.task.what)
         try:
             return self._computed(order, tell, beat, stopped)
-        except PoolError as error:
+        except (PoolError, WorkerLostError) as error:
+            # A process that is lost, as where memory runs out, is the machine's fault rather than the task's.
             return Answer(fault=JobFailure(POOL_FAULT, str(error)))
         except BaseException as error:  # noqa: BLE001 - a panic of obstore, too: the rig is told, and computes by itself
             if not isinstance(error, ScanCancelledError):
@@ -115,15 +119,21 @@ class Host(WorkerPlugin):
             message = "the machine's versions of slrig and its libraries have changed; start slrig worker again"
             raise PoolError(message)
         with tempfile.TemporaryDirectory(prefix="slrig-pool-") as scratch:
+            last, told_s = "", 0.0
 
             def progress(stage: str, fraction: float, detail: str) -> None:
+                nonlocal last, told_s
+                if stage == last and self._clock() - told_s < TELL_S:
+                    return
+                last, told_s = stage, self._clock()
                 told = detail.replace(f"{scratch}/", "")
                 tell({"job": order.job, "stage": stage, "fraction": fraction, "detail": told})
 
             bundle, result = Path(scratch) / "bundle", Path(scratch) / "result"
             result.mkdir()
             self._store.fetch_bundle(order.bundle, bundle, beat)
-            task = replace(order.task, given=(bundle, result, *order.task.given), where={"where": "pool"})
+            given = (bundle, result, *order.task.given)
+            task = replace(order.task, given=given, where={"where": "pool"}, remedy="Its rig computes by itself.")
             answer = self._worker.run(task, progress=progress, cancelled=stopped)
             return Answer(answer, self._store.put_result(order.job, result, beat))
 

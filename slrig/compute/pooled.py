@@ -102,9 +102,11 @@ class PooledWorker:
         within_s: float | None = None,
     ) -> Any:
         """See `Compute`. Raises what the local process raises, and nothing else."""
-        # Frames that the local process has taken already are half of its work.
-        if task.movable and (feed is None or feed.receiver is None):
+        if task.movable:
             try:
+                if feed is not None and feed.receiver is not None:
+                    # Frames that the local process has taken already are half of its work.
+                    raise PoolError(f"{self._cluster.fault} when the frames came")  # noqa: TRY301
                 return self._by_pool(task, progress, cancelled, made)
             except (PoolError, StorageError) as error:
                 if not self._closed:

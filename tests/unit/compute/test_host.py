@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ pytest.importorskip("distributed", reason="needs a pool's libraries: pip install
 
 import obstore
 
-from slrig.compute.host import BEAT_S, POOL_FAULT, Answer, Order
+from slrig.compute.host import BEAT_S, POOL_FAULT, TELL_S, Answer, Order
+from slrig.errors import WorkerLostError
 from slrig.jobs.versions import versions
+from slrig.jobs.worker_process import Task
 from tests.unit.compute.tame_pool import Pool, job
 
 
@@ -52,6 +54,37 @@ def test_a_bundle_that_was_changed_in_the_store_is_not_computed(pool: Pool, tmp_
 @pytest.mark.parametrize(("what", "code"), [("fail", "nothing-to-reconstruct"), ("break", "unexpected")])
 def test_whatever_goes_wrong_is_answered(pool: Pool, tmp_path: Path, what: str, code: str) -> None:
     assert fault(pool.cluster.host.done(order(pool, tmp_path, what), lambda _: None))[0] == code
+
+
+def test_a_machine_that_loses_its_process_leaves_the_job_to_another_try(
+    pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(*_given: object, **_options: object) -> None:
+        raise WorkerLostError("The worker's process ended (signal SIGKILL).")
+
+    given = order(pool, tmp_path)
+    monkeypatch.setattr(pool.remote, "run", lost)
+    assert fault(pool.cluster.host.done(given, lambda _: None)) == (
+        POOL_FAULT,
+        "The worker's process ended (signal SIGKILL).",
+    )
+
+
+def test_a_stage_is_told_now_and_then(pool: Pool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, heard = order(pool, tmp_path), list[Mapping[str, Any]]()
+
+    def run(task: Task, *, progress: Callable[[str, float, str], None] = lambda *_: None, **_: object) -> object:
+        if not task.movable:
+            return versions()
+        for number in range(10):
+            progress("read bundle", number / 10, "")
+            pool.clock.now_s += TELL_S / 3.9
+        progress("decode", 1.0, "")
+        return None
+
+    monkeypatch.setattr(pool.remote, "run", run)
+    assert pool.cluster.host.done(given, heard.append).fault is None
+    assert [each["fraction"] for each in heard if "stage" in each] == [0.0, 0.4, 0.8, 1.0]
 
 
 def test_a_job_that_its_rig_gave_up_is_stopped_in_the_middle(pool: Pool, tmp_path: Path) -> None:
