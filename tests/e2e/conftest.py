@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ import pytest
 
 from slrig.client import Client
 from tests.e2e.forking import ForkedCommand, worker_of
+from tests.e2e.pool_processes import Pool
 from tests.npm import lacking
 
 if TYPE_CHECKING:
@@ -169,3 +171,17 @@ def browser() -> Iterator[Browser]:
         opened = driver.chromium.launch(executable_path=path, args=list(_BROWSER_OPTIONS))
         yield opened
         opened.close()
+
+
+@pytest.fixture
+def pool(tmp_path: Path) -> Iterator[Pool]:
+    try:
+        import distributed
+        import flask_cors
+        import moto
+        import obstore
+    except ImportError:
+        lacking("needs a pool's libraries, and an S3 server: pip install -e '.[pool,s3]'")
+    del distributed, flask_cors, moto, obstore
+    with ExitStack() as stack:
+        yield Pool(tmp_path, stack)

@@ -6,87 +6,28 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from slrig.cli.commands import app
 from slrig.jobs.worker import Worker
 from slrig.scan.job import PIPELINE, reconstruction
 from slrig.scan.plan import ReconstructionPlan
 from tests.e2e.conftest import Start, write_rig
-from tests.e2e.pool_processes import Process, S3Server, Wire
-from tests.listening import free_port, listening_at
-from tests.npm import lacking
+from tests.e2e.pool_processes import SECRET, Pool
 
-SECRET = "the-secret-of-the-store"  # noqa: S105 - nothing but a test's
-BUCKET = "s3://scans/hall-3"
 FOUND_LIMIT_S = 60.0
 """So long a service may take to find its pool."""
-
-
-class Pool:
-    """A scheduler, two workers and a store; the rig reaches the scheduler by `wire`."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        certificates, port = folder / "certificates", free_port()
-        made = CliRunner().invoke(app, ["pool", "certificates", str(certificates)])
-        assert made.exit_code == 0, made.output
-        self.certificates = certificates / "rig"
-        self.logs = [folder / f"{name}.log" for name in ("store", "scheduler", "one", "two")]
-        self.store = S3Server(self.logs[0])
-        self.environment = {
-            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{self.store.port}",
-            "AWS_ACCESS_KEY_ID": "somebody",
-            "AWS_SECRET_ACCESS_KEY": SECRET,
-        }
-        scheduler = ["slrig.cli", "pool", "--port", str(port), "--certificates", str(certificates / "scheduler")]
-        worker = ["slrig.cli", "worker", "--scheduler", f"tls://127.0.0.1:{port}", "--store", BUCKET, "--certificates"]
-        worker = [*worker, str(certificates / "worker")]
-        self.scheduler = Process(scheduler, {}, self.logs[1], said="scheduler is at tls://")
-        self.workers = [Process(worker, self.environment, log, said="computes for") for log in self.logs[2:]]
-        self.wire = Wire(port)
-        self.address = f"tls://127.0.0.1:{self.wire.port}"
-        for each in (self.store, self.scheduler, *self.workers):
-            stack.callback(each.kill)
-        stack.callback(self.wire.close)
-        self.store.make_bucket("scans")
-        for each in (self.scheduler, *self.workers):
-            each.wait_until_it_works()
-            assert {at.rpartition(":")[0] for at in listening_at(each.process.pid)} == {"127.0.0.1"}
-
-
-@pytest.fixture
-def pool(tmp_path: Path) -> Iterator[Pool]:
-    try:
-        import distributed
-        import flask_cors
-        import moto
-        import obstore
-    except ImportError:
-        lacking("needs a pool's libraries, and an S3 server: pip install -e '.[pool,s3]'")
-    del distributed, flask_cors, moto, obstore
-    with ExitStack() as stack:
-        yield Pool(tmp_path, stack)
 
 
 class Rig:
     """What a service has bundles reconstructed by, and what came of one."""
 
     def __init__(self, pool: Pool, bundle: Path, local: Worker) -> None:
-        from slrig.compute.cluster import DaskCluster
-        from slrig.compute.pooled import PooledWorker
-        from slrig.compute.security import pool_security
-        from slrig.compute.store import open_store
-
         self.bundle = bundle
-        self.cluster = DaskCluster(pool.address, pool_security(pool.address, pool.certificates))
-        self.worker = PooledWorker(local, self.cluster, open_store(BUCKET))
-        self.worker.start()
+        self.worker, self.cluster = pool.rig(local, wired=True)
 
     def computed(self, result: Path, *, when_begun: Callable[[], None]) -> dict[str, Any]:
         """Reconstruct, with something done in the middle; return the report's section."""
@@ -111,13 +52,9 @@ class Rig:
 def test_whatever_is_lost_a_scan_has_its_one_result(
     pool: Pool, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, value in pool.environment.items():
+    for name, value in pool.service(wired=True).items():
         monkeypatch.setenv(name, value)
-    with monkeypatch.context() as of_the_service:
-        of_the_service.setenv("SLRIG_COMPUTE", pool.address)
-        of_the_service.setenv("SLRIG_COMPUTE_STORE", BUCKET)
-        of_the_service.setenv("SLRIG_COMPUTE_CERTIFICATES", str(pool.certificates))
-        service = start(write_rig(tmp_path / "rig"))
+    service = start(write_rig(tmp_path / "rig"))
     with service.client() as client:
         # The first ones may come before the service has found its pool.
         until_s = time.monotonic() + FOUND_LIMIT_S
@@ -155,8 +92,8 @@ def test_whatever_is_lost_a_scan_has_its_one_result(
         with monkeypatch.context() as impatient:
             impatient.setattr("slrig.compute.pooled.SILENCE_LIMIT_S", 3.0)
             impatient.setattr("slrig.compute.pooled.BEGIN_LIMIT_S", 3.0)
-            assert "because" in right("network", pool.wire.cut)
-        pool.wire.mend()
+            assert "because" in right("network", pool.wires[0].cut)
+        pool.wires[0].mend()
         assert rig.cluster.usable(30)
 
         assert "lost" in right("scheduler", pool.scheduler.kill)["because"]
