@@ -6,6 +6,7 @@ import ast
 import json
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,7 @@ def named_settings() -> set[str]:
     return {str(ast.literal_eval(call.args[0])) for call in named}
 
 
+@cache
 def flags() -> set[str]:
     """Every long option of every command."""
     found: set[str] = set()
@@ -50,6 +52,7 @@ def flags() -> set[str]:
     return found
 
 
+@cache
 def keys() -> set[str]:
     """Every key of a request or a rig file."""
     found: set[str] = set()
