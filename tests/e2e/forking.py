@@ -24,7 +24,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-_LOADED = ("slrig.cli.commands", "slrig.api.server", "simulated_rig.device", "slrig.scan.reconstruct")
+_LOADED = (
+    "slrig.cli.commands", "slrig.api.server", "simulated_rig.device", "scipy.signal", "slrig.scan.reconstruct",
+)  # fmt: skip
 """What a service of a rendered rig and its worker load; before the last one, so that it finds their kernels."""
 
 
