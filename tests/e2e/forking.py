@@ -44,7 +44,9 @@ class ForkedCommand:
         self.args = args
         assert "LD_PRELOAD" not in environment, "it is read as a program begins: this one has to be fresh"
         near, far = _context().Pipe(duplex=False)
-        self._process = _context().Process(target=_run, args=(list(args), dict(environment), str(log), far))
+        context = _context()
+        address = vars(forkserver._forkserver)["_forkserver_address"]
+        self._process = context.Process(target=_run, args=(list(args), dict(environment), str(log), far, address))
         self._process.start()
         far.close()
         self.stdout = os.fdopen(os.dup(near.fileno()), "rb")
@@ -124,8 +126,10 @@ def _work(environment: dict[str, str], log: str, service: int, target: Any, args
         target(*args)
 
 
-def _run(args: list[str], environment: dict[str, str], log: str, output: Connection) -> None:
-    """Become the command, in the process that was forked."""
+def _run(args: list[str], environment: dict[str, str], log: str, output: Connection, address: str) -> None:
+    """Become the command, in the process that was forked. address : of the process that forks, for the worker."""
+    # By itself it would start one of its own, which has loaded nothing.
+    vars(forkserver._forkserver).update(_forkserver_address=address, ensure_running=lambda: None)
     _become(environment, log)
     os.dup2(output.fileno(), 1)
     output.close()
