@@ -188,7 +188,8 @@ class PooledWorker:
             if self._clock() - heard_s > (SILENCE_LIMIT_S if begun else BEGIN_LIMIT_S):
                 silence = "nothing more was heard of the job" if begun else "the job has not begun"
                 message = f"{silence} in the pool for {self._clock() - heard_s:.0f} s"
-                raise PoolError(message)
+                # In a pool that has too much to do, a second try would wait behind all others once more.
+                raise PoolError(message, final=not begun)
 
     def _stay(self, task: Task, cancelled: Callable[[], bool]) -> None:
         """Raise what ends the wait for the pool."""

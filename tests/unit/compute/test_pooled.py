@@ -53,7 +53,7 @@ def gone(pool: Pool) -> None:
 
 
 def never_begins(pool: Pool) -> None:
-    pool.cluster.acts = [pool.passes(BEGIN_LIMIT_S + 1)] * 2
+    pool.cluster.acts = [pool.passes(BEGIN_LIMIT_S + 1)]
 
 
 def falls_silent(pool: Pool) -> None:
@@ -113,7 +113,7 @@ def is_full(pool: Pool) -> None:
     ("fault", "orders", "because"),
     [
         (gone, 0, "does not answer"),
-        (never_begins, 2, "has not begun"),
+        (never_begins, 1, "has not begun"),
         (falls_silent, 1, "nothing more was heard"),
         (is_lost_twice, 2, "lost the job"),
         (is_lost_for_good, 1, "lost the job"),
