@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -177,6 +179,27 @@ def test_workers_of_other_versions_are_not_used() -> None:
     assert "no workers" in str(cluster._lack([]))
     assert "this machine's versions" in str(cluster._lack([newer]))
     assert cluster._lack([newer, mine]) is None
+
+
+def test_what_workers_can_do_is_asked_for_when_they_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    members = {"one": {"resources": {resource(versions()): 1}}}
+    asked: list[int] = []
+
+    class Scheduler:
+        async def identity(self, n_workers: int) -> dict[str, object]:
+            asked.append(n_workers)
+            if len(asked) == 10:
+                members.clear()
+            if len(asked) == 20:
+                raise OSError("gone")
+            return {"n_workers": len(members), "workers": members if n_workers else {}}
+
+    monkeypatch.setattr("slrig.compute.cluster.LOOK_S", 0.0)
+    cluster = DaskCluster("tcp://127.0.0.1:1", None)
+    with pytest.raises(OSError, match="gone"):
+        asyncio.run(cluster._watch(SimpleNamespace(scheduler=Scheduler())))  # type: ignore[arg-type]
+    assert asked == [0, -1, *[0] * 8, -1, *[0] * 9]
+    assert not cluster.usable()
 
 
 def test_other_tasks_stay_here(pool: Pool) -> None:
