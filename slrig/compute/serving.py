@@ -34,6 +34,10 @@ RETURN_S = 2.0
 LOST_WORKER_S = 30
 """From when on a worker that was not heard of is given up by the scheduler; each is heard of once a second."""
 
+KEPT_EVENTS = 50
+"""How many events of each topic the scheduler keeps, which nobody asks for. Each start of a rig's service is a topic,
+and never forgotten: of dask's 1 000 it would keep 0.3 MB."""
+
 _PAGES = "127.0.0.1:0"
 """Where dask's HTTP server listens, which cannot be left out and asks nobody for a certificate. It has no pages."""
 
@@ -56,6 +60,7 @@ def serve_scheduler(address: str, security: Security | None, *, say: Callable[[s
             await stopped.wait()
 
     dask.config.set({"distributed.scheduler.worker-ttl": LOST_WORKER_S, **_NO_PAGES})
+    dask.config.set({"distributed.admin.low-level-log-length": KEPT_EVENTS})
     _until_told(life)
 
 

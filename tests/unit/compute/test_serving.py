@@ -14,20 +14,28 @@ import pytest
 
 pytest.importorskip("distributed", reason="needs a pool's libraries: pip install 'slrig[pool]'")
 
-from slrig.compute.serving import _scratch, serve_scheduler
+from distributed import Scheduler, Status
+
+from slrig.compute.serving import KEPT_EVENTS, _scratch, serve_scheduler
 from slrig.errors import ConfigError
 from tests.listening import listening_at
 
 
-def test_nothing_of_a_scheduler_listens_beyond_its_address() -> None:
+def test_a_scheduler_listens_at_its_address_alone_and_keeps_few_events() -> None:
     found: set[str] = set()
+    kept: set[int] = set()
 
     def say(_words: str) -> None:
         found.update(listening_at())
+        (scheduler,) = (each for each in Scheduler._instances if each.status is Status.running)
+        for number in range(2 * KEPT_EVENTS):
+            scheduler.log_event("a rig", number)
+        kept.add(len(scheduler.get_events("a rig")))
         signal.raise_signal(signal.SIGTERM)
 
     before = listening_at()
     serve_scheduler("tcp://127.0.0.1:0", None, say=say)
+    assert kept == {KEPT_EVENTS}
     assert len(found - before) == 2
     assert {address.rpartition(":")[0] for address in found - before} == {"127.0.0.1"}
 
