@@ -72,7 +72,7 @@ class FrameFeed:
 
     send : sends one message, and returns False when nobody receives it any more; it may block. number : of the task
     that will use the frames. receiver : what they are sent to, by which the task's process is known. region : what of
-    the scene is asked for.
+    the scene is asked for. `evidence` is what the frames have proven once all have come, whether they were sent or not.
     """
 
     def __init__(
@@ -86,6 +86,7 @@ class FrameFeed:
     ) -> None:
         self.number = number
         self.receiver = receiver
+        self.evidence: EvidenceSummary | None = None
         self._send = send
         self._region = region
         self._most_bytes = most_waiting_bytes() if most_bytes is None else most_bytes
@@ -123,6 +124,7 @@ class FrameFeed:
 
     def end(self, evidence: EvidenceSummary) -> None:
         """Queue the end."""
+        self.evidence = evidence
         self._waiting.put(evidence)
 
     def abandon(self) -> None:

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import structlog
 
 from slrig.bundle.health import write_health
+from slrig.capture.evidence import EvidenceSummary
 from slrig.devices import Rig
 from slrig.errors import StorageError
 from slrig.failure import disk_errors
@@ -155,7 +156,8 @@ class _Scan:
         tools, record = self._tools, self._record
         staged = tools.folder.clear_results(self._id)
         result = tools.folder.stage_result(self._id)
-        call = reconstruction(tools.worker.module, staged / BUNDLE, result, self.plan.reconstruction)
+        judged = None if self._feed is None else self._feed.evidence
+        call = reconstruction(tools.worker.module, staged / BUNDLE, result, self.plan.reconstruction, judged)
         report: Mapping[str, Any] = tools.worker.run(
             call, progress=progress, cancelled=job.stop.is_set, made=progress.file_made, feed=self._feed
         )
@@ -175,12 +177,17 @@ class _Scan:
         return Outcome(report_summary(report))
 
 
-def reconstruction(pipeline: str, bundle: Path, folder: Path, plan: ReconstructionPlan) -> Task:
-    """The worker's job of reconstructing a bundle into a folder that is there. pipeline : `Compute.module`."""
+def reconstruction(
+    pipeline: str, bundle: Path, folder: Path, plan: ReconstructionPlan, judged: EvidenceSummary | None = None
+) -> Task:
+    """The worker's job of reconstructing a bundle into a folder that is there. pipeline : `Compute.module`.
+
+    judged : what the frames proved as they were captured, where this process has captured them.
+    """
     return Task(
         f"{pipeline}:reconstruct_into",
         (bundle, folder),
-        {"plan": plan},
+        {"plan": plan, "judged": judged},
         what="reconstruction",
         remedy="The bundle is kept: download bundle.zip and run `slrig reconstruct` on it, or scan again.",
         movable=True,

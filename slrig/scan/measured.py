@@ -62,10 +62,12 @@ def measured(
     *,
     axis: Axis | None,
     region: Region | None = None,
+    judged: EvidenceSummary | None = None,
 ) -> tuple[Walked, Triangulated]:
     """The points of a recorded bundle: of the frames that came while it was captured, or else of its files.
 
     axis : the one that was asked for; None for that which tells most of depth. region : what of the scene is asked for.
+    judged : what the frames proved as they were captured; without it, files of one exposure are judged again.
 
     Raises
     ------
@@ -74,12 +76,12 @@ def measured(
     NothingToReconstructError
         No pixel could be decoded, no stripe be found, or the light tells no depth.
     """
-    walked = _walked(folder, calibration_file, live, entered, axis=axis, region=region)
+    walked = _walked(folder, calibration_file, live, entered, axis=axis, region=region, judged=judged)
     tries = [_tried(walked, folder, entered, region)]
     others = walked.shown - {walked.axis} if axis is None else frozenset()
     for other in others:
         if _is_weak(tries[0]):
-            again = _walked(folder, calibration_file, None, entered, axis=other, region=region)
+            again = _walked(folder, calibration_file, None, entered, axis=other, region=region, judged=judged)
             tries.append(_tried(again, folder, entered, region))
     sound = [each for each in tries if not isinstance(each, NothingToReconstructError)]
     if not sound:
@@ -172,6 +174,7 @@ def _walked(
     *,
     axis: Axis | None,
     region: Region | None,
+    judged: EvidenceSummary | None,
 ) -> Walked:
     """Frames to curves: those that came while the scan was captured, or else those of the bundle, along `axis`."""
     names: list[str] = []
@@ -204,7 +207,7 @@ def _walked(
         names += files.outline.cameras
         devices = _require_calibration(folder, names, files.calibration)
         try:
-            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis, region)
+            stream, evidence, cut_short = _streamed(files, devices, stage_entered, axis, region, judged)
             seen = stream.finish()
         except PatternError as cause:
             message = f"{folder}: {cause}"
@@ -226,11 +229,12 @@ def _streamed(
     entered: Callable[[str, str], None],
     axis: Axis | None,
     region: Region | None,
+    proven: EvidenceSummary | None,
 ) -> tuple[ScanStream, EvidenceSummary, tuple[str, ...]]:
     """The frames of a bundle in a stream, what they prove, and words for each code that was cut short.
 
     Frames are read one after another, so that memory holds only those that are needed. Brackets, and frames that a
-    missing bit gives other patterns, are read first.
+    missing bit gives other patterns, are read first. proven : what the frames proved as they were captured.
     """
     refused = read_refused(files.folder)
     capture, cut_short = without_missing_bits(files.outline)
@@ -243,6 +247,7 @@ def _streamed(
         every = tuple(files.shots(range(len(files.outline.shots))))
         capture, _ = without_missing_bits(replace(files.outline, shots=every))
         shots: Iterable[Shot] = [capture.shots[index] for index in order]
+        proven = None  # of other patterns, or of each exposure by itself
     else:
         shots = files.shots(order)
     stream = ScanStream(
@@ -251,11 +256,13 @@ def _streamed(
     evidence = Evidence(capture.patterns, capture.cameras, refused)
     for index, shot in zip(order, shots, strict=True):
         stream.take(shot)
-        if one_exposure and index in judged:
+        if proven is None and one_exposure and index in judged:
             entered("check frames", shot.camera)
             evidence.contradictions(shot)
         entered("read bundle", shot.camera)
-    return stream, evidence.summary() if one_exposure else check_exposures(capture, refused), cut_short
+    if proven is None:
+        proven = evidence.summary() if one_exposure else check_exposures(capture, refused)
+    return stream, proven, cut_short
 
 
 def _is_of(live: LiveScan, folder: Path, calibration_file: Path | None) -> bool:

@@ -19,6 +19,7 @@ from slrig.bundle.health import read_health
 from slrig.bundle.notes import read_notes
 from slrig.bundle.stage import read_stage
 from slrig.bundle.storage import write_file
+from slrig.capture.evidence import EvidenceSummary
 from slrig.errors import ScanCancelledError
 from slrig.jobs.frame_feed import FedFrames
 from slrig.jobs.versions import computed
@@ -114,10 +115,12 @@ def reconstruct_into(
     made: Callable[[str], None] = lambda _: None,
     where: Mapping[str, str] | None = None,
     live: LiveScan | None = None,
+    judged: EvidenceSummary | None = None,
 ) -> dict[str, object]:
     """Reconstruct a recorded bundle into a folder that only its maker knows yet, and return the report.
 
     `live` has taken the frames already while they were captured; where it is of this bundle they are not read again.
+    judged : what the frames proved as they were captured, so that they need not be judged again.
     where : `slrig.jobs.worker_process.Task.where`, for the report.
 
     Writes mesh.ply first, then mesh.glb and points.ply, then preview.png, two pictures of the refused pixels
@@ -158,7 +161,7 @@ def reconstruct_into(
 
     with compilations_told(compiling), ThreadPoolExecutor(1, thread_name_prefix="slrig-pictures") as beside:
         entered("read bundle", 0.0, str(bundle))
-        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region)
+        walked, found = measured(bundle, calibration, live, entered, axis=plan.axis, region=plan.region, judged=judged)
         meshed = _meshed(bundle, found, walked, plan, entered)
         mesh, cameras = meshed.mesh, meshed.cameras
         entered("write mesh", 0.75, f"{len(mesh.faces)} triangles")

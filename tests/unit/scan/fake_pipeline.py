@@ -109,6 +109,7 @@ def reconstruct_into(
     cancelled: Callable[[], bool],
     made: Callable[[str], None] = lambda _: None,
     live: LiveScan | None = None,
+    judged: EvidenceSummary | None = None,  # noqa: ARG001 - as it is called
 ) -> Mapping[str, object]:
     """Do what `bundle/order` says: finish, fail, break, die, or wait to be cancelled."""
     order = (bundle / "order").read_text()

@@ -33,7 +33,7 @@ from slrig.model import Axis, Calibration, Capture, Gray, LineShift, Refusal, Sh
 from slrig.model.header import CaptureHeader
 from slrig.scan.acquisition import capture_frames
 from slrig.scan.plan import PatternPlan, ReconstructionPlan, ScanPlan
-from slrig.scan.reconstruct import reconstruct_bundle
+from slrig.scan.reconstruct import reconstruct_bundle, reconstruct_into
 from slrig.scan.stream import LiveScan
 
 RIG = Path(__file__).parents[3] / "config" / "rigs" / "sphere.toml"
@@ -345,6 +345,19 @@ def test_frames_taken_live_give_the_bytes_that_the_bundle_gives(recorded: Path, 
         assert not path.exists() or path.read_bytes() == (tmp_path / "read" / name).read_bytes()
     assert (tmp_path / "live" / "mesh.ply").exists()
     assert reports_alike(live, read)
+
+
+def test_frames_that_were_judged_as_they_were_captured_are_not_judged_again(recorded: Path, tmp_path: Path) -> None:
+    (tmp_path / "judged").mkdir()
+    judged = reconstruct_into(
+        recorded, tmp_path / "judged", plan=ReconstructionPlan(), progress=lambda *_: None, cancelled=lambda: False,
+        judged=seen_live(recorded).evidence,
+    )  # fmt: skip
+    read = run(recorded, tmp_path / "read")
+    assert "check frames" not in judged["stages_s"]  # type: ignore[operator]
+    assert "check frames" in read["stages_s"]  # type: ignore[operator]
+    assert reports_alike(judged, read)
+    assert (tmp_path / "judged" / "mesh.ply").read_bytes() == (tmp_path / "read" / "mesh.ply").read_bytes()
 
 
 @pytest.mark.slow
